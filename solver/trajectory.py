@@ -1,0 +1,152 @@
+"""Pose at any time between the samples of a trajectory: cubic Hermite position, cubic attitude on the rotation group."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .rotation import (
+    angles_from_matrix,
+    angles_jacobian,
+    matrix_from_quaternion,
+    quaternion_conjugate,
+    quaternion_from_vector,
+    quaternion_multiply,
+    vector_from_quaternion,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Measured exterior orientation at n times.
+
+    Attributes
+    ----------
+    time_s : (n,)
+    position_l : (n, 3) perspective centre, local frame, metres
+    angles : (n, 3) omega, phi, kappa, radians
+    velocity_l : (n, 3) m/s
+    angle_rate : (n, 3) time derivative of omega, phi, kappa, rad/s
+    """
+
+    time_s: Array
+    position_l: Array
+    angles: Array
+    velocity_l: Array
+    angle_rate: Array
+
+    @property
+    def R_lc(self) -> Array:
+        from .rotation import matrix_from_angles
+
+        return matrix_from_angles(*self.angles.T)
+
+
+class Trajectory:
+    """A sampled pose, interpolated.
+
+    The four samples about a time decide its pose (slopes at the two inner ones from their neighbours), so the result
+    does not depend on how much of the trajectory has been received, and is continuous with its first derivative.
+
+    Parameters
+    ----------
+    time_s : (n,) strictly increasing, n >= 2
+    position_l : (n, 3) metres, local frame
+    quaternion : (n, 4) ``R_lc`` as xyzw
+
+    Raises
+    ------
+    ValueError : fewer than two samples, shapes that do not match, times that do not increase
+    """
+
+    def __init__(self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike):
+        self.time_s = np.ascontiguousarray(time_s, dtype=float)
+        self.position_l = np.ascontiguousarray(position_l, dtype=float)
+        q = np.array(quaternion, dtype=float)
+        n = len(self.time_s)
+        if n < 2:
+            raise ValueError(f"a trajectory needs at least 2 samples, got {n}")
+        if self.position_l.shape != (n, 3) or q.shape != (n, 4):
+            raise ValueError(
+                f"position {self.position_l.shape} and quaternion {q.shape} do not match {n} times"
+            )
+        step = np.diff(self.time_s)
+        if not (step > 0).all():
+            raise ValueError(f"times must increase; sample {int(np.argmin(step > 0)) + 1} does not")
+        self.quaternion = q / np.linalg.norm(q, axis=1, keepdims=True)
+        relative = quaternion_multiply(quaternion_conjugate(self.quaternion[:-1]), self.quaternion[1:])
+        self._turn = vector_from_quaternion(
+            relative
+        )  # rotation vector from one sample to the next, image frame
+        self._velocity = _slopes(step, np.diff(self.position_l, axis=0))
+        self._rate = _slopes(step, self._turn)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def start_s(self) -> float:
+        return float(self.time_s[0])
+
+    @property
+    def end_s(self) -> float:
+        return float(self.time_s[-1])
+
+    def covers(self, time_s: ArrayLike) -> NDArray[np.bool_]:
+        """Which times lie inside the trajectory."""
+        t = np.asarray(time_s, dtype=float)
+        return (t >= self.time_s[0]) & (t <= self.time_s[-1])
+
+    def at(self, time_s: ArrayLike) -> Poses:
+        """Pose at times (m,).
+
+        Raises
+        ------
+        ValueError : a time outside the trajectory
+        """
+        t = np.atleast_1d(np.asarray(time_s, dtype=float))
+        if not self.covers(t).all():
+            bad = t[~self.covers(t)][0]
+            raise ValueError(
+                f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s"
+            )
+        i = np.clip(np.searchsorted(self.time_s, t, side="right") - 1, 0, len(self) - 2)
+        h = (self.time_s[i + 1] - self.time_s[i])[:, None]
+        s = (t - self.time_s[i])[:, None] / h
+        p0, p1 = self.position_l[i], self.position_l[i + 1]
+        position, velocity = _hermite(s, h, p1 - p0, self._velocity[i], self._velocity[i + 1])
+        theta, theta_rate = _hermite(s, h, self._turn[i], self._rate[i], self._rate[i + 1])
+        q = quaternion_multiply(self.quaternion[i], quaternion_from_vector(theta))
+        R = matrix_from_quaternion(q)
+        angles = angles_from_matrix(R)
+        # angles between two samples are small, so theta_rate is the body rate to first order; one more term is kept
+        rate_c = theta_rate - 0.5 * np.cross(theta, theta_rate)
+        rate_l = np.einsum("nij,nj->ni", R, rate_c)
+        angle_rate = np.einsum("nij,nj->ni", angles_jacobian(angles), rate_l)
+        return Poses(t, p0 + position, angles, velocity, angle_rate)
+
+
+def _slopes(step: Array, change: Array) -> Array:
+    """Derivatives (n, k) at the samples from changes (n-1, k) over steps (n-1,): parabola through three neighbours."""
+    secant = change / step[:, None]
+    slope = np.empty((len(step) + 1, change.shape[1]))
+    if len(step) == 1:
+        slope[:] = secant[0]
+        return slope
+    w = (step[1:] / (step[:-1] + step[1:]))[:, None]
+    slope[1:-1] = w * secant[:-1] + (1.0 - w) * secant[1:]
+    slope[0] = 2.0 * secant[0] - slope[1]
+    slope[-1] = 2.0 * secant[-1] - slope[-2]
+    return slope
+
+
+def _hermite(s: Array, h: Array, change: Array, slope0: Array, slope1: Array) -> tuple[Array, Array]:
+    """Cubic from 0 to ``change`` with the slopes given: value and time derivative at share ``s`` of step ``h``."""
+    s2, s3 = s * s, s * s * s
+    value = (3 * s2 - 2 * s3) * change + h * ((s3 - 2 * s2 + s) * slope0 + (s3 - s2) * slope1)
+    rate = (6 * (s - s2) / h) * change + (3 * s2 - 4 * s + 1) * slope0 + (3 * s2 - 2 * s) * slope1
+    return value, rate
