@@ -76,9 +76,7 @@ class LineCamera:
         known = {lens.id for lens in self.lenses}
         for line in self.lines:
             if line.lens not in known:
-                raise ValueError(
-                    f"CCD line {line.id!r} names lens {line.lens!r}; known lenses: {sorted(known)}"
-                )
+                raise ValueError(f"CCD line {line.id!r} names lens {line.lens!r}; known lenses: {sorted(known)}")
         if len(self.line_index) != len(self.lines):
             raise ValueError("two CCD lines of a camera have the same id")
 
@@ -152,9 +150,7 @@ def three_line_camera(
 ) -> LineCamera:
     """A single-lens camera with parallel lines looking forward (positive) or backward (negative) by ``view_deg``."""
     lines = tuple(
-        straight_line(
-            id, lens, pixels, pixel_size_mm, (focal_length_mm * float(np.tan(np.radians(angle))), 0.0)
-        )
+        straight_line(id, lens, pixels, pixel_size_mm, (focal_length_mm * float(np.tan(np.radians(angle))), 0.0))
         for id, angle in view_deg.items()
     )
     return LineCamera(name, (Lens(lens, focal_length_mm),), lines)

@@ -53,9 +53,7 @@ def geodetic_from_ecef(position_e: ArrayLike) -> Array:
     lat = np.arctan2(z + ep2 * b * np.sin(beta) ** 3, p - ECCENTRICITY2 * SEMI_MAJOR_M * np.cos(beta) ** 3)
     for _ in range(2):
         beta = np.arctan2((1.0 - FLATTENING) * np.sin(lat), np.cos(lat))
-        lat = np.arctan2(
-            z + ep2 * b * np.sin(beta) ** 3, p - ECCENTRICITY2 * SEMI_MAJOR_M * np.cos(beta) ** 3
-        )
+        lat = np.arctan2(z + ep2 * b * np.sin(beta) ** 3, p - ECCENTRICITY2 * SEMI_MAJOR_M * np.cos(beta) ** 3)
     R_E = curvature_radii(lat)[1]
     s, c = np.sin(lat), np.cos(lat)
     height = p * c + z * s - R_E * (1.0 - ECCENTRICITY2 * s * s)

@@ -144,13 +144,9 @@ def _transformer(crs):
 
     target = pyproj.CRS.from_epsg(4979)
     try:
-        return pyproj.Transformer.from_crs(
-            crs.to_3d() if len(crs.axis_info) < 3 else crs, target, always_xy=True
-        )
+        return pyproj.Transformer.from_crs(crs.to_3d() if len(crs.axis_info) < 3 else crs, target, always_xy=True)
     except pyproj.exceptions.ProjError as error:
-        raise CrsError(
-            f"PROJ cannot transform {crs.name!r} to WGS 84: {str(error).splitlines()[0]}"
-        ) from None
+        raise CrsError(f"PROJ cannot transform {crs.name!r} to WGS 84: {str(error).splitlines()[0]}") from None
 
 
 def R_lc_from_navigation(
@@ -158,11 +154,7 @@ def R_lc_from_navigation(
 ) -> Array:
     """Image-to-local rotation (n, 3, 3) from roll, pitch, heading (n, 3) in radians at local positions (n, 3)."""
     rpy = np.asarray(rpy, dtype=float)
-    return (
-        frame.R_ln(position_l)
-        @ matrix_from_navigation(rpy[..., 0], rpy[..., 1], rpy[..., 2])
-        @ np.asarray(R_bc)
-    )
+    return frame.R_ln(position_l) @ matrix_from_navigation(rpy[..., 0], rpy[..., 1], rpy[..., 2]) @ np.asarray(R_bc)
 
 
 def navigation_from_R_lc(
@@ -173,9 +165,7 @@ def navigation_from_R_lc(
     return navigation_from_matrix(R_nl @ np.asarray(R_lc) @ np.asarray(R_bc).T)
 
 
-def opk_covariance_from_navigation(
-    rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike, cov_rpy: ArrayLike
-) -> Array:
+def opk_covariance_from_navigation(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike, cov_rpy: ArrayLike) -> Array:
     """Covariance (..., 3, 3) of omega, phi, kappa from that of roll, pitch, heading; all radians."""
     rpy = np.asarray(rpy, dtype=float)
     sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])

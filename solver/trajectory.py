@@ -71,17 +71,13 @@ class Trajectory:
         if n < 2:
             raise ValueError(f"a trajectory needs at least 2 samples, got {n}")
         if self.position_l.shape != (n, 3) or q.shape != (n, 4):
-            raise ValueError(
-                f"position {self.position_l.shape} and quaternion {q.shape} do not match {n} times"
-            )
+            raise ValueError(f"position {self.position_l.shape} and quaternion {q.shape} do not match {n} times")
         step = np.diff(self.time_s)
         if not (step > 0).all():
             raise ValueError(f"times must increase; sample {int(np.argmin(step > 0)) + 1} does not")
         self.quaternion = q / np.linalg.norm(q, axis=1, keepdims=True)
         relative = quaternion_multiply(quaternion_conjugate(self.quaternion[:-1]), self.quaternion[1:])
-        self._turn = vector_from_quaternion(
-            relative
-        )  # rotation vector from one sample to the next, image frame
+        self._turn = vector_from_quaternion(relative)  # rotation vector from one sample to the next, image frame
         self._velocity = _slopes(step, np.diff(self.position_l, axis=0))
         self._rate = _slopes(step, self._turn)
 
@@ -111,9 +107,7 @@ class Trajectory:
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
         if not self.covers(t).all():
             bad = t[~self.covers(t)][0]
-            raise ValueError(
-                f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s"
-            )
+            raise ValueError(f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s")
         i = np.clip(np.searchsorted(self.time_s, t, side="right") - 1, 0, len(self) - 2)
         h = (self.time_s[i + 1] - self.time_s[i])[:, None]
         s = (t - self.time_s[i])[:, None] / h
