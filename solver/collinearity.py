@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .rotation import matrix_from_angles
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from .rotation import (
     navigation_from_matrix,
 )
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 class CrsError(ValueError):
@@ -131,7 +131,7 @@ class LocalFrame:
 
 
 def _parse_crs(crs: str):
-    import pyproj
+    import pyproj.exceptions
 
     try:
         return pyproj.CRS.from_user_input(crs)
@@ -140,7 +140,7 @@ def _parse_crs(crs: str):
 
 
 def _transformer(crs):
-    import pyproj
+    import pyproj.exceptions
 
     target = pyproj.CRS.from_epsg(4979)
     try:

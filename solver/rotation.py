@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 #: body (forward-right-down) <- image (forward-left-up), without boresight.
 R_BC_NOMINAL: Array = np.diag([1.0, -1.0, -1.0])

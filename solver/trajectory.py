@@ -17,7 +17,7 @@ from .rotation import (
     vector_from_quaternion,
 )
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,90 @@
+"""The command ``triline``: one file a sub-command, loaded when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from typing import Any
+
+from ..errors import UserError
+
+#: command -> (module, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args) -> exit code.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("demo", "the live on-line triangulation demo"),
+    "simulate": ("simulate", "a flight recording with truth, from a seed"),
+    "node": ("node", "one node alone, for running across machines"),
+    "replay": ("replay", "play a recording onto the bus with its timing"),
+    "process": ("process", "the same nodes over a recording, as fast as it goes"),
+    "adjust": ("adjust", "batch adjustment of a recording or a block folder"),
+    "navigate": ("navigate", "GNSS/inertial filter and smoother over a recording or a sensor folder"),
+    "analyze": ("analyze", "offline analysis: one self-contained HTML report"),
+    "info": ("info", "what a recording holds"),
+    "check": ("check", "whether a recording is whole"),
+    "recover": ("recover", "a valid recording from a broken one"),
+    "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
+    "import": ("import_", "block folder, sensor folder, SBET and others to a recording"),
+    "rectify": ("rectify", "orthoimage of a recording"),
+    "study": ("study", "Monte Carlo and sensitivity studies"),
+    "view": ("view", "open a recording in Rerun"),
+}
+
+
+def _parser(command: str | None) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triline",
+        description="On-line triangulation for line-scanner (pushbroom) cameras.",
+        epilog="'triline COMMAND --help' shows the options of a command and an example.",
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, (module_name, text) in COMMANDS.items():
+        sub = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.formatter_class = argparse.RawDescriptionHelpFormatter
+        if name == command:
+            module = _load(module_name)
+            module.add_arguments(sub)
+            sub.epilog = f"example:\n  {module.EXAMPLE}"
+            sub.set_defaults(run=module.run)
+            _add_common(sub)
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    taken = {option for action in parser._actions for option in action.option_strings}
+    if "--json" not in taken:
+        parser.add_argument("--json", action="store_true", help="print a machine-readable result")
+    if "-q" not in taken:
+        parser.add_argument("-q", "--quiet", action="store_true", help="print only the result and errors")
+    if "-v" not in taken:
+        parser.add_argument("-v", "--verbose", action="store_true", help="print details")
+
+
+def _load(module_name: str) -> Any:
+    return importlib.import_module(f".{module_name}", __package__)
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"triline {version('triline')}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
+    argv = sys.argv[1:] if argv is None else argv
+    command = next((word for word in argv if not word.startswith("-")), None)
+    args = _parser(command if command in COMMANDS else None).parse_args(argv)
+    try:
+        return args.run(args)
+    except UserError as error:
+        print(f"triline {args.command}: {error}", file=sys.stderr)
+    except FileNotFoundError as error:
+        print(f"triline {args.command}: {error.filename}: no such file or folder", file=sys.stderr)
+    except (PermissionError, IsADirectoryError, NotADirectoryError) as error:
+        print(f"triline {args.command}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
+    except BrokenPipeError:  # the reader of our output has gone, as in `triline info F | head`
+        sys.stderr.close()
+    except KeyboardInterrupt:
+        print(f"triline {args.command}: interrupted", file=sys.stderr)
+    return 1

@@ -1,0 +1,237 @@
+"""Between messages and the solver's arrays. Field numbers and quaternion orders are dealt with here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..schemas import messages as m
+from ..solver.camera import CcdLine, Lens, LineCamera
+from ..solver.frames import LocalFrame
+from ..solver.rotation import (
+    R_BC_NOMINAL,
+    angles_from_matrix,
+    matrix_from_angles,
+    matrix_from_navigation,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
+
+Array = NDArray[np.floating]
+
+SECOND_NS = 1_000_000_000
+LOCAL_FRAME_ID = "local"
+
+
+@dataclass(frozen=True)
+class PoseSample:
+    """A pose message as arrays: image frame in the local frame.
+
+    Attributes
+    ----------
+    time_ns : time of validity
+    position_l : (3,) m
+    quaternion : (4,) ``R_lc`` xyzw
+    covariance : (6, 6) X, Y, Z, omega, phi, kappa; m, rad; None if the message has none
+    valid, strip : as in the message
+    correction : (6,) m, rad; None if the message has none
+    """
+
+    time_ns: int
+    position_l: Array
+    quaternion: Array
+    covariance: Array | None
+    valid: bool
+    strip: str = ""
+    correction: Array | None = None
+
+
+def time_ns(timestamp: Any) -> int:
+    """Nanoseconds since the Unix epoch of a protobuf Timestamp."""
+    return timestamp.seconds * SECOND_NS + timestamp.nanos
+
+
+def set_time(timestamp: Any, time_ns: int) -> None:
+    """Set a protobuf Timestamp field in place."""
+    timestamp.seconds, timestamp.nanos = divmod(int(time_ns), SECOND_NS)
+
+
+def pose_message(
+    time_ns: int,
+    position_l: ArrayLike,
+    angles: ArrayLike,
+    covariance: ArrayLike | None = None,
+    *,
+    quaternion: ArrayLike | None = None,
+    valid: bool = True,
+    reason: str = "",
+    strip: str = "",
+    correction: ArrayLike | None = None,
+    velocity_l: ArrayLike | None = None,
+) -> Any:
+    """A PoseInFrame of the image frame in the local frame; angles are omega, phi, kappa in radians.
+
+    ``quaternion`` (xyzw) spares the conversion where the caller has computed many at once.
+    """
+    if quaternion is None:
+        quaternion = quaternion_from_matrix(matrix_from_angles(*np.asarray(angles, dtype=float)))
+    message = m.PoseInFrame(frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip)
+    set_time(message.timestamp, time_ns)
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = (float(v) for v in np.asarray(position_l))
+    q.x, q.y, q.z, q.w = (float(v) for v in np.asarray(quaternion))
+    message.angles.extend(np.asarray(angles, dtype=float).tolist())
+    if covariance is not None:
+        message.covariance.extend(np.asarray(covariance, dtype=float).ravel().tolist())
+    if correction is not None:
+        message.correction.extend(np.asarray(correction, dtype=float).tolist())
+    if velocity_l is not None:
+        v = message.velocity
+        v.x, v.y, v.z = (float(c) for c in np.asarray(velocity_l))
+    return message
+
+
+def pose_sample(message: Any) -> PoseSample:
+    """The arrays of a PoseInFrame.
+
+    Raises
+    ------
+    ValueError : a value that is not finite, a quaternion that is not a rotation, a covariance of the wrong size
+    """
+    p, q = message.pose.position, message.pose.orientation
+    position = np.array([p.x, p.y, p.z])
+    quaternion = np.array([q.x, q.y, q.z, q.w])
+    if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
+        raise ValueError("pose is not finite")
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > 1e-3:
+        raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+    covariance = _square(message.covariance, 6, "covariance")
+    correction = np.array(message.correction) if message.correction else None
+    return PoseSample(
+        time_ns(message.timestamp), position, quaternion / norm, covariance, message.valid, message.strip, correction
+    )
+
+
+def angles_of(quaternion: ArrayLike) -> Array:
+    """omega, phi, kappa (..., 3) in radians of ``R_lc`` quaternions (..., 4)."""
+    return angles_from_matrix(matrix_from_quaternion(quaternion))
+
+
+def _square(values: Any, n: int, name: str) -> Array | None:
+    """A flattened (n, n) matrix of a message, None if absent."""
+    if len(values) == 0:
+        return None
+    if len(values) != n * n:
+        raise ValueError(f"{name} has {len(values)} values, wanted {n * n}")
+    matrix = np.array(values).reshape(n, n)
+    if not np.isfinite(matrix).all() or (np.diagonal(matrix) < 0).any():
+        raise ValueError(f"{name} is not finite or has a negative variance")
+    return matrix
+
+
+def camera_message(camera: LineCamera) -> Any:
+    """A Camera message with the look-up tables of all lines."""
+    return m.Camera(
+        name=camera.name,
+        lenses=[
+            m.Lens(
+                id=lens.id,
+                focal_length_mm=lens.focal_length_mm,
+                principal_point_x_mm=lens.principal_point_mm[0],
+                principal_point_y_mm=lens.principal_point_mm[1],
+            )
+            for lens in camera.lenses
+        ],
+        lines=[
+            m.CcdLine(
+                id=line.id,
+                lens=line.lens,
+                x_mm=line.xy_mm[:, 0].tolist(),
+                y_mm=line.xy_mm[:, 1].tolist(),
+                chip_first_sample=line.chips,
+            )
+            for line in camera.lines
+        ],
+    )
+
+
+def camera_from(message: Any) -> LineCamera:
+    """The camera of a Camera message; raises ValueError for one that cannot be used."""
+    for lens in message.lenses:
+        if not lens.focal_length_mm > 0:
+            raise ValueError(f"lens {lens.id!r} has focal length {lens.focal_length_mm}, wanted more than 0 mm")
+    lines = []
+    for line in message.lines:
+        xy = np.array([line.x_mm, line.y_mm]).T if len(line.x_mm) == len(line.y_mm) else np.empty((0, 2))
+        if len(xy) < 2 or not np.isfinite(xy).all():
+            raise ValueError(f"CCD line {line.id!r} has no usable table of pixel centres")
+        lines.append(CcdLine(line.id, line.lens, xy, tuple(line.chip_first_sample)))
+    lenses = tuple(
+        Lens(lens.id, lens.focal_length_mm, (lens.principal_point_x_mm, lens.principal_point_y_mm))
+        for lens in message.lenses
+    )
+    return LineCamera(message.name, lenses, tuple(lines))
+
+
+def local_frame(project: Any) -> LocalFrame:
+    """The local frame of a Project message."""
+    return LocalFrame(project.origin_latitude, project.origin_longitude, project.origin_height, project.crs or "local")
+
+
+def R_bc_of(project: Any) -> Array:
+    """Image to body, with the boresight of a Project message."""
+    if not project.boresight_deg:
+        return R_BC_NOMINAL
+    roll, pitch, heading = np.radians(project.boresight_deg)
+    return matrix_from_navigation(roll, pitch, heading) @ R_BC_NOMINAL
+
+
+def lever_arm_of(project: Any) -> Array:
+    """Perspective centre to antenna, body frame, m."""
+    return np.array(project.lever_arm_m) if project.lever_arm_m else np.zeros(3)
+
+
+def gnss_message(
+    time_ns: int, geodetic_deg_m: ArrayLike, sigma_enu_m: ArrayLike, velocity_enu: ArrayLike | None = None,
+    velocity_sigma_enu: ArrayLike | None = None,
+) -> Any:  # fmt: skip
+    """A LocationFix of latitude, longitude (degrees) and ellipsoidal height, sigmas east-north-up."""
+    message = m.LocationFix(frame_id="gnss_antenna", position_covariance_type=2)
+    set_time(message.timestamp, time_ns)
+    message.latitude, message.longitude, message.altitude = (float(v) for v in np.asarray(geodetic_deg_m))
+    message.position_covariance.extend(np.diag(np.square(sigma_enu_m)).ravel().tolist())
+    if velocity_enu is not None:
+        v = message.velocity_enu
+        v.x, v.y, v.z = (float(c) for c in np.asarray(velocity_enu))
+        if velocity_sigma_enu is not None:
+            message.velocity_covariance.extend(np.diag(np.square(velocity_sigma_enu)).ravel().tolist())
+    return message
+
+
+def attitude_message(time_ns: int, rpy: ArrayLike, sigma: ArrayLike) -> Any:
+    """An Attitude message; roll, pitch, heading and their sigmas in radians."""
+    roll, pitch, heading = (float(v) for v in np.asarray(rpy))
+    covariance = np.diag(np.square(sigma)).ravel().tolist()
+    return m.Attitude(time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=covariance)
+
+
+def ground_point_message(point: str, position_l: ArrayLike, covariance: ArrayLike, role: str) -> Any:
+    """A GroundPoint; ``role`` is control, planimetric, height or check."""
+    x, y, z = (float(v) for v in np.asarray(position_l))
+    cov = np.asarray(covariance, dtype=float).ravel().tolist()
+    return m.GroundPoint(point=point, x=x, y=y, z=z, covariance=cov, role=m.GroundPoint.Role.Value(role.upper()))
+
+
+def role_of(ground_point: Any) -> str:
+    """control, planimetric, height or check."""
+    return m.GroundPoint.Role.Name(ground_point.role).lower()
+
+
+def tie_message(point: str, images: Iterable[dict[str, Any]]) -> Any:
+    """A TiePoint; each image is a dict of ImagePoint's fields."""
+    return m.TiePoint(point=point, images=[m.ImagePoint(**image) for image in images])

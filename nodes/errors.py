@@ -1,0 +1,5 @@
+"""What goes wrong in a way that a user can mend."""
+
+
+class UserError(Exception):
+    """Work failed for a reason outside the program: one line, what and where and what was wanted. Exit code 1."""

@@ -1,0 +1,66 @@
+"""What a node is: messages in, messages out, nothing else.
+
+A node reads only the messages it is given, in the order of their platform stamps, and never a clock: the bus runner and
+the recording runner drive the same `Node.step` and get the same answer.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message with its envelope.
+
+    Attributes
+    ----------
+    topic : e.g. ``sensor/lines/F``
+    stamp_ns : platform time (UTC, ns since the Unix epoch) at which it was measured or could be known
+    source : id of the publisher
+    sequence : number given by the publisher, per topic, from 0; -1 before a runner has given it
+    body : the decoded protobuf message
+    """
+
+    topic: str
+    stamp_ns: int
+    body: Any
+    source: str = ""
+    sequence: int = -1
+
+
+class Node:
+    """Base of all nodes.
+
+    ``inputs`` and ``outputs`` name topics of the topic table. `step` takes one message and returns what follows
+    from it; `finish` is called once, when no more messages come, and returns what was still held back. Bad data never raises:
+    it is counted with `problem`, dropped, and shown on ``status/<node>``.
+    """
+
+    name: ClassVar[str]
+    inputs: ClassVar[tuple[str, ...]]
+    outputs: ClassVar[tuple[str, ...]]
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+        self.last_problem = ""
+
+    def step(self, message: Message) -> Iterable[Message]:
+        """What follows from one message."""
+        raise TypeError(f"{type(self).__name__} does not define step")
+
+    def finish(self) -> Iterable[Message]:
+        """What was still held back when the last message has come."""
+        return ()
+
+    def state(self) -> str:
+        """One phrase for the status line, e.g. ``running`` or ``waiting for configuration/camera``."""
+        return "running"
+
+    def problem(self, kind: str, text: str) -> None:
+        """Count bad data of a kind (a short counter name) and keep one line about the newest case."""
+        self.counters[kind] += 1
+        self.last_problem = text

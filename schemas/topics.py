@@ -1,0 +1,113 @@
+"""The one table of topics: bus, recorder, replay, monitor and tests read it.
+
+A topic's place in the table is its rank: of two messages with the same platform stamp the one with the lower rank comes
+first, live and from a recording. Sensors stand before what is computed from them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from . import messages as m
+
+
+class Queue(Enum):
+    """What happens when a subscriber cannot keep up."""
+
+    LOSSLESS = "lossless"  # the publisher is slowed down
+    NEWEST = "newest"  # the oldest waiting message is thrown away, and counted
+
+
+class Family(Enum):
+    """Who makes a topic."""
+
+    CONFIGURATION = "configuration"
+    SENSOR = "sensor"
+    OBSERVATION = "observation"
+    RESULT = "result"
+    STATUS = "status"
+    TRUTH = "truth"  # of a simulation; no estimating node may read it
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A row of the table.
+
+    Attributes
+    ----------
+    name : topic; a last part ``*`` stands for any one name (a CCD line, a node)
+    type : message class
+    family : who makes it
+    rate_hz : typical rate, 0 = on events
+    queue : policy of the bounded queue in front of a subscriber
+    allowed_lateness_ms : platform time within which a message may arrive after its turn without changing a result
+    recorded : whether the recorder keeps it
+    latched : whether all that was sent so far is handed to whoever joins later
+    """
+
+    name: str
+    type: Any
+    family: Family
+    rate_hz: float
+    queue: Queue = Queue.LOSSLESS
+    allowed_lateness_ms: float = 50.0
+    recorded: bool = True
+    latched: bool = False
+
+    @property
+    def type_name(self) -> str:
+        return self.type.DESCRIPTOR.full_name
+
+    def matches(self, topic: str) -> bool:
+        if self.name.endswith("/*"):
+            return (
+                topic.startswith(self.name[:-1])
+                and "/" not in topic[len(self.name) - 1 :]
+                and len(topic) >= len(self.name)
+            )
+        return topic == self.name
+
+
+_C, _S, _O, _R = Family.CONFIGURATION, Family.SENSOR, Family.OBSERVATION, Family.RESULT
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("configuration/project", m.Project, _C, 0, latched=True),
+    Topic("configuration/camera", m.Camera, _C, 0, latched=True),
+    Topic("configuration/strip", m.Strip, _C, 0, latched=True),
+    Topic("sensor/imu", m.Imu, _S, 200, allowed_lateness_ms=20),
+    Topic("sensor/attitude", m.Attitude, _S, 200, allowed_lateness_ms=20),
+    Topic("sensor/gnss", m.LocationFix, _S, 5, allowed_lateness_ms=20),
+    Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST),
+    Topic("trajectory/filtered", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
+    Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
+    Topic("observation/control", m.GroundPoint, _O, 0, latched=True),
+    Topic("observation/tie", m.TiePoint, _O, 50),
+    Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
+    Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
+    Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
+    Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
+    Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
+    Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
+    Topic("event/log", m.Log, Family.STATUS, 0),
+    Topic("status/*", m.NodeStatus, Family.STATUS, 2, queue=Queue.NEWEST),
+)
+
+
+def find(topic: str) -> Topic:
+    """The row of a topic; raises KeyError for one that is not in the table."""
+    for row in TOPICS:
+        if row.matches(topic):
+            return row
+    raise KeyError(topic)
+
+
+def rank(topic: str) -> int:
+    """Place in the table: decides between messages with equal stamps."""
+    return TOPICS.index(find(topic))
+
+
+def key_expression(platform: str, topic: str) -> str:
+    """Zenoh key of a topic; ``*`` stays a wildcard."""
+    return f"triline/{platform}/{topic}"
