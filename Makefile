@@ -1,0 +1,55 @@
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# tests and studies use processes, not BLAS threads
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help demo test lint bench study schemas clean
+
+help:
+	@echo "make demo    live on-line triangulation of a simulated flight (headless where there is no display)"
+	@echo "make test    all tests"
+	@echo "make lint    ruff, type checker, import contract"
+	@echo "make bench   speed, side by side with peers"
+	@echo "make study   slow statistical studies"
+	@echo "make schemas compile the protobuf files"
+
+# a virtual environment with the package; made again when the dependencies change
+$(VENV)/.run: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.run
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.bench: $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
+	@touch $@
+
+demo: $(VENV)/.run
+	$(BIN)/triline demo
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright --level error
+	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/contract .
+	cd build/contract && ../../$(BIN)/lint-imports --config ../../pyproject.toml --no-cache
+
+bench: $(VENV)/.bench
+	$(BIN)/python bench/run.py
+
+study: $(VENV)/.bench
+	$(BIN)/triline study all
+
+schemas: $(VENV)/.dev
+	$(BIN)/python schemas/compile.py
+
+clean:
+	rm -rf build dist out *.egg-info
