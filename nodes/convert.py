@@ -1,4 +1,4 @@
-"""Between messages and the solver's arrays. Field numbers and quaternion orders are dealt with here and nowhere else."""
+"""Between messages and the solver's arrays: field numbers and quaternion orders are dealt with only here."""
 
 from __future__ import annotations
 

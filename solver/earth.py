@@ -43,7 +43,7 @@ def ecef_from_geodetic(lat: ArrayLike, lon: ArrayLike, height_m: ArrayLike) -> A
 
 
 def geodetic_from_ecef(position_e: ArrayLike) -> Array:
-    """``(lat, lon, height)`` in radians and metres, (..., 3), of Earth-fixed positions (Bowring, then two refinements)."""
+    """``(lat, lon, height)`` in radians and metres, (..., 3), of Earth-fixed positions (Bowring, refined twice)."""
     X = np.asarray(position_e, dtype=float)
     p = np.hypot(X[..., 0], X[..., 1])
     z = X[..., 2]

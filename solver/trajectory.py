@@ -1,4 +1,4 @@
-"""Pose at any time between the samples of a trajectory: cubic Hermite position, cubic attitude on the rotation group."""
+"""Pose at any time between samples: cubic Hermite position, cubic attitude on the rotation group."""
 
 from __future__ import annotations
 

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-
 from triline.solver.camera import CcdLine, Lens, LineCamera, straight_line, three_line_camera
 from triline.solver.collinearity import image_motion, project
 from triline.solver.rotation import matrix_from_angles
 
 RNG = np.random.default_rng(3)
 N = 40
-POSITION = RNG.normal(0, 100, (N, 3)) + [0, 0, 1500]
+POSITION = RNG.normal([0, 0, 1500], 100, (N, 3))
 ANGLES = RNG.normal(0, 0.05, (N, 3)) + np.column_stack([np.zeros(N), np.zeros(N), RNG.uniform(-3, 3, N)])
 POINT = RNG.normal(0, 400, (N, 3)) * [1, 1, 0.1]
 C = np.full(N, 62.7)

@@ -3,14 +3,13 @@
 import numpy as np
 import pyproj
 import pytest
-
 from triline.solver import earth
 from triline.solver.frames import (
     CrsError,
     LocalFrame,
+    R_lc_from_navigation,
     navigation_from_R_lc,
     opk_covariance_from_navigation,
-    R_lc_from_navigation,
 )
 from triline.solver.rotation import angles_from_matrix, matrix_from_navigation
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.trajectory import Trajectory
 

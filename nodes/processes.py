@@ -1,0 +1,97 @@
+"""Nodes as processes: start, watch, stop in order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+#: Large image blocks are allocated and freed all the time; glibc would return each to the system and fetch it again.
+ALLOCATOR = {
+    "MALLOC_MMAP_THRESHOLD_": "1073741824",
+    "MALLOC_TRIM_THRESHOLD_": "1073741824",
+    "MALLOC_TOP_PAD_": "67108864",
+    # the nodes are processes of their own: one BLAS thread each
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
+@dataclass
+class NodeProcess:
+    """One node in a process of its own, its output in a log file."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log_path: Path
+
+    @property
+    def running(self) -> bool:
+        return self.process.poll() is None
+
+    def stop(self, timeout_s: float = 10.0) -> int:
+        """Ask it to finish (SIGINT) and wait; kill it after the time-out. Returns the exit code."""
+        if self.running:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
+
+    def last_line(self) -> str:
+        """The last line it wrote, for messages about why it ended."""
+        lines = self.log_path.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "no output"
+
+
+class NodeGroup:
+    """Several nodes on one bus. As a context manager it leaves no process behind, whatever happens."""
+
+    def __init__(self, log_folder: Path, platform: str, port: int):
+        self.log_folder = log_folder
+        self.arguments = ["--platform", platform, "--port", str(port)]
+        self.processes: dict[str, NodeProcess] = {}
+        self._logs: list[IO[bytes]] = []
+        log_folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, *arguments: str, own_session: bool = True) -> NodeProcess:
+        """Start node ``name`` (again).
+
+        A session of its own keeps a Ctrl-C at the terminal from reaching all nodes at once: they are stopped in order.
+        """
+        path = self.log_folder / f"{name}.log"
+        log = path.open("ab")
+        self._logs.append(log)
+        command = [sys.executable, "-m", "triline.nodes.cli", "node", name, *self.arguments, *arguments]
+        process = subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            env={**os.environ, **ALLOCATOR}, start_new_session=own_session,
+        )  # fmt: skip
+        self.processes[name] = NodeProcess(name, process, path)
+        return self.processes[name]
+
+    def dead(self) -> list[NodeProcess]:
+        """Nodes that have ended by themselves."""
+        return [p for p in self.processes.values() if not p.running]
+
+    def __enter__(self) -> NodeGroup:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        running = [p for p in self.processes.values() if p.running]
+        for p in running:
+            p.process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + 5.0
+        for p in running:
+            try:
+                p.process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                p.process.kill()
+                p.process.wait()
+        for log in self._logs:
+            log.close()
