@@ -1,0 +1,81 @@
+"""Messages to bytes and back, with the checks every receiver makes before a node sees a message."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from . import image_lines, topics
+from . import messages as m
+from .image_lines import LineBlock
+
+#: type -> field -> how many values it has where it has any.
+_SIZES: dict[str, dict[str, int]] = {
+    "foxglove.LocationFix": {"position_covariance": 9, "velocity_covariance": 9},
+    "foxglove.PoseInFrame": {"covariance": 36, "correction": 6, "angles": 3},
+    "triline.Attitude": {"covariance": 9},
+    "triline.GroundPoint": {"covariance": 9},
+    "triline.ObjectPoint": {"covariance": 9},
+    "triline.Project": dict.fromkeys(
+        ("lever_arm_m", "boresight_deg", "offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m",
+         "wander_sigma_deg"), 3,
+    ),
+}  # fmt: skip
+
+
+def encode(body: Any) -> bytes:
+    """The payload of a message body (a protobuf message or a `LineBlock`); the same body gives the same bytes."""
+    if isinstance(body, LineBlock):
+        return body.encode()
+    return body.SerializeToString(deterministic=True)
+
+
+def decode(topic: str, data: bytes | memoryview) -> Any:
+    """The body of a payload: a protobuf message, or a `LineBlock` for image lines.
+
+    Raises
+    ------
+    ValueError : it cannot be decoded, or holds values no publisher may send (not finite, of the wrong size)
+    KeyError : the topic is not in the topic table
+    """
+    row = topics.find(topic)
+    if row.type is m.RawImage:
+        return image_lines.decode(data)
+    try:
+        body = row.type.FromString(data)
+    except DecodeError as error:
+        raise ValueError(f"not a {row.type_name}: {error}") from None
+    validate(body)
+    return body
+
+
+def validate(body: Any) -> None:
+    """Raise ValueError for a message with values that are not finite, or with the wrong number of values."""
+    sizes = _SIZES.get(body.DESCRIPTOR.full_name, {})
+    for field, value in body.ListFields():  # only fields that are set: a default is always finite
+        size = sizes.get(field.name)
+        if size is not None and len(value) != size:
+            raise ValueError(f"{field.name} has {len(value)} values, wanted {size}")
+        kind = field.cpp_type
+        if kind in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
+            finite = math.isfinite(value) if isinstance(value, float) else np.isfinite(np.asarray(value)).all()
+            if not finite:
+                raise ValueError(f"{field.name} is not finite")
+        elif kind == field.CPPTYPE_MESSAGE:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                validate(part)
+    if body.DESCRIPTOR.full_name == "foxglove.LocationFix" and not abs(body.latitude) <= 90:
+        raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
+    if body.DESCRIPTOR.full_name == "foxglove.PoseInFrame":
+        q = body.pose.orientation
+        norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+
+
+def vector_sizes(type_name: str) -> dict[str, int]:
+    """Number fields of a message type that hold a vector, and how many values each has where it has any."""
+    return dict(_SIZES.get(type_name, {}))
