@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -72,6 +73,8 @@ def _version() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
+    # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     argv = sys.argv[1:] if argv is None else argv
     command = next((word for word in argv if not word.startswith("-")), None)
     args = _parser(command if command in COMMANDS else None).parse_args(argv)

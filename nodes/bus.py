@@ -1,0 +1,257 @@
+"""The bus: Zenoh sessions that find each other on one machine, or as a configuration file says. The only file that
+knows Zenoh.
+
+Every session is a peer. Who comes first listens on the meeting port; all others connect to it, learn of each other
+there and link directly. When its owner dies they stay linked, and who comes next takes the port over: all others try it
+again and again. Nobody is a hub that all depend on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from ..schemas import codec, topics
+from ..schemas.envelope import Envelope, RawMessage, pack, unpack
+from .errors import UserError
+from .node import Message
+
+DEFAULT_PORT = 17447
+#: Messages of a latched topic that a publisher keeps for whoever joins later.
+LATCHED_KEPT = 100_000
+_RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+
+Receive = Callable[[RawMessage], None]
+Malformed = Callable[[str, str], None]
+Answer = Callable[[dict[str, str]], "tuple[str, Any] | None"]
+
+
+def default_port() -> int:
+    """The meeting port: the environment variable TRILINE_PORT, or 17447."""
+    text = os.environ.get("TRILINE_PORT", str(DEFAULT_PORT))
+    if not text.isdigit() or not 0 < int(text) < 65536:
+        raise UserError(f"TRILINE_PORT is {text!r}, wanted a port number")
+    return int(text)
+
+
+def configuration(port: int | None = None, file: str | Path | None = None) -> zenoh.Config:
+    """The Zenoh configuration: of a file, or peer to peer on loopback."""
+    if file is not None:
+        if not Path(file).is_file():
+            raise UserError(f"{file}: no such Zenoh configuration file")
+        try:
+            config = zenoh.Config.from_file(file)
+        except Exception as error:
+            raise UserError(f"{file}: not a Zenoh configuration: {_one_line(error)}") from None
+        config.insert_json5("timestamping/enabled", "true")  # late joiners are served by time
+        return config
+    endpoint = f"tcp/127.0.0.1:{port or default_port()}"
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "listen/endpoints": [endpoint, "tcp/127.0.0.1:0"],
+        "listen/timeout_ms": 0,
+        "listen/exit_on_failure": False,
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": _RETRY,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": 4000,  # ms after which a frozen peer counts as gone
+        "timestamping/enabled": True,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Bus:
+    """A session on the bus of one platform.
+
+    Parameters
+    ----------
+    platform : name of the platform, a part of every key
+    source : id under which this program publishes
+    port : meeting port on loopback; None = TRILINE_PORT or 17447
+    file : a Zenoh configuration file instead
+    """
+
+    def __init__(
+        self, platform: str = "demo", *, source: str = "", port: int | None = None, file: str | Path | None = None
+    ) -> None:
+        if not platform or any(c in platform for c in "/*$?#@ "):
+            raise UserError(f"platform {platform!r}, wanted a name without blanks and any of / * $ ? # @")
+        zenoh.init_log_from_env_or("off")
+        self.platform = platform
+        self.source = source
+        self.start = time.time_ns()
+        try:
+            self._session = zenoh.open(configuration(port, file))
+        except zenoh.ZError as error:
+            raise UserError(f"cannot open the bus: {_one_line(error)}") from None
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []
+        self._sequences: dict[str, int] = {}
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def key(self, topic: str) -> str:
+        """Key expression of a topic."""
+        return topics.key_expression(self.platform, topic)
+
+    # ---- publishing
+
+    def publish(self, message: Message) -> None:
+        """Publish a message; one without source or number gets this session's source and the next number."""
+        sequence = message.sequence
+        if sequence < 0:
+            sequence = self._sequences.get(message.topic, 0)
+            self._sequences[message.topic] = sequence + 1
+        envelope = Envelope(message.stamp_ns, message.source or self.source, sequence, self.start)
+        self.publish_raw(RawMessage(message.topic, envelope, codec.encode(message.body)))
+
+    def publish_raw(self, raw: RawMessage) -> None:
+        """Publish an encoded message with the envelope it has."""
+        publisher = self._publishers.get(raw.topic)
+        if publisher is None:
+            publisher = self._publishers[raw.topic] = self._declare_publisher(raw.topic)
+        data = raw.data if isinstance(raw.data, bytes) else bytes(raw.data)
+        publisher.put(data, attachment=pack(raw.envelope))
+
+    def _declare_publisher(self, topic: str) -> Any:
+        row = topics.find(topic)
+        encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name)
+        if row.latched:
+            return zenoh.ext.declare_advanced_publisher(
+                self._session,
+                self.key(topic),
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cache=zenoh.ext.CacheConfig(max_samples=LATCHED_KEPT),
+                publisher_detection=True,
+            )
+        # Status is the one thing that must never slow anybody down.
+        dropped = row.family is topics.Family.STATUS
+        congestion = zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK
+        return self._session.declare_publisher(self.key(topic), encoding=encoding, congestion_control=congestion)
+
+    # ---- receiving
+
+    def subscribe(self, name: str, receive: Receive, malformed: Malformed | None = None) -> None:
+        """Call ``receive`` with every message of a topic (a name of the table, wildcard included).
+
+        It is called in the thread that takes messages off the wire: while it waits, the publisher waits. For a latched
+        topic it also gets what was sent before. What has no readable envelope goes to ``malformed(topic, why)``.
+        """
+        prefix = len(self.key(""))
+
+        def take(sample: Any) -> None:
+            receive_ns = time.time_ns()
+            topic = str(sample.key_expr)[prefix:]
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            try:
+                if sample.attachment is None:
+                    raise ValueError("message without an envelope")
+                envelope = unpack(sample.attachment.to_bytes())
+            except ValueError as error:
+                if malformed is not None:
+                    malformed(topic, str(error))
+                return
+            receive(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
+
+        handler = zenoh.handlers.Callback(take, indirect=False)
+        row = next(row for row in topics.TOPICS if row.name == name or row.matches(name))
+        if row.latched:
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                self._session,
+                self.key(name),
+                handler,
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_KEPT),
+            )
+        else:
+            subscriber = self._session.declare_subscriber(self.key(name), handler)
+        self._declared.append(subscriber)
+
+    # ---- liveliness and queries
+
+    def announce(self, node: str) -> None:
+        """Show that a node lives, until this session ends in whatever way."""
+        self._declared.append(self._session.liveliness().declare_token(self.key(f"alive/{node}")))
+
+    def watch(self, changed: Callable[[str, bool], None]) -> None:
+        """Call ``changed(node, alive)`` for the nodes that live now and whenever one comes or goes."""
+
+        def take(sample: Any) -> None:
+            changed(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
+
+        handler = zenoh.handlers.Callback(take, indirect=False)
+        self._declared.append(self._session.liveliness().declare_subscriber(self.key("alive/*"), handler, history=True))
+
+    def alive(self, timeout_s: float = 1.0) -> set[str]:
+        """Names of the nodes that live now."""
+        replies = self._session.liveliness().get(self.key("alive/*"), timeout=timeout_s)
+        return {str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None}
+
+    def answer(self, name: str, answer: Answer) -> None:
+        """Answer queries ``query/<name>?key=value;..``: ``answer`` gives (topic, message body), or None for none."""
+        key = self.key(f"query/{name}")
+
+        def take(query: Any) -> None:
+            with query:
+                try:
+                    found = answer(dict(_parameters(str(query.parameters))))
+                except ValueError as error:
+                    query.reply_err(str(error).encode(), encoding="text/plain")
+                    return
+                if found is not None:
+                    topic, body = found
+                    encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(topics.find(topic).type_name)
+                    query.reply(key, codec.encode(body), encoding=encoding)
+
+        self._declared.append(self._session.declare_queryable(key, zenoh.handlers.Callback(take)))
+
+    def query(self, name: str, topic: str, timeout_s: float = 2.0, **parameters: object) -> list[Any]:
+        """Bodies (of the type of ``topic``) that answer a query; raises ValueError with the reason of a refusal."""
+        selector = self.key(f"query/{name}")
+        if parameters:
+            selector += "?" + ";".join(f"{key}={value}" for key, value in parameters.items())
+        bodies = []
+        for reply in self._session.get(selector, timeout=timeout_s):
+            if reply.ok is None:
+                raise ValueError(reply.err.payload.to_string() if reply.err is not None else "no reason given")
+            bodies.append(codec.decode(topic, reply.ok.payload.to_bytes()))
+        return bodies
+
+    def peers(self) -> int:
+        """How many sessions this one is linked with."""
+        info = self._session.info
+        return len(info.peers_zid()) + len(info.routers_zid())
+
+    def close(self) -> None:
+        """Withdraw everything and close the session; callbacks have ended when this returns."""
+        for declared in (*self._declared, *self._publishers.values()):
+            declared.undeclare()
+        self._declared.clear()
+        self._publishers.clear()
+        self._session.close()
+
+
+def _parameters(text: str) -> list[tuple[str, str]]:
+    return [(key, value) for key, _, value in (part.partition("=") for part in text.split(";") if part)]
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

@@ -1,0 +1,97 @@
+"""``triline info``: what a recording holds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ..access import Recording
+from ..player import iso
+from ..recording_summary import findings, time_span_ns, topic_summaries
+
+EXAMPLE = "triline info flight.mcap"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+
+
+def run(args: argparse.Namespace) -> int:
+    summary = _summary(Recording(args.recording))
+    print(json.dumps(summary, indent=2) if args.json else "\n".join(_lines(summary)))
+    return 0
+
+
+def _summary(recording: Recording) -> dict[str, Any]:
+    reader = recording.reader
+    span = time_span_ns(reader)
+    held = {channel.topic for channel in reader.channels.values() if channel.known}
+    summary: dict[str, Any] = {
+        "file": str(reader.path),
+        "bytes": reader.size,
+        "library": reader.library,
+        "messages": len(reader.index),
+        "chunks": reader.n_chunks,
+        "platforms": sorted({channel.platform for channel in reader.channels.values() if channel.platform}),
+        "start": iso(span[0]) if span else None,
+        "end": iso(span[1]) if span else None,
+        "duration_s": (span[1] - span[0]) / 1e9 if span else 0.0,
+        "topics": [vars(row) for row in topic_summaries(reader)],
+        "damage": findings(reader, decode=False),
+    }
+    if "configuration/project" in held:
+        p = recording.project()
+        summary["project"] = {
+            "name": p.name, "crs": p.crs or "local", "origin_latitude": p.origin_latitude,
+            "origin_longitude": p.origin_longitude, "origin_height": p.origin_height,
+        }  # fmt: skip
+    if "configuration/camera" in held:
+        camera = recording.camera()
+        summary["camera"] = {
+            "name": camera.name,
+            "focal_length_mm": [lens.focal_length_mm for lens in camera.lenses],
+            "lines": {line.id: len(line.xy_mm) for line in camera.lines},
+        }
+    if "configuration/strip" in held:
+        summary["strips"] = [
+            {"id": str(name), "start": iso(int(s.first_line_time_ns)), "line_rate_hz": float(s.line_rate_hz),
+             "lines": int(s.lines), "ended": bool(s.ended)}
+            for name, s in recording.strips().iterrows()
+        ]  # fmt: skip
+    return summary
+
+
+def _lines(s: dict[str, Any]) -> list[str]:
+    lines = [f"{s['file']}: {_size(s['bytes'])}, {s['messages']} messages in {s['chunks']} chunks"]
+    if s["start"]:
+        platform = ", ".join(s["platforms"]) or "-"
+        lines.append(f"{s['start']} to {s['end']}, {s['duration_s']:.1f} s, platform {platform}")
+    if "project" in s:
+        p = s["project"]
+        origin = f"{p['origin_latitude']:.6f}, {p['origin_longitude']:.6f}, {p['origin_height']:.1f} m"
+        lines.append(f"project {p['name'] or '-'}, crs {p['crs']}, origin {origin}")
+    if "camera" in s:
+        c = s["camera"]
+        focal = ", ".join(f"{f:g} mm" for f in c["focal_length_mm"])
+        lines.append(f"camera {c['name']}, {focal}; lines " + ", ".join(f"{k} ({n} px)" for k, n in c["lines"].items()))
+    for strip in s.get("strips", ()):
+        ended = "" if strip["ended"] else ", not ended"
+        rate = f"{strip['line_rate_hz']:.1f} Hz"
+        lines.append(f"strip {strip['id']}: from {strip['start']}, {strip['lines']} lines at {rate}{ended}")
+    lines.append(f"{'topic':<24} {'messages':>9} {'rate':>9}  {'gaps':>5}  source")
+    for row in s["topics"]:
+        rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] else "-"
+        sources = ", ".join(row["sources"])
+        lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
+    lines += [f"damaged: {text}" for text in s["damage"]]
+    return lines
+
+
+def _size(n: float) -> str:
+    for unit in ("bytes", "kB", "MB"):
+        if n < 1000:
+            return f"{n:.0f} {unit}" if unit == "bytes" else f"{n:.1f} {unit}"
+        n /= 1000
+    return f"{n:.2f} GB"

@@ -1,0 +1,71 @@
+"""``triline node``: one node alone."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from .. import registry
+from ..config import Tables, build, load
+from ..errors import UserError
+from ..live import BusRunner
+from ..node import Node
+from ..program import ProgramOptions, stop_on_signals
+from .bus_options import add_bus_arguments, reporter
+
+EXAMPLE = "triline node adjuster --config adjuster.toml --platform aircraft1"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=registry.names(), metavar="NAME", help=", ".join(registry.names()))
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file with one table a node")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one key of the node's table (repeatable)"
+    )
+    parser.add_argument("-o", "--output", metavar="FILE", help="what the recorder writes; short for --set output=FILE")
+    add_bus_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    tables = _tables(args)
+    options = ProgramOptions(args.name, args.platform, args.port, args.bus, tables, report=reporter(args.quiet))
+    stop_on_signals(options.stop)
+    if args.name in registry.PROGRAMS:
+        return registry.program(args.name)(options)
+    node = build(registry.node_class(args.name), tables, args.name)
+    return run_on_bus(node, options)
+
+
+def run_on_bus(node: Node, options: ProgramOptions) -> int:
+    """Run a step node until it is told to stop."""
+    with options.open_bus() as bus:
+        runner = BusRunner(node, bus, options.report, stop=options.stop)
+        options.report(f"{node.name} on platform {options.platform}")
+        runner.run()
+    counted = ", ".join(f"{n} {kind}" for kind, n in sorted(node.counters.items()))
+    options.report(f"{node.name} stopped" + (f"; {counted}; {node.last_problem}" if counted else ""))
+    return 0
+
+
+def _tables(args: argparse.Namespace) -> Tables:
+    tables = load(args.config)
+    settings = list(args.set)
+    table: dict[str, Any] = dict(tables.get(args.name, {}))
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise UserError(f"--set {setting}: wanted KEY=VALUE")
+        table[key.strip()] = _value(text)
+    if args.output:
+        table["output"] = args.output
+    return {**tables, args.name: table} if table else tables
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text as it is."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,118 @@
+"""``triline process``: nodes over a recording, in one process."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from .. import registry
+from ..config import build, load
+from ..errors import UserError
+from ..node import Node
+from ..recording import COMPRESSIONS, RecordingReader, RecordingWriter
+from ..runner import ProcessSummary, process
+from .progress import progress
+
+EXAMPLE = "triline process flight.mcap -o out.mcap"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="recording to write")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file with one table a node")
+    parser.add_argument(
+        "--nodes", default=",".join(registry.ESTIMATING), metavar="NAMES",
+        help=f"comma-separated, of {', '.join(registry.STEP_NODES)} (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the output (default: none)")
+    parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
+
+
+def run(args: argparse.Namespace) -> int:
+    tables = load(args.config)
+    reader = RecordingReader(args.recording)
+    _check(reader, args)
+    nodes: list[Node] = [build(registry.node_class(name.strip()), tables) for name in args.nodes.split(",")]
+    begun = time.monotonic()
+    part = args.output.with_name(args.output.name + ".part")
+    try:
+        with (
+            RecordingWriter(part, args.compression, platform=_platform(reader)) as writer,
+            progress("processing", args.quiet or args.json) as told,
+        ):
+            summary = process(reader, nodes, writer.write_raw, told)
+        if not summary.nodes:
+            raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
+        os.replace(part, args.output)
+    except OSError as error:
+        raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    seconds = time.monotonic() - begun
+    if args.json:
+        print(json.dumps(result(summary, args.output, seconds), indent=2))
+        return 0
+    for line in _lines(summary, reader, args.output, seconds):
+        print(line)
+    if reader.damage and not args.quiet:
+        lost = sum(d.length for d in reader.damage)
+        print(f"triline process: {args.recording}: skipped {len(reader.damage)} damaged places ({lost} bytes); "
+              f"the first: {reader.damage[0]}", file=sys.stderr)  # fmt: skip
+    return 0
+
+
+def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
+    if args.output.resolve() == args.recording.resolve():
+        raise UserError(f"{args.output}: the output would overwrite the recording")
+    if not any(channel.known for channel in reader.channels.values()):
+        raise UserError(f"{args.recording}: no topic of triline in it")
+    if args.strict and (reader.damage or not reader.complete):
+        what = str(reader.damage[0]) if reader.damage else "the file has no end"
+        raise UserError(f"{args.recording}: damaged: {what}")
+
+
+def _held(reader: RecordingReader) -> str:
+    held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
+    return f"it holds {', '.join(held)}"
+
+
+def _platform(reader: RecordingReader) -> str:
+    return next((c.platform for c in reader.channels.values() if c.platform), "demo")
+
+
+def result(summary: ProcessSummary, output: Path, seconds: float) -> dict[str, object]:
+    """The machine-readable result."""
+    return {
+        "output": str(output),
+        "nodes": summary.nodes,
+        "inputs": dict(sorted(summary.inputs.items())),
+        "outputs": dict(sorted(summary.outputs.items())),
+        "replaced": dict(sorted(summary.replaced.items())),
+        "dropped": dict(sorted(summary.dropped.items())),
+        "counters": summary.counters,
+        "problems": summary.problems,
+        "flight_s": (summary.last_ns - summary.first_ns) / 1e9,
+        "seconds": round(seconds, 3),
+    }
+
+
+def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, seconds: float) -> list[str]:
+    flight_s = (summary.last_ns - summary.first_ns) / 1e9
+    lines = [
+        f"{output}: {' and '.join(summary.nodes)} over {flight_s:.1f} s of flight in {seconds:.1f} s"
+        f" ({flight_s / max(seconds, 1e-9):.0f} times real time)"
+    ]
+    lines += [f"  {topic:<24} {n:>9} in" for topic, n in sorted(summary.inputs.items())]
+    lines += [f"  {topic:<24} {n:>9} out" for topic, n in sorted(summary.outputs.items())]
+    if summary.dropped:
+        counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
+        lines.append(f"  left out: {counted}; the last: {summary.last_problem}")
+    for name, counters in summary.counters.items():
+        if counters:
+            counted = ", ".join(f"{n} {kind}" for kind, n in counters.items())
+            lines.append(f"  {name}: {counted}; the last: {summary.problems.get(name, '')}")
+    return lines

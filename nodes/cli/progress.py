@@ -1,0 +1,35 @@
+"""Progress of long work: a bar on a terminal, plain lines elsewhere, nothing where quiet."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+#: Between two plain lines, s.
+_LINE_PERIOD_S = 5.0
+
+
+@contextmanager
+def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None] | None]:
+    """Gives a function that is told the fraction done."""
+    if quiet:
+        yield None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(text, total=1.0)
+            yield lambda fraction: bar.update(task, completed=fraction)
+    else:
+        last = time.monotonic()
+
+        def line(fraction: float) -> None:
+            nonlocal last
+            if time.monotonic() - last >= _LINE_PERIOD_S:
+                last = time.monotonic()
+                print(f"{text}: {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+
+        yield line

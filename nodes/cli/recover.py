@@ -1,0 +1,67 @@
+"""``triline recover``: a valid recording from a broken one."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+from ..errors import UserError
+from ..recording import RecordingReader, RecordingWriter
+from ..recording_summary import topic_summaries
+
+EXAMPLE = "triline recover broken.mcap -o whole.mcap"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="the broken recording; it is not changed")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="recording to write")
+
+
+def run(args: argparse.Namespace) -> int:
+    reader = RecordingReader(args.recording, salvage=True)
+    if args.output.exists() and args.output.samefile(args.recording):
+        raise UserError(f"{args.output}: the output would overwrite the recording")
+    numbers = reader.select()
+    if not len(numbers):
+        raise UserError(f"{args.recording}: nothing in it that could be recovered")
+    part = args.output.with_name(args.output.name + ".part")
+    try:
+        with RecordingWriter(part) as writer:
+            for number in numbers:
+                channel = reader.channels[int(reader.index.channel[number])]
+                writer.write_raw(reader.raw(int(number)), channel.platform or None)
+        os.replace(part, args.output)
+    except OSError as error:
+        raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    missing = {row.topic: row.gaps for row in topic_summaries(reader) if row.gaps}
+    result = {
+        "output": str(args.output),
+        "messages": len(numbers),
+        "chunks": reader.n_chunks,
+        "foreign_messages": int(len(reader.index) - len(numbers)),
+        "lost_bytes": sum(damage.length for damage in reader.damage),
+        "damage": [str(damage) for damage in reader.damage],
+        "complete": reader.complete,
+        "missing": missing,
+    }
+    print(json.dumps(result, indent=2) if args.json else "\n".join(_lines(result)))
+    return 0
+
+
+def _lines(r: dict) -> list[str]:
+    lines = [f"{r['output']}: kept {r['messages']} messages of {r['chunks']} whole chunks"]
+    if r["damage"]:
+        lines.append(f"lost {r['lost_bytes']} bytes in {len(r['damage'])} places; the first: {r['damage'][0]}")
+    elif not r["complete"]:
+        lines.append("the file had no end; no whole chunk was lost")
+    else:
+        lines.append("nothing was lost")
+    if r["missing"]:
+        lines.append("missing by their numbers: " + ", ".join(f"{n} of {topic}" for topic, n in r["missing"].items()))
+    if r["foreign_messages"]:
+        lines.append(f"left out {r['foreign_messages']} messages of other programs")
+    return lines

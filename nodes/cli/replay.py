@@ -1,0 +1,78 @@
+"""``triline replay``: a recording onto the bus."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import threading
+from pathlib import Path
+
+from ..bus import Bus
+from ..player import first_stamp_ns, iso, play, time_argument
+from ..program import stop_on_signals
+from ..recording import RecordingReader
+from .bus_options import add_bus_arguments, reporter
+from .progress import progress
+
+EXAMPLE = "triline replay flight.mcap --rate 4 --from 20 --to 50"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+    parser.add_argument("--rate", type=_rate, default=1.0, metavar="R", help="speed; 0 = as fast as it goes")
+    parser.add_argument("--from", dest="from_", metavar="T", help="first platform time: seconds from start or ISO time")
+    parser.add_argument("--to", metavar="T", help="last platform time: seconds from start or ISO time")
+    parser.add_argument("--loop", action="store_true", help="again and again; later rounds have shifted stamps")
+    parser.add_argument("--all", action="store_true", help="also what nodes make anew: trajectories, orientations, ...")
+    add_bus_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    reader = RecordingReader(args.recording)
+    first = first_stamp_ns(reader)
+    report = reporter(args.quiet or args.json)
+    stop = threading.Event()
+    stop_on_signals(stop)
+    if args.loop:
+        report("looping: stamps, times in messages and strip names of later rounds are shifted")
+    with Bus(args.platform, source="player", port=args.port, file=args.bus) as bus:
+        bus.announce("player")
+        report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
+        with progress("playing", args.quiet or args.json) as told:
+            result = play(
+                reader,
+                bus.publish_raw,
+                stop,
+                rate=args.rate,
+                from_ns=None if args.from_ is None else time_argument(args.from_, first),
+                to_ns=None if args.to is None else time_argument(args.to, first),
+                loop=args.loop,
+                everything=args.all,
+                start=bus.start,
+                progress=told,
+            )
+        stop.wait(0.5)  # what is still on its way
+    if args.json:
+        print(json.dumps({
+            "messages": dict(sorted(result.counts.items())), "left_out": dict(sorted(result.left_out.items())),
+            "rounds": result.rounds, "worst_late_ms": round(1e3 * result.worst_late_s, 3),
+            "mean_late_ms": round(1e3 * result.mean_late_s, 4),
+        }, indent=2))  # fmt: skip
+        return 0
+    left_out = sum(result.left_out.values())
+    print(
+        f"played {sum(result.counts.values())} messages"
+        + (f", left out {left_out} that nodes make anew" if left_out else "")
+        + f"; at most {1e3 * result.worst_late_s:.1f} ms late, {1e3 * result.mean_late_s:.2f} ms on average"
+    )
+    return 0
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = -1.0
+    if not 0 <= rate < 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r}, wanted a number of at least 0")
+    return rate

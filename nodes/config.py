@@ -1,0 +1,59 @@
+"""Configuration of nodes: a TOML file with one table a node.
+
+    [adjuster]
+    model = "ppm"
+
+The keys are the named arguments of the node; what is not there keeps its default.
+"""
+
+from __future__ import annotations
+
+import inspect
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from .errors import UserError
+
+Tables = dict[str, dict[str, Any]]
+
+
+def load(path: str | Path | None) -> Tables:
+    """The tables of a configuration file, none without a file.
+
+    Raises
+    ------
+    UserError : not TOML, or something outside a table
+    """
+    if path is None:
+        return {}
+    try:
+        with open(path, "rb") as file:
+            tables = tomllib.load(file)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not a TOML file: {error}") from None
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise UserError(f"{path}: {name} stands outside a table, wanted [node] tables")
+    return tables
+
+
+def build(cls: Any, tables: Tables, name: str | None = None) -> Any:
+    """An instance of a node class with what its table says.
+
+    Raises
+    ------
+    UserError : a key the node does not know, or a value it refuses
+    """
+    table_name: str = cls.name if name is None else name
+    table = tables.get(table_name, {})
+    parameters = inspect.signature(cls).parameters
+    known = [key for key, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    for key in table:
+        if key not in known:
+            wanted = f"wanted one of {', '.join(known)}" if known else "the node has nothing to configure"
+            raise UserError(f"configuration [{table_name}]: {key} is not known, {wanted}")
+    try:
+        return cls(**table)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"configuration [{table_name}]: {error}") from None

@@ -1,0 +1,272 @@
+"""Putting messages in order: what arrives with jitter leaves in the order of its stamps.
+
+Two steps, both without clocks and files. `StreamCheck` looks at one publisher's stream on one topic: gaps, duplicates,
+time that goes backwards, clock jumps. `Sequencer` merges the streams of several topics by (stamp, place of the topic in
+the table, topic, source, start, sequence), which is the order a recording is processed in; so a node gets the same
+messages in the same order live and from a recording, as long as none comes later than its topic allows.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from ..schemas import topics
+from ..schemas.envelope import Envelope
+from ..schemas.topics import Family
+
+T = TypeVar("T")
+Key = tuple[int, int, str, str, int, int]
+
+MILLISECOND_NS = 1_000_000
+#: A sensor whose stamps jump ahead by more is believed when its next message confirms it.
+MAX_JUMP_NS = 60_000_000_000
+#: So many messages in a row on an earlier time base mean that a clock was set back.
+REBASE_AFTER = 5
+#: Missing sequence numbers that are remembered, to tell a message out of order from a duplicate.
+_REMEMBERED = 10_000
+
+
+def order_key(topic: str, envelope: Envelope) -> Key:
+    """Place of a message among all others."""
+    return (envelope.stamp_ns, topics.rank(topic), topic, envelope.source, envelope.start, envelope.sequence)
+
+
+@dataclass
+class TopicCounts:
+    """What happened to the messages of a topic; names as in ``triline.TopicStatistics``."""
+
+    received: int = 0
+    gaps: int = 0
+    duplicates: int = 0
+    late: int = 0
+    malformed: int = 0
+    dropped: int = 0
+
+
+@dataclass
+class _Stream(Generic[T]):
+    """What is remembered of one run of a publisher on one topic."""
+
+    first: int
+    last: int
+    last_stamp: int
+    missing: dict[int, None] = field(default_factory=dict)
+    before_first: set[int] = field(default_factory=set)
+    base_stamp: int = 0  # newest stamp of a possible earlier time base ...
+    base_count: int = 0  # ... and how many messages support it
+    held: tuple[int, T] | None = None  # stamp and message after a jump ahead, waiting to be confirmed
+
+
+class StreamCheck(Generic[T]):
+    """Checks the streams of all publishers by their envelopes alone.
+
+    The verdict on a message depends on the messages of its own stream only, never on how streams interleave.
+
+    Parameters
+    ----------
+    problem : called with (kind, text) for every message that is dropped
+    """
+
+    def __init__(self, problem: Callable[[str, str], None] | None = None) -> None:
+        self.counts: defaultdict[str, TopicCounts] = defaultdict(TopicCounts)
+        self._streams: dict[tuple[str, str, int], _Stream[T]] = {}
+        self._problem = problem or (lambda kind, text: None)
+
+    def accept(self, topic: str, envelope: Envelope, item: T) -> list[T]:
+        """The messages that may go on because of this one: none, itself, or one held back before and itself."""
+        counts = self.counts[topic]
+        counts.received += 1
+        key = (topic, envelope.source, envelope.start)
+        stream = self._streams.get(key)
+        if stream is None:
+            self._streams[key] = _Stream(envelope.sequence, envelope.sequence, envelope.stamp_ns)
+            return [item]
+        sequence = envelope.sequence
+        if sequence <= stream.last:
+            return [item] if self._is_new(stream, sequence, counts, topic, envelope) else []
+        self._note_gap(stream, sequence, counts)
+        stream.last = sequence
+        row = topics.find(topic)
+        if row.latched or row.family is Family.STATUS:  # handed out again and again; said before time is known
+            return [item]
+        if envelope.stamp_ns < stream.last_stamp and stream.held is None:
+            return self._earlier(stream, envelope, item, counts, topic)
+        stream.base_count = 0
+        if row.family in (Family.SENSOR, Family.OBSERVATION):
+            return self._check_jump(stream, envelope, item, counts, topic)
+        stream.last_stamp = envelope.stamp_ns
+        return [item]
+
+    def _is_new(self, stream: _Stream[T], sequence: int, counts: TopicCounts, topic: str, envelope: Envelope) -> bool:
+        """Whether a number below the newest is a message out of order and not a duplicate."""
+        if sequence in stream.missing:
+            del stream.missing[sequence]
+            counts.gaps -= 1
+            return True
+        if sequence < stream.first and sequence not in stream.before_first:
+            stream.before_first.add(sequence)
+            return True
+        counts.duplicates += 1
+        self._problem("duplicate", f"{topic} {sequence} of {envelope.source!r} came twice")
+        return False
+
+    @staticmethod
+    def _note_gap(stream: _Stream[T], sequence: int, counts: TopicCounts) -> None:
+        missing = sequence - stream.last - 1
+        counts.gaps += missing
+        for number in range(max(stream.last + 1, sequence - _REMEMBERED), sequence):
+            stream.missing[number] = None
+        while len(stream.missing) > _REMEMBERED:
+            del stream.missing[next(iter(stream.missing))]
+
+    def _earlier(self, stream: _Stream[T], envelope: Envelope, item: T, counts: TopicCounts, topic: str) -> list[T]:
+        """A stamp before the one of the message before it."""
+        stream.base_count = stream.base_count + 1 if envelope.stamp_ns >= stream.base_stamp else 1
+        stream.base_stamp = envelope.stamp_ns
+        if stream.base_count >= REBASE_AFTER:
+            stream.base_count, stream.last_stamp = 0, envelope.stamp_ns
+            self._problem("clock", f"{topic} of {envelope.source!r}: the clock was set back to {envelope.stamp_ns}")
+            return [item]
+        counts.malformed += 1
+        back = f"time goes back by {(stream.last_stamp - envelope.stamp_ns) / 1e9:g} s"
+        self._problem("malformed", f"{topic} {envelope.sequence} of {envelope.source!r}: {back}")
+        return []
+
+    def _check_jump(self, stream: _Stream[T], envelope: Envelope, item: T, counts: TopicCounts, topic: str) -> list[T]:
+        """A stamp far ahead is held until the next message shows whether time really went on."""
+        stamp = envelope.stamp_ns
+        out: list[T] = []
+        if stream.held is not None:
+            held_stamp, held = stream.held
+            stream.held = None
+            if 0 <= stamp - held_stamp <= MAX_JUMP_NS:
+                out.append(held)
+                stream.last_stamp = held_stamp
+            else:
+                counts.malformed += 1
+                ahead_s = (held_stamp - stream.last_stamp) / 1e9
+                self._problem("malformed", f"{topic} of {envelope.source!r}: a stamp jumps ahead by {ahead_s:g} s")
+                if stamp < stream.last_stamp:
+                    return self._earlier(stream, envelope, item, counts, topic)
+        if stamp - stream.last_stamp > MAX_JUMP_NS:
+            stream.held = (stamp, item)
+            return out
+        stream.last_stamp = stamp
+        return [*out, item]
+
+
+@dataclass
+class _Watermark:
+    """How far one stream (or a topic nobody has spoken on) has come."""
+
+    place: tuple[int, str, str]
+    lateness_ns: int
+    steady: bool
+    latest_ns: int
+    heard_s: float
+
+
+class Sequencer(Generic[T]):
+    """Merges streams into the order of `order_key`.
+
+    A message leaves when no other stream can still bring one that belongs before it: the stream has passed it, or has
+    been silent while platform time went on by more than the allowed lateness of its topic. A steady stream (one with a
+    high rate) must also have been silent for ``grace_s`` of waiting time, so that a machine that hesitates does not
+    change the order. What arrives after its place has passed leaves at once, and is called late.
+
+    Parameters
+    ----------
+    inputs : topics of the table that are listened to
+    grace_s : waiting time granted to steady streams, s
+    """
+
+    STEADY_HZ = 100.0
+
+    def __init__(self, inputs: Iterable[str], *, grace_s: float = 0.5) -> None:
+        self._heap: list[tuple[Key, int, T]] = []
+        self._grace_s = grace_s
+        self._arrivals = 0
+        self._newest_ns: int | None = None
+        self._released: Key | None = None
+        self._streams: dict[tuple[str, str], _Watermark] = {}
+        self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
+        self._started_s: float | None = None
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp that has arrived."""
+        return self._newest_ns
+
+    def push(self, topic: str, envelope: Envelope, item: T, now_s: float) -> T | None:
+        """Take a message that arrived at waiting time ``now_s`` (any steady clock); returns it if it came late."""
+        stamp = envelope.stamp_ns
+        if self._started_s is None:
+            self._started_s = now_s
+        if self._newest_ns is None or stamp > self._newest_ns:
+            self._newest_ns = stamp
+        stream = self._streams.get((topic, envelope.source))
+        if stream is None:
+            row = topics.find(topic)
+            self._unheard.pop(row.name, None)
+            place = (topics.rank(topic), topic, envelope.source)
+            lateness, steady = _patience(row)
+            stream = self._streams[topic, envelope.source] = _Watermark(place, lateness, steady, stamp, now_s)
+        stream.latest_ns = max(stream.latest_ns, stamp)
+        stream.heard_s = now_s
+        key = order_key(topic, envelope)
+        if self._released is not None and key < self._released:
+            return item
+        self._arrivals += 1
+        heapq.heappush(self._heap, (key, self._arrivals, item))
+        return None
+
+    def pop(self, now_s: float) -> list[T]:
+        """The messages whose turn has come, in order."""
+        out: list[T] = []
+        while self._heap and self._may_leave(self._heap[0][0], now_s):
+            out.append(self._take())
+        return out
+
+    def flush(self) -> list[T]:
+        """Everything that waits, in order."""
+        out: list[T] = []
+        while self._heap:
+            out.append(self._take())
+        return out
+
+    def _take(self) -> T:
+        key, _, item = heapq.heappop(self._heap)
+        self._released = key
+        return item
+
+    def _may_leave(self, key: Key, now_s: float) -> bool:
+        stamp, rank, topic, source = key[:4]
+        assert self._newest_ns is not None and self._started_s is not None
+        for stream in self._streams.values():
+            if stream.place == (rank, topic, source):
+                continue
+            bound = stream.latest_ns
+            if not (stream.steady and now_s - stream.heard_s < self._grace_s):
+                bound = max(bound, self._newest_ns - stream.lateness_ns)
+            if bound < stamp or (bound == stamp and stream.place < (rank, topic, source)):
+                return False
+        for row in self._unheard.values():
+            lateness, steady = _patience(row)
+            if steady and now_s - self._started_s < self._grace_s:
+                return False
+            if self._newest_ns - lateness <= stamp:
+                return False
+        return True
+
+
+def _patience(row: topics.Topic) -> tuple[int, bool]:
+    """Allowed lateness in ns, and whether a topic is expected to speak all the time."""
+    steady = row.rate_hz >= Sequencer.STEADY_HZ and not row.latched
+    return round(row.allowed_lateness_ms * MILLISECOND_NS), steady

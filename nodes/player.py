@@ -1,0 +1,334 @@
+"""The player: recorded inputs onto the bus, with the timing they were recorded with."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..schemas import codec, topics
+from ..schemas.envelope import RawMessage
+from ..schemas.image_lines import LineBlock
+from ..schemas.topics import Family
+from . import registry
+from .bus import Bus
+from .errors import UserError
+from .program import ProgramOptions
+from .recording import RecordingReader
+from .runner import active_nodes
+
+SECOND_NS = 1_000_000_000
+#: Time for others to take in configuration and control before the first measurement goes out.
+SETTLE_S = 1.0
+#: Between the end of a recording and its next round, platform time.
+LOOP_PAUSE_NS = SECOND_NS
+
+
+@dataclass
+class PlayResult:
+    """What was played.
+
+    Attributes
+    ----------
+    counts : messages by topic
+    left_out : recorded messages by topic that nodes make anew
+    rounds : how often
+    worst_late_s, mean_late_s : how late messages were put on the bus, s
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+    rounds: int = 0
+    worst_late_s: float = 0.0
+    mean_late_s: float = 0.0
+
+
+class Pacer:
+    """Lets things happen at their time: ``due_s`` seconds after the start, divided by the rate.
+
+    Parameters
+    ----------
+    rate : speed, 1 = as it was; 0 = as fast as it goes
+    stop : ends every waiting
+    """
+
+    def __init__(self, rate: float, stop: threading.Event) -> None:
+        self._rate = rate
+        self._stop = stop
+        self._begun = time.perf_counter()
+        self.worst_late_s = 0.0
+        self._late_sum_s = 0.0
+        self._n = 0
+
+    @property
+    def mean_late_s(self) -> float:
+        return self._late_sum_s / max(self._n, 1)
+
+    def wait(self, due_s: float) -> bool:
+        """Wait until it is time; False where the waiting was ended."""
+        if self._rate:
+            target = self._begun + due_s / self._rate
+            remaining = target - time.perf_counter()
+            while remaining > 0:
+                if remaining > 0.002:
+                    self._stop.wait(remaining - 0.001)
+                else:
+                    time.sleep(min(remaining, 0.0002))
+                if self._stop.is_set():
+                    return False
+                remaining = target - time.perf_counter()
+            self.worst_late_s = max(self.worst_late_s, -remaining)
+            self._late_sum_s -= remaining
+            self._n += 1
+        return not self._stop.is_set()
+
+
+def publish_paced(
+    bus: Bus, messages: Iterable[Any], rate: float, stop: threading.Event, *, settle_s: float = SETTLE_S
+) -> Pacer:
+    """Publish `Message` objects at the pace of their stamps; used by programs that make messages, such as a simulator.
+
+    Latched messages at the beginning go out at once; the others follow ``settle_s`` later, so that all who listen know
+    the configuration by then.
+    """
+    pacer: Pacer | None = None
+    first_ns = 0
+    for message in messages:
+        if pacer is None:
+            if topics.find(message.topic).latched:
+                bus.publish(message)
+                continue
+            stop.wait(settle_s)
+            pacer, first_ns = Pacer(rate, stop), message.stamp_ns
+        if not pacer.wait((message.stamp_ns - first_ns) / SECOND_NS):
+            break
+        bus.publish(message)
+    return pacer or Pacer(rate, stop)
+
+
+def regenerated(reader: RecordingReader) -> set[str]:
+    """Topics of a recording that the estimating nodes make anew from the rest of it."""
+    recorded = {c.topic for c in reader.channels.values() if c.known}
+    classes = []
+    for name in registry.ESTIMATING:
+        try:
+            classes.append(registry.node_class(name))
+        except UserError:  # not installed: what it made stays in
+            continue
+    made = {output for node in active_nodes(classes, recorded) for output in node.outputs}
+    return {t for t in recorded if t in made or t.startswith("status/")}
+
+
+def play(
+    reader: RecordingReader,
+    publish: Callable[[RawMessage], None],
+    stop: threading.Event,
+    *,
+    rate: float = 1.0,
+    from_ns: int | None = None,
+    to_ns: int | None = None,
+    loop: bool = False,
+    everything: bool = False,
+    start: int = 0,
+    settle_s: float = SETTLE_S,
+    progress: Callable[[float], None] | None = None,
+) -> PlayResult:
+    """Publish the messages of a recording at the pace of their times of reception.
+
+    Parameters
+    ----------
+    reader : the recording
+    publish : puts a message on the bus
+    stop : ends it
+    rate : speed, 0 = as fast as it goes
+    from_ns, to_ns : platform time to play, ends included; configuration and control from before are played always
+    loop : again and again; stamps, times inside messages and strip names of later rounds are shifted
+    everything : also what nodes make anew
+    start : tells this run from others in the envelopes
+    settle_s : waiting time after configuration and control, s
+    """
+    result = PlayResult()
+    leave_out = set() if everything else regenerated(reader)
+    numbers = []
+    for number in reader.select():
+        topic = reader.channels[int(reader.index.channel[number])].topic
+        if topic in leave_out:
+            result.left_out[topic] += 1
+        else:
+            numbers.append(int(number))
+    head, body = _split(reader, np.array(numbers, dtype=np.int64), from_ns, to_ns)
+    if not len(head) and not len(body):
+        raise UserError(f"{reader.path}: nothing to play")
+    stamps = reader.index.stamp_ns[body]
+    span_ns = int(stamps.max() - stamps.min()) + LOOP_PAUSE_NS if len(body) else 0
+    starts = _Starts(start)
+    while not stop.is_set():
+        shift_ns = result.rounds * span_ns
+        for number in head:
+            _publish(reader.raw(int(number)), publish, starts, shift_ns, result)
+        stop.wait(settle_s if result.rounds == 0 else 0.0)
+        times = reader.index.receive_ns[body]
+        pacer = Pacer(rate, stop)
+        for i, number in enumerate(body):
+            raw = reader.raw(int(number))
+            if not pacer.wait(float(times[i] - times[0]) / SECOND_NS):
+                break
+            _publish(raw, publish, starts, shift_ns, result)
+            if progress is not None and i % 256 == 0:
+                progress(i / len(body))
+        result.rounds += 1
+        result.worst_late_s = max(result.worst_late_s, pacer.worst_late_s)
+        result.mean_late_s = pacer.mean_late_s
+        if not loop or not len(body):
+            break
+        stop.wait(LOOP_PAUSE_NS / SECOND_NS / (rate or 1.0))
+    return result
+
+
+def _split(reader: RecordingReader, numbers: Any, from_ns: int | None, to_ns: int | None) -> tuple[Any, Any]:
+    """Numbers of the latched messages to send at once, and of the others in order of reception."""
+    index = reader.index
+    ordered = numbers[np.argsort(index.receive_ns[numbers], kind="stable")]
+    latched = np.array([topics.find(reader.channels[int(c)].topic).latched for c in index.channel[ordered]], dtype=bool)
+    stamps = index.stamp_ns[ordered]
+    timed = np.flatnonzero(~latched)
+    begin = stamps[timed].min() if len(timed) else 0
+    begin = max(begin, from_ns) if from_ns is not None else begin
+    at_once = latched & (stamps <= begin)
+    inside = ~at_once & (stamps >= begin)
+    if to_ns is not None:
+        inside &= stamps <= to_ns
+    return ordered[at_once], ordered[inside]
+
+
+class _Starts:
+    """Start ids of a replay: one for each recorded run of a publisher, so that nothing looks like a duplicate."""
+
+    def __init__(self, start: int) -> None:
+        self._start = start
+        self._known: dict[tuple[str, str, int], int] = {}
+        self._runs: Counter[tuple[str, str]] = Counter()
+
+    def of(self, raw: RawMessage, round_: int) -> int:
+        key = (raw.topic, raw.envelope.source, raw.envelope.start)
+        if key not in self._known:
+            self._known[key] = self._runs[key[:2]]
+            self._runs[key[:2]] += 1
+        return self._start + round_ * 1000 + self._known[key]
+
+
+def _publish(
+    raw: RawMessage, publish: Callable[[RawMessage], None], starts: _Starts, shift_ns: int, result: PlayResult
+) -> None:
+    envelope = raw.envelope._replace(start=starts.of(raw, result.rounds))
+    data = raw.data
+    if shift_ns:
+        envelope = envelope._replace(stamp_ns=envelope.stamp_ns + shift_ns)
+        data = shifted(raw.topic, data, shift_ns, f"~{result.rounds + 1}")
+    publish(RawMessage(raw.topic, envelope, data))
+    result.counts[raw.topic] += 1
+
+
+def shifted(topic: str, data: bytes | memoryview, shift_ns: int, suffix: str) -> bytes | memoryview:
+    """A payload with all times shifted and a suffix on the names of strips; what cannot be decoded stays as it is."""
+    try:
+        body = codec.decode(topic, data)
+    except ValueError:
+        return data
+    if isinstance(body, LineBlock):
+        times = None if body.line_times_ns is None else body.line_times_ns + shift_ns
+        body = replace(body, time_ns=body.time_ns + shift_ns, line_times_ns=times, strip=body.strip + suffix)
+    else:
+        _shift(body, shift_ns, suffix)
+        if topic == "configuration/strip":
+            body.id += suffix
+    return codec.encode(body)
+
+
+def _shift(body: Any, shift_ns: int, suffix: str) -> None:
+    for descriptor, value in body.ListFields():
+        name = descriptor.name
+        if descriptor.message_type is not None:
+            if descriptor.message_type.full_name == "google.protobuf.Timestamp":
+                total = value.seconds * SECOND_NS + value.nanos + shift_ns
+                value.seconds, value.nanos = divmod(total, SECOND_NS)
+            else:
+                for part in (value,) if hasattr(value, "ListFields") else value:
+                    _shift(part, shift_ns, suffix)
+        elif name == "strip":
+            setattr(body, name, value + suffix)
+        elif name.endswith(("time_ns", "start_ns", "end_ns")):
+            setattr(body, name, value + shift_ns)
+
+
+def time_argument(text: str, first_ns: int) -> int:
+    """Platform time in ns of ``12.5`` (seconds after ``first_ns``) or of an ISO time (UTC where it names no zone)."""
+    from datetime import UTC, datetime
+
+    try:
+        return first_ns + round(float(text) * SECOND_NS)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise UserError(f"time {text!r}, wanted seconds from the start or an ISO time") from None
+    moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment
+    whole = moment.replace(microsecond=0)
+    return int(whole.timestamp()) * SECOND_NS + moment.microsecond * 1000
+
+
+def first_stamp_ns(reader: RecordingReader) -> int:
+    """Stamp of the first measurement of a recording (or of whatever there is)."""
+    index = reader.index
+    timed = [
+        c.id
+        for c in reader.channels.values()
+        if c.known and not topics.find(c.topic).latched and topics.find(c.topic).family is not Family.STATUS
+    ]
+    stamps = index.stamp_ns[np.isin(index.channel, timed)]
+    stamps = stamps if len(stamps) else index.stamp_ns
+    return int(stamps.min()) if len(stamps) else 0
+
+
+def run(options: ProgramOptions) -> int:
+    """Play the recording that the configuration names: [player] input, rate, from, to, loop, all."""
+    table = dict(options.table)
+    path = table.pop("input", None)
+    if not path:
+        raise UserError("the player needs a recording: --set input=FILE, or [player] input in the configuration")
+    unknown = set(table) - {"rate", "from", "to", "loop", "all"}
+    if unknown:
+        raise UserError(f"configuration [player]: {', '.join(sorted(unknown))} is not known")
+    reader = RecordingReader(Path(path))
+    first = first_stamp_ns(reader)
+    with options.open_bus() as bus:
+        bus.announce("player")
+        result = play(
+            reader,
+            bus.publish_raw,
+            options.stop,
+            rate=float(table.get("rate", 1.0)),
+            from_ns=time_argument(str(table["from"]), first) if "from" in table else None,
+            to_ns=time_argument(str(table["to"]), first) if "to" in table else None,
+            loop=bool(table.get("loop", False)),
+            everything=bool(table.get("all", False)),
+            start=bus.start,
+        )
+        options.stop.wait(0.5)  # what is still on its way
+    options.report(f"played {sum(result.counts.values())} messages")
+    return 0
+
+
+def iso(stamp_ns: int) -> str:
+    """A stamp as ISO time, UTC, to the microsecond."""
+    from datetime import UTC, datetime
+
+    seconds, rest = divmod(stamp_ns, SECOND_NS)
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"

@@ -1,0 +1,305 @@
+"""The recorder: everything the topic table marks as recorded, into a recording, without decoding it."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from ..schemas import topics
+from ..schemas.envelope import RawMessage
+from .bus import Bus
+from .errors import UserError
+from .live import StatusPublisher
+from .node import Node
+from .ordering import StreamCheck
+from .program import ProgramOptions
+from .recording import COMPRESSIONS, RecordingWriter
+
+#: The open chunk is closed at least so often: what SIGKILL can cost.
+FLUSH_S = 0.3
+#: Bytes that wait for the disk before publishers are slowed down.
+WAITING_BYTES = 256 << 20
+#: What comes in this time after the start is sorted: configuration and control to the head of the file.
+HEAD_S = 0.4
+#: A full disk is tried again after so long.
+RETRY_S = 2.0
+
+
+class RecordingFile:
+    """An unbuffered file that never ends inside a record: a write that fails is taken back."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        self._size = 0
+
+    def write(self, data: bytes | memoryview) -> int:
+        view = memoryview(data).cast("B") if len(data) else memoryview(b"")
+        done = 0
+        try:
+            while done < len(view):
+                done += os.write(self._descriptor, view[done:])
+        except OSError:
+            os.ftruncate(self._descriptor, self._size)
+            os.lseek(self._descriptor, self._size, os.SEEK_SET)
+            raise
+        self._size += done
+        return done
+
+    def tell(self) -> int:
+        return self._size
+
+    def flush(self) -> None:
+        """Every write goes to the operating system at once."""
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
+class Recorder(Node):
+    """Keeps messages in files.
+
+    Parameters
+    ----------
+    output : path of the recording
+    compression : ``none``, ``lz4`` or ``zstd``
+    rotate_mb : start a new file after so many megabytes; 0 = one file
+    """
+
+    name = "recorder"
+    inputs = tuple(row.name for row in topics.TOPICS if row.recorded)
+    outputs = ()
+
+    def __init__(self, output: str = "recording.mcap", compression: str = "none", rotate_mb: float = 0) -> None:
+        super().__init__()
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"compression is {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
+        if rotate_mb < 0:
+            raise ValueError(f"rotate_mb is {rotate_mb}, wanted 0 or more")
+        self._path = Path(output)
+        self._compression = compression
+        self._rotate_bytes = int(rotate_mb * 1e6)
+        self.files: list[Path] = []
+        self.platform = "demo"
+        self.newest_ns = 0
+        self._check: StreamCheck[None] = StreamCheck()
+        self._latched: list[RawMessage] = []
+        self._file: RecordingFile | None = None
+        self._writer: RecordingWriter | None = None
+        self._flushed_s = 0.0
+        self._retry_s = 0.0
+        self._unflushed = 0
+        self._lost = 0
+
+    @property
+    def statistics(self) -> Any:
+        """Counts by topic, see `ordering.TopicCounts`."""
+        return self._check.counts
+
+    def state(self) -> str:
+        return "recording" if self._writer is not None else f"not recording: {self.last_problem}"
+
+    def start(self) -> None:
+        """Open the first file.
+
+        Raises
+        ------
+        UserError : it cannot be written
+        """
+        try:
+            self._open()
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+
+    def take(self, messages: list[RawMessage]) -> None:
+        """Write messages; on a disk that is full they are counted and lost, and the recorder goes on."""
+        for raw in messages:
+            self._check.accept(raw.topic, raw.envelope, None)
+            if not raw.topic.startswith("status/"):
+                self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
+            if topics.find(raw.topic).latched:
+                self._latched.append(raw)
+            self._write(raw)
+
+    def tend(self) -> None:
+        """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""
+        now = time.monotonic()
+        if self._writer is None:
+            if now >= self._retry_s:
+                self._try_again(now)
+        elif now - self._flushed_s >= FLUSH_S:
+            self._flushed_s = now
+            try:
+                self._writer.flush()
+                self._unflushed = 0
+                if self._rotate_bytes and self._writer.size > self._rotate_bytes:
+                    self._close()
+                    self._open()
+            except OSError as error:
+                self._fail(error)
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        try:
+            self._close()
+        except OSError as error:
+            self._fail(error)
+
+    # ---- files
+
+    def _open(self) -> None:
+        number = len(self.files)
+        path = self._path if number == 0 else self._path.with_stem(f"{self._path.stem}_{number:04d}")
+        self._file = RecordingFile(path)
+        try:
+            self._writer = RecordingWriter(self._file, self._compression, platform=self.platform)  # type: ignore[arg-type]
+            for raw in self._latched if number else ():
+                self._writer.write_raw(raw)
+            if number:
+                self._writer.flush()
+        except OSError:
+            self._writer = None
+            self._file.close()
+            os.unlink(path)
+            raise
+        self.files.append(path)
+        self._flushed_s = time.monotonic()
+        self._unflushed = 0
+
+    def _close(self) -> None:
+        if self._writer is not None and self._file is not None:
+            self._writer.close()
+            self._file.close()
+            self._writer = self._file = None
+
+    def _write(self, raw: RawMessage) -> None:
+        if self._writer is None:
+            self._lose(1)
+            return
+        self._unflushed += 1
+        try:
+            self._writer.write_raw(raw)
+        except OSError as error:
+            self._fail(error)
+
+    def _lose(self, number: int) -> None:
+        self._lost += number
+        self.counters["lost"] += number
+
+    def _fail(self, error: OSError) -> None:
+        assert self._file is not None
+        self._file.close()
+        path = self._file.path
+        self._writer = self._file = None
+        self._lose(self._unflushed)  # at most: some of them may be in chunks that were written
+        self._unflushed = 0
+        self._retry_s = time.monotonic() + RETRY_S
+        self.problem("disk", f"{path}: {(error.strerror or str(error)).lower()}")
+
+    def _try_again(self, now: float) -> None:
+        self._retry_s = now + RETRY_S
+        try:
+            self._open()
+        except OSError as error:
+            self.last_problem = f"{self._path}: {(error.strerror or str(error)).lower()}"
+        else:
+            self.problem("resumed", f"recording again, into {self.files[-1]}; {self._lost} messages lost")
+
+
+class _Backlog:
+    """Messages on their way to the disk, bounded by bytes."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._messages: deque[RawMessage] = deque()
+        self._bytes = 0
+        self._open = True
+
+    def put(self, raw: RawMessage) -> None:
+        with self._condition:
+            while self._bytes >= WAITING_BYTES and self._open:
+                self._condition.wait(0.5)
+            self._messages.append(raw)
+            self._bytes += len(raw.data)
+            if len(self._messages) == 1:
+                self._condition.notify_all()
+
+    def take(self, timeout_s: float) -> list[RawMessage]:
+        with self._condition:
+            if not self._messages:
+                self._condition.wait(timeout_s)
+            taken = list(self._messages)
+            self._messages.clear()
+            self._bytes = 0
+            self._condition.notify_all()
+            return taken
+
+    def close(self) -> None:
+        with self._condition:
+            self._open = False
+            self._condition.notify_all()
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+
+def run(options: ProgramOptions) -> int:
+    """Record until told to stop."""
+    from .config import build
+
+    recorder = build(Recorder, options.tables, "recorder")
+    recorder.platform = options.platform
+    recorder.start()
+    options.report(f"recording to {recorder.files[0]}")
+    with options.open_bus() as bus:
+        record(recorder, bus, options)
+    recorder.close()
+    counts = recorder.statistics
+    total, gaps = sum(c.received for c in counts.values()), sum(c.gaps for c in counts.values())
+    lost = f", {recorder.counters['lost']} lost" if recorder.counters["lost"] else ""
+    names = ", ".join(str(path) for path in recorder.files)
+    options.report(f"{total} messages in {names}; {gaps} missing by number{lost}")
+    return 1 if recorder.counters["disk"] else 0
+
+
+def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
+    """Feed a recorder from the bus until ``options.stop`` is set."""
+    backlog = _Backlog()
+
+    def malformed(topic: str, why: str) -> None:
+        recorder.problem("malformed", f"{topic}: {why}")
+
+    def receive(raw: RawMessage) -> None:
+        try:
+            topics.find(raw.topic)
+        except KeyError:
+            malformed(raw.topic, "unknown topic")
+            return
+        backlog.put(raw)
+
+    for name in recorder.inputs:
+        bus.subscribe(name, receive, malformed)
+    bus.announce(recorder.name)
+    status = StatusPublisher(bus, recorder.name)
+    status.publish("starting", {}, recorder, 0.0, 0, 0)
+    problem = ""
+    head: list[RawMessage] = []
+    until = time.monotonic() + HEAD_S
+    while time.monotonic() < until and not options.stop.is_set():
+        head += backlog.take(0.05)
+    recorder.take(sorted(head, key=lambda raw: not topics.find(raw.topic).latched))
+    while not options.stop.is_set():
+        recorder.take(backlog.take(0.05))
+        recorder.tend()
+        if recorder.last_problem != problem:
+            problem = recorder.last_problem
+            options.report(f"recorder: {problem}")
+        if status.due():
+            status.publish(recorder.state(), dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
+    recorder.take(backlog.take(0.0))
+    status.publish("stopping", dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
+    backlog.close()

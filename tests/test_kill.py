@@ -1,0 +1,204 @@
+"""Nodes that are killed or frozen: the others go on, the restarted one catches up, recordings are readable."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+from bus_rig import Rig, simulated_flight, triline, wait_for
+from triline.nodes.bus import Bus
+from triline.nodes.recorder import FLUSH_S, Recorder, RecordingFile
+from triline.nodes.recording import RecordingReader
+from triline.nodes.recording_summary import findings, topic_summaries
+from triline.schemas import codec
+from triline.schemas.envelope import Envelope, RawMessage
+
+import sample_messages as sample  # isort: skip
+
+
+class Listener:
+    """Hears results and status on the bus."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.heard: dict[tuple[str, int], list[float]] = {}
+        self.statuses: list = []
+        for name in ("sensor/attitude", "trajectory/filtered", "adjustment/report", "orientation/final"):
+            bus.subscribe(name, self._hear)
+        bus.subscribe("status/*", lambda raw: self.statuses.append(codec.decode(raw.topic, raw.data)))
+
+    def _hear(self, raw: RawMessage) -> None:
+        self.heard.setdefault((raw.topic, raw.envelope.start), []).append(time.monotonic())
+
+    def since(self, topic: str, moment: float) -> int:
+        return sum(t > moment for (name, _), times in self.heard.items() if name == topic for t in times)
+
+    def runs(self, topic: str) -> int:
+        return sum(name == topic for name, _ in self.heard)
+
+
+def test_each_node_killed_in_turn(tmp_path):
+    """One flight of 18 s; navigator, adjuster and recorder are killed and restarted, the navigator is frozen."""
+    with Rig(tmp_path) as rig, Bus(port=rig.port, source="listener") as bus:
+        listener = Listener(bus)
+        nodes = {
+            "recorder": rig.start("node", "recorder", "-o", tmp_path / "0.mcap"),
+            "navigator": rig.start("node", "navigator"),
+            "adjuster": rig.start("node", "adjuster"),
+        }
+        wait_for(lambda: bus.alive() >= set(nodes), 30, "the nodes")
+        replay = rig.start("replay", simulated_flight(12), "--rate", 1.6)
+        wait_for(lambda: listener.since("adjustment/report", 0) > 3, 30, "reports")
+
+        # the recorder: at most half a second is lost, nobody else notices
+        nodes["recorder"].kill()
+        killed_ns, moment = time.time_ns(), time.monotonic()
+        nodes["recorder"].wait()
+        nodes["recorder"] = rig.start("node", "recorder", "-o", tmp_path / "1.mcap")
+
+        # the navigator: the adjuster waits for it and goes on with the restarted one
+        time.sleep(0.5)
+        assert listener.since("adjustment/report", moment) > 0
+        runs = listener.runs("trajectory/filtered")
+        moment = time.monotonic()
+        nodes["navigator"].kill()
+        nodes["navigator"].wait()
+        nodes["navigator"] = rig.start("node", "navigator")
+        wait_for(lambda: listener.runs("trajectory/filtered") == runs + 1, 10, "a trajectory after the restart")
+        assert listener.since("sensor/attitude", moment) > 50
+        back = time.monotonic()
+        wait_for(lambda: listener.since("adjustment/report", back) > 2, 10, "reports after the restart")
+
+        # the adjuster, with configuration and control from before its time
+        nodes["adjuster"].kill()
+        nodes["adjuster"].wait()
+        moment = time.monotonic()
+        nodes["adjuster"] = rig.start("node", "adjuster")
+        wait_for(lambda: listener.since("adjustment/report", moment) > 2, 10, "reports of the restarted adjuster")
+        assert listener.since("trajectory/filtered", moment) > 50
+
+        # frozen: sensors go on, and it catches up
+        nodes["navigator"].send_signal(signal.SIGSTOP)
+        moment = time.monotonic()
+        time.sleep(1.0)
+        assert listener.since("sensor/attitude", moment) > 100
+        nodes["navigator"].send_signal(signal.SIGCONT)
+        moment = time.monotonic()
+        wait_for(lambda: listener.since("trajectory/filtered", moment) > 150, 10, "the frozen navigator")
+
+        replay.send_signal(signal.SIGINT)
+        assert replay.wait(10) == 0
+        for name in ("navigator", "adjuster", "recorder"):
+            assert rig.stop(nodes[name]) == 0, rig.log(name)
+
+    first, second = tmp_path / "0.mcap", tmp_path / "1.mcap"
+    check = triline("check", first)
+    assert check.returncode == 1 and len(check.stderr.splitlines()) == 1
+    done = triline("recover", first, "-o", tmp_path / "whole.mcap")
+    assert done.returncode == 0, done.stderr
+    reader = RecordingReader(tmp_path / "whole.mcap")
+    assert findings(reader) == []
+    lost_s = (killed_ns - reader.index.receive_ns.max()) / 1e9
+    assert lost_s <= 0.5
+    assert triline("check", second).returncode == 0
+    held = {row.topic for row in topic_summaries(RecordingReader(second))}
+    assert {"configuration/camera", "configuration/project", "observation/control", "trajectory/filtered"} <= held
+    topics_at_head = [raw.topic for raw in map(RecordingReader(second).raw, range(3))]
+    assert all(topic.startswith(("configuration/", "observation/control")) for topic in topics_at_head)
+
+
+# ---- the recorder and its disk
+
+
+class FullDisk(RecordingFile):
+    """A disk with room for so many bytes."""
+
+    room = 0
+
+    def write(self, data):
+        taken = min(len(data), max(0, FullDisk.room))
+        FullDisk.room -= len(data)
+        if taken < len(data):
+            os.write(self._descriptor, bytes(data)[:taken])  # a part of the record is on the disk
+            os.ftruncate(self._descriptor, self._size)
+            os.lseek(self._descriptor, self._size, os.SEEK_SET)
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    import triline.nodes.recorder as module
+
+    monkeypatch.setattr(module, "RecordingFile", FullDisk)
+    monkeypatch.setattr(module, "RETRY_S", 0.0)
+    monkeypatch.setattr(module, "FLUSH_S", 0.0)
+    FullDisk.room = 60_000
+
+
+def raws(n, first=0):
+    return [
+        RawMessage(
+            "sensor/attitude",
+            Envelope(sample.EPOCH_NS + i, "test", i),
+            codec.encode(sample.body("sensor/attitude")),
+            i + 1,
+        )
+        for i in range(first, first + n)
+    ]
+
+
+def test_a_full_disk_is_reported_the_recorder_lives_and_resumes(full_disk, tmp_path):
+    recorder = Recorder(str(tmp_path / "a.mcap"))
+    recorder.start()
+    recorder.take(
+        [RawMessage("configuration/strip", Envelope(0, "test", 0), codec.encode(sample.body("configuration/strip")))]
+    )
+    sent = 0
+    while not recorder.counters["disk"]:
+        recorder.take(raws(20, sent))
+        sent += 20
+        recorder.tend()
+        assert sent < 2000
+    assert recorder.last_problem == f"{tmp_path / 'a.mcap'}: no space left on device"
+    assert recorder.state().startswith("not recording: ")
+    recorder.take(raws(20, sent))
+    sent += 20
+    recorder.tend()  # still full
+    assert recorder.state().startswith("not recording: ")
+    FullDisk.room = 10**9
+    recorder.tend()
+    assert recorder.state() == "recording"
+    recorder.take(raws(30, sent))
+    recorder.close()
+    assert recorder.files == [tmp_path / "a.mcap", tmp_path / "a_0001.mcap"]
+    # What is on the disk is readable, what is not was counted.
+    first, second = (RecordingReader(path) for path in recorder.files)
+    assert findings(second) == []
+    assert [c.topic for c in second.channels.values()] == ["configuration/strip", "sensor/attitude"]
+    kept = len(first.select(["sensor/attitude"]))
+    assert 100 < kept < sent
+    assert sent - kept <= recorder.counters["lost"] <= sent - kept + 21
+    assert [str(d) for d in first.damage] == []
+
+
+def test_a_recorder_changes_files_and_each_explains_itself(tmp_path):
+    recorder = Recorder(str(tmp_path / "a.mcap"), rotate_mb=0.05)
+    recorder.start()
+    recorder.take(
+        [RawMessage("configuration/strip", Envelope(0, "test", 0), codec.encode(sample.body("configuration/strip")))]
+    )
+    for i in range(40):
+        recorder.take(raws(25, 25 * i))
+        recorder._flushed_s -= FLUSH_S  # as if time had passed
+        recorder.tend()
+    recorder.close()
+    assert len(recorder.files) > 1
+    numbers = []
+    for path in recorder.files:
+        reader = RecordingReader(path)
+        assert findings(reader) == []
+        assert reader.raw(0).topic == "configuration/strip"
+        numbers += reader.index.sequence[reader.select(["sensor/attitude"])].tolist()
+    assert numbers == list(range(1000))

@@ -1,0 +1,217 @@
+"""Order and checks of message streams, without a bus."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from triline.nodes.ordering import MAX_JUMP_NS, REBASE_AFTER, Sequencer, StreamCheck, order_key
+from triline.schemas import topics
+from triline.schemas.envelope import Envelope
+
+MS = 1_000_000
+INPUTS = ("sensor/attitude", "sensor/gnss", "trajectory/filtered", "observation/tie", "configuration/strip")
+TOPICS = st.sampled_from(("sensor/attitude", "sensor/gnss", "trajectory/filtered", "observation/tie"))
+
+
+def lateness_ns(topic: str) -> int:
+    return round(topics.find(topic).allowed_lateness_ms * MS)
+
+
+@st.composite
+def arrivals(draw, within: float = 1.0):
+    """Messages (topic, envelope) in an order of arrival with jitter up to ``within`` times the allowed lateness.
+
+    A topic has one source, or two that have been heard before.
+    """
+    n = draw(st.integers(1, 60))
+    sources = draw(st.sampled_from(("a", "ab")))
+    last: dict[tuple[str, str], tuple[int, int]] = {}
+    timed = []
+    stamp = 10**18
+    if len(sources) > 1:
+        for place, (topic, source) in enumerate(itertools.product(INPUTS[:4], sources)):
+            last[topic, source] = (0, stamp + place)
+            timed.append((stamp + place, 0, topic, Envelope(stamp + place, source, 0)))
+        stamp += place
+    for _ in range(n):
+        stamp += draw(st.sampled_from((0, 0, 1, 5, 20, 60, 300))) * MS
+        topic, source = draw(TOPICS), draw(st.sampled_from(sources))
+        sequence, arrived = last.get((topic, source), (-1, 0))
+        arrived = max(arrived, stamp + int(draw(st.floats(0, within)) * lateness_ns(topic)))
+        last[topic, source] = sequence + 1, arrived
+        timed.append((arrived, draw(st.integers(0, 9)), topic, Envelope(stamp, source, sequence + 1)))
+    # What arrives at one instant comes in any order, but messages of one stream keep theirs.
+    taken = sorted(timed, key=lambda entry: entry[:2])
+    streams = {stream: iter([e for e in timed if (e[2], e[3].source) == stream]) for stream in last}
+    return [next(streams[entry[2], entry[3].source])[2:] for entry in taken]
+
+
+def run(messages, step_s: float = 10.0, **options):
+    """What leaves a Sequencer, with what was called late; the clock goes on by ``step_s`` with every message."""
+    sequencer: Sequencer = Sequencer(INPUTS, **options)
+    out, late = [], []
+    for i, (topic, envelope) in enumerate(messages):
+        item = (topic, envelope)
+        returned = sequencer.push(topic, envelope, item, i * step_s)
+        if returned is not None:
+            late.append(returned)
+            out.append(returned)
+        out += sequencer.pop(i * step_s)
+    out += sequencer.flush()
+    return out, late
+
+
+@given(arrivals())
+@settings(max_examples=400, deadline=None, derandomize=True, database=None)
+def test_jitter_inside_the_allowed_lateness_does_not_change_the_order(messages):
+    out, late = run(messages)
+    assert not late
+    assert out == sorted(messages, key=lambda m: order_key(*m))
+
+
+@given(arrivals(within=20.0))
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+def test_every_message_leaves_once_whatever_the_jitter(messages):
+    out, late = run(messages)
+    assert sorted(out) == sorted(messages)
+    # What was not late is in order.
+    on_time = [m for m in out if m not in late]
+    assert on_time == sorted(on_time, key=lambda m: order_key(*m))
+
+
+def test_a_message_after_its_turn_leaves_at_once_and_is_late():
+    early = [("sensor/attitude", Envelope(t * MS, "a", i)) for i, t in enumerate((0, 100, 500))]
+    out, late = run([*early, ("sensor/gnss", Envelope(50 * MS, "a", 0))])
+    assert late == [("sensor/gnss", Envelope(50 * MS, "a", 0))]
+    assert out.index(late[0]) < out.index(early[2])
+
+
+def test_a_machine_that_hesitates_does_not_make_a_steady_stream_late():
+    """The trajectory stands still for 2 s of platform time that pass within 0.1 s of waiting."""
+    ties = [("observation/tie", Envelope(t * MS, "s", i)) for i, t in enumerate(range(0, 2000, 20))]
+    poses = [("trajectory/filtered", Envelope(t * MS, "n", i)) for i, t in enumerate(range(0, 2000, 5))]
+    first = poses[:1]
+    out, late = run([*first, *ties, *poses[1:]], step_s=0.001)
+    assert not late
+    assert out == sorted([*poses, *ties], key=lambda m: order_key(*m))
+    _, late = run([*first, *ties, *poses[1:]], step_s=0.001, grace_s=0.0)
+    assert len(late) > 300  # the same without patience
+
+
+def test_a_steady_stream_that_has_died_holds_nothing_for_longer_than_its_grace():
+    sequencer: Sequencer = Sequencer(("trajectory/filtered", "observation/tie"), grace_s=0.5)
+    sequencer.push("trajectory/filtered", Envelope(0, "n", 0), "pose", 0.0)
+    for i in range(1, 20):
+        sequencer.push("observation/tie", Envelope(i * 100 * MS, "s", i), i, 0.01 * i)
+    assert sequencer.pop(0.4) == ["pose"]
+    assert sequencer.pop(0.6) == list(range(1, 18))  # all that is older than the allowed lateness of 100 ms
+
+
+def test_equal_stamps_leave_by_their_place_in_the_topic_table():
+    names = ("observation/tie", "trajectory/filtered", "sensor/gnss", "configuration/strip")
+    messages = [(name, Envelope(10**9, "x", 0)) for name in names]
+    for permutation in itertools.permutations(messages):
+        out, late = run(permutation)
+        assert [topic for topic, _ in out] == list(reversed(names))
+        assert not late
+
+
+def test_one_stream_needs_no_other_to_come_first():
+    sequencer: Sequencer = Sequencer(("sensor/gnss",))
+    assert sequencer.push("sensor/gnss", Envelope(10**9, "a", 0), "m", 0.0) is None
+    assert sequencer.pop(0.0) == ["m"]
+
+
+# ---- checks of one stream
+
+
+def accept(check, sequence, stamp_ms, topic="sensor/gnss", source="a", start=0):
+    return check.accept(topic, Envelope(stamp_ms * MS, source, sequence, start), (sequence, stamp_ms))
+
+
+@pytest.fixture
+def check():
+    return StreamCheck()
+
+
+def test_gaps_are_counted_and_filled_by_what_comes_out_of_order(check):
+    for sequence in (5, 6, 9):
+        assert accept(check, sequence, sequence)
+    counts = check.counts["sensor/gnss"]
+    assert (counts.received, counts.gaps, counts.duplicates) == (3, 2, 0)
+    assert accept(check, 7, 7) == [(7, 7)]
+    assert (counts.gaps, counts.duplicates) == (1, 0)
+    assert accept(check, 7, 7) == []
+    assert (counts.gaps, counts.duplicates) == (1, 1)
+
+
+def test_duplicates_are_dropped_and_a_restart_is_none(check):
+    assert accept(check, 0, 0)
+    assert accept(check, 0, 0) == []
+    assert accept(check, 0, 10, start=1) == [(0, 10)]
+    assert check.counts["sensor/gnss"].duplicates == 1
+
+
+def test_time_that_goes_backwards_is_dropped(check):
+    kinds = []
+    check = StreamCheck(lambda kind, text: kinds.append((kind, text)))
+    accept(check, 0, 1000)
+    assert accept(check, 1, 400) == []
+    assert accept(check, 2, 1200) == [(2, 1200)]
+    assert check.counts["sensor/gnss"].malformed == 1
+    assert kinds == [("malformed", "sensor/gnss 1 of 'a': time goes back by 0.6 s")]
+
+
+def test_a_clock_that_was_set_back_is_believed_after_a_while(check):
+    accept(check, 0, 100_000)
+    taken = [bool(accept(check, 1 + i, 10 * i)) for i in range(REBASE_AFTER + 3)]
+    assert taken == [False] * (REBASE_AFTER - 1) + [True] * 4
+    assert check.counts["sensor/gnss"].malformed == REBASE_AFTER - 1
+
+
+def test_one_stamp_far_ahead_is_dropped_and_poisons_nothing(check):
+    accept(check, 0, 0)
+    far = 2 * MAX_JUMP_NS // MS
+    assert accept(check, 1, far) == []
+    assert accept(check, 2, 400) == [(2, 400)]
+    assert accept(check, 3, 600) == [(3, 600)]
+    assert check.counts["sensor/gnss"].malformed == 1
+
+
+def test_a_true_pause_loses_nothing(check):
+    accept(check, 0, 0)
+    far = 2 * MAX_JUMP_NS // MS
+    assert accept(check, 1, far) == []
+    assert accept(check, 2, far + 200) == [(1, far), (2, far + 200)]
+    assert accept(check, 3, far + 400) == [(3, far + 400)]
+    assert check.counts["sensor/gnss"].malformed == 0
+
+
+def test_latched_topics_may_come_again_with_any_stamp(check):
+    assert accept(check, 0, 500, topic="observation/control")
+    assert accept(check, 1, 100, topic="observation/control")
+    assert check.counts["observation/control"].malformed == 0
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 12), st.integers(0, 200_000)), max_size=60))
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+def test_the_verdict_on_a_stream_does_not_depend_on_the_others(messages):
+    mixed = StreamCheck()
+    together = {s: [] for s in "abc"}
+    for source, sequence, stamp in messages:
+        together[source] += accept(mixed, sequence, stamp, source=source)
+    for source in "abc":
+        alone = StreamCheck()
+        passed = [m for s, q, t in messages if s == source for m in accept(alone, q, t, source=source)]
+        assert passed == together[source]
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 200_000)), max_size=60))
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+def test_no_message_passes_twice(messages):
+    check = StreamCheck()
+    passed = [m for q, t in messages for m in accept(check, q, t)]
+    assert len({sequence for sequence, _ in passed}) == len(passed)
