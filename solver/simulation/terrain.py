@@ -1,0 +1,87 @@
+"""Smooth relief that follows the curvature of the Earth, and where rays meet it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating]
+
+EARTH_RADIUS_M = 6.371e6
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Ground height as a sum of plane waves, longer ones higher, in the local frame.
+
+    Attributes
+    ----------
+    height_m : mean height above the local origin
+    wave_vector : (w, 2) rad/m
+    phase : (w,) rad
+    amplitude_m : (w,)
+    """
+
+    height_m: float
+    wave_vector: Array = field(repr=False)
+    phase: Array = field(repr=False)
+    amplitude_m: Array = field(repr=False)
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """Local Z of the ground below X, Y (...), metres."""
+        x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+        z = self.height_m - (x * x + y * y) / (2.0 * EARTH_RADIUS_M)
+        for k, phase, amplitude in zip(self.wave_vector, self.phase, self.amplitude_m, strict=True):
+            z = z + amplitude * np.sin(k[0] * x + k[1] * y + phase)
+        return z
+
+    def intersect(self, position_l: ArrayLike, direction_l: ArrayLike) -> Array:
+        """Ground points (n, 3) of rays from positions (n, 3) downward along directions (n, 3).
+
+        Raises
+        ------
+        ValueError : a ray that does not come down to the ground
+        """
+        origin, d = np.asarray(position_l, dtype=float), np.asarray(direction_l, dtype=float)
+        slope = d[:, :2] / d[:, 2:]
+        z = np.full(len(origin), self.height_m)
+        step = np.full(len(origin), np.inf)
+        for _ in range(60):
+            xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
+            step = self.height(xy[:, 0], xy[:, 1]) - z
+            z = z + step
+            if np.abs(step).max(initial=0.0) < 1e-9:
+                break
+        lost = ~(np.abs(step) < 1e-9)
+        if lost.any() or not (d[:, 2] < 0).all():
+            raise ValueError(f"{int((lost | (d[:, 2] >= 0)).sum())} rays do not come down to the ground")
+        xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
+        return np.column_stack([xy, z])
+
+
+def fractal_terrain(
+    rng: np.random.Generator,
+    height_m: float = 0.0,
+    amplitude_m: float = 75.0,
+    longest_m: float = 6000.0,
+    waves: int = 20,
+) -> Terrain:
+    """A relief whose heights stay mostly within ``+-amplitude_m`` of ``height_m``.
+
+    Wavelengths run from ``longest_m`` down to a fortieth of it; the amplitude of a wave is proportional to its
+    length, so that slopes are alike at all scales.
+
+    Raises
+    ------
+    ValueError : a negative amplitude
+    """
+    if amplitude_m < 0:
+        raise ValueError(f"terrain amplitude must not be negative, got {amplitude_m} m")
+    length = longest_m * np.geomspace(1.0, 1.0 / 40.0, waves)
+    azimuth = rng.uniform(0.0, 2 * np.pi, waves)
+    k = (2 * np.pi / length)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    # half the amplitude as standard deviation
+    amplitude = length * (amplitude_m / 2.0) / np.sqrt(0.5 * np.sum(length**2))
+    return Terrain(height_m, k, rng.uniform(0.0, 2 * np.pi, waves), amplitude)
