@@ -154,22 +154,3 @@ def three_line_camera(
         for id, angle in view_deg.items()
     )
     return LineCamera(name, (Lens(lens, focal_length_mm),), lines)
-
-
-#: Named presets of single-lens airborne scanners (`math.md` section 2 of the design pages).
-_THREE_LINE = {
-    "ads40": (62.7, 12000, 0.0065, {"F": 26.0, "N": 0.0, "B": -16.0}),
-    "si-100": (60.0, 10200, 0.007, {"F": 21.0, "N": 0.0, "B": -21.0}),
-}
-
-
-def preset(name: str) -> LineCamera:
-    """A camera by name.
-
-    Raises
-    ------
-    ValueError : a name that is not known; the message lists those that are
-    """
-    if name not in _THREE_LINE:
-        raise ValueError(f"unknown camera preset {name!r}; known: {', '.join(sorted(_THREE_LINE))}")
-    return three_line_camera(name, *_THREE_LINE[name])

@@ -1,0 +1,192 @@
+"""``triline export``: a topic of a recording to CSV, Parquet, GeoJSON, GeoPackage or SBET."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...schemas import messages as m
+from ...schemas import topics
+from ...solver.frames import LocalFrame, navigation_from_R_lc
+from ...solver.gps_time import gps_from_utc_ns
+from ...solver.rotation import matrix_from_quaternion
+from ...solver.trajectory import Trajectory
+from ..convert import R_bc_of, local_frame, pose_sample
+from ..errors import UserError
+from ..formats.features import features_of
+from ..formats.geojson import write_geojson
+from ..formats.geopackage import write_geopackage
+from ..formats.new_file import new_file
+from ..formats.rows import RowLayout, repeated_messages, spread_by_default
+from ..formats.sbet import write_sbet
+from ..node import Message
+from ..recording import RecordingReader
+
+EXAMPLE = "triline export flight.mcap --topic orientation/final --csv orientation.csv"
+
+#: Messages turned into rows at a time.
+BATCH = 20_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="RECORDING")
+    parser.add_argument("--topic", required=True, help="one of: " + ", ".join(row.name for row in topics.TOPICS))
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument("--csv", metavar="FILE", help="one row a message, or one an element of a repeated sub-message")
+    target.add_argument("--parquet", metavar="FILE", help="the same table as Parquet")
+    target.add_argument("--geojson", metavar="FILE", help="points and lines in WGS 84, with sigmas")
+    target.add_argument("--gpkg", metavar="FILE", help="the same as GeoPackage")
+    target.add_argument(
+        "--sbet", metavar="FILE", help="poses of trajectory/*, orientation/* or truth/trajectory as SBET"
+    )
+    parser.add_argument(
+        "--rows", metavar="FIELD",
+        help="repeated sub-message whose elements become rows ('none': one row a message); by default the only one",
+    )  # fmt: skip
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th message (default 1)")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.every < 1:
+        raise UserError(f"--every {args.every}, wanted at least 1")
+    path = Path(args.recording)
+    reader = RecordingReader(path)
+    try:
+        row = topics.find(args.topic)
+    except KeyError:
+        raise UserError(
+            f"--topic {args.topic}: not a topic; topics: {', '.join(t.name for t in topics.TOPICS)}"
+        ) from None
+    if not len(reader.select([args.topic])):
+        held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
+        raise UserError(f"{path}: no message on {args.topic}; it holds {', '.join(held) or 'no known topic'}")
+    kind, target = next((name, Path(getattr(args, name))) for name in _WRITERS if getattr(args, name))
+    if target.exists() and target.samefile(path):
+        raise UserError(f"{target}: is the recording itself")
+    with new_file(target) as part:
+        count = _WRITERS[kind](reader, args, part)
+    skipped = sum(reader.problems.values())
+    result = {
+        "recording": str(path), "topic": args.topic, "type": row.type_name, "file": str(target), **count,
+        "skipped": skipped, "damaged_stretches": len(reader.damage),
+    }  # fmt: skip
+    if args.json:
+        print(json.dumps(result, indent=2))
+    elif not args.quiet:
+        what = ", ".join(f"{number} {name}" for name, number in count.items())
+        print(f"{args.topic} -> {target}: {what}")
+        if skipped or reader.damage:
+            print(
+                f"  note: {skipped} messages left out ({reader.last_problem}), {len(reader.damage)} damaged stretches"
+            )
+    return 0
+
+
+def _messages(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Message]:
+    return islice(reader.sorted_messages([args.topic]), 0, None, args.every)
+
+
+def _batches(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Any]:
+    """Tables of the messages, at least one."""
+    type_name = topics.find(args.topic).type_name
+    spread = args.rows if args.rows else spread_by_default(type_name)
+    try:
+        layout = RowLayout(args.topic, None if spread == "none" else spread)
+    except ValueError:
+        known = ", ".join((*repeated_messages(type_name), "none"))
+        raise UserError(f"--rows {args.rows}: {args.topic} has no such field, wanted one of {known}") from None
+    messages = _messages(reader, args)
+    table = layout.frame(islice(messages, BATCH))
+    while True:
+        yield table
+        table = layout.frame(islice(messages, BATCH))
+        if not len(table):
+            return
+
+
+def _write_csv(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    count = 0
+    with open(target, "w", newline="", encoding="utf-8") as file:
+        for number, table in enumerate(_batches(reader, args)):
+            table.to_csv(file, index=False, header=number == 0, lineterminator="\n")
+            count += len(table)
+    return {"rows": count}
+
+
+def _write_parquet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise UserError("--parquet needs the package pyarrow; install it, or use --csv") from None
+    count, writer = 0, None
+    try:
+        for table in _batches(reader, args):
+            arrow = pyarrow.Table.from_pandas(table, preserve_index=False)
+            writer = writer or pyarrow.parquet.ParquetWriter(target, arrow.schema)
+            writer.write_table(arrow)
+            count += len(table)
+    finally:
+        if writer is not None:
+            writer.close()
+    return {"rows": count}
+
+
+def _project_and_frame(reader: RecordingReader) -> tuple[Any, LocalFrame | None]:
+    project = reader.first("configuration/project")
+    return project, None if project is None else local_frame(project)
+
+
+def _write_geojson(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    features = features_of(args.topic, _messages(reader, args), _project_and_frame(reader)[1])
+    return {"features": write_geojson(target, features)}
+
+
+def _write_gpkg(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    features = features_of(args.topic, _messages(reader, args), _project_and_frame(reader)[1])
+    return {"features": write_geopackage(target, args.topic, features)}
+
+
+def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    """Poses of the body: the boresight of the project is taken out; positions are those of the perspective centre."""
+    if topics.find(args.topic).type is not m.PoseInFrame:
+        poses = ", ".join(row.name for row in topics.TOPICS if row.type is m.PoseInFrame)
+        raise UserError(f"--sbet: {args.topic} has no poses; topics that have: {poses}")
+    project, frame = _project_and_frame(reader)
+    if frame is None:
+        raise UserError(
+            f"{reader.path}: no message on configuration/project: the place of the local frame is not known"
+        )
+    samples = []
+    for message in _messages(reader, args):
+        try:
+            samples.append(pose_sample(message.body))
+        except ValueError as error:
+            reader.problems["malformed"] += 1
+            reader.last_problem = str(error)
+    time_ns, first = np.unique(np.array([sample.time_ns for sample in samples], dtype=np.int64), return_index=True)
+    if len(time_ns) < 2:
+        raise UserError(f"{reader.path}: {len(time_ns)} poses on {args.topic}, wanted at least 2")
+    position = np.array([samples[i].position_l for i in first])
+    quaternion = np.array([samples[i].quaternion for i in first])
+    rpy = navigation_from_R_lc(frame, position, matrix_from_quaternion(quaternion), R_bc_of(project))
+    seconds = (time_ns - time_ns[0]) * 1e-9
+    velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
+    velocity_ned = np.einsum("nji,nj->ni", frame.R_ln(position), velocity_l)
+    write_sbet(target, gps_from_utc_ns(time_ns)[1], frame.to_geodetic(position), rpy, velocity_ned)
+    return {"records": len(time_ns)}
+
+
+_WRITERS: dict[str, Callable[[RecordingReader, argparse.Namespace, Path], dict[str, int]]] = {
+    "csv": _write_csv,
+    "parquet": _write_parquet,
+    "geojson": _write_geojson,
+    "gpkg": _write_gpkg,
+    "sbet": _write_sbet,
+}

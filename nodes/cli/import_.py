@@ -1,0 +1,185 @@
+"""``triline import``: block folder, sensor folder, AVIRIS, POS Export, SBET, CSV, ROS 2 to a recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from ...solver.camera import LineCamera
+from ...solver.sensors import PRESETS, preset
+from ..errors import UserError
+from ..formats.avirisc import LINE_RATE_HZ
+from ..formats.camera_json import read_camera, write_camera
+from ..formats.detect import KINDS, Options, kind_of_path, read_any
+from ..formats.geocal_xml import read_glas_camera, read_tie_points
+from ..formats.new_file import new_file
+from ..formats.tie_points import statistics, write_tie_points
+from ..formats.track import Accuracy, Mounting
+from ..node import Message
+from ..recording import RecordingWriter
+
+EXAMPLE = "triline import block_folder -o flight.mcap"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("input", metavar="INPUT", help="file or folder: " + "; ".join(KINDS.values()))
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="recording; camera.json for a camera, CSV for tie points"
+    )
+    parser.add_argument("--format", choices=KINDS, metavar="KIND", help=f"what the input is: {', '.join(KINDS)}")
+    parser.add_argument("--date", type=_day, metavar="YYYY-MM-DD", help="day of the flight, for files with GPS seconds")
+    parser.add_argument("--crs", metavar="CRS", help="of easting and northing, where the file does not say (PROJ)")
+    parser.add_argument(
+        "--camera", metavar="FILE", help=f"camera.json, AVIRIS-NG camera XML, or a preset ({', '.join(PRESETS)})"
+    )
+    parser.add_argument(
+        "--lever-arm", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("FWD", "RIGHT", "DOWN"),
+        help="from the point whose positions the file gives to the perspective centre, m",
+    )  # fmt: skip
+    parser.add_argument(
+        "--boresight", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("ROLL", "PITCH", "HEADING"),
+        help="of the camera against the body whose attitude the file gives, degrees",
+    )  # fmt: skip
+    for name, what in (("position", "X Y Z, m (default 0.2 0.2 0.2)"), ("attitude", "deg (default 0.01 0.01 0.02)")):
+        axes = ("X", "Y", "Z") if name == "position" else ("OMEGA", "PHI", "KAPPA")
+        parser.add_argument(
+            f"--{name}-sigma", type=float, nargs=3, metavar=axes,
+            help=f"accuracy of the poses, in place of what the file says: {what}",
+        )  # fmt: skip
+    parser.add_argument(
+        "--line-rate", type=float, default=LINE_RATE_HZ, metavar="HZ", help="of AVIRIS-C (default %(default)s)"
+    )
+    parser.add_argument("--seconds-of-day", action="store_true", default=None, help="SBET times count from midnight")
+
+
+def _day(text: str) -> date:
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a day, wanted YYYY-MM-DD") from None
+
+
+def run(args: argparse.Namespace) -> int:
+    source, output = Path(args.input), Path(args.output)
+    if not args.line_rate > 0:
+        raise UserError(f"--line-rate {args.line_rate:g}, wanted more than 0 Hz")
+    kind = args.format or kind_of_path(source)
+    if not source.exists():
+        raise UserError(f"{source}: no such file or folder")
+    if output.exists() and source.exists() and output.samefile(source):
+        raise UserError(f"{output}: is the input itself")
+    if kind == "camera":
+        result = _import_camera(source, output)
+    elif kind == "ties" and output.suffix.lower() == ".csv":
+        ties = read_tie_points(source)
+        result = {"rows": write_tie_points(output, ties), "statistics": statistics(ties), "notes": []}
+    else:
+        options = Options(
+            args.date,
+            args.crs,
+            Mounting(tuple(args.lever_arm), tuple(args.boresight)),
+            args.line_rate,
+            read_camera_of(args.camera) if args.camera else None,
+            args.seconds_of_day,
+            _accuracy(args),
+        )
+        result = _import_messages(source, kind, options, output, shown=not args.quiet and not args.json)
+    result = {"input": str(source), "kind": kind, "output": str(output), **result}
+    if args.json:
+        print(json.dumps(result, indent=2))
+    elif not args.quiet:
+        _print_summary(result)
+    return 0
+
+
+def _accuracy(args: argparse.Namespace) -> Accuracy:
+    position, attitude = args.position_sigma, args.attitude_sigma
+    for name, values in (("position", position), ("attitude", attitude)):
+        if values is not None and not all(0 < value < float("inf") for value in values):
+            raise UserError(f"--{name}-sigma {' '.join(f'{v:g}' for v in values)}: wanted three numbers above 0")
+    default = Accuracy()
+    x, y, z = position or default.position_m
+    omega, phi, kappa = attitude or default.attitude_deg
+    return Accuracy((x, y, z), (omega, phi, kappa), bool(position or attitude))
+
+
+def read_camera_of(text: str) -> LineCamera:
+    """A camera from a file (camera.json or AVIRIS-NG XML) or by the name of a preset.
+
+    Raises
+    ------
+    UserError : none of these
+    """
+    path = Path(text)
+    if path.is_file():
+        return read_glas_camera(path) if path.suffix.lower() == ".xml" else read_camera(path)
+    if text in PRESETS:
+        return preset(text)
+    raise UserError(f"--camera {text}: no such file, and no preset of that name; presets: {', '.join(PRESETS)}")
+
+
+def _import_camera(source: Path, output: Path) -> dict[str, Any]:
+    if output.suffix.lower() != ".json":
+        raise UserError(f"{output}: a camera goes to a camera.json, wanted a name that ends with .json")
+    notes: list[str] = []
+    camera = read_glas_camera(source, notes)
+    write_camera(output, camera)
+    return {"lines": {line.id: line.pixels for line in camera.lines}, "notes": notes}
+
+
+def _import_messages(source: Path, kind: str, options: Options, output: Path, *, shown: bool) -> dict[str, Any]:
+    imported = read_any(source, kind, options)
+    messages = iter(imported.messages)
+    first = next(messages, None)  # what is wrong with the input shows before a file is made
+    if first is None:
+        raise UserError(f"{source}: nothing in it to import")
+    start = end = first.stamp_ns
+    with new_file(output) as part, RecordingWriter(part) as writer:
+        writer.write(first)
+        for message in _with_progress(messages, shown):
+            writer.write(message)
+            end = max(end, message.stamp_ns)
+        counts = dict(sorted(writer.counts.items()))
+    result: dict[str, Any] = {"seconds": (end - start) * 1e-9, "messages": counts, "notes": imported.notes}
+    if imported.statistics:
+        result["statistics"] = imported.statistics
+    return result
+
+
+def _with_progress(messages: Iterable[Message], shown: bool) -> Iterator[Message]:
+    """The messages; how many there were is told in one line on a terminal, in a plain line now and then elsewhere."""
+    terminal = sys.stderr.isatty()
+    told = time.monotonic()
+    for i, message in enumerate(messages):
+        if shown and i % 1000 == 0 and time.monotonic() - told > (0.2 if terminal else 5.0):
+            told = time.monotonic()
+            print(f"\r{i} messages" if terminal else f"{i} messages", end="" if terminal else "\n", file=sys.stderr)
+        yield message
+    if shown and terminal:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _print_summary(result: dict[str, Any]) -> None:
+    print(f"{result['input']} ({KINDS[result['kind']]}) -> {result['output']}")
+    for topic, count in result.get("messages", {}).items():
+        print(f"  {topic:24s} {count:8d}")
+    if "seconds" in result:
+        print(f"  {result['seconds']:.3f} s")
+    if "rows" in result:
+        print(f"  {result['rows']} image points")
+    for id, pixels in result.get("lines", {}).items():
+        print(f"  CCD line {id}: {pixels} pixels")
+    for name, value in result.get("statistics", {}).items():
+        if isinstance(value, dict):
+            for what, (median, most, largest) in value.items():
+                print(f"  {name} {what}: median {median:g}, 95 % below {most:g}, largest {largest:g}")
+        else:
+            print(f"  {name}: {value}")
+    for note in result["notes"]:
+        print(f"  note: {note}")

@@ -1,0 +1,353 @@
+"""The block folder: a project as human-readable files, read into arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.camera import LineCamera
+from ...solver.frames import CrsError, LocalFrame
+from ...solver.network import ROLES, Strip
+from ...solver.rotation import matrix_from_angles, quaternion_from_matrix
+from ...solver.trajectory import Trajectory
+from ..errors import UserError
+from .camera_json import read_camera
+from .keys import read_toml
+from .projection import missing_grids
+from .table import Column, Table, one_line, read_table
+
+#: Files that make a folder a block folder (project.toml may be absent).
+FILES = ("camera.json", "strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv")
+
+_STRIPS = (
+    Column("strip", "text"),
+    Column("first_line_time_s", blank=True),
+    Column("line_rate_hz", blank=True, above=0.0),
+    Column("lines", "integer", blank=True, low=0),
+    Column("lens", "text", optional=True, blank=True),
+    Column("line_times", "text", optional=True, blank=True),
+)
+_LINE_TIMES = (Column("line", "integer", low=0), Column("time_s"))
+_POSE = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+_TRAJECTORY = (
+    Column("strip", "text"),
+    Column("time_s"),
+    *(Column(name) for name in _POSE),
+    Column("lens", "text", optional=True, blank=True),
+)
+_GROUND = (
+    Column("point", "text"),
+    *(Column(name, blank=True) for name in ("X_m", "Y_m", "Z_m")),
+    *(Column(name, blank=True, low=0.0) for name in ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")),
+    Column("role", "text", choices=ROLES),
+)
+_IMAGE = (
+    Column("point", "text"),
+    Column("strip", "text"),
+    Column("ccd", "text"),
+    Column("line"),
+    Column("sample"),
+    Column("sigma_px", optional=True, blank=True, above=0.0),
+)
+
+Key = tuple[str, str | None]  # strip and lens
+
+
+def is_block_folder(path: Path) -> bool:
+    """Whether a folder looks like a block folder."""
+    return path.is_dir() and any((path / name).is_file() for name in ("camera.json", "image_points.csv", "strips.csv"))
+
+
+def read_block(folder: Path | str) -> Block:
+    """Read a block folder into arrays in the local frame.
+
+    Raises
+    ------
+    UserError : a file that is missing, a value that is missing or malformed (``file:line: column: what is wrong``),
+        names that do not fit together, a CRS that PROJ does not know
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder, wanted a block folder with {', '.join(FILES)}")
+    for name in FILES:
+        if not (folder / name).is_file():
+            raise UserError(f"{folder}: no {name}; a block folder has {', '.join(FILES)}")
+    notes: list[str] = []
+    name, crs, apriori = _project(folder, notes)
+    camera = read_camera(folder / "camera.json", notes)
+    strip_table = read_table(folder / "strips.csv", _STRIPS, notes)
+    poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
+    ground_table = read_table(folder / "ground_points.csv", _GROUND, notes, may_be_empty=True)
+    frame = _frame(folder, crs, poses, ground_table)
+    grids = missing_grids(crs) if crs != "local" else []
+    if grids:
+        what = "heights or positions may be off by the geoid or datum shift"
+        notes.append(f"project.toml: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what}, all alike")
+
+    trajectories = _trajectories(poses, frame, notes)
+    strips = _strips(strip_table, camera, trajectories, notes)
+    used = {id(strip.trajectory) for strip in strips}
+    extra = [_name(*key) for key, trajectory in trajectories.items() if id(trajectory) not in used]
+    notes.extend(f"trajectory.csv: strip {name!r} is not in strips.csv and was ignored" for name in extra)
+    ground = _ground_points(ground_table, frame, notes)
+    point_ids, image = _image_points(folder / "image_points.csv", camera, strips, ground, apriori, notes)
+    return Block(name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes))
+
+
+def _name(strip: str, lens: str | None) -> str:
+    return strip if lens is None else f"{strip}/{lens}"
+
+
+def _project(folder: Path, notes: list[str]) -> tuple[str, str, Apriori]:
+    path = folder / "project.toml"
+    default = folder.resolve().name
+    if not path.is_file():
+        return default, "local", Apriori()
+    file = read_toml(path)
+    project, apriori, trajectory = file.table("project"), file.table("apriori"), file.table("trajectory")
+    name, crs = project.text("name", default), project.text("crs", "local")
+    sigma = apriori.number("image_sigma_px", Apriori.image_sigma_px, positive=True)
+    settings: dict[str, object] = {}
+    for key, value in trajectory.values.items():
+        if "_sigma" in key:  # one number stands for all three components
+            many = isinstance(value, list)
+            three = trajectory.numbers(key, 3, positive=True) if many else (trajectory.number(key, positive=True),) * 3
+            settings[key] = three
+        else:
+            settings[key] = trajectory.raw(key)
+    for table in (file, project, apriori):
+        notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
+    return name, crs, Apriori(sigma, settings)
+
+
+def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:
+    """Local frame at the middle of the box about ground points and trajectories."""
+    xyz = poses.stack("X_m", "Y_m", "Z_m")
+    known = ground.stack("X_m", "Y_m", "Z_m") if len(ground) else np.empty((0, 3))
+    both = np.concatenate([xyz, known[np.isfinite(known).all(axis=1)]])
+    try:
+        return LocalFrame.around(np.stack([both.min(axis=0), both.max(axis=0)]), crs)
+    except CrsError as error:
+        raise UserError(f"{folder / 'project.toml'}: project.crs: {error}") from None
+
+
+def _to_local(table: Table, xyz: NDArray[np.float64], frame: LocalFrame) -> NDArray[np.float64]:
+    """Coordinates in the local frame; a point that the CRS cannot carry is named by its line."""
+    try:
+        return np.asarray(frame.from_crs(xyz), dtype=float)
+    except CrsError as error:
+        for row in range(len(xyz)):
+            try:
+                frame.from_crs(xyz[row : row + 1])
+            except CrsError:
+                where = f"{table.path}:{table.line_of(row)}: X_m"
+                raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}") from None
+        raise UserError(f"{table.path}: {error}") from None
+
+
+def _trajectories(table: Table, frame: LocalFrame, notes: list[str]) -> dict[Key, Trajectory]:
+    xyz, angles = table.stack(*_POSE[:3]), np.radians(table.stack(*_POSE[3:]))
+    time = table["time_s"]
+    position = _to_local(table, xyz, frame)
+    R = matrix_from_angles(*angles.T)
+    if frame.crs != "local":
+        R = frame.R_l_crs(xyz) @ R
+    quaternion = quaternion_from_matrix(R)
+    found: dict[Key, Trajectory] = {}
+    lens = table["lens"] if "lens" in table else np.full(len(table), "", dtype=object)
+    for key, rows in _groups(table["strip"], lens):
+        step = np.diff(time[rows])
+        if (step <= 0).any():
+            late = int(rows[1:][step <= 0][0])
+            before = time[rows[int(np.flatnonzero(step <= 0)[0])]]
+            what = f"{time[late]:.6f} of strip {_name(*key)} does not come after {before:.6f}"
+            where = f"{table.path}:{table.line_of(late)}: time_s"
+            raise UserError(one_line([f"{where}: {what}"], int((step <= 0).sum()) - 1))
+        if len(rows) < 2:
+            where = f"{table.path}:{table.line_of(int(rows[0]))}"
+            raise UserError(f"{where}: strip: {_name(*key)} has one sample, wanted at least 2")
+        found[key] = Trajectory(time[rows], position[rows], quaternion[rows])
+        longest = float(step.max())
+        if longest > 1.0 and longest > 5 * float(np.median(step)):
+            notes.append(f"trajectory.csv: strip {_name(*key)} has a gap of {longest:.2f} s, interpolated")
+    return found
+
+
+def _groups(strip: NDArray[np.object_], lens: NDArray[np.object_]):
+    """Rows of each strip (and lens), in the order of their first appearance."""
+    names: dict[Key, int] = {}
+    pairs = list(zip(strip, lens, strict=True)) if len(set(lens)) > 1 or (len(lens) and lens[0]) else None
+    if pairs is None:
+        words, code = np.unique(strip.astype(str), return_inverse=True)
+        order = np.argsort([int(np.argmax(code == i)) for i in range(len(words))])
+        for i in order:
+            yield (str(words[i]), None), np.flatnonzero(code == i)
+        return
+    code = np.array([names.setdefault((s, l or None), len(names)) for s, l in pairs])
+    for key, i in names.items():
+        yield key, np.flatnonzero(code == i)
+
+
+def _strips(
+    table: Table, camera: LineCamera, trajectories: Mapping[Key, Trajectory], notes: list[str]
+) -> tuple[Strip, ...]:
+    strips: dict[str, Strip] = {}
+    lenses = {lens.id for lens in camera.lenses}
+    for row in range(len(table)):
+
+        def refuse(column: str, what: str, row: int = row) -> UserError:
+            return UserError(f"{table.path}:{table.line_of(row)}: {column}: {what}")
+
+        id, lens = table["strip"][row], (table["lens"][row] or None) if "lens" in table else None
+        if lens is not None and lens not in lenses:
+            raise refuse("lens", f"{lens!r}, wanted one of {', '.join(sorted(lenses))}")
+        name = _name(id, lens)
+        if name in strips:
+            raise refuse("strip", f"{name} comes twice")
+        trajectory = trajectories.get((id, lens)) or trajectories.get((id, None))
+        if trajectory is None:
+            raise refuse("strip", f"no trajectory of {name} in trajectory.csv")
+        first, rate, lines = (float(table[c][row]) for c in ("first_line_time_s", "line_rate_hz", "lines"))
+        lines = 0 if np.isnan(lines) else int(lines)
+        times = table["line_times"][row] if "line_times" in table else ""
+        line_time = None
+        if times:
+            line_time = _line_times(table.path.parent / times, refuse, notes)
+            if lines not in (0, len(line_time)):
+                raise refuse("lines", f"{lines}, but {times} has {len(line_time)}")
+            first, rate = float(line_time[0]), (len(line_time) - 1) / float(line_time[-1] - line_time[0])
+            lines = len(line_time)
+        elif np.isnan(first) or np.isnan(rate):
+            column = "first_line_time_s" if np.isnan(first) else "line_rate_hz"
+            raise refuse(column, "missing, wanted a number (or a file of line times in line_times)")
+        strip = Strip(name, trajectory, first, rate, lines, line_time, lens)
+        last = float(max(lines - 1, 0))
+        ends = strip.time_of(np.array([0.0, last]))
+        if not trajectory.covers(ends).any() and (ends[1] < trajectory.start_s or ends[0] > trajectory.end_s):
+            raise refuse(
+                "first_line_time_s",
+                f"lines from {ends[0]:.3f} to {ends[1]:.3f} s, trajectory from {trajectory.start_s:.3f} to "
+                f"{trajectory.end_s:.3f} s",
+            )
+        if lines:
+            lost = [u for u, inside in zip((0.0, last), trajectory.covers(ends), strict=True) if not inside]
+            notes.extend(f"strips.csv: line {u:.0f} of strip {name} lies outside its trajectory" for u in lost)
+        strips[name] = strip
+    return tuple(strips.values())
+
+
+def _line_times(path: Path, refuse, notes: list[str]) -> NDArray[np.float64]:
+    if not path.is_file():
+        raise refuse("line_times", f"no file {path.name!r} beside it")
+    table = read_table(path, _LINE_TIMES, notes)
+    line, time = table["line"], table["time_s"]
+    if len(line) < 2:
+        raise UserError(f"{path}: one line, wanted at least 2")
+    table.refuse(line != np.arange(len(line)), "line", lambda i: f"{line[i]:.0f}, wanted {i} (0, 1, 2, ...)")
+    back = np.concatenate([[False], np.diff(time) <= 0])
+    table.refuse(back, "time_s", lambda i: f"{time[i]:.6f} does not come after {time[i - 1]:.6f}")
+    return time
+
+
+def _ground_points(table: Table, frame: LocalFrame, notes: list[str]) -> GroundPoints:
+    n = len(table)
+    if not n:
+        notes.append("ground_points.csv: no points: the block stands on its trajectories alone")
+        return GroundPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
+    ids, role = table["point"], table["role"].astype(str)
+    repeated = np.ones(n, dtype=bool)
+    repeated[np.unique(ids.astype(str), return_index=True)[1]] = False
+    table.refuse(repeated, "point", lambda i: f"{ids[i]} comes twice")
+    xyz, sigma = table.stack("X_m", "Y_m", "Z_m"), table.stack("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
+    # what a point must have: coordinates that its role makes observations, with their sigma; check points need no sigma
+    needs = np.ones((n, 3), dtype=bool)
+    needs[role == "planimetric", 2] = False
+    needs[role == "height", :2] = False
+    for axis, letter in enumerate("XYZ"):
+        column = f"{letter}_m"
+        must = needs[:, axis] if axis == 2 else np.ones(n, dtype=bool)  # height points need a place as well
+        table.refuse(must & np.isnan(xyz[:, axis]), column, lambda i: f"missing, wanted a number ({role[i]} point)")
+        weighted = needs[:, axis] & (role != "check")
+        s = sigma[:, axis]
+        table.refuse(weighted & ~(s > 0), f"sigma_{column}", lambda i, s=s: f"{_shown(s[i])}, wanted a number above 0")
+    no_height = np.isnan(xyz[:, 2])
+    if no_height.any():
+        height = float(np.mean(xyz[~no_height, 2])) if (~no_height).any() else 0.0
+        notes.append(f"ground_points.csv: {no_height.sum()} points without height were put at {height:.1f} m")
+        xyz[no_height, 2] = height
+    R = frame.R_l_crs(xyz)
+    covariance = R @ (np.square(np.nan_to_num(sigma))[:, :, None] * np.swapaxes(R, -1, -2))
+    return GroundPoints(tuple(ids), _to_local(table, xyz, frame), covariance, tuple(role.tolist()))
+
+
+def _shown(value: float) -> str:
+    return "missing" if np.isnan(value) else f"{value:g}"
+
+
+def _image_points(
+    path: Path, camera: LineCamera, strips: tuple[Strip, ...], ground: GroundPoints, apriori: Apriori, notes: list[str]
+) -> tuple[tuple[str, ...], ImagePoints]:
+    table = read_table(path, _IMAGE, notes)
+    ids: dict[str, int] = {id: i for i, id in enumerate(ground.id)}
+    point = _codes(table["point"], lambda id: ids.setdefault(id, len(ids)))
+    ccd = _codes(table["ccd"], lambda id: camera.line_index.get(id, -1))
+    base = {_base(strip): i for i, strip in enumerate(strips)}
+    strip = _codes(table["strip"], lambda id: base.get((id, None), -1))
+    if any(s.lens is not None for s in strips):  # strip and lens of the CCD line decide
+        lens = np.array([line.lens for line in camera.lines] + [""])[ccd]
+        for key, i in base.items():
+            if key[1] is not None:
+                strip[(table["strip"] == key[0]) & (lens == key[1])] = i
+    unknown = np.flatnonzero((strip < 0) | (ccd < 0))
+    for row in unknown[:5]:
+        what = f"ccd: {table['ccd'][row]!r} is not in camera.json"
+        if strip[row] < 0:
+            what = f"strip: {table['strip'][row]!r} is not in strips.csv"
+        notes.append(f"image_points.csv:{table.line_of(int(row))}: {what}; the ray cannot be used")
+    if len(unknown) > 5:
+        notes.append(f"image_points.csv: {len(unknown) - 5} more rays name an unknown strip or CCD line")
+    line, sample = table["line"], table["sample"]
+    sigma = np.full(len(table), apriori.image_sigma_px)
+    if "sigma_px" in table:
+        sigma = np.where(np.isnan(table["sigma_px"]), sigma, table["sigma_px"])
+    time = np.full(len(table), np.nan)
+    for i, one in enumerate(strips):
+        mine = strip == i
+        time[mine] = one.time_of(line[mine])
+    keep = _without_repeats(point, strip, ccd, line, sample, notes)
+    names = {i: (str(table["strip"][row]), str(table["ccd"][row])) for i, row in _places(keep, unknown)}
+    measured = (c[keep].astype(float) for c in (line, sample, sigma, time))
+    return tuple(ids), ImagePoints(point[keep], strip[keep], ccd[keep], *measured, unknown=names)
+
+
+def _base(strip: Strip) -> Key:
+    return (strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}"), strip.lens)
+
+
+def _codes(words: NDArray[np.object_], code: Callable[[str], int]) -> NDArray[np.int64]:
+    """A number for every word; ``code`` is asked once per different word, in the order of appearance."""
+    known: dict[str, int] = {}
+    return np.fromiter((known[w] if w in known else known.setdefault(w, code(w)) for w in words), np.int64, len(words))
+
+
+def _without_repeats(point, strip, ccd, line, sample, notes: list[str]) -> NDArray[np.int64]:
+    """Rows without exact repeats of the same measurement, which would count twice."""
+    columns = np.stack([point, strip, ccd, line, sample], axis=1)
+    order = np.lexsort(columns.T[::-1])
+    same = np.zeros(len(point), dtype=bool)
+    same[order[1:]] = (columns[order[1:]] == columns[order[:-1]]).all(axis=1)
+    if same.any():
+        notes.append(f"image_points.csv: {same.sum()} rows repeat a measurement and were left out")
+    return np.flatnonzero(~same)
+
+
+def _places(keep: NDArray[np.int64], rows: NDArray[np.int64]):
+    """(place among the kept rows, row) of those rows that were kept."""
+    place = np.searchsorted(keep, rows)
+    for p, row in zip(place, rows, strict=True):
+        if p < len(keep) and keep[p] == row:
+            yield int(p), int(row)

@@ -1,0 +1,139 @@
+"""Points and trajectories of a recording as map features, WGS 84 with sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import topics
+from ...solver.frames import LocalFrame
+from ..convert import SECOND_NS
+from ..errors import UserError
+from ..node import Message
+
+
+@dataclass(frozen=True)
+class Features:
+    """Points with properties, and lines through them; n points.
+
+    Attributes
+    ----------
+    lon_lat_height : (n, 3) degrees, degrees, metres above the ellipsoid
+    properties : columns (n,) of the points
+    lines : name of a line -> rows of its points, in order of time
+    """
+
+    lon_lat_height: NDArray[np.float64] = field(repr=False)
+    properties: dict[str, list[Any]] = field(repr=False)
+    lines: dict[str, list[int]] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.lon_lat_height)
+
+
+def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | None) -> Features:
+    """Features of a topic with places: poses, object points, ground points, GNSS fixes.
+
+    Of several messages about one point the last counts. Poses are joined to one line a strip.
+
+    Parameters
+    ----------
+    frame : of the project; GNSS fixes do without
+
+    Raises
+    ------
+    UserError : a topic without places, nothing on it, or no project in the recording
+    """
+    kind = topics.find(topic).type_name
+    if kind not in ("foxglove.PoseInFrame", "foxglove.LocationFix", "triline.ObjectPoint", "triline.GroundPoint"):
+        raise UserError(f"{topic} has no places for a map; topics that have: {', '.join(topics_with_places())}")
+    if kind == "foxglove.LocationFix":
+        return _fixes(topic, messages)
+    if frame is None:
+        raise UserError("no message on configuration/project: the place of the local frame is not known")
+    return _poses(topic, messages, frame) if kind == "foxglove.PoseInFrame" else _points(topic, messages, frame)
+
+
+def topics_with_places() -> tuple[str, ...]:
+    """Topics that `features_of` takes."""
+    kinds = ("foxglove.PoseInFrame", "foxglove.LocationFix", "triline.ObjectPoint", "triline.GroundPoint")
+    return tuple(row.name for row in topics.TOPICS if row.type_name in kinds)
+
+
+def _needed(topic: str, found: list[Any]) -> None:
+    if not found:
+        raise UserError(f"no message on {topic}")
+
+
+def _on_globe(frame: LocalFrame, position_l: Any) -> NDArray[np.float64]:
+    lat, lon, height = np.moveaxis(frame.to_geodetic(np.asarray(position_l, dtype=float)), -1, 0)
+    return np.column_stack([lon, lat, height])
+
+
+def _sigmas(covariances: list[Any], size: int, names: tuple[str, ...]) -> dict[str, list[float | None]]:
+    """Square roots of the diagonals, None where a message has no covariance."""
+    rows = []
+    for covariance in covariances:
+        whole = len(covariance) == size * size
+        diagonal = [covariance[i * (size + 1)] for i in range(size)] if whole else []
+        rows.append([float(np.sqrt(v)) if v >= 0 else None for v in diagonal] or [None] * size)
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def _poses(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Features:
+    bodies = [message.body for message in messages]
+    _needed(topic, bodies)
+    bodies.sort(key=lambda body: (body.timestamp.seconds, body.timestamp.nanos))
+    place = [body.pose.position for body in bodies]
+    properties: dict[str, list[Any]] = {
+        "time_ns": [body.timestamp.seconds * SECOND_NS + body.timestamp.nanos for body in bodies],
+        "strip": [body.strip for body in bodies],
+        "valid": [body.valid for body in bodies],
+    }
+    for i, name in enumerate(("omega_deg", "phi_deg", "kappa_deg")):
+        properties[name] = [float(np.degrees(body.angles[i])) if len(body.angles) == 3 else None for body in bodies]
+    names = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m", "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
+    sigmas = _sigmas([body.covariance for body in bodies], 6, names)
+    for name in names[3:]:
+        sigmas[name] = [None if v is None else float(np.degrees(v)) for v in sigmas[name]]
+    properties |= sigmas
+    lines: dict[str, list[int]] = {}
+    for i, body in enumerate(bodies):
+        lines.setdefault(body.strip, []).append(i)
+    position = [(p.x, p.y, p.z) for p in place]
+    return Features(_on_globe(frame, position), properties, {k: v for k, v in lines.items() if len(v) > 1})
+
+
+def _points(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Features:
+    newest: dict[str, Any] = {}
+    for message in messages:
+        newest[message.body.point] = message.body
+    bodies = list(newest.values())
+    _needed(topic, bodies)
+    properties: dict[str, list[Any]] = {"point": [body.point for body in bodies]}
+    if bodies[0].DESCRIPTOR.full_name == "triline.ObjectPoint":
+        names = bodies[0].DESCRIPTOR.enum_types_by_name["Status"].values_by_number
+        properties["role"] = [body.role for body in bodies]
+        properties["rays"] = [body.rays for body in bodies]
+        properties["status"] = [names[body.status].name.lower() if body.status in names else "" for body in bodies]
+    else:
+        names = bodies[0].DESCRIPTOR.enum_types_by_name["Role"].values_by_number
+        properties["role"] = [names[body.role].name.lower() if body.role in names else "" for body in bodies]
+    properties |= _sigmas([body.covariance for body in bodies], 3, ("sigma_X_m", "sigma_Y_m", "sigma_Z_m"))
+    return Features(_on_globe(frame, [(body.x, body.y, body.z) for body in bodies]), properties)
+
+
+def _fixes(topic: str, messages: Iterable[Message]) -> Features:
+    bodies = [message.body for message in messages]
+    _needed(topic, bodies)
+    properties: dict[str, list[Any]] = {
+        "time_ns": [body.timestamp.seconds * SECOND_NS + body.timestamp.nanos for body in bodies]
+    }
+    names = ("sigma_E_m", "sigma_N_m", "sigma_U_m")
+    properties |= _sigmas([body.position_covariance for body in bodies], 3, names)
+    place = np.array([(body.longitude, body.latitude, body.altitude) for body in bodies])
+    return Features(place, properties, {"gnss": list(range(len(bodies)))} if len(bodies) > 1 else {})

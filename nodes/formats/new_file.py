@@ -1,0 +1,28 @@
+"""Files that appear when they are whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import UserError
+
+
+@contextmanager
+def new_file(target: Path) -> Iterator[Path]:
+    """A path to write to that takes the place of ``target`` at the end, and goes away if something fails before.
+
+    Raises
+    ------
+    UserError : the folder of ``target`` is not there
+    """
+    if not target.parent.is_dir():
+        raise UserError(f"{target}: no folder {target.parent}")
+    part = target.with_name(f".{target.name}.part")
+    try:
+        yield part
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,65 @@
+"""Map projections of files that give no more than easting and northing."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...solver.frames import CrsError
+
+
+class Projection:
+    """A projected CRS: to longitude and latitude (WGS 84), and its meridian convergence.
+
+    Raises
+    ------
+    CrsError : a CRS that PROJ does not know or that is not projected
+    """
+
+    def __init__(self, crs: str):
+        import pyproj
+        import pyproj.exceptions
+
+        try:
+            self._crs = pyproj.CRS.from_user_input(crs)
+        except pyproj.exceptions.CRSError as error:
+            raise CrsError(f"PROJ does not know the CRS {crs!r}: {str(error).splitlines()[0]}") from None
+        if not self._crs.is_projected:
+            raise CrsError(f"{crs!r} is not a projected CRS, wanted one with easting and northing")
+
+    def to_lonlat(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Longitude and latitude (n,) in degrees of easting and northing (n,)."""
+        lon, lat = self._to_wgs84.transform(np.asarray(x), np.asarray(y))
+        if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
+            raise CrsError(f"coordinates outside the area of {self._crs.name!r}")
+        return lon, lat
+
+    def convergence(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> NDArray[np.float64]:
+        """Meridian convergence (n,) in radians: true heading minus heading against grid north."""
+        import pyproj
+
+        factors = pyproj.Proj(self._crs).get_factors(np.asarray(lon_deg), np.asarray(lat_deg))
+        return np.radians(factors.meridian_convergence)
+
+    @cached_property
+    def _to_wgs84(self):
+        import pyproj
+
+        return pyproj.Transformer.from_crs(self._crs, "EPSG:4326", always_xy=True)
+
+
+def missing_grids(crs: str) -> list[str]:
+    """Names of the grids (geoids, datum shifts) that PROJ's best way from a CRS to WGS 84 needs and has not here."""
+    import pyproj
+    from pyproj.transformer import TransformerGroup
+
+    known = pyproj.CRS.from_user_input(crs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup(known if len(known.axis_info) == 3 else known.to_3d(), "EPSG:4979", always_xy=True)
+    if group.best_available:
+        return []
+    return sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available})

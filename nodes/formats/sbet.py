@@ -1,0 +1,91 @@
+"""SBET: smoothed best estimate of trajectory, records of 17 float64."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...solver.gps_time import DAY_S
+from ..errors import UserError
+from .track import NavigationTrack, checked, times_from_gps
+
+#: Fields of a record: seconds; radians; metres; m/s and m/s^2 in the wander frame; rad/s in the body.
+FIELDS = (
+    *("time", "lat", "lon", "alt", "x_velocity", "y_velocity", "z_velocity"),
+    *("roll", "pitch", "platform_heading", "wander_angle"),
+    *("x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate"),
+)
+RECORD = 8 * len(FIELDS)
+
+
+def is_sbet(path: Path) -> bool:
+    """Whether a file looks like SBET: whole records, the first with a time of the week and a place on Earth."""
+    size = path.stat().st_size
+    if size < RECORD or size % RECORD:
+        return "sbet" in path.name.lower()
+    first = np.fromfile(path, "<f8", count=len(FIELDS))
+    time, lat, lon = first[:3]
+    return bool(0 <= time < 2 * 604800 and abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi and np.isfinite(first).all())
+
+
+def read_sbet(path: Path, day: date | None = None, *, seconds_of_day: bool | None = None) -> NavigationTrack:
+    """Poses of an SBET file. True heading is the platform heading less the wander angle.
+
+    Times are GPS seconds of the week, or of the day: ``seconds_of_day`` says which; None takes them as seconds of the
+    day where all are below one day and ``day`` is not a Sunday or Monday.
+
+    Raises
+    ------
+    UserError : a file that is not whole records, or values that no pose can have
+    """
+    size = path.stat().st_size
+    if size == 0 or size % RECORD:
+        raise UserError(f"{path}: {size} bytes, wanted a whole number of SBET records of {RECORD} bytes; truncated?")
+    values = np.fromfile(path, "<f8").reshape(-1, len(FIELDS))
+    column = dict(zip(FIELDS, values.T, strict=True))
+    notes: list[str] = []
+    of_day = seconds_of_day
+    if of_day is None:
+        of_day = day is not None and float(column["time"].max()) < DAY_S and day.isoweekday() not in (7, 1)
+        if of_day:
+            notes.append(f"{path.name}: times below one day, taken as seconds of {day}")
+    time = times_from_gps(path, column["time"], day, notes, of_day=of_day)
+    with np.errstate(over="ignore"):  # of a damaged file; refused below
+        lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))
+    heading = column["platform_heading"] - column["wander_angle"]
+    track = NavigationTrack(
+        path.stem,
+        time,
+        np.column_stack([lat_lon, column["alt"]]),
+        np.column_stack([column["roll"], column["pitch"], (heading + np.pi) % (2 * np.pi) - np.pi]),
+        notes=tuple(notes),
+    )
+    return checked(track, path)
+
+
+def write_sbet(
+    path: Path,
+    seconds_of_week: ArrayLike,
+    geodetic: NDArray[np.floating],
+    rpy: NDArray[np.floating],
+    velocity_ned: NDArray[np.floating],
+) -> None:
+    """Write poses as SBET with wander angle 0; accelerations and rates, which an orientation has not, are 0.
+
+    Parameters
+    ----------
+    seconds_of_week : (n,) GPS seconds
+    geodetic : (n, 3) latitude, longitude in degrees, height in metres
+    rpy : (n, 3) roll, pitch, heading, radians
+    velocity_ned : (n, 3) m/s
+    """
+    values = np.zeros((len(geodetic), len(FIELDS)), dtype="<f8")
+    values[:, 0] = seconds_of_week
+    values[:, 1:3] = np.radians(geodetic[:, :2])
+    values[:, 3] = geodetic[:, 2]
+    values[:, 4:7] = velocity_ned
+    values[:, 7:10] = rpy
+    values.tofile(path)

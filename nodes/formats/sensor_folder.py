@@ -1,0 +1,289 @@
+"""Sensor folder: raw inertial and GNSS data as CSV, with what is known of the platform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.alignment import AttitudePrior
+from ...solver.inertial_checks import Finding, clean_gnss, clean_inertial
+from ...solver.inertial_data import MEMS, GnssData, InertialData, InertialGrade
+from ...solver.navigation import NavigationSettings
+from ...solver.navigation_trajectory import CameraMount
+from ...solver.rotation import R_BC_NOMINAL, matrix_from_navigation
+from ..errors import UserError
+from .keys import Keys, read_toml
+from .table import Column, Table, read_table
+
+Array = NDArray[np.floating]
+
+FORCE = ("fx_m_s2", "fy_m_s2", "fz_m_s2")
+RATE = ("wx_rad_s", "wy_rad_s", "wz_rad_s")
+DV = ("dvx_m_s", "dvy_m_s", "dvz_m_s")
+DTHETA = ("dthx_rad", "dthy_rad", "dthz_rad")
+POSITION = ("lat_deg", "lon_deg", "height_m")
+SIGMA = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
+VELOCITY = ("vn_m_s", "ve_m_s", "vd_m_s")
+SIGMA_VELOCITY = ("sigma_vn_m_s", "sigma_ve_m_s", "sigma_vd_m_s")
+ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
+SIGMA_ANGLES = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
+
+_INITIAL_SIGMA_DEG = (2.0, 2.0, 5.0)  # where [initial] gives an angle without a sigma
+_UNKNOWN_DEG = (20.0, 20.0, 60.0)  # where it does not give one
+_VELOCITY_SIGMA_M_S = 0.05  # where gnss.csv has velocities without sigmas
+
+
+@dataclass(frozen=True)
+class AttitudeTable:
+    """attitude.csv: (n,) times, (n, 3) roll, pitch, heading and sigmas, radians."""
+
+    time_s: Array
+    angles: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Platform:
+    """platform.toml.
+
+    Attributes
+    ----------
+    lever_arm_m : antenna from the inertial sensor, body axes
+    camera_lever_arm_m : perspective centre from the inertial sensor, body axes
+    boresight_deg : roll, pitch, heading of the camera against the body
+    lever_arm_sigma_m : 0 takes the lever arm as known
+    grade : of the inertial sensor
+    initial : attitude at the first inertial sample, where given
+    """
+
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm_sigma_m: float = 0.0
+    grade: InertialGrade = MEMS
+    initial: AttitudePrior | None = None
+
+    @property
+    def settings(self) -> NavigationSettings:
+        scale = self.grade.gyro_scale > 0.0 or self.grade.accel_scale > 0.0
+        return NavigationSettings(
+            self.grade, lever_arm_b=self.lever_arm_m, lever_arm_sigma_m=self.lever_arm_sigma_m, scale_factors=scale
+        )
+
+    @property
+    def mount(self) -> CameraMount:
+        turned = matrix_from_navigation(*np.radians(self.boresight_deg)) @ R_BC_NOMINAL
+        return CameraMount(self.camera_lever_arm_m, turned)
+
+
+@dataclass(frozen=True)
+class SensorFolder:
+    """A sensor folder as it stands.
+
+    Attributes
+    ----------
+    path : the folder
+    time_s : (n,) stamps of the inertial samples, or None without imu.csv
+    rotation, force : (n, 3) angular rates (rad/s) and specific forces (m/s^2), or increments (rad, m/s)
+    increments : which of both
+    gnss : fixes, or None without gnss.csv
+    attitude : or None without attitude.csv
+    platform : of platform.toml, or defaults
+    notes : remarks on reading
+    """
+
+    path: Path
+    time_s: Array | None
+    rotation: Array | None
+    force: Array | None
+    increments: bool
+    gnss: GnssData | None
+    attitude: AttitudeTable | None
+    platform: Platform
+    notes: list[str] = field(default_factory=list)
+
+    def cleaned(self) -> tuple[InertialData, GnssData, list[Finding]]:
+        """Data for the navigator, and what was taken out of them.
+
+        Raises
+        ------
+        UserError : imu.csv or gnss.csv is missing, or too little is left of them
+        """
+        if self.time_s is None or self.rotation is None or self.force is None:
+            raise UserError(f"{self.path}: imu.csv is missing, wanted inertial data ({','.join((*FORCE, *RATE))})")
+        if self.gnss is None:
+            raise UserError(f"{self.path}: gnss.csv is missing, wanted GNSS positions")
+        time, rotation, force, findings = clean_inertial(self.time_s, self.rotation, self.force)
+        if len(time) < 10:
+            raise UserError(f"{self.path / 'imu.csv'}: only {len(time)} usable samples, wanted at least 10")
+        make = InertialData.from_increments if self.increments else InertialData.from_rates
+        gnss, more = clean_gnss(self.gnss)
+        findings += more
+        for finding in (f for f in more if f.fatal):
+            raise UserError(self.named(finding))
+        if len(gnss) < 2:
+            raise UserError(f"{self.path / 'gnss.csv'}: only {len(gnss)} usable fixes, wanted at least 4")
+        return make(time, rotation, force), gnss, findings
+
+    def named(self, finding: Finding) -> str:
+        """A finding in one line, with file and columns."""
+        force, rate = (DV, DTHETA) if self.increments else (FORCE, RATE)
+        where = {
+            "imu.time": ("imu.csv", ("time_s",)),
+            "imu.force": ("imu.csv", force),
+            "imu.rate": ("imu.csv", rate),
+            "imu.axes": ("imu.csv", (*force, *rate)),
+            "imu.noise": ("platform.toml", ("[imu]",)),
+            "gnss.time": ("gnss.csv", ("time_s",)),
+            "gnss.sigma": ("gnss.csv", SIGMA),
+            "gnss.position": ("gnss.csv", POSITION),
+            "gnss.velocity": ("gnss.csv", VELOCITY),
+        }.get(finding.subject)
+        return finding.text if where is None else f"{where[0]}: {','.join(where[1])}: {finding.text}"
+
+
+def read_sensor_folder(path: str | Path) -> SensorFolder:
+    """Read a sensor folder.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise UserError(f"{folder}: not a folder, wanted one with imu.csv and gnss.csv")
+    notes: list[str] = []
+    time, rotation, force, increments = _read_imu(folder / "imu.csv", notes)
+    gnss = _read_gnss(folder / "gnss.csv", notes)
+    attitude = _read_attitude(folder / "attitude.csv", notes)
+    platform = _read_platform(folder / "platform.toml", notes)
+    if platform.initial is None and attitude is not None and time is not None:
+        initial = _initial_of(attitude, float(time[0]))
+        platform = Platform(**{**vars(platform), "initial": initial})
+    return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes)
+
+
+def _read_imu(path: Path, notes: list[str]) -> tuple[Array | None, Array | None, Array | None, bool]:
+    if not path.is_file():
+        return None, None, None, False
+    optional = [Column(name, optional=True) for name in (*FORCE, *RATE, *DV, *DTHETA)]
+    table = read_table(path, [Column("time_s"), *optional], notes)
+    rates = [name for name in (*FORCE, *RATE) if name in table]
+    increments = [name for name in (*DV, *DTHETA) if name in table]
+    if rates and increments:
+        raise UserError(f"{path}:1: {increments[0]}: increments beside rates ({rates[0]}), wanted one of both")
+    wanted = (*DV, *DTHETA) if increments else (*FORCE, *RATE)
+    missing = [name for name in wanted if name not in table]
+    if missing:
+        other = "" if increments else f" (or increments: {','.join((*DV, *DTHETA))})"
+        raise UserError(f"{path}:1: {missing[0]}: column missing, wanted time_s,{','.join(wanted)}{other}")
+    force, rotation = table.stack(*wanted[:3]), table.stack(*wanted[3:])
+    return table["time_s"], rotation, force, bool(increments)
+
+
+def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
+    if not path.is_file():
+        return None
+    columns = [Column(name) for name in ("time_s", *POSITION)]
+    columns += [Column(name, blank=True) for name in SIGMA]
+    columns += [Column(name, optional=True, blank=True) for name in (*VELOCITY, *SIGMA_VELOCITY)]
+    table = read_table(path, columns, notes)
+    position = table.stack(*POSITION)
+    velocity = _optional(path, table, VELOCITY)
+    sigma_v = _optional(path, table, SIGMA_VELOCITY)
+    if velocity is not None and sigma_v is None:
+        notes.append(
+            f"{path.name}: velocities without sigmas ({','.join(SIGMA_VELOCITY)}): {_VELOCITY_SIGMA_M_S} m/s taken"
+        )
+        sigma_v = np.full_like(velocity, _VELOCITY_SIGMA_M_S)
+    lat, lon = np.radians(position[:, 0]), np.radians(position[:, 1])
+    return GnssData(table["time_s"], lat, lon, position[:, 2], table.stack(*SIGMA), velocity, sigma_v)
+
+
+def _optional(path: Path, table: Table, names: tuple[str, ...]) -> Array | None:
+    there = [name for name in names if name in table]
+    if not there:
+        return None
+    missing = [name for name in names if name not in table]
+    if missing:
+        raise UserError(f"{path}:1: {missing[0]}: column missing beside {there[0]}, wanted {','.join(names)}")
+    return table.stack(*names)
+
+
+def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
+    if not path.is_file():
+        return None
+    columns = [Column(name) for name in ("time_s", *ANGLES)]
+    columns += [Column(name, optional=True, above=0.0) for name in SIGMA_ANGLES]
+    table = read_table(path, columns, notes)
+    angles = np.radians(table.stack(*ANGLES))
+    sigma = _optional(path, table, SIGMA_ANGLES)
+    if sigma is None:
+        sigma = np.tile([0.5, 0.5, 1.0], (len(angles), 1))
+        notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg taken")
+    return AttitudeTable(table["time_s"], angles, np.radians(sigma))
+
+
+def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:
+    i = int(np.argmin(np.abs(attitude.time_s - time_s)))
+    off = abs(float(attitude.time_s[i]) - time_s)
+    if off > 1.0:
+        return None
+    return AttitudePrior(attitude.angles[i], np.hypot(attitude.sigma[i], np.radians(5.0) * off))
+
+
+def _read_platform(path: Path, notes: list[str]) -> Platform:
+    if not path.is_file():
+        notes.append(f"{path.name}: absent: no lever arm, a MEMS unit taken")
+        return Platform()
+    keys = read_toml(path)
+    zero = (0.0, 0.0, 0.0)
+    arms = [keys.numbers(name, 3, zero) for name in ("lever_arm_m", "camera_lever_arm_m", "boresight_deg")]
+    sigma = keys.number("lever_arm_sigma_m", 0.0)
+    imu, initial = keys.table("imu"), keys.table("initial")
+    grade = _grade(imu, notes, path.name)
+    prior = _prior(initial) if initial.values else None
+    for table in (keys, imu, initial):
+        notes.extend(f"{path.name}: key {name!r} is not known and was ignored" for name in table.unread())
+    a, b, c = ((float(x), float(y), float(z)) for x, y, z in arms)
+    return Platform(a, b, c, sigma, grade, prior)
+
+
+def _grade(imu: Keys, notes: list[str], file: str) -> InertialGrade:
+    deg, names = (
+        np.pi / 180.0,
+        ("gyro_noise_deg_sqrt_h", "gyro_bias_deg_h", "accel_noise_m_s_sqrt_h", "accel_bias_mgal"),
+    )
+    default = (
+        MEMS.gyro_noise / deg * 60.0,
+        MEMS.gyro_bias / deg * 3600.0,
+        MEMS.accel_noise * 60.0,
+        MEMS.accel_bias * 1e5,
+    )
+    missing = [name for name in names if not imu.has(name)]
+    if missing:
+        notes.append(f"{file}: [imu] {', '.join(missing)} absent: those of a MEMS unit taken")
+    values = [imu.number(name, round(d, 9), positive=True) for name, d in zip(names, default, strict=True)]
+    # biases of MEMS units wander within minutes, those of better ones within hours
+    time_s = imu.number("bias_time_s", 600.0 if values[1] > 2.0 else 7200.0, positive=True)
+    grade = InertialGrade.from_datasheet(values[0], values[1], values[2], values[3], time_s)
+    ppm = [imu.number(name, 0.0) * 1e-6 for name in ("gyro_scale_ppm", "accel_scale_ppm")]
+    if min(ppm) < 0.0:
+        raise imu.refuse("gyro_scale_ppm" if ppm[0] < 0.0 else "accel_scale_ppm", "a number of at least 0")
+    return InertialGrade(grade.gyro_noise, grade.gyro_bias, grade.accel_noise, grade.accel_bias, time_s, ppm[0], ppm[1])
+
+
+def _prior(initial: Keys) -> AttitudePrior | None:
+    """[initial]: roll_deg, pitch_deg, heading_deg, each with NAME_sigma_deg (or sigma_NAME_deg)."""
+    angles, sigmas = [], []
+    for name, default, unknown in zip(("roll", "pitch", "heading"), _INITIAL_SIGMA_DEG, _UNKNOWN_DEG, strict=True):
+        given = initial.has(f"{name}_deg")
+        angles.append(initial.number(f"{name}_deg", 0.0))
+        spelling = f"sigma_{name}_deg" if initial.has(f"sigma_{name}_deg") else f"{name}_sigma_deg"
+        sigmas.append(initial.number(spelling, default if given else unknown, positive=True))
+    if not any(initial.has(f"{name}_deg") for name in ("roll", "pitch", "heading")):
+        return None
+    return AttitudePrior(np.radians(angles), np.radians(sigmas))

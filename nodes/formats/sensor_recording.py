@@ -1,0 +1,117 @@
+"""A sensor folder as the messages of a flight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import messages as m
+from ...schemas.topics import rank
+from ...solver.block import Apriori
+from ...solver.inertial_checks import Finding, clean_gnss, clean_inertial
+from ...solver.inertial_data import InertialData
+from ...solver.rotation import R_ENU_NED
+from ..convert import SECOND_NS, attitude_message, gnss_message
+from ..errors import UserError
+from ..node import Message
+from .sensor_folder import SensorFolder, read_sensor_folder
+
+
+def sensor_messages(path: Path, notes: list[str], source: str = "import") -> Iterator[Message]:
+    """``configuration/project``, ``sensor/imu``, ``sensor/gnss`` and ``sensor/attitude``, sorted by stamp and rank.
+
+    Times in the files count from the Unix epoch. Increments become the rates and forces they are the integral of. The
+    noise of the inertial unit travels as the sigma of each sample; its biases and the initial attitude do not travel.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``, or nothing usable in the folder
+    """
+    folder = read_sensor_folder(path)
+    notes.extend(folder.notes)
+    messages = [*_imu(folder, notes, source), *_gnss(folder, notes, source), *_attitude(folder, source)]
+    if not messages:
+        raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")
+    messages.sort(key=lambda message: (message.stamp_ns, rank(message.topic)))
+    platform = folder.platform
+    arm = np.asarray(platform.lever_arm_m) - np.asarray(platform.camera_lever_arm_m)
+    project = m.Project(
+        name=path.resolve().name,
+        crs="local",
+        lever_arm_m=arm.tolist(),
+        boresight_deg=platform.boresight_deg,
+        image_sigma_px=Apriori.image_sigma_px,
+    )
+    if folder.gnss is not None:
+        project.origin_latitude = round(float(np.degrees(np.nanmedian(folder.gnss.lat))), 6)
+        project.origin_longitude = round(float(np.degrees(np.nanmedian(folder.gnss.lon))), 6)
+    yield Message("configuration/project", messages[0].stamp_ns, project, source)
+    yield from messages
+
+
+def _ns(time_s: NDArray[np.floating]) -> list[int]:
+    whole = np.floor(time_s)
+    return (whole.astype(np.int64) * SECOND_NS + np.rint((time_s - whole) * 1e9).astype(np.int64)).tolist()
+
+
+def _told(folder: SensorFolder, findings: list[Finding], notes: list[str]) -> None:
+    for finding in findings:
+        if finding.fatal:
+            raise UserError(f"{folder.path}: {folder.named(finding)}")
+        notes.append(folder.named(finding))
+
+
+def _imu(folder: SensorFolder, notes: list[str], source: str) -> Iterator[Message]:
+    if folder.time_s is None or folder.rotation is None or folder.force is None:
+        return
+    time, rotation, force, findings = clean_inertial(folder.time_s, folder.rotation, folder.force)
+    _told(folder, findings, notes)
+    if len(time) < 2:
+        raise UserError(f"{folder.path / 'imu.csv'}: {len(time)} usable samples, wanted at least 2")
+    make = InertialData.from_increments if folder.increments else InertialData.from_rates
+    data = make(time, rotation, force)
+    rate, force = data.dtheta / data.dt_s[:, None], data.dv / data.dt_s[:, None]
+    grade, root = folder.platform.grade, np.sqrt(data.dt_s)
+    for i, stamp in enumerate(_ns(data.time_s)):
+        f, w = force[i], rate[i]
+        body = m.Imu(
+            time_ns=stamp, interval_ns=round(float(data.dt_s[i]) * 1e9),
+            force_x=f[0], force_y=f[1], force_z=f[2], rate_x=w[0], rate_y=w[1], rate_z=w[2],
+            force_sigma=grade.accel_noise / root[i], rate_sigma=grade.gyro_noise / root[i],
+        )  # fmt: skip
+        yield Message("sensor/imu", stamp, body, source)
+
+
+def _gnss(folder: SensorFolder, notes: list[str], source: str) -> Iterator[Message]:
+    if folder.gnss is None:
+        return
+    gnss, findings = clean_gnss(folder.gnss)
+    _told(folder, findings, notes)
+    place = np.column_stack([np.degrees(gnss.lat), np.degrees(gnss.lon), gnss.height_m])
+    sigma = np.abs(gnss.sigma_ned_m @ R_ENU_NED.T)
+    velocity = None if gnss.velocity_n is None else gnss.velocity_n @ R_ENU_NED.T
+    sigma_v = None if gnss.sigma_velocity_n is None else np.abs(gnss.sigma_velocity_n @ R_ENU_NED.T)
+    for i, stamp in enumerate(_ns(gnss.time_s)):
+        has_velocity = velocity is not None and bool(np.isfinite(velocity[i]).all())
+        body = gnss_message(
+            stamp,
+            place[i],
+            sigma[i],
+            velocity[i] if velocity is not None and has_velocity else None,
+            sigma_v[i] if sigma_v is not None and has_velocity else None,
+        )
+        yield Message("sensor/gnss", stamp, body, source)
+
+
+def _attitude(folder: SensorFolder, source: str) -> Iterator[Message]:
+    if folder.attitude is None:
+        return
+    table = folder.attitude
+    newest = np.maximum.accumulate(table.time_s)
+    rising = np.concatenate([[True], table.time_s[1:] > newest[:-1]])
+    for i, stamp in enumerate(_ns(table.time_s)):
+        if rising[i]:
+            yield Message("sensor/attitude", stamp, attitude_message(stamp, table.angles[i], table.sigma[i]), source)

@@ -1,0 +1,245 @@
+"""CSV files with named columns: read fast, and with the line and column of whatever is wrong."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import UserError
+
+#: Numbers are read to the last bit; pandas 3 does so by itself.
+_EXACT: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
+#: How many problems of one file are looked for before giving up.
+MOST_PROBLEMS = 10
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that a file may or must have.
+
+    Attributes
+    ----------
+    name : as in the header
+    kind : "text", "number" or "integer"
+    optional : the column may be absent
+    blank : single values may be empty (read as NaN or "")
+    low : smallest value allowed
+    above : values must be larger than this
+    choices : allowed words of a text column; empty = any
+    """
+
+    name: str
+    kind: str = "number"
+    optional: bool = False
+    blank: bool = False
+    low: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+
+    @property
+    def wanted(self) -> str:
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        if self.kind == "text":
+            return "a name"
+        noun = "an integer" if self.kind == "integer" else "a number"
+        if self.low is not None:
+            return f"{noun} of at least {self.low:g}"
+        return noun if self.above is None else f"{noun} above {self.above:g}"
+
+    def problem(self, text: str) -> str | None:
+        """What is wrong with one value, None if nothing."""
+        if not text:
+            return None if self.blank else f"missing, wanted {self.wanted}"
+        if self.kind == "text":
+            return f"{text!r}, wanted {self.wanted}" if self.choices and text not in self.choices else None
+        try:
+            value = float(text)
+        except ValueError:
+            more = "" if self.wanted == "a number" else f", wanted {self.wanted}"
+            return f"{text!r} is not a number{more}"
+        bad = not np.isfinite(value) or (self.kind == "integer" and value != int(value))
+        bad = bad or (self.low is not None and value < self.low) or (self.above is not None and value <= self.above)
+        return f"{text}, wanted {self.wanted}" if bad else None
+
+    def fits(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """The same check for a whole column that was read as numbers or words."""
+        if self.kind == "text":
+            good = np.isin(values, self.choices) if self.choices else values != ""
+            return good | (values == "") if self.blank else good
+        good = np.isfinite(values)
+        if self.kind == "integer":
+            good &= values == np.floor(values)
+        if self.low is not None:
+            good &= values >= self.low
+        if self.above is not None:
+            good &= values > self.above
+        return good | np.isnan(values) if self.blank else good
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a file: numbers as float64 (NaN where blank), words as objects; absent optional ones are not there."""
+
+    path: Path
+    values: Mapping[str, NDArray[Any]] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.values.values())))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.values
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.values[name]
+
+    def stack(self, *names: str) -> NDArray[np.float64]:
+        """Number columns side by side, (rows, len(names))."""
+        return np.column_stack([self.values[name] for name in names]).astype(float)
+
+    def line_of(self, row: int) -> int:
+        """Line number in the file (from 1) of a row (from 0)."""
+        with _open(self.path) as file:
+            for place, (line, _) in enumerate(_rows(file)):
+                if place == row + 1:
+                    return line
+        return row + 2
+
+    def refuse(self, bad: ArrayLike, column: str, what: Callable[[int], str]) -> None:
+        """Raise UserError for the first row where ``bad`` holds, with the count of the others."""
+        rows = np.flatnonzero(np.asarray(bad))
+        if len(rows):
+            row = int(rows[0])
+            raise UserError(one_line([f"{self.path}:{self.line_of(row)}: {column}: {what(row)}"], len(rows) - 1))
+
+
+def one_line(problems: Sequence[str], others: int = 0) -> str:
+    """The first problem, and how many more there are."""
+    more = others + len(problems) - 1
+    return problems[0] + (f" (and {more} more like it)" if more > 0 else "")
+
+
+def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_be_empty: bool = False) -> Table:
+    """Read a CSV file with a header; columns in any order, unknown ones ignored with a note.
+
+    Parameters
+    ----------
+    path : file
+    columns : what it may have
+    notes : remarks are appended here
+    may_be_empty : whether a file with a header and no rows is all right
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``, and how many more problems there are
+    """
+    header = _header(path, columns, notes)
+    known = {column.name: column for column in columns if column.name in header}
+    try:
+        frame = pd.read_csv(
+            path,
+            usecols=list(known),
+            dtype={name: str if column.kind == "text" else float for name, column in known.items()},
+            keep_default_na=False,
+            na_values={name: [""] for name, column in known.items() if column.kind != "text" and column.blank},
+            skipinitialspace=True,
+            encoding="utf-8-sig",
+            index_col=False,
+            **_EXACT,
+        )
+    except (ValueError, pd.errors.ParserError):  # not said where: look line by line
+        raise UserError(one_line(_problems(path, known) or [f"{path}: cannot be read as CSV"])) from None
+    if path.read_bytes().count(b",") != (len(header) - 1) * (len(frame) + 1):  # pandas cuts rows that are too long
+        problems = _problems(path, known)
+        if problems:
+            raise UserError(one_line(problems))
+    values: dict[str, NDArray[Any]] = {}
+    for name, column in known.items():
+        if column.kind == "text":
+            # few different names, many rows: clean the names, not the rows
+            codes, names = pd.factorize(frame[name], use_na_sentinel=False)
+            clean = np.array([str(word).strip() if isinstance(word, str) else "" for word in names], dtype=object)
+            values[name] = clean[codes] if len(clean) else np.empty(0, dtype=object)
+        else:
+            values[name] = frame[name].to_numpy(dtype=float)
+        if not column.fits(values[name]).all():
+            raise UserError(one_line(_problems(path, known) or [f"{path}: {name}: unreadable value"]))
+    if not len(frame) and not may_be_empty:
+        raise UserError(f"{path}: no rows below the header, wanted at least one")
+    return Table(path, values)
+
+
+def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]], formats: Mapping[str, str]) -> None:
+    """Write columns as CSV; ``formats`` gives the format (``".6f"``) of number columns, ``""`` keeps all digits."""
+    cells = []
+    for name, values in columns.items():
+        spec = formats.get(name)
+        cells.append([str(v) if spec is None else "" if v != v else format(v, spec) for v in values])
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*cells, strict=True))
+
+
+def _open(path: Path):
+    return open(path, newline="", encoding="utf-8-sig", errors="replace")
+
+
+def _rows(file: Any):
+    """(line number, fields) of all lines that are not blank."""
+    reader = csv.reader(file, skipinitialspace=True)
+    for fields in reader:
+        if fields and any(text.strip() for text in fields):
+            yield reader.line_num, [text.strip() for text in fields]
+
+
+def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str]:
+    with _open(path) as file:
+        try:
+            _, header = next(_rows(file), (0, []))
+        except csv.Error as error:
+            raise UserError(f"{path}:1: not a text table ({error})") from None
+    if not header:
+        raise UserError(f"{path}: empty, wanted a header with {_names(columns)}")
+    if any("\0" in name or "\ufffd" in name for name in header):
+        raise UserError(f"{path}:1: not a text table, wanted a header with {_names(columns)}")
+    repeated = {name for name in header if header.count(name) > 1}
+    if repeated:
+        raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
+    missing = [column.name for column in columns if not column.optional and column.name not in header]
+    if missing:
+        hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in ";\t ") else ""
+        raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{hint}")
+    known = {column.name for column in columns}
+    notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in header if name not in known)
+    return header
+
+
+def _names(columns: Sequence[Column]) -> str:
+    return ",".join(column.name for column in columns if not column.optional)
+
+
+def _problems(path: Path, known: Mapping[str, Column]) -> list[str]:
+    """Look at every value; used once something is known to be wrong."""
+    found: list[str] = []
+    with _open(path) as file:
+        rows = _rows(file)
+        _, header = next(rows)
+        place = {name: header.index(name) for name in known}
+        for line, fields in rows:
+            if len(fields) > len(header) and any(fields[len(header) :]):
+                found.append(f"{path}:{line}: {header[-1]}: {len(fields)} values, wanted {len(header)}")
+            for name, column in known.items():
+                what = column.problem(fields[place[name]] if place[name] < len(fields) else "")
+                if what:
+                    found.append(f"{path}:{line}: {name}: {what}")
+            if len(found) >= MOST_PROBLEMS:
+                break
+    return found

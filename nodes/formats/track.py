@@ -1,0 +1,273 @@
+"""A navigation solution of a platform, as position and attitude files give it, and its messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import messages as m
+from ...solver.block import Apriori
+from ...solver.earth import ecef_from_geodetic
+from ...solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
+from ...solver.gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps
+from ...solver.models.dgr import DgrOptions
+from ...solver.rotation import (
+    R_BC_NOMINAL,
+    angles_from_matrix,
+    matrix_from_navigation,
+    quaternion_from_matrix,
+)
+from ...solver.trajectory import Trajectory
+from ..convert import pose_message
+from ..errors import UserError
+from ..node import Message
+
+Array = NDArray[np.floating]
+
+#: More than aircraft that carry cameras do, m/s^2.
+MOST_ACCELERATION = 50.0
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the camera sits on the body whose poses a file gives.
+
+    Attributes
+    ----------
+    lever_arm_m : from the body's reference point to the perspective centre, forward-right-down
+    boresight_deg : roll, pitch, heading of the camera against the body
+    """
+
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def R_bc(self) -> Array:
+        return matrix_from_navigation(*np.radians(self.boresight_deg)) @ R_BC_NOMINAL
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """1-sigma accuracies of poses for files that give none, and in place of those in the file where ``stated``.
+
+    Attributes
+    ----------
+    position_m : X, Y, Z (east, north, up)
+    attitude_deg : omega, phi, kappa
+    stated : given by the user
+    """
+
+    position_m: tuple[float, float, float] = DgrOptions.offset_sigma_m
+    attitude_deg: tuple[float, float, float] = DgrOptions.shift_sigma_deg
+    stated: bool = False
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of a pose."""
+        return np.diag(np.concatenate([self.position_m, np.radians(self.attitude_deg)])) ** 2
+
+
+@dataclass(frozen=True)
+class NavigationTrack:
+    """Poses of the body (forward-right-down) against north-east-down, with time; n of them.
+
+    Attributes
+    ----------
+    name : of the flight line
+    time_ns : (n,) UTC, rising
+    geodetic : (n, 3) latitude and longitude in degrees (WGS 84), height in metres
+    rpy : (n, 3) roll, pitch, heading against true north, radians
+    sigma_ned_m, sigma_rpy : (n, 3) or None; metres, radians
+    line_rate_hz : image lines a second where each pose belongs to an image line, 0 otherwise
+    notes : what the reader wants said
+    """
+
+    name: str
+    time_ns: NDArray[np.int64] = field(repr=False)
+    geodetic: Array = field(repr=False)
+    rpy: Array = field(repr=False)
+    sigma_ned_m: Array | None = field(default=None, repr=False)
+    sigma_rpy: Array | None = field(default=None, repr=False)
+    line_rate_hz: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
+    """The track without poses that do not come after the one before them.
+
+    Raises
+    ------
+    UserError : values that no pose can have (by the number of the record), or fewer than two poses
+    """
+    lat, lon, height = track.geodetic.T
+    for name, values, low, high, unit in (
+        ("latitude", lat, -90, 90, "deg"),
+        ("longitude", lon, -180, 360, "deg"),
+        ("height", height, -1000, 2e6, "m"),
+        ("roll", np.degrees(track.rpy[:, 0]), -180, 180, "deg"),
+        ("pitch", np.degrees(track.rpy[:, 1]), -90, 90, "deg"),
+        ("heading", np.degrees(track.rpy[:, 2]), -360, 720, "deg"),
+    ):
+        bad = np.flatnonzero(~((values >= low) & (values <= high)))
+        if len(bad):
+            more = f" (and {len(bad) - 1} more like it)" if len(bad) > 1 else ""
+            what = f"{values[bad[0]]:.6g}, wanted {low:g} to {high:g} {unit}"
+            raise UserError(f"{path}: record {bad[0] + 1}: {name}: {what}{more}")
+    newest = np.maximum.accumulate(track.time_ns)
+    rising = np.concatenate([[True], track.time_ns[1:] > newest[:-1]])
+    if rising.sum() < 2:
+        raise UserError(f"{path}: {int(rising.sum())} poses with rising time, wanted at least 2")
+    if rising.all():
+        return _with_jumps(track, path)
+    parts: dict[str, Any] = {
+        name: None if getattr(track, name) is None else getattr(track, name)[rising]
+        for name in ("time_ns", "geodetic", "rpy", "sigma_ned_m", "sigma_rpy")
+    }
+    note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
+    return _with_jumps(replace(track, **parts, notes=(*track.notes, note)), path)
+
+
+def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:
+    """The track with a note about positions that no aircraft can take: a step off the velocity before it."""
+    lat, lon, height = track.geodetic.T
+    position = ecef_from_geodetic(np.radians(lat), np.radians(lon), height)
+    step_s = np.diff(track.time_ns) * 1e-9
+    velocity = np.diff(position, axis=0) / step_s[:, None]
+    off = np.linalg.norm(np.diff(velocity, axis=0), axis=1) * step_s[1:]
+    bad = np.flatnonzero(off > np.maximum(MOST_ACCELERATION * step_s[1:] ** 2, 0.5))
+    if not len(bad):
+        return track
+    first = bad[np.concatenate([[True], np.diff(bad) > 3])]
+    note = f"position jumps at {len(first)} places, by {off[bad].max():.1f} m at most, first at record {first[0] + 3}"
+    return replace(track, notes=(*track.notes, f"{path.name}: {note}"))
+
+
+def times_from_gps(
+    path: Path, seconds: Array, day: date | None, notes: list[str], *, of_day: bool = False
+) -> NDArray[np.int64]:
+    """UTC nanoseconds of GPS seconds of the week (or of the day), given the day of the flight.
+
+    Without a day the times count from the start of GPS time, which is noted.
+
+    Raises
+    ------
+    UserError : seconds that no week has, or that say another day of the week than the day given
+    """
+    bad = np.flatnonzero(~((seconds >= 0) & (seconds < 2 * WEEK_S)))
+    if len(bad):
+        what = f"{seconds[bad[0]]:.6g}, wanted GPS seconds of the week, 0 to {WEEK_S}"
+        raise UserError(f"{path}: record {bad[0] + 1}: time: {what}")
+    seconds = unwrap_weeks(seconds)
+    if day is None:
+        notes.append(f"{path.name}: the day of the flight is not known (--date); times count from 1980-01-06")
+        return utc_ns_from_gps(0, seconds)
+    week, weekday = gps_week(day)
+    if of_day:
+        return utc_ns_from_gps(week, seconds + weekday * DAY_S)
+    said = int(seconds[0] // DAY_S) % 7
+    apart = (said - weekday + 3) % 7 - 3  # UTC and GPS days, and flights over midnight, may differ by one
+    if abs(apart) > 1:
+        names = ("Sunday", "Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday")
+        raise UserError(f"{path}: GPS seconds of the week say {names[said]}, but {day} is a {names[weekday]}")
+    if apart and abs(said - weekday) > 1:  # the week begins or ends between the two
+        week += 1 if said < weekday else -1
+    return utc_ns_from_gps(week, seconds)
+
+
+def frame_of(track: NavigationTrack) -> LocalFrame:
+    """Local frame in the middle of a track, on the ellipsoid."""
+    lat, lon, _ = track.geodetic.T
+    lon = np.degrees(np.unwrap(np.radians(lon)))
+    middle = (lon.min() + lon.max()) / 2
+    return LocalFrame(round(float(lat.min() + lat.max()) / 2, 6), round(float((middle + 180) % 360 - 180), 6), 0.0)
+
+
+def camera_poses(
+    track: NavigationTrack, frame: LocalFrame, mounting: Mounting = Mounting()
+) -> tuple[Array, Array, Array | None]:
+    """Perspective centres (n, 3), rotations image to local (n, 3, 3), and covariances (n, 6, 6) or None."""
+    body_l = frame.from_geodetic(*track.geodetic.T)
+    R_ln = frame.R_ln(body_l)
+    R_nb = matrix_from_navigation(*track.rpy.T)
+    position = body_l + np.einsum("nij,njk,k->ni", R_ln, R_nb, np.asarray(mounting.lever_arm_m))
+    R_lc = R_lc_from_navigation(frame, body_l, track.rpy, mounting.R_bc)
+    if track.sigma_ned_m is None or track.sigma_rpy is None:
+        return position, R_lc, None
+    covariance = np.zeros((len(track), 6, 6))
+    covariance[:, :3, :3] = R_ln @ (np.square(track.sigma_ned_m)[:, :, None] * np.swapaxes(R_ln, -1, -2))
+    cov_rpy = np.square(track.sigma_rpy)[:, :, None] * np.eye(3)
+    covariance[:, 3:, 3:] = opk_covariance_from_navigation(track.rpy, R_lc, R_ln, cov_rpy)
+    return position, R_lc, covariance
+
+
+def track_messages(
+    track: NavigationTrack,
+    source: str,
+    mounting: Mounting = Mounting(),
+    frame: LocalFrame | None = None,
+    accuracy: Accuracy = Accuracy(),
+) -> Iterator[Message]:
+    """The track as ``configuration/project``, ``configuration/strip`` (of line-by-line poses), ``trajectory/smoothed``.
+
+    A pose is stamped with the time it is valid for. Errors of such trajectories are slow, so the accuracy of the poses
+    stands in the project too, as a-priori sigma of offset and shift, and, for the drift, once more.
+    """
+    frame = frame_of(track) if frame is None else frame
+    start = int(track.time_ns[0])
+    position, R_lc, covariance = camera_poses(track, frame, mounting)
+    if covariance is None or accuracy.stated:
+        covariance = np.broadcast_to(accuracy.covariance, (len(track), 6, 6))
+    sigma = np.sqrt(np.median(np.einsum("nii->ni", covariance), axis=0))
+    attitude_deg = np.degrees(sigma[3:]).tolist()
+    project = m.Project(
+        name=track.name,
+        crs=frame.crs,
+        origin_latitude=frame.lat_deg,
+        origin_longitude=frame.lon_deg,
+        origin_height=frame.height_m,
+        boresight_deg=mounting.boresight_deg,
+        image_sigma_px=Apriori.image_sigma_px,
+        offset_sigma_m=sigma[:3].tolist(),
+        shift_sigma_deg=attitude_deg,
+        drift_sigma_deg=attitude_deg,
+    )
+    yield Message("configuration/project", start, project, source)
+    strip = track.name if track.line_rate_hz > 0 else ""
+    if strip:
+        yield Message("configuration/strip", start, _strip(track, ended=False), source)
+    quaternion = quaternion_from_matrix(R_lc)
+    angles = angles_from_matrix(R_lc)
+    time_s = (track.time_ns - start) * 1e-9
+    velocity = Trajectory(time_s, position, quaternion).at(time_s).velocity_l
+    for i, time in enumerate(track.time_ns.tolist()):
+        body = pose_message(
+            time,
+            position[i],
+            angles[i],
+            covariance[i],
+            quaternion=quaternion[i],
+            strip=strip,
+            velocity_l=velocity[i],
+        )
+        yield Message("trajectory/smoothed", time, body, source)
+    if strip:
+        yield Message("configuration/strip", int(track.time_ns[-1]) + 1, _strip(track, ended=True), source)
+
+
+def _strip(track: NavigationTrack, *, ended: bool) -> Any:
+    return m.Strip(
+        id=track.name,
+        first_line_time_ns=int(track.time_ns[0]),
+        line_rate_hz=track.line_rate_hz,
+        lines=len(track),
+        ended=ended,
+    )
