@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .rotation import matrix_from_angles
-
 Array = NDArray[np.floating]
 
 
@@ -39,35 +37,60 @@ def project(position_l: Array, angles: Array, point_l: Array, focal_length_mm: A
     point_l : (n, 3) object point of each ray, metres
     focal_length_mm : (n,)
     """
-    R = matrix_from_angles(angles[:, 0], angles[:, 1], angles[:, 2])
-    d = point_l - position_l
-    f = np.einsum("nji,nj->ni", R, d)
-    c = focal_length_mm
-    inv = 1.0 / f[:, 2]
-    xy = -(c * inv)[:, None] * f[:, :2]
+    xy, d_orientation, d_point, depth = collinearity(position_l.T, angles.T, point_l.T, focal_length_mm)
+    return Projection(
+        np.ascontiguousarray(xy.T),
+        np.ascontiguousarray(d_orientation.transpose(2, 0, 1)),
+        np.ascontiguousarray(d_point.transpose(2, 0, 1)),
+        depth < 0,
+    )
 
-    d_f = np.zeros((len(d), 2, 3))  # of (x, y) to f
-    d_f[:, 0, 0] = d_f[:, 1, 1] = -c * inv
-    d_f[:, 0, 2] = -xy[:, 0] * inv
-    d_f[:, 1, 2] = -xy[:, 1] * inv
-    d_point = d_f @ np.swapaxes(R, 1, 2)
 
-    # f = Rz(-k) Ry(-p) Rx(-o) d: each angle turns d about its own axis
-    so, co = np.sin(angles[:, 0]), np.cos(angles[:, 0])
-    f_angles = np.empty((len(d), 3, 3))
-    zero = np.zeros_like(so)
-    dd_omega = np.stack([zero, d[:, 2], -d[:, 1]], axis=1)  # of Rx(-omega) d, turned back to the local frame
-    f_angles[:, :, 0] = np.einsum("nji,nj->ni", R, dd_omega)
-    axis_phi = np.stack([zero, co, so], axis=1)
-    f_angles[:, :, 1] = np.einsum("nji,nj->ni", R, np.cross(d, axis_phi))
-    f_angles[:, 0, 2] = f[:, 1]
-    f_angles[:, 1, 2] = -f[:, 0]
-    f_angles[:, 2, 2] = 0.0
+def collinearity(
+    position_l: Array, angles: Array, point_l: Array, focal_length_mm: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The same with the ray as the last axis, which is how long arrays are computed fastest.
 
-    d_orientation = np.empty((len(d), 2, 6))
-    d_orientation[:, :, :3] = -d_point
-    d_orientation[:, :, 3:] = d_f @ f_angles
-    return Projection(xy, d_orientation, d_point, f[:, 2] < 0)
+    Parameters
+    ----------
+    position_l, angles, point_l : (3, n)
+    focal_length_mm : (n,)
+
+    Returns
+    -------
+    xy_mm : (2, n)
+    d_orientation : (2, 6, n)
+    d_point : (2, 3, n)
+    depth : (n,) third image coordinate of the object point, metres; negative in front of the camera
+    """
+    d1, d2, d3 = point_l - position_l
+    (so, sp, sk), (co, cp, ck) = np.sin(angles), np.cos(angles)
+    # f = Rz(-kappa) Ry(-phi) Rx(-omega) d, turned axis by axis
+    u2, u3 = co * d2 + so * d3, co * d3 - so * d2
+    v1, v3 = cp * d1 - sp * u3, sp * d1 + cp * u3
+    f1, f2 = ck * v1 + sk * u2, ck * u2 - sk * v1
+    inverse = 1.0 / v3
+    a = -focal_length_mm * inverse
+    xy = np.stack([a * f1, a * f2])
+    b = xy * inverse  # d(xy) = a d(f1, f2) - b d(f3)
+
+    d_orientation = np.empty((2, 6, len(d1)))
+    d_point = np.empty((2, 3, len(d1)))
+    rotated = (  # derivative of f to the point, omega, phi and kappa: three components each
+        (cp * ck, -cp * sk, sp),
+        (co * sk + so * sp * ck, co * ck - so * sp * sk, -so * cp),
+        (so * sk - co * sp * ck, so * ck + co * sp * sk, co * cp),
+        (ck * sp * u2 + sk * u3, ck * u3 - sk * sp * u2, -cp * u2),
+        (-ck * v3, sk * v3, v1),
+    )
+    for column, (g1, g2, g3) in enumerate(rotated):
+        target = d_point[:, column] if column < 3 else d_orientation[:, column]
+        np.subtract(a * g1, b[0] * g3, out=target[0])
+        np.subtract(a * g2, b[1] * g3, out=target[1])
+    np.negative(d_point, out=d_orientation[:, :3])
+    d_orientation[0, 5] = xy[1]
+    d_orientation[1, 5] = -xy[0]
+    return xy, d_orientation, d_point, v3
 
 
 def image_motion(d_orientation: Array, velocity_l: Array, angle_rate: Array) -> Array:

@@ -1,0 +1,20 @@
+"""Trajectory models. Every module here that defines `ModelOptions` is found by its name; see `base`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from .base import COMPONENTS, CorrectionModel, Design, Extent, ModelOptions, PseudoObservations
+
+__all__ = ["COMPONENTS", "MODELS", "CorrectionModel", "Design", "Extent", "ModelOptions", "PseudoObservations"]
+
+
+def _find() -> dict[str, type[ModelOptions]]:
+    for module in iter_modules(__path__):
+        import_module(f"{__name__}.{module.name}")
+    return {options.name: options for options in sorted(ModelOptions.__subclasses__(), key=lambda o: o.name)}
+
+
+#: Options class of each model, by the name the command line uses.
+MODELS: dict[str, type[ModelOptions]] = _find()

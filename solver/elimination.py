@@ -1,0 +1,163 @@
+"""How a network is taken apart: cells of rays that share their columns, clusters of points that share most of them.
+
+Made once per network and model; each iteration then works with dense blocks only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from .layout import Layout
+from .normal_matrix import BandedMatrix, DenseMatrix, NormalMatrix, Structure, find_structure
+
+IntArray = NDArray[np.int64]
+
+#: Costs that decide how points are clustered: seconds per multiply-add in a dense product, per element added to the
+#: normal matrix, per value scattered, and per cluster. Only their ratios matter.
+FLOP, ADD, CLUSTER = 3e-11, 4e-9, 1e-4
+#: Fewest points that make a cluster, and most rays (so that its arrays stay in the cache).
+FEWEST_POINTS, MOST_RAYS = 8, 8192
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Rays with the same columns: places ``low:high`` of `Elimination.by_cell`; ``columns`` (q,) with -1 for none."""
+
+    low: int
+    high: int
+    columns: IntArray
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Neighbouring points eliminated together.
+
+    Attributes
+    ----------
+    points, rays : ranges; rays of the points are contiguous
+    columns : (U,) sorted columns of the reduced system that these rays touch
+    place : (q, rays) flat index of each term in a (points, U + 1) array; column U takes what a ray does not have
+    """
+
+    points: slice
+    rays: slice
+    columns: IntArray
+    place: IntArray
+
+    @property
+    def n_points(self) -> int:
+        return self.points.stop - self.points.start
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """The plan: cells, clusters, and the q = T + slots terms that rays have.
+
+    Attributes
+    ----------
+    point : (n,) point of each ray
+    n_points : number of points
+    by_cell : (n,) order of rays in which cells are contiguous
+    cell : (n,) cell of each ray
+    structure : order of the unknowns that makes a band; None for a dense system
+    """
+
+    point: IntArray
+    n_points: int
+    by_cell: IntArray
+    cell: IntArray
+    cells: tuple[Cell, ...]
+    clusters: tuple[Cluster, ...]
+    n_unknowns: int
+    structure: Structure | None
+
+    def new_matrix(self) -> NormalMatrix:
+        """A zero matrix for the reduced system."""
+        return DenseMatrix(self.n_unknowns) if self.structure is None else BandedMatrix(self.structure)
+
+
+def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ray: IntArray) -> Elimination:
+    """Group rays and points.
+
+    Parameters
+    ----------
+    layout : unknowns
+    prior : (n_unknowns, n_unknowns) normal matrix of the a-priori knowledge
+    point : (n,) point of each ray, ascending
+    first_ray : (p + 1,) rays of point i are ``first_ray[i]:first_ray[i + 1]``
+    """
+    cell, by_cell, cells = _cells(layout)
+    clusters = []
+    for low, high in _cluster_bounds(layout.n_unknowns, cell, cells, first_ray):
+        rays = slice(int(first_ray[low]), int(first_ray[high]))
+        used = np.unique(cell[rays])
+        columns = np.unique(np.concatenate([cells[k].columns for k in used])) if len(used) else np.empty(0, dtype=int)
+        columns = columns[columns >= 0]
+        width = len(columns) + 1
+        local = np.full(layout.n_unknowns + 1, width - 1)
+        local[columns] = np.arange(width - 1)
+        table = np.zeros((len(cells), len(cells[0].columns)), dtype=np.int64)
+        table[used] = local[np.stack([cells[k].columns for k in used])] if len(used) else 0
+        place = table[cell[rays]].T + (point[rays] - low) * width
+        clusters.append(Cluster(slice(low, high), rays, columns, np.ascontiguousarray(place)))
+    cliques = [c.columns for c in clusters if len(c.columns)]
+    structure = find_structure(layout.n_model, layout.n_unknowns, cliques, prior)
+    return Elimination(
+        point, len(first_ray) - 1, by_cell, cell, tuple(cells), tuple(clusters), layout.n_unknowns, structure
+    )
+
+
+def _cells(layout: Layout) -> tuple[IntArray, IntArray, list[Cell]]:
+    """Cell of each ray, order by cell, cells."""
+    n = layout.columns.shape[1]
+    key = np.zeros(n, dtype=np.uint64)
+    with np.errstate(over="ignore"):
+        for t, column in enumerate(layout.columns):  # hash of the column list: the odd multiplier of each place differs
+            key = (key ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15 + 2 * t)
+            key ^= key >> np.uint64(29)
+        if layout.camera is not None:
+            key = (key ^ layout.camera.pattern.astype(np.uint64)) * np.uint64(0xD6E8FEB86659FD93)
+            key ^= key >> np.uint64(32)
+    _, first, cell = np.unique(key, return_index=True, return_inverse=True)
+    by_cell = np.argsort(cell, kind="stable")
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=len(first)))])
+    cells = []
+    for k, example in enumerate(first):
+        columns = layout.columns[:, example].astype(np.int64)
+        if layout.camera is not None:
+            own = layout.camera.columns[layout.camera.pattern[example]].astype(np.int64)
+            columns = np.concatenate([columns, np.where(own >= 0, own + layout.n_model, -1)])
+        cells.append(Cell(int(bounds[k]), int(bounds[k + 1]), columns))
+    return cell.astype(np.int64), by_cell, cells
+
+
+def _cluster_bounds(n_unknowns: int, cell: IntArray, cells: list[Cell], first_ray: IntArray) -> list[tuple[int, int]]:
+    """Ranges of points: halves of halves, as far as a split saves work."""
+    touched = np.zeros((len(cells), n_unknowns + 1), dtype=bool)
+    for k, c in enumerate(cells):
+        touched[k, c.columns] = True
+    touched[:, -1] = False
+
+    def cost(low: int, high: int) -> float:
+        present = np.zeros(len(cells), dtype=bool)
+        present[cell[first_ray[low] : first_ray[high]]] = True
+        u = int(np.count_nonzero(touched[present].any(axis=0)))
+        return 3 * (high - low) * u * u * FLOP + u * u * ADD + CLUSTER
+
+    def divide(low: int, high: int) -> tuple[float, list[tuple[int, int]]]:
+        own = cost(low, high)
+        rays = first_ray[high] - first_ray[low]
+        if high - low < 2 * FEWEST_POINTS or (own < 3 * CLUSTER and rays <= MOST_RAYS):
+            return own, [(low, high)]
+        middle = (low + high) // 2
+        left, left_bounds = divide(low, middle)
+        right, right_bounds = divide(middle, high)
+        if left + right < own or rays > MOST_RAYS:
+            return left + right, left_bounds + right_bounds
+        return own, [(low, high)]
+
+    return divide(0, len(first_ray) - 1)[1]

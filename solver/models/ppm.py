@@ -1,0 +1,181 @@
+"""Piecewise polynomial model: second-order corrections per segment, tied together at the borders [K 4.22-4.33], [P]."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .base import (
+    COMPONENTS,
+    CorrectionModel,
+    Design,
+    Extent,
+    ModelOptions,
+    PseudoObservations,
+    direct_observations,
+    join_observations,
+    three,
+)
+
+Array = NDArray[np.floating]
+Triple = tuple[float, float, float]
+
+#: A ray to a control point counts as so many when segments are placed by the data.
+CONTROL_COUNTS = 3
+
+_ORDERS = ("value", "first order term", "second order term")
+
+
+@dataclass(frozen=True)
+class PpmOptions(ModelOptions):
+    """Settings of the piecewise polynomial model.
+
+    Attributes
+    ----------
+    segments : per correction set
+    placed : "equal" in time, or "data": equal numbers of rays, those to control points counting more
+    order : 2, or 1 to fix the second-order terms by their weight
+    continuity : highest derivative that is continuous at borders: 0, 1 or 2
+    offset_sigma_m, shift_sigma_deg : of the constant terms
+    first_sigma_m, first_sigma_deg : of the first-order terms: change over a segment
+    second_sigma_m, second_sigma_deg : of the second-order terms
+    continuity_sigma_m, continuity_sigma_deg : of C0; per second of C1; per second squared of C2
+    """
+
+    name: ClassVar[str] = "ppm"
+    segments: int = 4
+    placed: str = "equal"
+    order: int = 2
+    continuity: int = 1
+    offset_sigma_m: Triple = (0.2, 0.2, 0.2)
+    shift_sigma_deg: Triple = (0.01, 0.01, 0.02)
+    first_sigma_m: Triple = (0.1, 0.1, 0.1)
+    first_sigma_deg: Triple = (0.01, 0.01, 0.02)
+    second_sigma_m: Triple = (0.1, 0.1, 0.1)
+    second_sigma_deg: Triple = (0.01, 0.01, 0.02)
+    continuity_sigma_m: Triple = (0.01, 0.01, 0.01)
+    continuity_sigma_deg: Triple = (0.0005, 0.0005, 0.0005)
+
+    def __post_init__(self) -> None:
+        if self.segments < 1:
+            raise ValueError(f"segments: wanted 1 or more, got {self.segments}")
+        if self.placed not in ("equal", "data"):
+            raise ValueError(f"segments are placed 'equal' or by 'data', not {self.placed!r}")
+        if self.order not in (1, 2):
+            raise ValueError(f"order: wanted 1 or 2, got {self.order}")
+        if self.continuity not in (0, 1, 2):
+            raise ValueError(f"continuity: wanted 0, 1 or 2, got {self.continuity}")
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, object]) -> Self:
+        triples = {
+            key: three(settings, key, getattr(cls, key))
+            for key in cls.__dataclass_fields__
+            if key.endswith(("_m", "_deg"))
+        }
+        return cls(
+            int(str(settings.get("segments", cls.segments))),
+            str(settings.get("placed", cls.placed)),
+            int(str(settings.get("order", cls.order))),
+            int(str(settings.get("continuity", cls.continuity))),
+            **triples,
+        )
+
+    def build(self, extent: Extent) -> PiecewisePolynomial:
+        return PiecewisePolynomial(extent, self)
+
+
+class PiecewisePolynomial(CorrectionModel):
+    """Segment k: ``a0 + a1 s + a2 s^2`` for each of six corrections, s from 0 to 1 in the segment.
+
+    Column ``18 k + 6 j + c``: coefficient ``a_j`` of component c of segment k.
+
+    Attributes
+    ----------
+    borders : (segments + 1,) times, seconds
+    """
+
+    def __init__(self, extent: Extent, options: PpmOptions):
+        self.extent = extent
+        self.options = options
+        self.borders = _borders(extent, options)
+        self.unknown_names = tuple(
+            f"{component} {order} of segment {k + 1} of {extent.name}"
+            for k in range(self.segments)
+            for order in _ORDERS
+            for component in COMPONENTS
+        )
+        self.notes = ("s = 0 at the start, 1 at the end of each segment",)
+
+    @property
+    def segments(self) -> int:
+        return len(self.borders) - 1
+
+    def design(self, time_s: ArrayLike) -> Design:
+        t = np.asarray(time_s, dtype=float)
+        k = np.clip(np.searchsorted(self.borders, t, side="right") - 1, 0, self.segments - 1)
+        s = (t - self.borders[k]) / np.diff(self.borders)[k]
+        columns = (18 * k)[:, None, None] + np.arange(18).reshape(3, 6)
+        return Design(columns.astype(np.int32), np.stack([np.ones_like(s), s, s * s], axis=1))
+
+    def pseudo_observations(self) -> PseudoObservations:
+        o = self.options
+        second = np.concatenate([o.second_sigma_m, np.radians(o.second_sigma_deg)])
+        if o.order == 1:
+            second = second * 1e-6
+        of_segment = [*o.offset_sigma_m, *np.radians(o.shift_sigma_deg)]
+        of_segment += [*o.first_sigma_m, *np.radians(o.first_sigma_deg), *second]
+        parts = [direct_observations(np.tile(of_segment, self.segments), self.unknown_names)]
+        if self.segments > 1:
+            parts += [self._continuity(derivative) for derivative in range(o.continuity + 1)]
+        return join_observations(parts)
+
+    def _continuity(self, derivative: int) -> PseudoObservations:
+        """Equal derivatives on both sides of every inner border: 6 observations a border [K 4.24, 4.25]."""
+        length = np.diff(self.borders)
+        left, right = length[:-1] ** -derivative, length[1:] ** -derivative
+        at_end = ((1.0, 1.0, 1.0), (0.0, 1.0, 2.0), (0.0, 0.0, 2.0))[derivative]
+        at_start = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 2.0))[derivative]
+        border, component = (a.ravel() for a in np.indices((self.segments - 1, 6)))
+        terms = np.arange(3)
+        of_left = 18 * border[:, None] + 6 * terms + component[:, None]
+        columns = np.concatenate([of_left, of_left + 18], axis=1)
+        coefficients = np.concatenate([np.outer(left[border], at_end), -np.outer(right[border], at_start)], axis=1)
+        columns = np.where(coefficients != 0.0, columns, -1)
+        o = self.options
+        sigma = np.concatenate([o.continuity_sigma_m, np.radians(o.continuity_sigma_deg)])[component]
+        labels = tuple(
+            f"C{derivative} of {COMPONENTS[c]} at border {b + 1} of {self.extent.name}"
+            for b, c in zip(border, component, strict=True)
+        )
+        return PseudoObservations(columns.astype(np.int32), coefficients, np.zeros(len(border)), sigma, labels)
+
+    def describe(self, theta: ArrayLike, sigma: ArrayLike) -> dict[str, object]:
+        values = {"": np.reshape(theta, (self.segments, 3, 6)), "_sigma": np.reshape(sigma, (self.segments, 3, 6))}
+        segments: list[dict[str, object]] = []
+        for k in range(self.segments):
+            one: dict[str, object] = {"start_s": float(self.borders[k]), "end_s": float(self.borders[k + 1])}
+            for j, name in enumerate(("value", "first", "second")):
+                for suffix, array in values.items():
+                    one[f"{name}_m{suffix}"] = array[k, j, :3].tolist()
+                    one[f"{name}_deg{suffix}"] = np.degrees(array[k, j, 3:]).tolist()
+            segments.append(one)
+        return {"segments": segments}
+
+
+def _borders(extent: Extent, options: PpmOptions) -> Array:
+    """Borders of segments, equal or by the data; at least a tenth of the equal length apart."""
+    equal = np.linspace(extent.start_s, extent.end_s, options.segments + 1)
+    if options.placed == "equal" or len(extent.ray_time_s) < options.segments:
+        return equal
+    times = np.concatenate([extent.ray_time_s] + [extent.control_time_s] * (CONTROL_COUNTS - 1))
+    inner = np.quantile(times, np.arange(1, options.segments) / options.segments)
+    least = 0.1 * (equal[1] - equal[0])
+    place = np.arange(1, options.segments)
+    inner = np.maximum.accumulate(inner - least * place) + least * place
+    inner = np.clip(inner, extent.start_s + least * place, extent.end_s - least * place[::-1])
+    return np.concatenate([equal[:1], inner, equal[-1:]])

@@ -1,0 +1,176 @@
+"""Wander model: constant, drift, and a wander whose value and slope at borders are the unknowns.
+
+The piecewise model with its weights taken from what the errors are, not from experience: between borders the correction
+is the conditional mean of a second-order Gauss-Markov process (for a correlation time long against a segment: the cubic
+through both values and slopes, so that C0 and C1 hold exactly), and from border to border its transition is observed
+with its own noise. What a segment cannot follow is known too: `left_out_variance`.
+
+Source: the process in `wander`; interpolation as in T. D. Barfoot, State Estimation for Robotics, 2017, section 3.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..slow_errors import SlowErrors
+from ..wander import second_order_gauss_markov
+from .base import (
+    COMPONENTS,
+    CorrectionModel,
+    Design,
+    Extent,
+    ModelOptions,
+    PseudoObservations,
+    direct_observations,
+    join_observations,
+    three,
+)
+
+Array = NDArray[np.float64]
+
+#: A-priori sigma in place of zero, share of a metre or radian: an error that is said not to exist.
+NOTHING = 1e-7
+#: A trajectory without slow errors.
+NO_SLOW_ERRORS = SlowErrors()
+#: Columns of offset, shift and drift before those of the borders.
+GLOBALS = 9
+
+
+@dataclass(frozen=True)
+class WanderOptions(ModelOptions):
+    """Settings of the wander model.
+
+    Attributes
+    ----------
+    slow : a-priori sigmas of offset, shift, drift and wander
+    segment_s : longest time between borders; 0 = a tenth of the correlation time
+    """
+
+    name: ClassVar[str] = "wander"
+    slow: SlowErrors = NO_SLOW_ERRORS
+    segment_s: float = 0.0
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, object]) -> Self:
+        degree = float(np.pi / 180)
+
+        def angles(key: str, default: float) -> tuple[float, float, float]:
+            a, b, c = three(settings, key, (default, default, default))
+            return (a * degree, b * degree, c * degree)
+
+        slow = SlowErrors(
+            three(settings, "offset_sigma_m", (0.2, 0.2, 0.2)),
+            angles("shift_sigma_deg", 0.01),
+            angles("drift_sigma_deg", 0.01),
+            three(settings, "wander_sigma_m", (0.1, 0.1, 0.1)),
+            angles("wander_sigma_deg", 0.005),
+            float(str(settings.get("wander_time_s", 30.0))),
+        )
+        return cls(slow, float(str(settings.get("segment_s", 0.0))))
+
+    def build(self, extent: Extent) -> Wander:
+        return Wander(extent, self)
+
+
+class Wander(CorrectionModel):
+    """Columns 0..8: offset, shift, drift; ``9 + 12 k + c`` value, ``15 + 12 k + c`` slope of component c at border k.
+
+    Attributes
+    ----------
+    borders : (segments + 1,) times, seconds; equally far apart, the last one at the end of the extent or beyond
+    """
+
+    def __init__(self, extent: Extent, options: WanderOptions):
+        self.extent = extent
+        self.options = options
+        slow = options.slow
+        self.step_s = options.segment_s or 0.1 * slow.wander_time_s
+        segments = max(1, int(np.ceil((extent.end_s - extent.start_s) / self.step_s - 1e-9)))
+        self.borders = extent.start_s + self.step_s * np.arange(segments + 1)
+        kinds = ["offset"] * 3 + ["shift"] * 3 + ["drift"] * 3
+        names = [f"{c} {kind} of {extent.name}" for c, kind in zip(COMPONENTS + COMPONENTS[3:], kinds, strict=True)]
+        names += [
+            f"{c} wander {kind} at border {k + 1} of {extent.name}"
+            for k in range(segments + 1)
+            for kind in ("value", "slope")
+            for c in COMPONENTS
+        ]
+        self.unknown_names = tuple(names)
+        self.notes = ("drift is the change over the strip: s = (t - start) / (end - start)",)
+        self._sigma = np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING)
+        self._F, self._Q, self._P0 = second_order_gauss_markov(1.0, slow.wander_time_s, self.step_s)
+
+    def design(self, time_s: ArrayLike) -> Design:
+        t = np.asarray(time_s, dtype=float)
+        k, part, _ = self._inside(t)
+        share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
+        columns = np.empty((len(t), 6, 6), dtype=np.int32)
+        columns[:, 0] = np.arange(6)
+        columns[:, 1] = [-1, -1, -1, 6, 7, 8]
+        columns[:, 2:] = (GLOBALS + 12 * k)[:, None, None] + np.arange(24).reshape(4, 6)
+        return Design(columns, np.column_stack([np.ones_like(t), share, part]))
+
+    def left_out_variance(self, time_s: ArrayLike) -> Array:
+        """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
+        t = np.asarray(time_s, dtype=float)
+        return self._inside(t)[2][:, None] * self._sigma**2
+
+    def _inside(self, t: Array) -> tuple[NDArray[np.int_], Array, Array]:
+        """Segment (n,), coefficients (n, 4) of value and slope at both its borders, variance (n,) for sigma 1."""
+        k = np.clip(np.floor((t - self.borders[0]) / self.step_s).astype(int), 0, len(self.borders) - 2)
+        after = np.clip(t - self.borders[k], 0.0, self.step_s)
+        time = self.options.slow.wander_time_s
+        F0, Q0, _ = second_order_gauss_markov(1.0, time, after)
+        F1, _, _ = second_order_gauss_markov(1.0, time, self.step_s - after)
+        back = Q0 @ np.swapaxes(F1, 1, 2)
+        right = back @ np.linalg.inv(self._Q)
+        left = F0 - right @ self._F
+        variance = Q0[:, 0, 0] - np.einsum("nk,nk->n", right[:, 0], back[:, 0])
+        return k, np.concatenate([left[:, 0], right[:, 0]], axis=1), np.maximum(variance, 0.0)
+
+    def pseudo_observations(self) -> PseudoObservations:
+        slow = self.options.slow
+        sigma = np.concatenate([slow.offset_m, slow.shift, slow.drift])
+        start = GLOBALS + np.arange(12)
+        slope_sigma = self._sigma * np.sqrt(self._P0[1, 1])
+        direct = direct_observations(
+            np.concatenate([np.maximum(sigma, NOTHING), self._sigma, slope_sigma]), self.unknown_names[: GLOBALS + 12]
+        )
+        assert (direct.columns[GLOBALS:, 0] == start).all()
+        return join_observations([direct, self._transitions()])
+
+    def _transitions(self) -> PseudoObservations:
+        """Two whitened observations ``G (z_k+1 - F z_k) = 0`` of every component and segment, ``G Q G^T = I``."""
+        G = np.linalg.inv(np.linalg.cholesky(self._Q))
+        rows = np.concatenate([-G @ self._F, G], axis=1)  # (2, 4) on value, slope, next value, next slope
+        segment, component, row = (a.ravel() for a in np.indices((len(self.borders) - 1, 6, 2)))
+        columns = GLOBALS + 12 * segment[:, None] + component[:, None] + np.array([0, 6, 12, 18])
+        labels = tuple(
+            f"wander of {COMPONENTS[c]} over segment {k + 1} of {self.extent.name}"
+            for k, c in zip(segment, component, strict=True)
+        )
+        return PseudoObservations(
+            columns.astype(np.int32), rows[row], np.zeros(len(row)), self._sigma[component], labels
+        )
+
+    def describe(self, theta: ArrayLike, sigma: ArrayLike) -> dict[str, object]:
+        result: dict[str, object] = {"s": "share of the strip"}
+        values = {"": np.asarray(theta, dtype=float), "_sigma": np.asarray(sigma, dtype=float)}
+        for key, part, unit in (("offset_m", 0, 1.0), ("shift_deg", 3, 180 / np.pi), ("drift_deg", 6, 180 / np.pi)):
+            for suffix, array in values.items():
+                result[key + suffix] = (array[part : part + 3] * unit).tolist()
+        borders: list[dict[str, object]] = []
+        for k, time in enumerate(self.borders):
+            one: dict[str, object] = {"time_s": float(time)}
+            for suffix, array in values.items():
+                value = array[GLOBALS + 12 * k : GLOBALS + 12 * k + 6]
+                one["value_m" + suffix] = value[:3].tolist()
+                one["value_deg" + suffix] = np.degrees(value[3:]).tolist()
+            borders.append(one)
+        result["borders"] = borders
+        return result

@@ -1,0 +1,222 @@
+"""The reduced normal matrix while it is being summed up: dense, or blocks along a band with a border."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from .reduced_system import BandedFactor, DenseFactor, Factor
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Systems up to this size are dense whatever their structure.
+DENSE_UP_TO = 600
+#: Levels of the band are joined to blocks of at least this size.
+BLOCK = 48
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Order and blocks of the unknowns: block i has entries with blocks i - 1, i, i + 1 and the border only.
+
+    Attributes
+    ----------
+    position : (n,) place of each unknown in the order of the band
+    bounds : (T + 1,) limits of the blocks; behind ``bounds[-1]`` stands the border
+    """
+
+    position: IntArray
+    bounds: IntArray
+
+
+class NormalMatrix(Protocol):
+    """A symmetric matrix that blocks are added to."""
+
+    def add(self, columns: IntArray, block: Array) -> None:
+        """Add a symmetric block (m, m) at some unknowns (m,)."""
+        ...
+
+    def add_sparse(self, matrix: csr_array) -> None:
+        """Add a symmetric sparse matrix (n, n)."""
+        ...
+
+    def damp(self, damping: float) -> None:
+        """Multiply the diagonal by ``1 + damping``."""
+        ...
+
+    def factorise(self) -> Factor: ...
+
+
+class DenseMatrix:
+    """All of it."""
+
+    def __init__(self, n: int):
+        self.values = np.zeros((n, n))
+
+    def add(self, columns: IntArray, block: Array) -> None:
+        _add_at(self.values, columns, columns, block)
+
+    def add_sparse(self, matrix: csr_array) -> None:
+        entries = matrix.tocoo()
+        row, column = entries.coords
+        self.values[row, column] += entries.data
+
+    def damp(self, damping: float) -> None:
+        self.values[np.diag_indices_from(self.values)] *= 1.0 + damping
+
+    def factorise(self) -> Factor:
+        return DenseFactor(self.values)
+
+
+class BandedMatrix:
+    """Diagonal blocks, the blocks below them, the border below all, and its corner."""
+
+    def __init__(self, structure: Structure):
+        self.structure = structure
+        size = np.diff(structure.bounds)
+        edge = len(structure.position) - int(structure.bounds[-1])
+        self.diagonal: list[Array] = [np.zeros((m, m)) for m in size]
+        self.below: list[Array] = [np.zeros((low, m)) for m, low in pairwise(size)]
+        self.border: list[Array] = [np.zeros((edge, m)) for m in size]
+        self.corner = np.zeros((edge, edge))
+
+    def add(self, columns: IntArray, block: Array) -> None:
+        bounds = self.structure.bounds
+        place = self.structure.position[columns]
+        if not (np.diff(place) > 0).all():
+            order = np.argsort(place)
+            place, block = place[order], block[np.ix_(order, order)]
+        cut = np.searchsorted(place, bounds)
+        first = int(np.searchsorted(bounds, place[0], side="right")) - 1
+        last = len(bounds) - 1
+        edge = slice(int(cut[-1]), len(place))
+        at_edge = place[edge] - bounds[-1]
+        for i in range(first, last):
+            own = slice(int(cut[i]), int(cut[i + 1]))
+            if own.start == len(place) or own.start == own.stop:
+                if i > first:
+                    break
+                continue
+            here = place[own] - bounds[i]
+            _add_at(self.diagonal[i], here, here, block[own, own])
+            if i + 1 < last and cut[i + 1] < cut[i + 2]:
+                following = slice(int(cut[i + 1]), int(cut[i + 2]))
+                _add_at(self.below[i], place[following] - bounds[i + 1], here, block[following, own])
+            if len(at_edge):
+                _add_at(self.border[i], at_edge, here, block[edge, own])
+        _add_at(self.corner, at_edge, at_edge, block[edge, edge])
+
+    def add_sparse(self, matrix: csr_array) -> None:
+        entries = matrix.tocoo()
+        row, column = (self.structure.position[i] for i in entries.coords)
+        bounds, last = self.structure.bounds, len(self.structure.bounds) - 1
+        block_row, block_column = (np.searchsorted(bounds, p, side="right") - 1 for p in (row, column))
+        keep = np.flatnonzero(block_row >= block_column)  # the upper blocks are not stored
+        keep = keep[np.argsort(block_column[keep], kind="stable")]
+        limits = np.searchsorted(block_column[keep], np.arange(last + 2))
+        for i in range(last + 1):
+            own = keep[limits[i] : limits[i + 1]]
+            for target, j in self._column(i):
+                mine = own[block_row[own] == j]
+                if len(mine):
+                    np.add.at(target, (row[mine] - bounds[j], column[mine] - bounds[i]), entries.data[mine])
+
+    def _column(self, i: int) -> list[tuple[Array, int]]:
+        """Stored blocks of column i with their block rows."""
+        last = len(self.diagonal)
+        if i == last:
+            return [(self.corner, last)]
+        below = [(self.below[i], i + 1)] if i + 1 < last else []
+        return [(self.diagonal[i], i), *below, (self.border[i], last)]
+
+    def damp(self, damping: float) -> None:
+        for block in (*self.diagonal, self.corner):
+            block[np.diag_indices_from(block)] *= 1.0 + damping
+
+    def factorise(self) -> Factor:
+        return BandedFactor(
+            self.structure.position, self.structure.bounds, self.diagonal, self.below, self.border, self.corner
+        )
+
+
+def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:
+    """``target[rows, columns] += block`` by flat places, three times as fast as by rows and columns."""
+    place = (rows[:, None] * target.shape[1] + columns).ravel()
+    target.reshape(-1)[place] += block.ravel()
+
+
+def find_structure(n_model: int, n_unknowns: int, cliques: Sequence[IntArray], prior: csr_array) -> Structure | None:
+    """Order and blocks for a matrix with the entries of `prior` and within some cliques; None where dense is as good.
+
+    Unknowns from `n_model` on (additional parameters) go to the border. The others are ordered by reverse
+    Cuthill-McKee; its levels, joined until they are worth a block, are the blocks.
+
+    Parameters
+    ----------
+    n_model, n_unknowns : numbers of unknowns
+    cliques : sets of columns that have entries with each other
+    prior : (n_unknowns, n_unknowns)
+    """
+    if n_unknowns <= DENSE_UP_TO:
+        return None
+    group, n_groups = _alike(n_model, cliques)
+    size = np.bincount(group, minlength=n_groups)
+    member = [np.unique(group[c[c < n_model]]) for c in cliques]
+    count = np.array([len(m) for m in member])
+    rows = np.repeat(np.arange(len(member)), count)
+    touch = csr_array((np.ones(len(rows)), (rows, np.concatenate(member))), shape=(len(member), n_groups))
+    row, column = (c.astype(np.int64) for c in prior.tocoo().coords)
+    inner = (row < n_model) & (column < n_model)
+    pairs = (np.ones(int(inner.sum())), (group[row[inner]], group[column[inner]]))
+    graph = csr_array(touch.T @ touch + csr_array(pairs, shape=(n_groups, n_groups)))
+    order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.int64)
+    place = np.empty(n_groups, dtype=np.int64)
+    place[order] = np.arange(n_groups)
+    # furthest group that any group up to here has entries with
+    reach = np.arange(n_groups)
+    of_row = np.repeat(np.arange(n_groups), np.diff(graph.indptr))
+    np.maximum.at(reach, place[of_row], place[graph.indices])
+    reach = np.maximum.accumulate(reach)
+    start = np.concatenate([[0], np.cumsum(size[order])])
+    bounds = [0]
+    end = 1  # groups in the blocks so far
+    while end < n_groups and start[end] < BLOCK:
+        end += 1
+    bounds.append(int(start[end]))
+    while end < n_groups:
+        following = max(int(reach[end - 1]) + 1, end + 1)
+        while following < n_groups and start[following] - start[end] < BLOCK:
+            following += 1
+        end = following
+        bounds.append(int(start[end]))
+    blocks = np.diff(bounds)
+    edge = n_unknowns - n_model
+    work = (blocks**3).sum() / 3 + (blocks[:-1] ** 2 * blocks[1:] + blocks[:-1] * blocks[1:] ** 2).sum()
+    work += edge * (blocks**2).sum() * 2 + edge**2 * n_model
+    if 2 * work > n_unknowns**3 / 3:
+        return None
+    position = np.empty(n_unknowns, dtype=np.int64)
+    by_group = np.argsort(place[group], kind="stable")
+    position[by_group] = np.arange(n_model)
+    position[n_model:] = np.arange(n_model, n_unknowns)
+    return Structure(position, np.array(bounds, dtype=np.int64))
+
+
+def _alike(n_model: int, cliques: Sequence[IntArray]) -> tuple[IntArray, int]:
+    """Groups of unknowns that belong to the same cliques: group of each (n_model,), and their number."""
+    key = np.zeros(n_model, dtype=np.uint64)
+    with np.errstate(over="ignore"):
+        for k, c in enumerate(cliques):
+            mine = c[c < n_model]
+            key[mine] = (key[mine] ^ np.uint64(k + 1)) * np.uint64(0x9E3779B97F4A7C15)
+            key[mine] ^= key[mine] >> np.uint64(29)
+    unique, group = np.unique(key, return_inverse=True)
+    return group.astype(np.int64), len(unique)

@@ -1,0 +1,298 @@
+"""Solving the reduced system: scaled Cholesky, dense or along a band with a border; null vectors if it is singular."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, get_lapack_funcs, solve_triangular
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+Blocks = list[Array]
+
+_potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
+
+#: Pivots (or eigenvalues) of the matrix scaled to a unit diagonal below this are taken as zero.
+SINGULAR = 1e-11
+#: What the diagonal of a singular banded matrix is raised by.
+RAISED = 1e-10
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """Directions of the reduced unknowns about which the observations say nothing.
+
+    Attributes
+    ----------
+    vectors : (n_unknowns, m) null vectors, largest element 1 in units of the unknowns' scale ``scale``
+    eigenvalues : (m,) of the scaled matrix
+    scale : (n_unknowns,) sigma each unknown would have alone; vectors * scale is in the unknowns' own units
+    """
+
+    vectors: Array
+    eigenvalues: Array
+    scale: Array
+
+    def __len__(self) -> int:
+        return self.vectors.shape[1]
+
+
+class Factor(Protocol):
+    """A factorised reduced system."""
+
+    undetermined: Undetermined
+    pivots: Array
+
+    def solve(self, rhs: Array) -> Array: ...
+    def cofactors(self, columns: IntArray) -> Array: ...
+    def variances(self) -> Array: ...
+
+
+class DenseFactor:
+    """Cholesky factor of a dense symmetric matrix (which it overwrites), or its eigenvectors where it is singular.
+
+    Directions without information are held: the solution has no part in them, and their cofactors are zero.
+
+    Attributes
+    ----------
+    undetermined : null space, empty for a regular matrix
+    pivots : (n,) squared pivots of the matrix scaled to a unit diagonal, in the given order of unknowns; each is
+        ``1 - R^2`` of its unknown against those before it
+    """
+
+    def __init__(self, matrix: Array):
+        n = len(matrix)
+        diagonal = np.diagonal(matrix).copy()
+        self.scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+        scaled = matrix.T  # column by column as LAPACK wants it, and in place
+        scaled *= self.scale[:, None]
+        scaled *= self.scale
+        none = Undetermined(np.empty((n, 0)), np.empty(0), self.scale)
+        factor, info = _potrf(scaled, lower=1, clean=0, overwrite_a=1)
+        pivots = np.diagonal(factor) ** 2
+        self._factor: Array | None = None
+        self._inverse: Array | None = None
+        if info == 0 and (n == 0 or pivots.min() > SINGULAR):
+            self._factor = factor
+            self.undetermined, self.pivots = none, pivots
+            return
+        scaled[np.diag_indices(n)] = diagonal * self.scale**2  # the upper triangle is as it was
+        values, vectors = np.linalg.eigh(scaled, UPLO="U")
+        good = values > SINGULAR * max(float(values[-1]), 1.0)
+        kept = vectors[:, good]
+        self._inverse = (kept / values[good]) @ kept.T * self.scale[:, None] * self.scale
+        null = vectors[:, ~good]
+        self.undetermined = Undetermined(null / np.abs(null).max(axis=0, initial=1e-300), values[~good], self.scale)
+        self.pivots = np.where(np.arange(n) < (info - 1 if info > 0 else n), pivots, 0.0)
+
+    def solve(self, rhs: Array) -> Array:
+        """``matrix^-1 rhs`` for (n,) or (n, m)."""
+        if self._factor is None:
+            return self.inverse() @ rhs
+        scale = self.scale if rhs.ndim == 1 else self.scale[:, None]
+        return scale * cho_solve((self._factor, True), scale * rhs, check_finite=False)
+
+    def inverse(self) -> Array:
+        """(n, n) cofactor matrix."""
+        if self._inverse is None:
+            self._inverse = _inverse_of(self._factor) * self.scale[:, None] * self.scale
+        return self._inverse
+
+    def cofactors(self, columns: NDArray[np.int64]) -> Array:
+        """Block (m, m) of the cofactor matrix."""
+        return self.inverse()[np.ix_(columns, columns)]
+
+    def variances(self) -> Array:
+        """(n,) diagonal of the cofactor matrix."""
+        return np.diagonal(self.inverse()).copy()
+
+
+class BandedFactor:
+    """Block Cholesky factor along a band with a border; cofactors inside the band without the dense inverse.
+
+    A singular matrix gets its diagonal raised by `RAISED`; the null vectors are then found by iteration, and solution
+    and cofactors have no part in them, as in `DenseFactor`.
+
+    Parameters
+    ----------
+    position : (n,) place of each unknown in the order of the band
+    bounds : (T + 1,) limits of the blocks; the border stands behind
+    diagonal, below, border, corner : blocks of the matrix; not changed
+    """
+
+    def __init__(
+        self, position: IntArray, bounds: IntArray, diagonal: Blocks, below: Blocks, border: Blocks, corner: Array
+    ):
+        self.position, self.bounds = position, bounds
+        n, last = len(position), len(diagonal)
+        d = np.concatenate([np.diagonal(block) for block in (*diagonal, corner)])
+        scale = np.where(d > 0, 1.0 / np.sqrt(np.where(d > 0, d, 1.0)), 1.0)
+        self._scale = scale  # in the order of the band
+        self.scale = scale[position]
+        parts = [scale[bounds[i] : bounds[i + 1]] for i in range(last)] + [scale[bounds[-1] :]]
+        scaled = [parts[i][:, None] * diagonal[i] * parts[i] for i in range(last)]
+        under = [parts[i + 1][:, None] * below[i] * parts[i] for i in range(last - 1)]
+        edge = [parts[-1][:, None] * border[i] * parts[i] for i in range(last)]
+        end = parts[-1][:, None] * corner * parts[-1]
+        self._z: tuple[Blocks, Blocks, Blocks, Array] | None = None
+        self._null = np.empty((n, 0))
+        good, pivots = self._factorise(scaled, under, edge, end, 0.0)
+        self.pivots = pivots[position]
+        values = np.empty(0)
+        if not good:
+            _, _ = self._factorise(scaled, under, edge, end, RAISED)
+            values, self._null = self._null_vectors(n)
+        vectors = self._null[position]
+        vectors = vectors / np.abs(vectors).max(axis=0, initial=1e-300)
+        self.undetermined = Undetermined(vectors, values, self.scale)
+
+    def _factorise(
+        self, diagonal: Blocks, below: Blocks, border: Blocks, corner: Array, raised: float
+    ) -> tuple[bool, Array]:
+        """Factor the scaled blocks; whether all pivots are sound, and the squared pivots (n,)."""
+        self._L, self._C, self._B = [], [], []
+        pivots: list[Array] = []
+        here, edge, end = diagonal[0], border[0], corner
+        for i in range(len(diagonal)):
+            L, sound = _cholesky(here, raised)
+            if not sound:
+                pivots += [np.zeros(len(d)) for d in (*diagonal[i:], corner)]
+                return False, np.concatenate(pivots)
+            pivots.append(np.diagonal(L) ** 2)
+            B = solve_triangular(L, edge.T, lower=True, check_finite=False).T
+            self._L.append(L)
+            self._B.append(B)
+            end = end - B @ B.T
+            if i + 1 < len(diagonal):
+                C = solve_triangular(L, below[i].T, lower=True, check_finite=False).T
+                self._C.append(C)
+                here, edge = diagonal[i + 1] - C @ C.T, border[i + 1] - B @ C.T
+        self._E, sound = _cholesky(end, raised)
+        pivots.append(np.diagonal(self._E) ** 2 if sound else np.zeros(len(end)))
+        return sound, np.concatenate(pivots)
+
+    def _null_vectors(self, n: int) -> tuple[Array, Array]:
+        """Eigenvalues and vectors of the scaled matrix that count as zero, from the raised factor."""
+        rng = np.random.default_rng(0)
+        wanted = 16
+        while True:  # subspace iteration with the inverse; more vectors if all of them belong to the null space
+            wanted = min(wanted, n)
+            V = np.linalg.qr(rng.standard_normal((n, wanted)))[0]
+            for _ in range(8):
+                V = np.linalg.qr(self._solve(V))[0]
+            T = V.T @ self._solve(V)
+            values, turn = np.linalg.eigh(0.5 * (T + T.T))
+            eigenvalues = 1.0 / values - RAISED
+            zero = eigenvalues < 10 * RAISED
+            if wanted == n or not zero.all():
+                return np.maximum(eigenvalues[zero], 0.0), (V @ turn)[:, zero]
+            wanted *= 2
+
+    def _solve(self, b: Array) -> Array:
+        """Solve with the (raised) scaled factor, in the order of the band; (n,) or (n, m)."""
+        bounds, last = self.bounds, len(self._L)
+        x = np.array(b, dtype=float)
+        part = [x[bounds[i] : bounds[i + 1]] for i in range(last)] + [x[bounds[-1] :]]
+        for i in range(last):
+            part[i][:] = solve_triangular(self._L[i], part[i], lower=True, check_finite=False)
+            if i + 1 < last:
+                part[i + 1][:] -= self._C[i] @ part[i]
+            part[-1][:] -= self._B[i] @ part[i]
+        if len(part[-1]):
+            part[-1][:] = cho_solve((self._E, True), part[-1], check_finite=False)
+        for i in range(last - 1, -1, -1):
+            t = part[i] - self._B[i].T @ part[-1]
+            if i + 1 < last:
+                t -= self._C[i].T @ part[i + 1]
+            part[i][:] = solve_triangular(self._L[i], t, lower=True, trans=1, check_finite=False)
+        return x
+
+    def solve(self, rhs: Array) -> Array:
+        """``matrix^-1 rhs`` for (n,) or (n, m)."""
+        scale = self._scale if rhs.ndim == 1 else self._scale[:, None]
+        b = np.empty_like(rhs)
+        b[self.position] = rhs
+        b *= scale
+        b -= self._null @ (self._null.T @ b)
+        x = self._solve(b)
+        x -= self._null @ (self._null.T @ x)
+        return (scale * x)[self.position]
+
+    def _selected(self) -> tuple[Blocks, Blocks, Blocks, Array]:
+        """Blocks of the scaled inverse where the matrix has blocks, from the last to the first (Takahashi)."""
+        if self._z is None:
+            last = len(self._L)
+            corner = _inverse_of(self._E)
+            diagonal: Blocks = [np.empty(0)] * last
+            below: Blocks = [np.empty(0)] * (last - 1)
+            border: Blocks = [np.empty(0)] * last
+            for i in range(last - 1, -1, -1):
+                XB = solve_triangular(self._L[i], self._B[i].T, lower=True, trans=1, check_finite=False).T
+                own = _inverse_of(self._L[i])
+                if i + 1 < last:
+                    XC = solve_triangular(self._L[i], self._C[i].T, lower=True, trans=1, check_finite=False).T
+                    below[i] = -(diagonal[i + 1] @ XC + border[i + 1].T @ XB)
+                    border[i] = -(border[i + 1] @ XC + corner @ XB)
+                    diagonal[i] = own - XC.T @ below[i] - XB.T @ border[i]
+                else:
+                    border[i] = -corner @ XB
+                    diagonal[i] = own - XB.T @ border[i]
+            self._z = diagonal, below, border, corner
+        return self._z
+
+    def cofactors(self, columns: IntArray) -> Array:
+        """Block (m, m) of the cofactor matrix; cheap where the unknowns lie in neighbouring blocks."""
+        bounds, last = self.bounds, len(self._L)
+        place = self.position[columns]
+        block = np.searchsorted(bounds, place, side="right") - 1
+        inner = block[block < last]
+        if len(inner) and inner.max() - inner.min() > 1:
+            unit = np.zeros((len(self.position), len(columns)))
+            unit[columns, np.arange(len(columns))] = 1.0
+            Q = self.solve(unit)[columns]
+            return 0.5 * (Q + Q.T)
+        diagonal, below, border, corner = self._selected()
+        Q = np.empty((len(columns), len(columns)))
+        present = sorted(set(block.tolist()))
+        rows = {i: np.flatnonzero(block == i) for i in present}
+        for a in present:
+            for b in present:
+                if b > a:
+                    continue
+                stored = corner if b == last else border[b] if a == last else diagonal[a] if a == b else below[b]
+                values = stored[np.ix_(place[rows[a]] - bounds[a], place[rows[b]] - bounds[b])]
+                Q[np.ix_(rows[a], rows[b])] = values
+                Q[np.ix_(rows[b], rows[a])] = values.T
+        null = self._null[place]
+        Q -= null @ null.T / RAISED
+        scale = self._scale[place]
+        return scale[:, None] * Q * scale
+
+    def variances(self) -> Array:
+        """(n,) diagonal of the cofactor matrix."""
+        diagonal, _, _, corner = self._selected()
+        d = np.concatenate([np.diagonal(block) for block in (*diagonal, corner)])
+        d = d - (self._null**2).sum(axis=1) / RAISED
+        return (d * self._scale**2)[self.position]
+
+
+def _cholesky(matrix: Array, raised: float) -> tuple[Array, bool]:
+    """Lower factor of a matrix with its diagonal raised, and whether its pivots are sound."""
+    if not len(matrix):
+        return matrix, True
+    work = matrix.copy()
+    work[np.diag_indices_from(work)] += raised
+    factor, info = _potrf(work, lower=1, clean=1)
+    pivots = np.diagonal(factor) ** 2
+    return factor, bool(info == 0 and pivots.min() > (0.0 if raised else SINGULAR))
+
+
+def _inverse_of(factor: Array | None) -> Array:
+    """``(L L^T)^-1`` from L."""
+    if factor is None or not len(factor):
+        return np.empty((0, 0))
+    lower, _ = _potri(factor, lower=1)
+    return np.tril(lower) + np.tril(lower, -1).T
