@@ -1,0 +1,138 @@
+"""The tables of a batch adjustment: adjusted points, residuals, refined trajectory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..solver.adjustment import Solution
+from ..solver.layout import CorrectionSet
+from ..solver.reliability import reliability
+from ..solver.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from .adjustment_result import Adjustment, set_name
+
+Array = NDArray[np.floating]
+
+_AXES = ("X", "Y", "Z")
+_ANGLES = ("omega", "phi", "kappa")
+
+
+def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
+    """Write ``points.csv``, ``residuals.csv`` and ``trajectory_refined.csv``; returns their paths."""
+    tables = {
+        "points.csv": points_table(adjustment),
+        "residuals.csv": residuals_table(adjustment),
+        "trajectory_refined.csv": trajectory_table(adjustment),
+    }
+    paths = []
+    for name, table in tables.items():
+        path = folder / name
+        table.to_csv(path, index=False)
+        paths.append(path)
+    return paths
+
+
+def points_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined."""
+    block, result = adjustment.block, adjustment.result
+    network = result.network
+    order = np.array([network.point_index[id] for id in block.point_ids if id in network.point_index], dtype=np.int64)
+    xyz, C = result.adjusted_points()[order], result.point_covariance[order]
+    known = np.isfinite(xyz).all(axis=1)
+    places = np.full_like(xyz, np.nan)
+    sigma = np.full_like(xyz, np.nan)
+    frame = block.frame
+    if known.any():
+        places[known] = frame.to_crs(xyz[known])
+        R = frame.R_l_crs(places[known])
+        sigma[known] = np.sqrt(np.maximum(np.einsum("pji,pjk,pki->pi", R, C[known], R), 0.0))
+    in_use = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points).astype(int)
+    decimals = 9 if frame.is_geographic else 5
+    columns: dict[str, object] = {"point": [network.point_ids[i] for i in order]}
+    columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+    columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
+    return pd.DataFrame(columns | {"rays": in_use[order], "role": network.role()[order]})
+
+
+def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Residuals of all image points that could be used, in the order of the input, pixels."""
+    block, result = adjustment.block, adjustment.result
+    rays, s = result.network.rays, result.rays
+    order = np.argsort(rays.source)
+    names = [block.image_name(int(row)) for row in rays.source[order]]
+    r = reliability(s.redundancy, s.sigma_px)
+    out = np.zeros(len(rays), dtype=bool)
+    out[[x.ray for x in result.rejected if x.ray >= 0]] = True
+    columns: dict[str, object] = {
+        "point": [n[0] for n in names],
+        "strip": [n[1] for n in names],
+        "ccd": [n[2] for n in names],
+        "line": rays.line[order],
+        "sample": rays.sample[order],
+    }
+    detectable = np.where(np.isfinite(r.detectable), r.detectable, np.nan)
+    for prefix, values, digits in (
+        ("v", s.v_px, 5),
+        ("w", s.w, 4),
+        ("redundancy", r.redundancy, 5),
+        ("detectable", detectable, 4),
+    ):
+        unit = "_px" if prefix in ("v", "detectable") else ""
+        for k, coordinate in enumerate(("line", "sample")):
+            columns[f"{prefix}_{coordinate}{unit}"] = np.round(values[order, k], digits)
+    return pd.DataFrame(columns | {"rejected": out[order].astype(int)})
+
+
+def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas."""
+    frame = adjustment.block.frame
+    parts = []
+    for item in adjustment.result.solution.layout.sets:
+        strip = adjustment.block.strips[item.strip]
+        time = strip.trajectory.time_s
+        correction, sigma = correction_functions(adjustment, item, time)
+        position = strip.trajectory.position_l + correction[:, :3]
+        angles = angles_from_matrix(matrix_from_quaternion(strip.trajectory.quaternion)) + correction[:, 3:]
+        places = frame.to_crs(position)
+        if frame.crs != "local":
+            R = np.swapaxes(frame.R_l_crs(places), 1, 2) @ matrix_from_angles(*angles.T)
+            angles = angles_from_matrix(R)
+        angles = np.degrees(angles)
+        angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
+        decimals = 9 if frame.is_geographic else 5
+        columns: dict[str, object] = {"strip": set_name(adjustment, item), "time_s": np.round(time, 9)}
+        columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+        columns |= {f"{a}_deg": np.round(angles[:, k], 9) for k, a in enumerate(_ANGLES)}
+        columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
+        columns |= {f"sigma_{a}_deg": np.round(np.degrees(sigma[:, 3 + k]), 9) for k, a in enumerate(_ANGLES)}
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def correction_functions(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array]:
+    """Corrections (n, 6) of all stages together, and their a-posteriori sigmas (n, 6); metres and radians.
+
+    The sigmas are those of the last stage, which estimates what the stages before it left.
+    """
+    result = adjustment.result
+    total = np.zeros((len(time_s), 6))
+    for stage in result.stages:
+        mine = next(s for s in stage.layout.sets if (s.strip, s.lens) == (item.strip, item.lens))
+        total += mine.model.evaluate(stage.state.theta[mine.columns], time_s)
+    return total, result.sigma0 * correction_sigma(result.solution, item, time_s)
+
+
+def correction_sigma(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
+    """Sigmas (n, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
+    design = item.model.design(time_s)
+    Q = solution.factor.cofactors(np.arange(item.columns.start, item.columns.stop))
+    Q = np.pad(Q, ((0, 1), (0, 1)))  # column -1 reads zeros
+    variance = np.zeros((len(time_s), 6))
+    for a in range(design.columns.shape[1]):
+        for b in range(design.columns.shape[1]):
+            weight = design.coefficients[:, a] * design.coefficients[:, b]
+            variance += weight[:, None] * Q[design.columns[:, a], design.columns[:, b]]
+    return np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,213 @@
+"""``triline adjust``: batch adjustment of a block folder or a recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ...solver.adjustment import Iteration
+from ...solver.batch import Event, Job, NotAdjustableError, Phase
+from ...solver.batch import run as run_job
+from ...solver.block import Block, network_from_block
+from ...solver.determinability import Limits, Removal
+from ...solver.models import MODELS
+from ...solver.models.base import ModelOptions
+from ...solver.robust import WEIGHT_FUNCTIONS
+from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
+from ...solver.snooping import Round
+from ..adjustment_result import Adjustment, result_of
+from ..adjustment_summary import summary_lines
+from ..adjustment_tables import write_tables
+from ..errors import UserError
+from ..formats.block_folder import read_block
+from ..formats.block_recording import TOPICS, block_from_messages
+from ..recording import RecordingReader
+
+EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
+  triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("input", metavar="INPUT", help="block folder, or recording (MCAP)")
+    parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
+    group = parser.add_argument_group("model")
+    group.add_argument("--model", choices=sorted(MODELS), default="dgr", help="trajectory model (dgr)")
+    group.add_argument("--then", choices=sorted(MODELS), help="a second model on the orientation the first one refined")
+    group.add_argument("--segments", type=int, metavar="N", help="segments a strip, for ppm")
+    group.add_argument("--fixes", type=int, metavar="N", help="orientation fixes a strip, for lim")
+    sets = ["none", *SELF_CALIBRATIONS]
+    group.add_argument("--selfcal", choices=sets, default="none", help="additional parameters of the camera (none)")
+    group.add_argument("--free", action="store_true", help="additional parameters without a-priori weight")
+    group.add_argument(
+        "--keep",
+        choices=("significant", "all", "determinable"),
+        default="significant",
+        help="what the determinability tests do: keep a parameter that is significant though correlated (significant), "
+        "remove whatever fails a test (determinable), remove nothing (all)",
+    )
+    group = parser.add_argument_group("observations")
+    group.add_argument("--snoop", action="store_true", help="data snooping: test and leave out outliers")
+    group.add_argument("--critical", type=float, default=3.29, metavar="W", help="critical value of |w| (3.29)")
+    group.add_argument("--robust", choices=sorted(WEIGHT_FUNCTIONS), help="robust estimation; with --snoop its start")
+    group.add_argument("--reweight", action="store_true", help="re-estimate the image sigma")
+    group.add_argument(
+        "--variance-components", action="store_true", help="estimate sigmas of image, control, position and attitude"
+    )
+    group.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
+    parser.add_argument("--plots", action="store_true", help="pictures of residuals, check points and corrections (-o)")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.plots and not args.output:
+        raise UserError("--plots needs a folder for the pictures: -o DIR")
+    if not args.critical > 0:
+        raise UserError(f"--critical {args.critical:g}, wanted more than 0")
+    if args.iterations < 1:
+        raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
+    block = read_input(Path(args.input))
+    adjustment = adjust_block(block, job_of(args, block), _Teller(args))
+    content = result_of(adjustment)
+    if args.output:
+        write_result(adjustment, content, Path(args.output), plots=args.plots)
+    if args.json:
+        print(json.dumps(content, indent=2))
+    else:
+        for line in summary_lines(content, verbose=args.verbose):
+            print(line)
+        if args.output and not args.quiet:
+            print(f"written to {args.output}")
+    return 0
+
+
+def read_input(path: Path) -> Block:
+    """The block in a folder or a recording.
+
+    Raises
+    ------
+    UserError : neither, or one that cannot be adjusted
+    """
+    if path.is_dir():
+        return read_block(path)
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder")
+    reader = RecordingReader(path)
+    return block_from_messages(reader.messages(TOPICS), path.name)
+
+
+def job_of(args: argparse.Namespace, block: Block) -> Job:
+    """The job that the options ask for."""
+    settings: dict[str, object] = dict(block.apriori.trajectory)
+    settings |= {key: value for key in ("segments", "fixes") if (value := getattr(args, key)) is not None}
+    models = {args.model, args.then}
+    for option, model in (("segments", "ppm"), ("fixes", "lim")):
+        if getattr(args, option) is not None and model not in models:
+            raise UserError(f"--{option} is for the model {model}; asked for is {args.model}")
+    limits = Limits(keep_significant=args.keep == "significant")
+    robust = WEIGHT_FUNCTIONS[args.robust]() if args.robust else None
+    return Job(
+        _model(args.model, settings),
+        _model(args.then, settings) if args.then else None,
+        _self_calibration(args, block),
+        args.keep != "all",
+        limits,
+        args.snoop,
+        args.critical,
+        robust,
+        args.reweight,
+        args.variance_components,
+        max_iterations=args.iterations,
+    )
+
+
+def _model(name: str, settings: Mapping[str, object]) -> ModelOptions:
+    try:
+        return MODELS[name].from_settings(settings)
+    except ValueError as error:
+        raise UserError(f"model {name}: {error}") from None
+
+
+def _self_calibration(args: argparse.Namespace, block: Block) -> SelfCalibration | None:
+    if args.selfcal == "none":
+        return None
+    try:
+        parameters = SELF_CALIBRATIONS[args.selfcal](block.camera)
+    except ValueError as error:
+        raise UserError(f"--selfcal {args.selfcal}: {error}") from None
+    return parameters.free() if args.free else parameters
+
+
+def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
+    """Do a job on a block.
+
+    Raises
+    ------
+    UserError : a block from which nothing can be computed
+    """
+    start = time.perf_counter()
+    try:
+        result = run_job(network_from_block(block), job, tell)
+    except NotAdjustableError as error:
+        raise UserError(f"{block.name}: {error}") from None
+    except ValueError as error:
+        raise UserError(f"{block.name}: cannot be adjusted: {error}") from None
+    finally:
+        if isinstance(tell, _Teller):
+            tell.close()
+    return Adjustment(block, job, result, time.perf_counter() - start)
+
+
+def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False) -> None:
+    """Write ``result.json`` and the tables, and the pictures on request."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file, wanted a folder for the result")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
+    write_tables(adjustment, folder)
+    if plots:
+        from ..report.adjustment_plots import write_plots
+
+        write_plots(adjustment, folder)
+
+
+class _Teller:
+    """Progress on standard error: one line that is written over on a terminal, plain lines elsewhere."""
+
+    def __init__(self, args: argparse.Namespace):
+        self.silent = args.quiet or (args.json and not args.verbose)
+        self.terminal = sys.stderr.isatty()
+        self.phase = ""
+
+    def __call__(self, event: Event) -> None:
+        if self.silent:
+            return
+        if isinstance(event, Phase):
+            self.phase = event.name
+            if not self.terminal:
+                return
+        text = f"{self.phase}: {_words(event)}" if not isinstance(event, Phase) else f"{self.phase} ..."
+        if self.terminal:
+            print(f"\r\x1b[K{text[:110]}", end="", file=sys.stderr, flush=True)
+        else:
+            print(text, file=sys.stderr)
+
+    def close(self) -> None:
+        if self.terminal and not self.silent:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _words(event: Iteration | Round | Removal | Phase) -> str:
+    if isinstance(event, Iteration):
+        fate = "" if event.accepted else ", step refused"
+        damping = f", damping {event.damping:.0e}" if event.damping else ""
+        return f"iteration {event.number}, vTPv {event.cost_before:.6g} -> {event.cost:.6g}{damping}{fate}"
+    if isinstance(event, Round):
+        back = f", {event.returned} returned" if event.returned else ""
+        return f"round {event.number}, largest w {event.largest_w:.2f}, {event.left_out} left out{back}"
+    if isinstance(event, Removal):
+        return f"{event.name} removed, {event.reason}"
+    return event.name

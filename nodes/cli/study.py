@@ -1,0 +1,67 @@
+"""``triline study``: studies, one module each."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from typing import Any
+
+#: study -> (module beside this one, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args).
+STUDIES: dict[str, tuple[str, str]] = {
+    "testfields": ("study_testfields", "the testfields of the dissertation, simulated: published accuracy beside ours"),
+    "consistency": ("study_consistency", "whether errors of adjusted blocks are as large as their sigmas say"),
+}
+
+EXAMPLE = "triline study testfields --seeds 10"
+
+_COMMON = (
+    (("--json",), "print a machine-readable result"),
+    (("-q", "--quiet"), "print only the result and errors"),
+    (("-v", "--verbose"), "print details"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    subparsers = parser.add_subparsers(dest="study", metavar="STUDY", required=True)
+    for name, (module_name, text) in STUDIES.items():
+        module = _load(module_name)
+        sub = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.formatter_class = argparse.RawDescriptionHelpFormatter
+        sub.epilog = f"example:\n  {module.EXAMPLE}"
+        module.add_arguments(sub)
+        sub.set_defaults(run_study=module.run)
+        _add_common(sub)
+    sub = subparsers.add_parser("all", help="all of them, one after another, with their defaults")
+    sub.set_defaults(run_study=_run_all)
+    _add_common(sub)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    """The common options behind the name of the study; SUPPRESS keeps what was said before it."""
+    for flags, text in _COMMON:
+        if flags[0] not in parser._option_string_actions:
+            parser.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)
+
+
+def _load(module_name: str) -> Any:
+    return importlib.import_module(f".{module_name}", __package__)
+
+
+def run(args: argparse.Namespace) -> int:
+    return args.run_study(args)
+
+
+def _run_all(args: argparse.Namespace) -> int:
+    """Every study with its own defaults; with ``--json`` one document after another."""
+    code = 0
+    for name, (module_name, text) in STUDIES.items():
+        module = _load(module_name)
+        parser = argparse.ArgumentParser()
+        module.add_arguments(parser)
+        if not args.json:
+            print(f"== {name}: {text}", flush=True)
+        common = argparse.Namespace(json=args.json, quiet=args.quiet, verbose=args.verbose)
+        code = max(code, module.run(parser.parse_args([], common)))
+        if not args.json:
+            print()
+    return code

@@ -1,0 +1,51 @@
+"""``triline study consistency``: whether the errors of adjusted blocks are as large as their sigmas say."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+
+from ...solver.simulation.consistency import MODELS, Consistency, consistency
+from ..errors import UserError
+from .progress import progress
+
+EXAMPLE = "triline study consistency --seeds 50"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=int, default=50, metavar="N", help="simulated blocks a model (50)")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.seeds < 1:
+        raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    cases = [(name, calibrated) for name in MODELS for calibrated in (False, True)]
+    found: dict[str, Consistency] = {}
+    for name, calibrated in cases:
+        label = f"{name}{' + TLS-18' if calibrated else ''}"
+        with progress(label, args.quiet or args.json) as tell:
+            found[label] = consistency(MODELS[name], calibrated, args.seeds, tell)
+    if args.json:
+        print(json.dumps({"seeds": args.seeds, "models": {k: _plain(c) for k, c in found.items()}}, indent=2))
+        return 0
+    print(f"{args.seeds} simulated blocks a model, errors drawn as assumed; 1 is right, chi-square tests pass in 95 %")
+    print(f"{'':16s}{'RMSE / sigma of points':>26s}{'orientation':>22s}{'camera':>9s}{'sigma0':>9s}{'test':>8s}")
+    print(f"{'':16s}{'X':>10s}{'Y':>8s}{'Z':>8s}{'NEES (95 % band)':>22s}{'NEES':>9s}{'':>9s}{'passed':>8s}")
+    for label, c in found.items():
+        x, y, z = c.points
+        band = f"{c.orientation:.3f} ({c.band[0]:.2f}-{c.band[1]:.2f})"
+        camera = "-" if math.isnan(c.parameters) else f"{c.parameters:.3f}"
+        print(f"{label:16s}{x:10.3f}{y:8.3f}{z:8.3f}{band:>22s}{camera:>9s}{c.sigma0:9.4f}{100 * c.passed:7.0f} %")
+    return 0
+
+
+def _plain(c: Consistency) -> dict[str, object]:
+    return {
+        "rmse_over_sigma": c.points.tolist(),
+        "orientation_nees": c.orientation,
+        "orientation_nees_band": list(c.band),
+        "camera_nees": None if math.isnan(c.parameters) else c.parameters,
+        "sigma0": c.sigma0,
+        "chi_square_passed": c.passed,
+    }

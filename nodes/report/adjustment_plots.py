@@ -1,0 +1,166 @@
+"""Pictures of a batch adjustment: residuals per CCD line, check and control vectors, correction functions over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment_result import Adjustment, set_name
+from ..adjustment_tables import correction_functions
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+Array = NDArray[np.floating]
+
+#: Image points drawn at most for a CCD line.
+MOST_ARROWS = 3000
+
+_BLUE, _RED, _GREY, _GREEN = "#2b5d8a", "#c0392b", "#9aa5b1", "#3a7d44"
+
+
+def write_plots(adjustment: Adjustment, folder: Path) -> list[Path]:
+    """Write ``residuals.png``, ``points.png`` and ``corrections.png``; returns their paths."""
+    style: Any = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.axisbelow": True, "figure.dpi": 110}
+    paths = []
+    with plt.rc_context(style):
+        for name, draw in (
+            ("residuals.png", draw_residuals),
+            ("points.png", draw_points),
+            ("corrections.png", draw_corrections),
+        ):
+            figure = draw(adjustment)
+            path = folder / name
+            figure.savefig(path)
+            plt.close(figure)
+            paths.append(path)
+    return paths
+
+
+def draw_residuals(adjustment: Adjustment) -> Any:
+    """Residual vectors of every CCD line over the strip, in pixels; rejected image points are crosses."""
+    result = adjustment.result
+    network, rays, s = result.network, result.network.rays, result.rays
+    out = np.zeros(len(rays), dtype=bool)
+    out[[r.ray for r in result.rejected if r.ray >= 0]] = True
+    lines = [k for k in range(len(network.camera.lines)) if (rays.ccd == k).any()]
+    strips = [i for i in range(len(network.strips)) if (rays.strip == i).any()]
+    figure, axes = plt.subplots(
+        len(strips), len(lines), figsize=(1.5 + 4.2 * len(lines), 0.9 + 1.9 * len(strips)), squeeze=False, sharex="row"
+    )
+    rms = float(np.sqrt(np.mean(s.v_px[~out] ** 2))) or 1.0
+    for a, i in enumerate(strips):
+        first, reach = float(rays.line[rays.strip == i].min()), float(np.ptp(rays.line[rays.strip == i])) or 1.0
+        for b, k in enumerate(lines):
+            axis = axes[a, b]
+            mine = np.flatnonzero((rays.strip == i) & (rays.ccd == k))
+            used = _thin(mine[~out[mine]])
+            pixels = network.camera.lines[k].pixels
+            # both residuals in the same scale on paper: one rms is 1/25 of the picture's width
+            axis.quiver(
+                rays.line[used], rays.sample[used], s.v_px[used, 0], s.v_px[used, 1], color=_BLUE, width=0.003,
+                scale=25 * rms, scale_units="width", angles="uv",
+            )  # fmt: skip
+            bad = mine[out[mine]]
+            axis.plot(rays.line[bad], rays.sample[bad], "x", color=_RED, markersize=5)
+            axis.set_xlim(first - 0.03 * reach, first + 1.03 * reach)
+            axis.set_ylim(-0.03 * pixels, 1.03 * pixels)
+            rms_here = np.sqrt(np.mean(s.v_px[used] ** 2, axis=0)) if len(used) else np.full(2, np.nan)
+            name = f"strip {network.strips[i].id}, {network.camera.lines[k].id}"
+            axis.set_title(f"{name}: rms {rms_here[0]:.2f}, {rms_here[1]:.2f} px", fontsize=9)
+            if a == len(strips) - 1:
+                axis.set_xlabel("line")
+            if b == 0:
+                axis.set_ylabel("sample")
+    figure.suptitle(
+        f"Residuals of line and sample; an arrow of 1/25 of a frame is {rms:.2f} px; {int(out.sum())} rejected (x)"
+    )
+    figure.tight_layout()
+    return figure
+
+
+def _thin(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    return places[:: max(1, -(-len(places) // MOST_ARROWS))]
+
+
+def draw_points(adjustment: Adjustment) -> Any:
+    """Differences at check and control points, adjusted minus given: planimetry as arrows, height as bars."""
+    result = adjustment.result
+    network, points = result.network, result.adjusted_points()
+    figure, axis = plt.subplots(figsize=(9, 7.5))
+    axis.plot(*network.approximate_l[:, :2].T, ".", color=_GREY, markersize=2.5, label="object points")
+    sets = (("check", network.check, _RED, "o"), ("control", network.control, _GREEN, "^"))
+    differences = []
+    for _, given, _, _ in sets:
+        d = np.where(np.isfinite(given.sigma_m), points[given.point] - given.xyz_l, np.nan)
+        differences.append(d)
+    together = np.concatenate(differences)
+    finite = together[np.isfinite(together)]
+    largest = float(np.abs(finite).max()) if len(finite) else 1.0
+    scale = 0.1 * float(np.ptp(network.approximate_l[:, :2], axis=0).max()) / max(largest, 1e-9)
+    for (name, given, colour, marker), d in zip(sets, differences, strict=True):
+        if not len(given):
+            continue
+        at = np.where(np.isfinite(given.xyz_l), given.xyz_l, points[given.point])
+        rms = np.sqrt(np.nanmean(d**2, axis=0)) if np.isfinite(d).any() else np.full(3, np.nan)
+        label = f"{name} ({len(given)}): RMS {rms[0]:.3f}, {rms[1]:.3f}, {rms[2]:.3f} m"
+        axis.plot(at[:, 0], at[:, 1], marker, color=colour, markersize=5, label=label)
+        flat = np.nan_to_num(d[:, :2]) * scale
+        axis.quiver(
+            at[:, 0],
+            at[:, 1],
+            flat[:, 0],
+            flat[:, 1],
+            color=colour,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.0025,
+        )
+        height = np.nan_to_num(d[:, 2]) * scale
+        axis.vlines(at[:, 0], at[:, 1], at[:, 1] + height, color=colour, linewidth=2.2, alpha=0.45)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("X, m (local)")
+    axis.set_ylabel("Y, m (local)")
+    axis.set_title(
+        f"Adjusted minus given, enlarged {scale:.0f} times (largest {largest:.3f} m); arrows: X, Y; broad bars: Z"
+    )
+    axis.legend(loc="upper right", fontsize=8)
+    figure.tight_layout()
+    return figure
+
+
+def draw_corrections(adjustment: Adjustment) -> Any:
+    """Correction functions of every strip over time with their one-sigma band."""
+    layout = adjustment.result.solution.layout
+    names = ("dX, m", "dY, m", "dZ, m", "domega, mdeg", "dphi, mdeg", "dkappa, mdeg")
+    unit = np.array([1.0] * 3 + [1e3 * 180 / np.pi] * 3)
+    figure, axes = plt.subplots(2, 3, figsize=(13, 6.5), sharex=True)
+    colours = plt.get_cmap("tab10")
+    several = len(layout.sets) > 1
+    for n, item in enumerate(layout.sets):
+        extent = item.model.extent
+        time = np.linspace(extent.start_s, extent.end_s, 400)
+        value, sigma = correction_functions(adjustment, item, time)
+        value, sigma = value * unit, sigma * unit
+        share = time - extent.start_s
+        for c, axis in enumerate(axes.ravel()):
+            colour = colours(n % 10)
+            axis.plot(share, value[:, c], color=colour, linewidth=1.3, label=set_name(adjustment, item))
+            axis.fill_between(
+                share, value[:, c] - sigma[:, c], value[:, c] + sigma[:, c], color=colour, alpha=0.18, linewidth=0
+            )
+    for c, axis in enumerate(axes.ravel()):
+        axis.axhline(0.0, color="black", linewidth=0.6)
+        axis.set_ylabel(names[c])
+        if c >= 3:
+            axis.set_xlabel("time from the start of the strip, s")
+    if several:
+        axes[0, 0].legend(fontsize=8, title="strip")
+    figure.suptitle("Corrections of the measured orientation, with one sigma")
+    figure.tight_layout()
+    return figure

@@ -1,0 +1,168 @@
+"""Stepwise elimination of additional parameters: solve, examine, remove the worst, solve again [K 4.2.2.4]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .adjustment import AdjustmentOptions, Problem, Solution, State, pose_problem, solve
+from .covariance import point_cofactors, point_unknown_cofactors
+from .determinability import Evidence, Limits, Removal, examine
+from .network import Network
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """Outcome: the adjustment with the determinable parameters, what was removed in which order, what stays in spite of
+    a failed criterion (name -> why)."""
+
+    solution: Solution
+    removed: tuple[Removal, ...]
+    kept: dict[str, str]
+
+
+def ground_sample_distance(network: Network) -> float:
+    """Median pixel size on the ground, metres, over all rays."""
+    rays = network.rays
+    height = np.abs(rays.position_l[:, 2] - network.approximate_l[rays.point, 2])
+    pitch = np.linalg.norm(rays.pitch_mm, axis=1)
+    return float(np.median(pitch / rays.focal_length_mm * height))
+
+
+def gather_evidence(solution: Solution) -> Evidence:
+    """What a solution says about its additional parameters."""
+    layout = solution.layout
+    m, first = layout.n_camera, layout.n_model
+    columns = np.arange(first, first + m)
+    unit = np.zeros((layout.n_unknowns, m))
+    unit[columns, np.arange(m)] = 1.0
+    Q = solution.factor.solve(unit)
+    q = np.maximum(np.diagonal(Q[columns]), 0.0)
+    everything = solution.factor.variances()
+    of_orientation = _correlation(Q[:first], everything[:first], q)
+    point_sigma = np.sqrt(np.maximum(np.einsum("pii->pi", point_cofactors(solution)), 0.0))
+    to_points = point_unknown_cofactors(solution, columns).reshape(-1, m)
+    of_points = _correlation(to_points, point_sigma.ravel() ** 2, q)
+    partner, strongest = _partners(solution, of_orientation, of_points)
+    effect = np.divide(to_points**2, q, out=np.zeros_like(to_points), where=q > 0).reshape(-1, 3, m)
+    sigma0 = solution.sigma0 if solution.redundancy > 0 else 1.0
+    return Evidence(
+        layout.names[first:],
+        solution.camera_parameters,
+        Q[columns],
+        _pivots(solution, q),
+        partner,
+        strongest,
+        np.sqrt(effect.mean(axis=0)).T,
+        sigma0,
+        max(solution.redundancy, 0),
+        ground_sample_distance(solution.network),
+        _ranks(solution),
+    )
+
+
+def _ranks(solution: Solution) -> NDArray[np.int64]:
+    """Which of a group to do without first: the parameter of the nadir line, to which those of the other lines then
+    refer; of powers the highest."""
+    camera = solution.network.camera
+    nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id if len(camera.lenses) == 1 else None
+    names = solution.layout.names[solution.layout.n_model :]
+    power = {"k2": 1, "k3": 2, "p2": 1}
+    return np.array([power.get(name.split("_")[0], int(name.partition("_")[2] == nadir)) for name in names])
+
+
+def eliminate(
+    solution: Solution,
+    limits: Limits = Limits(),  # noqa: B008  (frozen)
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
+    adapt: Callable[[Problem], Problem] = lambda problem: problem,
+    progress: Callable[[Removal], None] | None = None,
+) -> Elimination:
+    """Remove parameters that are not determinable, one at a time, the worst first.
+
+    Parameters
+    ----------
+    solution : with the full set
+    limits, options : critical values; how to iterate
+    adapt : what was done to the a-priori weights of the problem, for the problems posed anew
+    progress : called with every removal
+    """
+    removed: list[Removal] = []
+    kept: dict[str, str] = {}
+    while solution.layout.n_camera:
+        verdict = examine(gather_evidence(solution), limits)
+        kept = verdict.kept
+        if verdict.removal is None:
+            break
+        removed.append(verdict.removal)
+        if progress:
+            progress(verdict.removal)
+        solution = without(solution, verdict.removal.name, options, adapt)
+    return Elimination(solution, tuple(removed), kept)
+
+
+def without(solution: Solution, name: str, options: AdjustmentOptions, adapt: Callable[[Problem], Problem]) -> Solution:
+    """The adjustment without one additional parameter, from the values of the one with it."""
+    old = solution.problem
+    assert old.self_calibration is not None
+    smaller = old.self_calibration.without([name])
+    problem = adapt(pose_problem(old.network, old.model, smaller if smaller.n_unknowns else None))
+    problem = replace(problem, control=old.control, earlier=old.earlier)
+    place = old.layout.n_model + old.layout.names[old.layout.n_model :].index(name)
+    start = State(np.delete(solution.state.theta, place), solution.state.points_l)
+    return solve(problem, start, solution.ray_weight, options)
+
+
+def own_information(solution: Solution) -> Array:
+    """(n_unknowns,) diagonal of the normal matrix of the rays before anything is eliminated."""
+    layout, lin, weight = solution.layout, solution.linearisation, solution.ray_weight
+    n = np.zeros(layout.n_unknowns + 1)
+    squares = np.einsum("ckn,ckn->kn", lin.orientation, lin.orientation) * weight
+    for t, columns in enumerate(layout.columns):
+        values = squares[layout.component[t]] * layout.coefficients[layout.node[t]] ** 2
+        n += np.bincount(columns + 1, values, layout.n_unknowns + 1)  # place 0 takes the absent ones
+    own = n[1:]
+    if layout.camera is not None:
+        of_ray = layout.camera.columns[layout.camera.pattern]
+        squares = np.einsum("csn,csn->sn", lin.camera, lin.camera) * weight
+        for s in range(of_ray.shape[1]):
+            own[layout.n_model :] += np.bincount(of_ray[:, s] + 1, squares[s], layout.n_camera + 1)[1:]
+    return own
+
+
+def _pivots(solution: Solution, q: Array) -> Array:
+    """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where singular."""
+    own = own_information(solution)[solution.layout.n_model :]
+    pivot = np.divide(1.0, own * q, out=np.ones_like(q), where=(own > 0) & (q > 0))
+    pivot[own == 0] = 0.0
+    null = np.abs(solution.factor.undetermined.vectors[solution.layout.n_model :])
+    pivot[(null > 0.3).any(axis=1)] = 0.0
+    return np.minimum(pivot, 1.0)
+
+
+def _correlation(cross: Array, variance: Array, q: Array) -> Array:
+    """Correlation coefficients (k, m) from cross-cofactors (k, m) and variances (k,) and (m,)."""
+    scale = np.sqrt(np.maximum(variance, 0.0))[:, None] * np.sqrt(q)
+    return np.divide(cross, scale, out=np.zeros_like(cross), where=scale > 0)
+
+
+def _partners(solution: Solution, of_orientation: Array, of_points: Array) -> tuple[tuple[str, ...], Array]:
+    """The unknown with the largest correlation for each parameter, by name, and the coefficient."""
+    m = of_orientation.shape[1]
+    names, network = solution.layout.names, solution.network
+    partner, value = [], np.zeros(m)
+    for i in range(m):
+        e = int(np.argmax(np.abs(of_orientation[:, i])))
+        p = int(np.argmax(np.abs(of_points[:, i])))
+        if abs(of_points[p, i]) > abs(of_orientation[e, i]):
+            value[i] = of_points[p, i]
+            partner.append(f"{'XYZ'[p % 3]} of point {network.point_ids[p // 3]}")
+        else:
+            value[i] = of_orientation[e, i]
+            partner.append(names[e])
+    return tuple(partner), value

@@ -1,0 +1,104 @@
+"""Residuals of image points as the surveyor measured them: lines and samples, with cofactors, w and reliability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .adjustment import Solution
+from .covariance import Cofactors
+from .reliability import UNCONTROLLED
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class RayStatistics:
+    """Residuals of n rays; component 0 is the line, 1 the sample.
+
+    For a ray that is left out they are those of its prediction from all others.
+
+    Attributes
+    ----------
+    v_px : (n, 2) measured minus computed
+    sigma_px : (n, 2) a-priori
+    redundancy : (n, 2) redundancy numbers
+    w : (n, 2) normalised residuals [K A.17]; 0 where the observation is not controlled
+    joint : (n,) ``v^T Qvv^-1 v`` of both coordinates, chi-square with two degrees of freedom (one where only one
+        direction is controlled); what tells which of several rays is wrong
+    """
+
+    v_px: Array
+    sigma_px: Array
+    redundancy: Array
+    w: Array
+    joint: Array
+
+    @cached_property
+    def largest_w(self) -> Array:
+        """(n,) larger |w| of line and sample."""
+        return np.abs(self.w).max(axis=1)
+
+
+def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
+    """Whitened residuals of a solution turned back into lines and samples.
+
+    The covariance of a residual is ``M M^T``, where the columns of M are what one sigma of the line and one sigma of
+    the sample move it by; so ``M^-1 v`` are the residuals of line and sample in their sigmas.
+    """
+    rays, lin = solution.network.rays, solution.linearisation
+    g = solution.whitening.g
+    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
+    M = np.empty((len(rays), 2, 2))
+    # a later line lets the computed point move on: the residual goes against the image motion
+    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)).T
+    pitch = rays.pitch_mm.T * rays.sigma_sample_px
+    M[:, 0, 1] = g[0] * pitch[0]
+    M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
+    # robust weights fade away; what hardly has any is as good as left out
+    weight = np.where(solution.ray_weight > 1e-6, solution.ray_weight, 0.0)
+    Qvv = cofactors.residuals(weight)
+    # a ray with part of its weight: P^-1 - A Q A^T, in the units of full weight
+    part = np.where((weight > 0) & (weight < 1), 1.0 / np.where(weight > 0, weight, 1.0) - 1.0, 0.0)
+    Qvv = Qvv + part[:, None, None] * np.eye(2)
+    back = _inverse(M)
+    v = np.einsum("nij,jn->ni", back, lin.residual)
+    C = back @ Qvv @ np.swapaxes(back, 1, 2)
+    q = np.einsum("nii->ni", C)
+    unit = np.einsum("nij,nij->ni", back, back)  # 1, or sigma0^-2 where the image sigma was re-estimated
+    unit = unit * (1.0 + part[:, None])
+    redundancy = np.where((weight > 0)[:, None], q / unit, 0.0)
+    controlled = q / unit > UNCONTROLLED
+    w = np.where(controlled, v / np.sqrt(np.where(controlled, q, 1.0)), 0.0)
+    sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
+    return RayStatistics(v * sigma, sigma * np.sqrt(unit), np.clip(redundancy, 0.0, 1.0), w, _joint(v, C, unit))
+
+
+def _inverse(M: Array) -> Array:
+    """Inverses (n, 2, 2), kept finite where the image moves along the CCD line, so that line and sample are one."""
+    det = M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
+    floor = 1e-6 * np.einsum("nij,nij->n", M, M)
+    det = np.where(np.abs(det) > floor, det, np.where(det < 0, -floor, floor))
+    rows = [M[:, 1, 1], -M[:, 0, 1], -M[:, 1, 0], M[:, 0, 0]]
+    return (np.stack(rows, axis=1) / det[:, None]).reshape(-1, 2, 2)
+
+
+def _joint(v: Array, C: Array, unit: Array) -> Array:
+    """``v^T C^+ v`` (n,), without directions that are not controlled."""
+    limit = UNCONTROLLED * unit.max(axis=1)
+    a, b, d = C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]
+    smaller = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
+    x, y = v.T
+    det = a * d - b * b
+    regular = smaller > 10 * limit
+    joint = np.divide(d * x * x - 2 * b * x * y + a * y * y, det, out=np.zeros_like(det), where=regular)
+    rest = np.flatnonzero(~regular)
+    if len(rest):
+        values, vectors = np.linalg.eigh(C[rest])
+        along = np.einsum("nij,ni->nj", vectors, v[rest])
+        good = values > limit[rest, None]
+        joint[rest] = np.where(good, along**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
+    return joint

@@ -1,0 +1,214 @@
+"""Data snooping after Baarda: test, leave out the worst, adjust again, until nothing fails [K A.17].
+
+Several observations go in one round only where they cannot have caused each other's failure: at most one of an object
+point, and none that is much smaller than the largest of all. What was left out is tested against the adjustment without
+it and returns if it agrees: an outlier that was masked, or that made good neighbours look bad, is undone that way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from .adjustment import AdjustmentOptions, Solution, solve
+from .covariance import Cofactors, cofactors
+from .ray_statistics import RayStatistics, ray_statistics
+from .reliability import CRITICAL_W, normalised_residuals
+
+Array = NDArray[np.floating]
+
+#: A failing observation goes in the same round as the largest only if it has at least this share of it.
+TOGETHER = 0.5
+
+#: Rounds after which the search ends in any case; blocks with a few per cent of outliers take ten.
+MOST_ROUNDS = 100
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round, for progress lines."""
+
+    number: int
+    largest_w: float
+    left_out: int
+    returned: int
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """An observation left out: ray (place in the network's rays), or coordinate of a control point.
+
+    Attributes
+    ----------
+    ray, point, axis : place of the ray, or of the control point with its coordinate 0..2; -1 where it is the other kind
+    w : normalised residual against the final adjustment without it; when it was left out where nothing controls it now
+    reason : "snooping", or "lone" for the last ray of a point whose others contradicted each other
+    """
+
+    ray: int
+    point: int
+    axis: int
+    w: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Snooping:
+    """Outcome: the adjustment without the rejected observations, its cofactors and residuals."""
+
+    solution: Solution
+    cofactors: Cofactors
+    statistics: RayStatistics
+    rejected: tuple[Rejected, ...]
+    rounds: int
+
+
+def joint_limit(critical: float) -> float:
+    """Limit of the joint test value of line and sample with the same error probability as one |w| (13.8 for 3.29)."""
+    return float(stats.chi2.isf(2.0 * stats.norm.sf(critical), 2))
+
+
+def control_tests(solution: Solution, cofactors: Cofactors) -> Array:
+    """Normalised residuals (p, 3) of the control coordinates, adjusted minus given; 0 where nothing is given."""
+    control = solution.problem.control
+    root = np.sqrt(control.weight)
+    q = 1.0 - control.weight * np.einsum("pii->pi", cofactors.points)
+    v = -control.residual(solution.state.points_l)
+    return np.where(root > 0, normalised_residuals(v, q), 0.0)
+
+
+def snoop(
+    solution: Solution,
+    critical: float = CRITICAL_W,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
+    progress: Callable[[Round], None] | None = None,
+    before: Snooping | None = None,
+) -> Snooping:
+    """Leave out image points and control coordinates whose normalised residual exceeds the critical value.
+
+    An image point goes with both its coordinates, and so is judged by both: one of its w must fail, and the joint test
+    of the two at the same error probability, which keeps the share of good points lost at that of a single test. Of
+    several rays at one object point the one with the largest joint value goes.
+
+    Parameters
+    ----------
+    solution : start; rays it gives no weight stay out and are not reported
+    critical : of ``|w|``; 3.29 for alpha = 0.001
+    options : for the adjustments in between
+    progress : called after every round
+    before : search in an earlier adjustment of the same network, from which `solution` has its weights: what it left
+        out is reported again, and may return
+    """
+    if not critical > 0:
+        raise ValueError(f"critical value {critical}, wanted more than 0")
+    search = _Search(solution, critical, before)
+    for number in range(1, MOST_ROUNDS + 1):
+        largest, out = search.leave_out()
+        back = 0 if out else search.bring_back()
+        if progress:
+            progress(Round(number, largest, out, back))
+        if not (out or back):
+            return search.result(number)
+        search.solve(options)
+    return search.result(MOST_ROUNDS)
+
+
+class _Search:
+    """The state of a search: weights of rays and control, and what was left out when."""
+
+    def __init__(self, solution: Solution, critical: float, before: Snooping | None):
+        self.critical = critical
+        self.joint_limit = joint_limit(critical)
+        self.point = solution.network.rays.point
+        self.weight = solution.ray_weight.copy()
+        self.control_weight = solution.problem.control.weight.copy()
+        self.out: dict[int, float] = {}
+        self.control_out: dict[tuple[int, int], float] = {}
+        self.returned: set[int] = set()
+        for r in before.rejected if before else ():
+            if r.reason == "snooping" and r.ray >= 0:
+                self.out[r.ray] = r.w
+            elif r.reason == "snooping":
+                self.control_out[r.point, r.axis] = r.w
+        self._take(solution)
+
+    def _take(self, solution: Solution) -> None:
+        self.solution = solution
+        self.cofactors = cofactors(solution)
+        self.statistics = ray_statistics(solution, self.cofactors)
+        self.control_w = control_tests(solution, self.cofactors)
+
+    def solve(self, options: AdjustmentOptions) -> None:
+        control = self.solution.problem.control
+        if (self.control_weight != control.weight).any():
+            count = int((self.control_weight > 0).sum())
+            control = replace(control, weight=self.control_weight.copy(), n_observations=count)
+            problem = replace(self.solution.problem, control=control)
+            self.solution = replace(self.solution, problem=problem)
+        self._take(solve(self.solution.problem, self.solution, self.weight, options))
+
+    def leave_out(self) -> tuple[float, int]:
+        """Largest |w| of what takes part, and how many observations go."""
+        in_use = self.weight > 0
+        joint = self.statistics.joint
+        w = np.where(in_use & (joint > self.joint_limit), self.statistics.largest_w, 0.0)
+        control_w = np.abs(self.control_w)
+        of_control = float(control_w.max(initial=0.0))
+        limit = max(self.critical, TOGETHER * max(float(w.max(initial=0.0)), of_control))
+        largest = max(float(self.statistics.largest_w[in_use].max(initial=0.0)), of_control)
+        failing = np.flatnonzero(w > limit)
+        worst_control = control_w.max(axis=1)
+        first = failing[_largest_of_group(self.point[failing], joint[failing])]
+        # a control coordinate goes instead of a ray of its point if it fails more clearly
+        p, axis = np.nonzero((control_w > limit) & (control_w == worst_control[:, None]))
+        ray_w = np.zeros(len(control_w))
+        ray_w[self.point[first]] = np.sqrt(joint[first])
+        clear = worst_control[p] >= ray_w[p]
+        p, axis = p[clear], axis[clear]
+        first = first[~np.isin(self.point[first], p)]
+        for i in first:
+            self.out[int(i)] = float(w[i])
+        self.weight[first] = 0.0
+        for i, a in zip(p, axis, strict=True):
+            self.control_out[int(i), int(a)] = float(self.control_w[i, a])
+        self.control_weight[p, axis] = 0.0
+        return largest, len(first) + len(p)
+
+    def bring_back(self) -> int:
+        """Of the rays left out, those that agree with the others return, one of a point; each only once."""
+        candidates = np.array([i for i in self.out if i not in self.returned], dtype=np.int64)
+        if not len(candidates):
+            return 0
+        known = self.solution.points.rank[self.point[candidates]] == 3
+        w, joint = self.statistics.largest_w[candidates], self.statistics.joint[candidates]
+        agrees = (w <= self.critical) | (joint <= self.joint_limit)
+        candidates = candidates[known & agrees]
+        first = candidates[_largest_of_group(self.point[candidates], -self.statistics.joint[candidates])]
+        for i in first:
+            del self.out[int(i)]
+            self.returned.add(int(i))
+        self.weight[first] = 1.0
+        return len(first)
+
+    def result(self, rounds: int) -> Snooping:
+        rank = self.solution.points.rank
+        rejected = []
+        for i, w in self.out.items():
+            now = float(self.statistics.largest_w[i]) if rank[self.point[i]] == 3 else w
+            rejected.append(Rejected(i, -1, -1, now, "snooping"))
+        p = self.point
+        lone = np.flatnonzero((self.weight > 0) & (rank[p] < 3) & np.isin(p, [p[i] for i in self.out]))
+        rejected += [Rejected(int(i), -1, -1, 0.0, "lone") for i in lone]
+        rejected += [Rejected(-1, i, a, w, "snooping") for (i, a), w in self.control_out.items()]
+        rejected.sort(key=lambda r: -abs(r.w))
+        return Snooping(self.solution, self.cofactors, self.statistics, tuple(rejected), rounds)
+
+
+def _largest_of_group(group: NDArray[np.int64], value: Array) -> NDArray[np.int64]:
+    """Places of the largest value in each group."""
+    order = np.lexsort((-value, group))
+    return order[np.concatenate([[True], np.diff(group[order]) != 0])] if len(order) else order

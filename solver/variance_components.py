@@ -1,0 +1,205 @@
+"""Variance components of image, control, position and attitude, in the style of Helmert and Foerstner.
+
+For each group of observations the squares of its residuals are compared with its share of the redundancy,
+``s_g^2 = v_g^T P_g v_g / r_g`` with ``r_g = n_g - tr(P_g A_g Q A_g^T)``; its sigma is multiplied by ``s_g`` and the
+block adjusted again until nothing changes. A-priori sigmas of trajectories are guesses; this says what they should have
+been.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
+from .covariance import Cofactors, cofactors
+from .linearisation import Whitening
+from .normal_equations import Prior
+
+Array = NDArray[np.floating]
+
+GROUPS = ("image", "control", "position", "attitude")
+
+#: A group with less redundancy keeps its a-priori sigma: the estimate would be chance.
+LEAST_REDUNDANCY = 5.0
+
+#: Converged when no factor changes by more than this share of itself.
+TOLERANCE = 0.01
+
+#: Factors are kept inside these limits; beyond them a group contributes nothing that could be estimated.
+SMALLEST, LARGEST = 1e-3, 1e3
+
+
+@dataclass(frozen=True)
+class Component:
+    """One group.
+
+    Attributes
+    ----------
+    group : image, control, position or attitude
+    n : observations with weight
+    redundancy : their share of the redundancy
+    factor : what the a-priori sigmas were multiplied by
+    uncertainty : relative standard deviation of the factor, ``1 / sqrt(2 r)``
+    estimated : False where the group kept its a-priori sigmas
+    """
+
+    group: str
+    n: int
+    redundancy: float
+    factor: float
+    uncertainty: float
+    estimated: bool
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """Outcome: the adjustment with the sigmas found, and the groups."""
+
+    solution: Solution
+    components: tuple[Component, ...]
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What a-priori sigmas are multiplied by, per group."""
+
+    factor: dict[str, float] = field(default_factory=lambda: dict.fromkeys(GROUPS, 1.0))
+
+    def times(self, change: dict[str, float]) -> Scales:
+        return Scales({g: f * change.get(g, 1.0) for g, f in self.factor.items()})
+
+    def apply(self, problem: Problem) -> Problem:
+        """A problem posed with a-priori sigmas, with control, position and attitude scaled (the image is scaled in the
+        solution)."""
+        f = np.ones(problem.prior.n_observations)
+        for group, rows in prior_groups(problem).items():
+            f[rows] = 1.0 / self.factor[group]
+        matrix = csr_array(problem.prior.matrix.multiply(f[:, None]))
+        prior = Prior(matrix, problem.prior.value * f, csr_array(matrix.T @ matrix))
+        control = replace(problem.control, weight=problem.control.weight / self.factor["control"] ** 2)
+        return replace(problem, prior=prior, control=control)
+
+
+def prior_groups(problem: Problem) -> dict[str, NDArray[np.int64]]:
+    """Rows of the a-priori equations that belong to position and attitude, by the words of their labels."""
+    given = problem.layout.prior
+    labels = [label for label, s in zip(given.labels, given.sigma, strict=True) if np.isfinite(s)]
+    of_model = given.columns[np.isfinite(given.sigma)].max(axis=1) < problem.layout.n_model
+    words = [label.split(" of strip")[0] for label in labels]
+    angle = np.array([any(word in text for word in ("omega", "phi", "kappa")) for text in words], dtype=bool)
+    return {"position": np.flatnonzero(of_model & ~angle), "attitude": np.flatnonzero(of_model & angle)}
+
+
+def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float, float]]:
+    """Number, ``v^T P v`` and redundancy of each group in a solution."""
+    problem, weight = solution.problem, solution.ray_weight
+    v = solution.linearisation.residual
+    trace = np.einsum("nii->n", of.observed)
+    result = {
+        "image": (
+            2 * int((weight > 0).sum()),
+            float(np.sum(weight * (v * v).sum(axis=0))),
+            float(np.sum(np.where(weight > 0, 2.0 - weight * trace, 0.0))),
+        )
+    }
+    control = problem.control
+    given = control.weight > 0
+    c = control.residual(solution.state.points_l)
+    taken = control.weight * np.einsum("pii->pi", of.points)
+    result["control"] = (int(given.sum()), float(np.sum(c * c)), float(np.sum(np.where(given, 1.0 - taken, 0.0))))
+    e = problem.prior.residual(solution.state.theta)
+    r = 1.0 - _row_variances(solution)
+    for group, rows in prior_groups(problem).items():
+        result[group] = (len(rows), float(e[rows] @ e[rows]), float(r[rows].sum()))
+    return result
+
+
+def _can_be_estimated(sums: dict[str, tuple[int, float, float]], group: str) -> bool:
+    """Enough redundancy in the group and in the image points; a-priori values that nothing contradicts do not count."""
+    n, squares, redundancy = sums[group]
+    enough = redundancy >= LEAST_REDUNDANCY and sums["image"][2] >= LEAST_REDUNDANCY
+    return bool(n) and enough and squares > SMALLEST**2 * redundancy
+
+
+def _row_variances(solution: Solution) -> Array:
+    """Diagonal of ``B Q B^T`` for the whitened a-priori equations B."""
+    B = solution.problem.prior.matrix
+    entries = np.diff(B.indptr)
+    if entries.max(initial=0) <= 1:
+        square = B.multiply(B)
+        return np.asarray(square @ solution.factor.variances()).ravel()
+    Q = solution.factor.cofactors(np.arange(solution.layout.n_unknowns))
+    return np.asarray(B.multiply(B @ Q).sum(axis=1)).ravel()
+
+
+def estimate_components(
+    solution: Solution,
+    groups: tuple[str, ...] = GROUPS,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
+    most_iterations: int = 15,
+    start: Scales = Scales(),
+    progress: Callable[[int, dict[str, float]], None] | None = None,
+) -> VarianceComponents:
+    """Estimate the sigmas of some groups; the others keep theirs.
+
+    Parameters
+    ----------
+    solution : start
+    groups : of `GROUPS`
+    options : how to adjust in between
+    most_iterations : re-weightings at most
+    start : what the solution's sigmas have been multiplied by already
+    progress : called after every re-weighting with its number and the factors
+
+    Raises
+    ------
+    ValueError : a group that does not exist
+    """
+    unknown = set(groups) - set(GROUPS)
+    if unknown:
+        raise ValueError(f"no observation group {sorted(unknown)}; there are {', '.join(GROUPS)}")
+    scales, converged, number = start, False, 0
+    sums = group_sums(solution, cofactors(solution))
+    groups = tuple(g for g in groups if _can_be_estimated(sums, g))
+    while number < most_iterations:
+        change = {}
+        for group in groups:
+            _, squares, redundancy = sums[group]
+            total = scales.factor[group] * np.sqrt(max(squares, 0.0) / max(redundancy, 1e-6))
+            change[group] = float(np.clip(total, SMALLEST, LARGEST)) / scales.factor[group]
+        if all(abs(f - 1.0) <= TOLERANCE for f in change.values()):
+            converged = True
+            break
+        number += 1
+        scales = scales.times(change)
+        solution = scaled(solution, change, options)
+        sums = group_sums(solution, cofactors(solution))
+        if progress:
+            progress(number, scales.factor)
+    components = []
+    for group in GROUPS:
+        n, _, redundancy = sums[group]
+        uncertainty = 1.0 / np.sqrt(2.0 * redundancy) if redundancy > 0 else np.inf
+        components.append(Component(group, n, redundancy, scales.factor[group], float(uncertainty), group in groups))
+    return VarianceComponents(solution, tuple(components), number, converged)
+
+
+def scaled(
+    solution: Solution,
+    change: dict[str, float],
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
+) -> Solution:
+    """The adjustment with sigmas of groups multiplied by factors, from the values of the one before."""
+    problem = Scales().times(change).apply(solution.problem)
+    f = 1.0 / change.get("image", 1.0)
+    lin = solution.linearisation.reweighted(np.full(len(solution.ray_weight), f * f))
+    start = replace(solution, problem=problem, whitening=Whitening(solution.whitening.g * f), linearisation=lin)
+    start = replace(start, cost=cost_of(problem, solution.state, lin.reweighted(solution.ray_weight)))
+    return solve(problem, start, solution.ray_weight, options)
