@@ -1,0 +1,305 @@
+"""The adjuster: measured trajectory, tie points and control in; refined orientation, object points and reports out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ..solver.selfcalibration import SELF_CALIBRATIONS
+from ..solver.window import Window
+from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
+from . import adjuster_messages as out
+from . import convert
+from .adjuster_poses import OrientationStore, PoseBuffer
+from .navigator import slow_errors_of
+from .node import Message, Node
+
+#: Image sigma where neither measurement nor project gives one, px.
+DEFAULT_IMAGE_SIGMA_PX = 0.3
+
+
+class Adjuster(Node):
+    """Runs the sliding window.
+
+    The window is updated when the first message comes whose stamp lies beyond the next multiple of ``update_s`` of
+    platform time, with what came before it; so batches depend on stamps alone. The live orientation follows every pose
+    at once.
+
+    Parameters
+    ----------
+    model : trajectory model: wander, dgr, ppm, lim
+    segment_s, window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
+    update_s : platform time between updates
+    self_calibration : set of additional parameters, or "none"
+    """
+
+    name = "adjuster"
+    inputs = (
+        "configuration/project",
+        "configuration/camera",
+        "configuration/strip",
+        "trajectory/filtered",
+        "trajectory/smoothed",
+        "observation/control",
+        "observation/tie",
+    )
+    outputs = ("orientation/live", "orientation/final", "point/object", "adjustment/report", "event/log")
+
+    def __init__(
+        self,
+        *,
+        model: str = WindowOptions.model,
+        segment_s: float = WindowOptions.segment_s,
+        window_s: float = WindowOptions.window_s,
+        window_looks: float = WindowOptions.window_looks,
+        grid_hz: float = WindowOptions.grid_hz,
+        settle_s: float = WindowOptions.settle_s,
+        snoop: bool = True,
+        update_s: float = 0.2,
+        self_calibration: str = "none",
+    ) -> None:
+        super().__init__()
+        if not update_s > 0:
+            raise ValueError(f"update_s: wanted more than 0, got {update_s}")
+        if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
+            known = ", ".join(("none", *SELF_CALIBRATIONS))
+            raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
+        self.options = WindowOptions(
+            model=model, segment_s=segment_s, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
+            settle_s=settle_s, snoop=snoop,
+        )  # fmt: skip
+        self._update_ns = round(update_s * convert.SECOND_NS)
+        self._self_calibration = self_calibration
+        self._window: Window | None = None
+        self._project: Any = None
+        self._camera: Any = None
+        self._strips: dict[str, Any] = {}
+        self._control: dict[str, Any] = {}
+        self._reference_ns = 0
+        self._next_update_ns: int | None = None
+        self._stamp_ns = 0
+        self._poses = PoseBuffer()
+        self._store = OrientationStore()
+        self._refusals: list[Refusal] = []
+        self._rejected_total = 0
+        self._updates = 0
+        self._next_live = -np.inf
+
+    # -- node ----------------------------------------------------------------------------------------------------------
+
+    def step(self, message: Message) -> Iterable[Message]:
+        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        outputs = self._update_if_due(message.stamp_ns)
+        try:
+            outputs += self._take(message)
+        except ValueError as error:
+            self.problem("malformed", f"{message.topic}: {error}")
+        return outputs
+
+    def finish(self) -> Iterable[Message]:
+        if self._window is None:
+            return ()
+        self._hand_over_poses()
+        return self._results(self._window.finish())
+
+    def state(self) -> str:
+        if self._window is not None:
+            return "running"
+        missing = [n for n, c in (("project", self._project), ("camera", self._camera)) if c is None]
+        return "waiting for " + ", ".join(f"configuration/{n}" for n in missing)
+
+    def query(self, name: str, parameters: dict[str, str]) -> Message | None:
+        """Refined orientation at a time: ``query/orientation?t=..``, seconds (or nanoseconds) since the Unix epoch.
+
+        The newest answer for that time: final where there is one, else live. None for a time without one.
+        """
+        if name != "orientation":
+            return None
+        try:
+            t = float(parameters.get("t", ""))
+        except ValueError:
+            self.problem("malformed", f"query/orientation: t={parameters.get('t')!r} is not a time")
+            return None
+        if not np.isfinite(t):
+            return None
+        time_ns = int(parameters["t"]) if parameters["t"].isdigit() and t > 1e15 else round(t * convert.SECOND_NS)
+        body = self._store.at(time_ns)
+        return None if body is None else Message("query/orientation", self._stamp_ns, body)
+
+    # -- input ---------------------------------------------------------------------------------------------------------
+
+    def _take(self, message: Message) -> list[Message]:
+        topic, body = message.topic, message.body
+        if topic.startswith("trajectory/"):
+            return self._pose(body, topic == "trajectory/smoothed")
+        if topic == "observation/tie":
+            self._tie(body)
+        elif topic == "observation/control":
+            self._ground_point(body)
+        elif topic == "configuration/strip":
+            return self._strip(body)
+        else:
+            return self._configure(topic, body, message.stamp_ns)
+        return []
+
+    def _configure(self, topic: str, body: Any, stamp_ns: int) -> list[Message]:
+        if topic == "configuration/project":
+            if body == self._project:
+                return []
+            slow_errors_of(body)
+            self._project = body
+        else:
+            if body == self._camera:
+                return []
+            convert.camera_from(body)
+            self._camera = body
+        if self._project is None or self._camera is None:
+            return []
+        again = self._window is not None
+        self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
+        camera = convert.camera_from(self._camera)
+        parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
+        self._window = Window(camera, slow_errors_of(self._project), self.options, parameters)
+        self._poses.clear()
+        for strip in self._strips.values():
+            self._begin(strip)
+        for point in self._control.values():
+            self._ground_point(point)
+        return [self._log("configuration changed: the window starts again", warning=True)] if again else []
+
+    def _strip(self, body: Any) -> list[Message]:
+        if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
+            raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+        known = self._strips.get(body.id)
+        if known is not None and known.ended and body.ended:
+            return []
+        self._strips[body.id] = body
+        if self._window is None:
+            return []
+        self._begin(body)
+        return [self._log(f"strip {body.id} {'ended' if body.ended else 'began'}")]
+
+    def _begin(self, body: Any) -> None:
+        assert self._window is not None
+        first_s = self._seconds(body.first_line_time_ns)
+        self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines))
+        if body.ended:
+            self._window.end_strip(body.id, int(body.lines))
+
+    def _ground_point(self, body: Any) -> None:
+        if not body.point:
+            raise ValueError("ground point without a name")
+        xyz = np.array([body.x, body.y, body.z])
+        role = convert.role_of(body)
+        covariance = np.array(body.covariance) if body.covariance else np.zeros(9)
+        if not np.isfinite(xyz).all() or covariance.shape != (9,) or not np.isfinite(covariance).all():
+            raise ValueError(f"ground point {body.point!r} is not finite or its covariance has not 9 values")
+        variance = covariance[::4]
+        given = {"control": (0, 1, 2), "planimetric": (0, 1), "height": (2,)}.get(role, ())
+        sigma = np.full(3, np.inf)
+        for axis in given:
+            if not variance[axis] > 0:
+                raise ValueError(f"ground point {body.point!r}: variance {variance[axis]}, wanted more than 0")
+            sigma[axis] = np.sqrt(variance[axis])
+        self._control[body.point] = body
+        if self._window is not None:
+            self._window.add_control(body.point, xyz, sigma, role)
+
+    def _tie(self, body: Any) -> None:
+        if self._window is None:
+            self.problem("before configuration", "observation/tie came before configuration/project and camera")
+            return
+        sigma = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX
+        for image in body.images:
+            look = Look(
+                image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma, image.sigma_sample or sigma
+            )
+            if body.point:
+                self._window.add_look(body.point, look)
+            else:
+                self._refusals.append(Refusal("", look, "point without a name"))
+
+    def _pose(self, body: Any, smoothed: bool) -> list[Message]:
+        if self._window is None:
+            self.problem("before configuration", "a pose came before configuration/project and camera")
+            return []
+        sample = convert.pose_sample(body)
+        if sample.covariance is None:
+            raise ValueError("pose without covariance")
+        time_s = self._seconds(sample.time_ns)
+        self._poses.add(time_s, sample, smoothed, body.reason)
+        # without a filter (an imported trajectory) the smoothed poses lead
+        if smoothed and self._poses.filtered_seen:
+            return []
+        return self._live(time_s, sample.valid, body.reason)
+
+    # -- output --------------------------------------------------------------------------------------------------------
+
+    def _live(self, time_s: float, valid: bool, reason: str) -> list[Message]:
+        assert self._window is not None
+        hz = self.options.grid_hz
+        if time_s < self._next_live:
+            return []
+        due = self._window.grid(max(self._next_live, time_s - 1.0), time_s + 1e-6)
+        self._next_live = (np.floor(time_s * hz + 1e-6) + 1) / hz - 1e-6
+        if not len(due) or self._window.strip_at(time_s) is None:
+            return []
+        self._hand_over_poses()
+        outputs = []
+        for t in due:
+            orientation = self._window.live(float(t))
+            if orientation is not None:
+                outputs += out.orientations("orientation/live", orientation, self._reference_ns, self._stamp_ns,
+                                            lambda _: (valid, reason))  # fmt: skip
+        self._store.add_live([message.body for message in outputs])
+        return outputs
+
+    def _update_if_due(self, stamp_ns: int) -> list[Message]:
+        if self._window is None:
+            return []
+        if self._next_update_ns is None:
+            self._next_update_ns = (stamp_ns // self._update_ns + 1) * self._update_ns
+        if stamp_ns < self._next_update_ns:
+            return []
+        now_ns = stamp_ns // self._update_ns * self._update_ns
+        self._next_update_ns = now_ns + self._update_ns
+        self._hand_over_poses()
+        return self._results(self._window.update(self._seconds(now_ns)))
+
+    def _hand_over_poses(self) -> None:
+        assert self._window is not None
+        for poses in self._poses.take(self._window.slow):
+            late = self._window.trajectory.add(*poses)
+            if late:
+                self.problem("pose out of order", f"{late} poses came twice or too late")
+
+    def _results(self, update: WindowUpdate) -> list[Message]:
+        for refusal in update.refused:
+            self.counters["rejected" if refusal.reason == "snooping" else refusal.reason] += 1
+        refusals, self._refusals = self._refusals + update.refused, []
+        self._rejected_total += len(refusals)
+        outputs: list[Message] = []
+        for orientation in update.final:
+            messages = out.orientations(
+                "orientation/final", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
+            )
+            self._store.add_final([message.body for message in messages])
+            outputs += messages
+        outputs += [out.object_point(point, self._stamp_ns) for point in update.points]
+        if update.report is not None:
+            outputs.append(
+                out.report(
+                    update.report, refusals, self._rejected_total, self._updates, self._reference_ns, self._stamp_ns
+                )
+            )
+            self._updates += 1
+        outputs += [self._log(text) for text in update.events]
+        return outputs
+
+    def _seconds(self, time_ns: int) -> float:
+        return (time_ns - self._reference_ns) * 1e-9
+
+    def _log(self, text: str, warning: bool = False) -> Message:
+        return out.log(self.name, text, self._stamp_ns, warning)

@@ -1,0 +1,124 @@
+"""What the adjuster keeps of poses: measured ones on their way into the window, refined ones for those who ask."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..solver.slow_errors import SlowErrors
+from ..solver.trajectory import Trajectory
+from . import convert
+
+Array = NDArray[np.floating]
+Poses = tuple[list[float], Array, Array, Array, bool]
+
+#: Measured poses that were not valid are remembered this long, s; longer than any window.
+REMEMBERED_S = 300.0
+#: Refined orientation is kept this long for queries, s.
+KEPT_S = 600.0
+
+
+class PoseBuffer:
+    """Measured poses since the last hand-over."""
+
+    def __init__(self) -> None:
+        self.filtered_seen = False
+        self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
+        self._invalid: dict[bool, deque[tuple[float, str]]] = {False: deque(), True: deque()}
+        self._newest = {False: -np.inf, True: -np.inf}
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        for waiting in self._waiting.values():
+            waiting.clear()
+
+    def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
+        self.filtered_seen |= not smoothed
+        self._waiting[smoothed].append((time_s, sample))
+        self._newest[smoothed] = max(self._newest[smoothed], time_s)
+        if not sample.valid:
+            invalid = self._invalid[smoothed]
+            invalid.append((time_s, reason))
+            while invalid[0][0] < time_s - REMEMBERED_S:
+                invalid.popleft()
+
+    def take(self, slow: SlowErrors) -> Iterator[Poses]:
+        """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
+        for smoothed in (False, True):
+            waiting = self._waiting[smoothed]
+            if waiting:
+                samples = [sample for _, sample in waiting]
+                yield (
+                    [time for time, _ in waiting],
+                    np.array([s.position_l for s in samples]),
+                    np.array([s.quaternion for s in samples]),
+                    slow.without(np.array([s.covariance for s in samples])),
+                    smoothed,
+                )
+                self._waiting[smoothed] = []
+
+    def validity(self, time_s: float) -> tuple[bool, str]:
+        """Whether the measured pose at a time is valid, and why not."""
+        smoothed = time_s <= self._newest[True]
+        near = [reason for t, reason in self._invalid[smoothed] if abs(t - time_s) < 0.05]
+        return (False, near[0]) if near else (True, "")
+
+
+class OrientationStore:
+    """Refined orientation of the last minutes, final where there is, live elsewhere."""
+
+    def __init__(self) -> None:
+        self._final: tuple[list[int], list[Any]] = ([], [])
+        self._live: tuple[list[int], list[Any]] = ([], [])
+
+    def add_final(self, bodies: list[Any]) -> None:
+        self._add(self._final, bodies)
+
+    def add_live(self, bodies: list[Any]) -> None:
+        self._add(self._live, bodies)
+
+    @staticmethod
+    def _add(kept: tuple[list[int], list[Any]], bodies: list[Any]) -> None:
+        times, poses = kept
+        for body in bodies:
+            time_ns = convert.time_ns(body.timestamp)
+            if not times or time_ns > times[-1]:
+                times.append(time_ns)
+                poses.append(body)
+        old = bisect_right(times, times[-1] - round(KEPT_S * convert.SECOND_NS)) if times else 0
+        if old > 256:
+            del times[:old], poses[:old]
+
+    def at(self, time_ns: int) -> Any:
+        """Pose message at a time, interpolated between its neighbours; None outside."""
+        for times, poses in (self._final, self._live):
+            i = bisect_right(times, time_ns) - 1
+            if i >= 0 and times[i] == time_ns:
+                return poses[i]
+            if 0 <= i < len(times) - 1 and times[i + 1] - times[i] < convert.SECOND_NS:
+                return _between(poses[max(i - 1, 0) : i + 3], times[max(i - 1, 0) : i + 3], poses[i], time_ns)
+        return None
+
+
+def _between(poses: list[Any], times: list[int], before: Any, time_ns: int) -> Any:
+    samples = [convert.pose_sample(p) for p in poses]
+    reference = times[0]
+    trajectory = Trajectory(
+        [(t - reference) * 1e-9 for t in times], [s.position_l for s in samples], [s.quaternion for s in samples]
+    )
+    at = trajectory.at([(time_ns - reference) * 1e-9])
+    nearest = samples[int(np.argmin([abs(t - time_ns) for t in times]))]
+    return convert.pose_message(
+        time_ns,
+        at.position_l[0],
+        at.angles[0],
+        nearest.covariance,
+        valid=nearest.valid,
+        strip=before.strip,
+        correction=nearest.correction,
+    )

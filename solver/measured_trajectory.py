@@ -1,0 +1,199 @@
+"""The measured trajectory as it arrives: filtered at once, smoothed a little later, both interpolated the same way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .rotation import quaternion_conjugate, quaternion_multiply, vector_from_quaternion
+from .trajectory import Poses, Trajectory, _slopes
+
+Array = NDArray[np.floating]
+
+
+class GrowingTrajectory(Trajectory):
+    """A trajectory to which samples are added, and whose old ones are dropped, at constant cost per sample."""
+
+    def __init__(self) -> None:
+        self._size = self._start = 0
+        self._buffer = {
+            "time_s": np.empty(64),
+            "position_l": np.empty((64, 3)),
+            "quaternion": np.empty((64, 4)),
+            "_turn": np.empty((64, 3)),
+            "_velocity": np.empty((64, 3)),
+            "_rate": np.empty((64, 3)),
+            "covariance": np.empty((64, 6, 6)),
+        }
+        self._view()
+
+    def _view(self) -> None:
+        part = slice(self._start, self._size)
+        self.time_s, self.position_l = self._buffer["time_s"][part], self._buffer["position_l"][part]
+        self.quaternion, self.covariance = self._buffer["quaternion"][part], self._buffer["covariance"][part]
+        self._velocity, self._rate = self._buffer["_velocity"][part], self._buffer["_rate"][part]
+        self._turn = self._buffer["_turn"][self._start : max(self._size - 1, self._start)]
+
+    def append(self, time_s: Array, position_l: Array, quaternion: Array, covariance: Array) -> None:
+        """Add n samples after the last one; times increase."""
+        n = len(time_s)
+        if self._size + n > len(self._buffer["time_s"]):
+            self._make_room(n)
+        new = slice(self._size, self._size + n)
+        b = self._buffer
+        b["time_s"][new], b["position_l"][new], b["covariance"][new] = time_s, position_l, covariance
+        b["quaternion"][new] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        # the slope at the last old sample changes with its new neighbour
+        first = max(self._size - 2, self._start)
+        self._size += n
+        q = b["quaternion"][first : self._size]
+        if len(q) >= 2:
+            turn = vector_from_quaternion(quaternion_multiply(quaternion_conjugate(q[:-1]), q[1:]))
+            step = np.diff(b["time_s"][first : self._size])
+            velocity = _slopes(step, np.diff(b["position_l"][first : self._size], axis=0))
+            rate = _slopes(step, turn)
+            b["_turn"][first : self._size - 1] = turn
+            keep = first + (1 if first > self._start else 0)
+            b["_velocity"][keep : self._size] = velocity[keep - first :]
+            b["_rate"][keep : self._size] = rate[keep - first :]
+        self._view()
+
+    def forget(self, before_s: float) -> None:
+        """Drop samples older than a time, but for two."""
+        self._start += max(int(np.searchsorted(self.time_s, before_s)) - 2, 0)
+        self._view()
+
+    def _make_room(self, n: int) -> None:
+        used = slice(self._start, self._size)
+        size = max(2 * (self._size - self._start + n), 64)
+        for name, old in self._buffer.items():
+            fresh = np.empty((size, *old.shape[1:]))
+            fresh[: self._size - self._start] = old[used]
+            self._buffer[name] = fresh
+        self._start, self._size = 0, self._size - self._start
+
+
+@dataclass(frozen=True)
+class MeasuredPoses:
+    """Measured orientation at n times.
+
+    Attributes
+    ----------
+    poses : the orientation
+    covariance : (n, 6, 6) of its white noise
+    smoothed : (n,) whether from the smoother
+    """
+
+    poses: Poses
+    covariance: Array
+    smoothed: NDArray[np.bool_]
+
+
+class MeasuredTrajectory:
+    """Filtered and smoothed poses of one flight, the best of both at any time.
+
+    Parameters
+    ----------
+    gap_s : samples farther apart than this have a gap between them, in which there is no orientation
+    """
+
+    def __init__(self, gap_s: float = 0.2):
+        self.gap_s = gap_s
+        self._filtered, self._smoothed = GrowingTrajectory(), GrowingTrajectory()
+
+    def add(
+        self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike, covariance: ArrayLike, smoothed: bool
+    ) -> int:
+        """Add poses (n,) in time order; returns how many came too late or twice and were left out.
+
+        Parameters
+        ----------
+        covariance : (n, 6, 6) of the white noise
+        """
+        target = self._smoothed if smoothed else self._filtered
+        t = np.asarray(time_s, dtype=float)
+        last = target.end_s if len(target) else -np.inf
+        keep = t > np.maximum.accumulate(np.concatenate([[last], t[:-1]]))
+        if keep.any():
+            target.append(
+                t[keep], np.asarray(position_l)[keep], np.asarray(quaternion)[keep], np.asarray(covariance)[keep]
+            )
+        return int((~keep).sum())
+
+    @property
+    def end_s(self) -> float:
+        """Newest pose; minus infinity before the second one."""
+        ends = [t.end_s for t in (self._filtered, self._smoothed) if len(t) >= 2]
+        return max(ends, default=-np.inf)
+
+    @property
+    def start_s(self) -> float:
+        starts = [t.start_s for t in (self._filtered, self._smoothed) if len(t) >= 2]
+        return min(starts, default=np.inf)
+
+    @property
+    def smoothed_to_s(self) -> float:
+        return self._smoothed.end_s if len(self._smoothed) >= 2 else -np.inf
+
+    def covers(self, time_s: ArrayLike) -> NDArray[np.bool_]:
+        """Which times (n,) have an orientation: inside, and not in a gap."""
+        t = np.atleast_1d(np.asarray(time_s, dtype=float))
+        by_smoothed = self._is_smoothed(t)
+        good = np.zeros(len(t), dtype=bool)
+        for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
+            if len(source) < 2 or not mine.any():
+                continue
+            i = np.clip(np.searchsorted(source.time_s, t[mine], side="right") - 1, 0, len(source) - 2)
+            step = source.time_s[i + 1] - source.time_s[i]
+            good[mine] = source.covers(t[mine]) & (step <= self.gap_s)
+        return good
+
+    def _is_smoothed(self, t: Array) -> NDArray[np.bool_]:
+        if len(self._smoothed) < 2:
+            return np.zeros(len(t), dtype=bool)
+        return (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
+
+    def at(self, time_s: ArrayLike) -> MeasuredPoses:
+        """Orientation at times (n,) that are covered.
+
+        The white noise of the attitude shrinks between samples, since the interpolation averages; that of the position
+        does not, it is correlated over many samples.
+
+        Raises
+        ------
+        ValueError : a time outside
+        """
+        t = np.atleast_1d(np.asarray(time_s, dtype=float))
+        by_smoothed = self._is_smoothed(t)
+        values = np.empty((4, len(t), 3))
+        covariance = np.empty((len(t), 6, 6))
+        for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
+            if not mine.any():
+                continue
+            if len(source) < 2:
+                raise ValueError("no orientation yet")
+            p = source.at(t[mine])
+            values[:, mine] = p.position_l, p.angles, p.velocity_l, p.angle_rate
+            i = np.clip(np.searchsorted(source.time_s, t[mine], side="right") - 1, 0, len(source) - 2)
+            s = (t[mine] - source.time_s[i]) / (source.time_s[i + 1] - source.time_s[i])
+            nearest = source.covariance[np.where(s < 0.5, i, i + 1)]
+            factor = np.ones((len(s), 6))
+            factor[:, 3:] = np.sqrt(hermite_noise(s))[:, None]
+            covariance[mine] = nearest * factor[:, :, None] * factor[:, None, :]
+        return MeasuredPoses(Poses(t, *values), covariance, by_smoothed)
+
+    def forget(self, before_s: float) -> None:
+        """Drop what is older."""
+        for trajectory in (self._filtered, self._smoothed):
+            if len(trajectory):
+                trajectory.forget(before_s)
+
+
+def hermite_noise(s: Array) -> Array:
+    """Sum of squared weights of the four samples about share ``s`` of a step: what is left of white noise variance."""
+    s2, s3 = s * s, s * s * s
+    h0, h1 = s3 - 2 * s2 + s, s3 - s2  # of the slopes, each half the difference of its sample's neighbours
+    w0, w1 = 1 - 3 * s2 + 2 * s3, 3 * s2 - 2 * s3
+    return (0.5 * h0) ** 2 + (w0 - 0.5 * h1) ** 2 + (w1 + 0.5 * h0) ** 2 + (0.5 * h1) ** 2

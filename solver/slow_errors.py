@@ -1,0 +1,65 @@
+"""What is known beforehand of the slow errors of a measured trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+Three = tuple[float, float, float]
+_NONE: Three = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class SlowErrors:
+    """A-priori sigmas; X, Y, Z in metres, omega, phi, kappa in radians.
+
+    Attributes
+    ----------
+    offset_m, shift : constant over a strip
+    drift : change of omega, phi, kappa from the first line of a strip to the last
+    wander_m, wander : wander of position and attitude
+    wander_time_s : correlation time of both (see `wander`)
+    """
+
+    offset_m: Three = _NONE
+    shift: Three = _NONE
+    drift: Three = _NONE
+    wander_m: Three = _NONE
+    wander: Three = _NONE
+    wander_time_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
+                raise ValueError(f"{name}: wanted sigmas not below 0, got {value}")
+        if not self.wander_time_s > 0:
+            raise ValueError(f"wander_time_s: wanted more than 0 s, got {self.wander_time_s}")
+
+    @property
+    def attitude_sigma(self) -> Array:
+        """(3,) of omega, phi, kappa together; of the drift all, since a filter knows nothing of strips."""
+        return np.sqrt(np.square(self.shift) + np.square(self.drift) + np.square(self.wander))
+
+    @property
+    def position_sigma(self) -> Array:
+        """(3,) of X, Y, Z together."""
+        return np.sqrt(np.square(self.offset_m) + np.square(self.wander_m))
+
+    def without(self, covariance: Array) -> Array:
+        """The white part of pose covariances (..., 6, 6): what is left without slow errors, 1 mm and 1 urad at least.
+
+        Correlations are kept between components whose variance stays.
+        """
+        slow = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
+        floor = np.array([1e-3] * 3 + [1e-6] * 3) ** 2
+        rest = np.array(covariance, dtype=float)
+        variance = np.einsum("...ii->...i", rest)
+        left = np.maximum(variance - slow, floor)
+        too_small = left <= floor
+        variance[...] = left
+        off = too_small[..., :, None] | too_small[..., None, :]
+        rest[off & ~np.eye(6, dtype=bool)] = 0.0
+        return rest

@@ -1,0 +1,447 @@
+"""The sliding-window adjustment: triangulation while the strip is flown.
+
+Tie points are adjusted as they arrive, with the same residuals, models, weights and statistics as the batch adjustment.
+Object points are eliminated batch by batch; what is older than the window is marginalised into a prior on the rest.
+
+What is known of the slow errors beforehand makes the problem regular without any control; the window never refuses, it
+says how uncertain it is.
+
+A point that is seen again in a later strip after it has become final is a new point there: the tie to the earlier strip
+is not used. That loses information and invents none.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .camera import LineCamera
+from .measured_trajectory import MeasuredTrajectory
+from .selfcalibration import SelfCalibration
+from .slow_errors import SlowErrors
+from .window_batch import Batch
+from .window_output import CostHistory, Orienter, adjusted_points, parameters
+from .window_points import BatchMaker, ControlPoint, PointLooks
+from .window_results import (
+    Look,
+    Parameter,
+    RefinedOrientation,
+    Refusal,
+    WindowOptions,
+    WindowReport,
+    WindowUpdate,
+)
+from .window_snooping import snoop
+from .window_state import Marginal, WindowState
+from .window_strip import WindowStrip
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Unknowns become present so long before a time needs them, s.
+AHEAD_S = 1.0
+#: Change of a correction, m and rad, beyond which a batch is linearised again: its square over the flying height is far
+#: below a pixel.
+MOVED_M, MOVED_RAD = 0.5, 0.5e-3
+#: Every so many updates it is looked whether a batch has moved, if new data did not move far.
+LOOKED_AFTER = 16
+#: Time after which a look whose orientation has not come is given up, s.
+PATIENCE_S = 2.0
+
+
+class Window:
+    """The window; see the module.
+
+    Parameters
+    ----------
+    camera : line camera
+    slow : a-priori slow errors of the measured trajectory
+    options : settings
+    self_calibration : additional parameters to estimate all along
+
+    Attributes
+    ----------
+    trajectory : the measured trajectory; its covariance is that of the white noise alone
+    """
+
+    def __init__(
+        self,
+        camera: LineCamera,
+        slow: SlowErrors,
+        options: WindowOptions = WindowOptions(),  # noqa: B008  (frozen)
+        self_calibration: SelfCalibration | None = None,
+    ):
+        self.camera, self.slow, self.options = camera, slow, options
+        self.trajectory = MeasuredTrajectory()
+        self.state = WindowState()
+        self.strips: dict[str, WindowStrip] = {}
+        self.marginals: list[Marginal] = []
+        self._self_calibration = self_calibration
+        self._camera_columns = np.empty(0, dtype=np.int64)
+        if self_calibration is not None:
+            self._camera_columns = self.state.new_numbers(self_calibration.n_unknowns)
+            self.state.enter(self._camera_columns)
+            m = len(self._camera_columns)
+            columns = self._camera_columns[:, None].astype(np.int32)
+            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+        self._control: dict[str, ControlPoint] = {}
+        self._maker = BatchMaker(
+            camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
+        )
+        self._points: dict[str, PointLooks] = {}
+        self._arrived: dict[str, None] = {}
+        self._waiting: dict[str, None] = {}
+        self._batches: list[Batch] = []
+        self._done: deque[tuple[float, str]] = deque()
+        self._done_names: set[str] = set()
+        self._history = CostHistory()
+        self._now_s = -np.inf
+        self._serial = 0
+        self._newest_ray_s = -np.inf
+        self._length_s = options.window_s
+        self._orienter = Orienter(self.state, self.trajectory)
+        self._refused: list[Refusal] = []
+
+    # -- input ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def length_s(self) -> float:
+        """Length of the window; 0 while it is not known yet."""
+        return self._length_s
+
+    def begin_strip(self, id: str, first_line_time_s: float, line_rate_hz: float, lines: int = 0) -> None:
+        """A strip begins.
+
+        Raises
+        ------
+        ValueError : a line rate that is not positive
+        """
+        if not line_rate_hz > 0:
+            raise ValueError(f"strip {id}: line rate {line_rate_hz} Hz, wanted more than 0")
+        if id in self.strips:
+            return
+        self.strips[id] = WindowStrip(id, first_line_time_s, line_rate_hz, lines, self.slow, self.options, self.state)
+
+    def end_strip(self, id: str, lines: int = 0) -> None:
+        """A strip is over; ``lines`` as counted."""
+        if id in self.strips:
+            self.strips[id].end(lines)
+
+    def add_control(self, name: str, xyz_l: ArrayLike, sigma_m: ArrayLike, role: str) -> None:
+        """Known coordinates (3,), before or after the point's looks; sigma infinite where a coordinate is not given."""
+        self._control[name] = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
+        if name in self._points:
+            self._arrived[name] = None
+
+    def add_look(self, name: str, look: Look) -> str:
+        """A look at a point; returns why it is refused, "" if it is taken."""
+        reason = self._judge(look)
+        time_s = float(self.strips[look.strip].time_of(look.line)) if not reason else 0.0
+        if not reason and time_s < self.strips[look.strip].final_to_s:
+            reason = "too late"
+        if not reason and name in self._done_names:
+            reason = "point is final"
+        if not reason and name in self._points and look in self._points[name].looks:
+            reason = "duplicate"
+        if reason:
+            self._refused.append(Refusal(name, look, reason))
+            return reason
+        point = self._points.setdefault(name, PointLooks())
+        point.looks.append(look)
+        point.time_s.append(time_s)
+        point.weight.append(1.0)
+        self._arrived[name] = None
+        if point.batch is None:
+            self._waiting[name] = None
+        return ""
+
+    def _judge(self, look: Look) -> str:
+        values = (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px)
+        if not np.isfinite(values).all():
+            return "value is not finite"
+        if min(values[2:]) <= 0:
+            return "sigma is not positive"
+        if look.ccd not in self.camera.line_index:
+            return "unknown ccd"
+        if look.strip not in self.strips:
+            return "unknown strip"
+        if not self.camera.lines[self.camera.line_index[look.ccd]].contains(look.sample):
+            return "beyond the ccd line"
+        if not self.strips[look.strip].contains(look.line):
+            return "outside strip"
+        return ""
+
+    # -- update --------------------------------------------------------------------------------------------------------
+
+    def update(self, now_s: float) -> WindowUpdate:
+        """Work in what has arrived, let go what is older than the window."""
+        self._now_s = max(self._now_s, now_s)
+        self._serial += 1
+        result = WindowUpdate()
+        for strip in self.strips.values():
+            if not (strip.ended and strip.is_gone(self.state)):
+                strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
+        fresh = self._take_arrived()
+        self._replace_filtered()
+        iterations = self._solve(fresh, result)
+        for batch in fresh:
+            result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
+        self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
+        result.refused += self._refused
+        self._refused = []
+        result.report = self._report(iterations)
+        return result
+
+    def finish(self) -> WindowUpdate:
+        """Everything that is left becomes final."""
+        result = WindowUpdate()
+        fresh = self._take_arrived()
+        iterations = self._solve(fresh, result)
+        for strip in self.strips.values():
+            strip.end(0)
+        self._let_go(np.inf, result)
+        result.refused += self._refused
+        self._refused = []
+        result.report = self._report(iterations)
+        return result
+
+    def _take_arrived(self) -> list[Batch]:
+        """Batches of the points that have new looks with a measured orientation; others wait."""
+        ready: dict[int, list[str]] = {}
+        step = self.options.segment_s or 0.1 * self.slow.wander_time_s
+        again: list[Batch] = []
+        for name in self._with_orientation(list(self._arrived)):
+            point = self._points[name]
+            del self._arrived[name]
+            if point.batch is not None:
+                again.append(point.batch)
+                continue
+            if point.looks:
+                ready.setdefault(int(min(point.time_s) // step), []).append(name)
+        known: dict[str, Array] = {}
+        for batch in {id(b): b for b in again}.values():
+            known |= dict(zip(batch.names, batch.points_l, strict=True))
+            self._remove(batch)
+            for name in batch.names:
+                self._points[name].batch = None
+                self._waiting[name] = None
+                ready.setdefault(int(min(self._points[name].time_s) // step), []).append(name)
+        fresh = []
+        for names in ready.values():
+            few = [n for n in names if len(self._points[n].looks) < 2 and n not in self._control]
+            names = [n for n in names if n not in few]
+            if not names:
+                continue
+            batch, _ = self._maker.make(names, [self._points[n] for n in names], known)
+            if batch is None:
+                continue
+            for name in batch.names:
+                self._points[name].batch = batch
+                self._waiting.pop(name, None)
+            self._batches.append(batch)
+            self.state.add(batch.columns, batch.information)
+            self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
+            fresh.append(batch)
+        if not self._length_s and fresh:
+            self._length_s = self.options.window_looks * self._look_time(fresh[0])
+        return fresh
+
+    def _with_orientation(self, names: list[str]) -> list[str]:
+        """Points all of whose looks have a measured orientation; looks for which none will come are refused."""
+        times = [np.asarray(self._points[name].time_s) for name in names]
+        if not times:
+            return []
+        covered = np.split(self.trajectory.covers(np.concatenate(times)), np.cumsum([len(t) for t in times])[:-1])
+        ready = []
+        for name, t, good in zip(names, times, covered, strict=True):
+            lost = np.flatnonzero(~good & (t < min(self._now_s - PATIENCE_S, self.trajectory.end_s)))
+            point = self._points[name]
+            for i in lost[::-1]:
+                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
+                del point.looks[i], point.time_s[i], point.weight[i]
+            if len(lost) + int(good.sum()) == len(t):
+                ready.append(name)
+        return ready
+
+    def _look_time(self, batch: Batch) -> float:
+        """Time between the first and the last look at a point, from view angles, height and speed."""
+        rays = batch.rays
+        tangent = np.array([line.centre_mm[0] for line in self.camera.lines]) - self.camera.principal_point_mm[:, 0]
+        tangent = tangent / self.camera.focal_length_mm
+        height = float(np.median(rays.position_l[:, 2] - batch.points_l[rays.point, 2]))
+        speed = float(np.median(np.linalg.norm(rays.velocity_l, axis=1)))
+        return float(np.ptp(tangent)) * height / max(speed, 1.0)
+
+    def _replace_filtered(self) -> None:
+        """Put smoothed orientation under batches that had to do with the filtered one."""
+        for batch in self._batches:
+            if batch.provisional and batch.newest_s <= self.trajectory.smoothed_to_s:
+                self.state.add(batch.columns, batch.information, -1)
+                self._maker.refresh(batch)
+                batch.linearise(self.state.values(batch.columns), reweigh=True)
+                self.state.add(batch.columns, batch.information)
+
+    def _solve(self, fresh: list[Batch], result: WindowUpdate) -> int:
+        """Gauss-Newton from the warm state, then tests; number of solutions computed."""
+        iterations = 1
+        self.state.solve()
+        for batch in fresh:
+            batch.back_substitute(self.state.values(batch.columns))
+        if self._follow(fresh):
+            self.state.solve()
+            iterations += 1
+        if self.options.snoop:
+            due = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: b.tested)[: self.options.retest]
+            refused, rounds = snoop(fresh + due, self.state, self._points, self.options.critical, self._serial)
+            iterations += rounds
+            result.refused += refused
+        self._orienter.forget()
+        return iterations
+
+    def _follow(self, fresh: list[Batch]) -> bool:
+        """Linearise batches again whose unknowns or points have moved far; whether there were any.
+
+        New batches tell whether anything moved at all; if not, the others are looked after in turn.
+        """
+        values = [self.state.values(batch.columns) for batch in fresh]
+        far = any(b.has_moved(theta, MOVED_M, MOVED_RAD) for b, theta in zip(fresh, values, strict=True))
+        turn = self._serial % LOOKED_AFTER
+        others = self._batches if far else self._batches[turn::LOOKED_AFTER]
+        new = {id(b) for b in fresh}
+        due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
+        for batch in others:
+            theta = self.state.values(batch.columns)
+            if id(batch) not in new and batch.has_moved(theta, MOVED_M, MOVED_RAD):
+                batch.back_substitute(theta)
+                due.append((batch, theta))
+        for batch, theta in due:
+            self.state.add(batch.columns, batch.information, -1)
+            batch.linearise(theta, reweigh=False)
+            self.state.add(batch.columns, batch.information)
+        return bool(due)
+
+    def _remove(self, batch: Batch) -> None:
+        self.state.add(batch.columns, batch.information, -1)
+        self._batches = [b for b in self._batches if b is not batch]
+
+    # -- what leaves ---------------------------------------------------------------------------------------------------
+
+    def _let_go(self, limit_s: float, result: WindowUpdate) -> None:
+        """Batches and unknowns older than the limit, and those of strips that are over, become final."""
+        limits = {}
+        for strip in self.strips.values():
+            settled = strip.ended and self._now_s >= strip.end_s + self.options.settle_s
+            limits[strip.id] = np.inf if settled else limit_s
+        by_index = [limits[id] for id in self.strips]
+        leaving = [b for b in self._batches if b.oldest_s <= max(by_index[i] for i in b.strips)]
+        if self.options.snoop and leaving:
+            refused, rounds = snoop(leaving, self.state, self._points, self.options.critical, self._serial)
+            result.refused += refused
+            if rounds:
+                self._orienter.forget()
+        for batch in leaving:
+            result.points += adjusted_points(batch, self.state, self._points, self._control, final=True)
+        for batch in leaving:
+            self.state.fix(batch.columns, batch.information)
+            for name in batch.names:
+                del self._points[name]
+                self._arrived.pop(name, None)
+                self._done.append((batch.newest_s, name))
+                self._done_names.add(name)
+        if leaving:
+            gone = {id(b) for b in leaving}
+            self._batches = [b for b in self._batches if id(b) not in gone]
+        for strip in self.strips.values():
+            numbers, to_s = strip.leaving(limits[strip.id], self.state)
+            if not len(numbers):
+                continue
+            final = self._final(strip, to_s)
+            if final is not None:
+                result.final.append(final)
+            strip.final_to_s = to_s
+            self.marginals.append(self.state.marginalise(numbers))
+            self._orienter.forget()
+        self._forget(limit_s, result)
+
+    def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
+        """Orientation at the grid times that become final now."""
+        end = self.trajectory.end_s
+        if not np.isfinite(end):
+            return None
+        times = self.grid(strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
+        times = times[self.trajectory.covers(times)] if len(times) else times
+        return self._orienter.at(strip, times) if len(times) else None
+
+    def grid(self, from_s: float, to_s: float) -> Array:
+        """Times of the published orientation in [from, to)."""
+        hz = self.options.grid_hz
+        return np.arange(np.ceil(from_s * hz - 1e-6), np.ceil(to_s * hz - 1e-6)) / hz
+
+    def _forget(self, limit_s: float, result: WindowUpdate) -> None:
+        """Drop what nothing can need any more: single looks that found no partner, old poses, strips that are over."""
+        if not np.isfinite(limit_s) and limit_s < 0:
+            return
+        for name in list(self._waiting):
+            point = self._points[name]
+            if not point.time_s or max(point.time_s) <= limit_s:
+                result.refused += [Refusal(name, look, "too few looks") for look in point.looks]
+                del self._points[name], self._waiting[name]
+                self._arrived.pop(name, None)
+        while self._done and self._done[0][0] < limit_s - self._length_s:
+            self._done_names.discard(self._done.popleft()[1])
+        used = min((b.oldest_s for b in self._batches), default=np.inf)
+        waiting = min((min(self._points[n].time_s, default=np.inf) for n in self._waiting), default=np.inf)
+        finals = min((s.final_to_s for s in self.strips.values() if not s.is_gone(self.state)), default=np.inf)
+        self.trajectory.forget(min(limit_s - self._length_s, used, waiting, finals) - 1.0)
+
+    # -- output --------------------------------------------------------------------------------------------------------
+
+    def live(self, time_s: float) -> RefinedOrientation | None:
+        """Orientation at a time that is not final yet; None where no strip or no measured orientation is."""
+        strip = self.strip_at(time_s)
+        if strip is None or not self.trajectory.covers([time_s])[0]:
+            return None
+        if strip.activate(time_s, self.state):
+            self.state.solve()
+            self._orienter.forget()
+        return self._orienter.at(strip, np.array([time_s]))
+
+    def strip_at(self, time_s: float) -> WindowStrip | None:
+        """The strip a time belongs to, if its orientation there is not final."""
+        for strip in self.strips.values():
+            if strip.final_to_s <= time_s <= strip.end_s and time_s >= strip.first_line_time_s:
+                return strip
+        return None
+
+    def _report(self, iterations: int) -> WindowReport:
+        state, length = self.state, max(self._length_s, 1.0)
+        cost = state.cost()
+        sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
+        total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
+        active = [s for s in self.strips.values() if not s.is_gone(state)]
+        unknowns = len(state) + sum(b.determined for b in self._batches)
+        return WindowReport(
+            sigma0=sigma0,
+            redundancy=gained,
+            sigma0_total=total,
+            redundancy_total=state.redundancy,
+            observations=unknowns + sum(b.information.rows for b in self._batches),
+            unknowns=unknowns,
+            iterations=iterations,
+            start_s=min((s.final_to_s for s in active), default=self._now_s),
+            end_s=self._newest_ray_s,
+            rays=sum(b.active_rays for b in self._batches),
+            points=sum(b.n_points for b in self._batches),
+            control=sum(b.active_control for b in self._batches),
+            strip=active[-1].id if active else "",
+            parameters=self.parameters(active[-1]) if active else (),
+        )
+
+    def parameters(self, strip: WindowStrip) -> tuple[Parameter, ...]:
+        """Offset, shift and drift of a strip where its model has them, and the additional parameters."""
+        with_globals = self.options.model in ("wander", "dgr")
+        return parameters(
+            self.state, strip.numbers[:9] if with_globals else (), self._self_calibration, self._camera_columns
+        )

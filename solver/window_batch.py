@@ -1,0 +1,299 @@
+"""Object points that became known together: their rays, linearised, with the points eliminated; a block of its own.
+
+A batch gives the window one dense block of information about the unknowns its rays touch, and can take it back.
+Residuals, weights, models and statistics are those of the batch adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .collinearity import collinearity
+from .covariance import Cofactors
+from .layout import Layout
+from .linearisation import Linearisation, Whitening, linearise, residual_covariance, whiten
+from .models.base import Design, PseudoObservations
+from .network import Rays
+from .normal_equations import ControlWeights, PointNormals, point_normals
+from .ray_statistics import RayStatistics, ray_statistics
+from .selfcalibration import SelfCalibration
+
+if TYPE_CHECKING:
+    from .adjustment import Solution
+    from .elimination import Elimination
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+_NO_PRIOR = PseudoObservations(np.empty((0, 1), np.int32), np.empty((0, 1)), np.empty(0), np.empty(0), ())
+
+
+@dataclass(frozen=True)
+class Information:
+    """What a batch knows of the unknowns ``theta`` of its columns: cost ``square - 2 rhs theta + theta matrix theta``.
+
+    Attributes
+    ----------
+    matrix, rhs : (u, u), (u,) reduced normal equations
+    square : sum of squares at theta = 0
+    rows : observations less object coordinates
+    """
+
+    matrix: Array
+    rhs: Array
+    square: float
+    rows: int
+
+
+@dataclass
+class Batch:
+    """A mini network of p points with n rays (sorted by point).
+
+    Attributes
+    ----------
+    names : (p,) points
+    rays : image measurements with the measured orientation
+    pose_covariance : (n, 6, 6) white noise of the measured orientation, with what the model leaves out
+    columns : (u,) unknowns of the window that the rays touch, by their number; those of the camera last
+    layout : the same, counted from 0
+    control : weighted coordinates of the points
+    weight : (n,) factor on each ray's weight; 0 = left out
+    points_l : (p, 3)
+    provisional : whether a ray leans on a filtered pose that a smoothed one will replace
+    tested : number of the update that tested it last
+    active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    """
+
+    names: list[str]
+    rays: Rays
+    pose_covariance: Array
+    columns: IntArray
+    layout: Layout
+    control: ControlWeights
+    weight: Array
+    points_l: Array
+    provisional: bool
+    tested: int = -1
+    active_rays: int = field(init=False, default=0)
+    active_control: int = field(init=False, default=0)
+    determined: int = field(init=False, default=0)
+    origin_l: Array = field(init=False, repr=False)
+    theta: Array = field(init=False)
+    lin: Linearisation = field(init=False)
+    whitening: Whitening = field(init=False)
+    normals: PointNormals = field(init=False)
+    information: Information = field(init=False)
+    _rows: Array = field(init=False, repr=False)
+    _coupling: Array = field(init=False, repr=False)
+    _reach: Array | None = field(init=False, repr=False, default=None)
+
+    @property
+    def n_points(self) -> int:
+        return len(self.names)
+
+    def __post_init__(self) -> None:
+        self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
+        self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
+        self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
+
+    def linearise(self, theta: Array, reweigh: bool) -> None:
+        """Linearise at values (u,) of the unknowns and the present points; ``reweigh`` renews the rays' weights."""
+        self.theta, self.origin_l = theta, self.points_l
+        if reweigh:
+            self.whitening = self._weigh(theta)
+        self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+        self.eliminate()
+
+    def _weigh(self, theta: Array) -> Whitening:
+        correction = self.layout.corrections(theta)
+        _, d_orientation, _, _ = collinearity(
+            self.rays.position_l.T + correction[:3],
+            self.rays.angles.T + correction[3:],
+            self.points_l[self.rays.point].T,
+            self.rays.focal_length_mm,
+        )
+        covariance = residual_covariance(self.rays, d_orientation)
+        through = np.einsum("akn,nkl->anl", d_orientation, self.pose_covariance)
+        pose = np.einsum("anl,bln->abn", through, d_orientation)
+        return whiten(covariance + np.stack([pose[0, 0], pose[0, 1], pose[1, 1]]))
+
+    def eliminate(self) -> None:
+        """Information about the orientation, with the points eliminated, at the present linearisation and weights."""
+        n, u, p = len(self.rays), len(self.columns), self.n_points
+        lin = self.lin if (self.weight == 1.0).all() else self.lin.reweighted(self.weight)
+        layout, rays = self.layout, np.arange(n)
+        A = np.zeros((n, 2, u + 1))  # the last column takes what a ray does not have
+        for axis in range(2):
+            A[rays, axis, layout.columns] = layout.coefficients[layout.node] * lin.orientation[axis, layout.component]
+        if layout.camera is not None:
+            place = layout.camera.columns[layout.camera.pattern]
+            place = np.where(place >= 0, place + layout.n_model, u).T
+            for axis in range(2):
+                A[rays, axis, place] = lin.camera[axis]
+        A = np.ascontiguousarray(A[:, :, :u])
+        # the right-hand side for theta counted from zero, the points from where they are
+        lin = replace(lin, residual=lin.residual + np.einsum("nau,u->an", A, self.theta))
+        plan = cast("Elimination", _PointsOf(self.rays.point, p))
+        normals = point_normals(lin, plan, self.control, self.origin_l)
+        a, b, c, d, e, f = normals.inverse_factor[:, self.rays.point]
+        j = lin.point
+        w = np.stack([a * j[:, 0], b * j[:, 0] + c * j[:, 1], d * j[:, 0] + e * j[:, 1] + f * j[:, 2]])  # (3, 2, n)
+        D = np.add.reduceat(np.einsum("kan,nau->nku", w, A), self.first_ray[:-1], axis=0)  # (p, 3, u)
+        flat, of_points = A.reshape(2 * n, u), D.reshape(3 * p, u)
+        y = normals.y.T.ravel()
+        matrix = flat.T @ flat - of_points.T @ of_points
+        rhs = lin.residual.T.ravel() @ flat - y @ of_points
+        off = self.control.residual(self.origin_l)
+        square = float(np.vdot(lin.residual, lin.residual) + np.vdot(off, off) - y @ y)
+        self.active_rays = int((self.weight > 0).sum())
+        self.active_control = int(self.control.weight.any(axis=1).sum())
+        self.determined = int(normals.rank.sum())
+        rows = 2 * self.active_rays + self.control.n_observations - self.determined
+        self.normals, self.information = normals, Information(matrix, rhs, square, rows)
+        self._rows, self._coupling = A, D
+
+    def back_substitute(self, theta: Array) -> None:
+        """Put the points where they belong for values (u,) of the unknowns."""
+        rest = self.normals.y.T - self._coupling @ theta
+        self.points_l = self.origin_l + self.normals.back(rest.T).T
+
+    def has_moved(self, theta: Array, far_m: float, far_rad: float) -> bool:
+        """Whether a correction may have changed by more than this since the linearisation."""
+        far = np.array([far_m] * 3 + [far_rad] * 3)
+        if self._reach is None:
+            reach = np.zeros(len(self.columns) + 1)
+            largest = np.abs(self.layout.coefficients).max(axis=1)
+            for t, (node, component) in enumerate(zip(self.layout.node, self.layout.component, strict=True)):
+                reach[np.unique(self.layout.columns[t])] = largest[node] / far[component]
+            self._reach = reach[:-1]
+        return bool((np.abs(theta - self.theta) * self._reach).max(initial=0.0) > 1.0)
+
+    def points_moved(self) -> float:
+        """How far a point has moved at most since the linearisation, m."""
+        return float(np.abs(self.points_l - self.origin_l).max(initial=0.0))
+
+    def leave_out_control(self, fails: NDArray[np.bool_]) -> None:
+        """Take the weight from control coordinates (p, 3)."""
+        weight = np.where(fails, 0.0, self.control.weight)
+        self.control = ControlWeights(weight, self.control.xyz_l, int((weight > 0).sum()))
+
+    def cofactors(self, Q: Array) -> Cofactors:
+        """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
+        L = self._inverse_factors()
+        n, p = len(self.rays), self.n_points
+        D, u = self._coupling, len(self.columns)
+        inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
+        points = np.swapaxes(L, 1, 2) @ inner @ L
+        root = np.where(self.weight > 0, 1.0, 0.0)
+        j = self.lin.point.transpose(2, 0, 1)  # (n, 2, 3), of full weight
+        W = j @ np.swapaxes(L, 1, 2)[self.rays.point]
+        scale = np.where(self.weight > 0, np.sqrt(np.where(self.weight > 0, self.weight, 1.0)), 1.0)
+        own = self._rows / scale[:, None, None]
+        if (root == 0.0).any():
+            own[root == 0.0] = self._full_rows(np.flatnonzero(root == 0.0))
+        rows = own - W @ D[self.rays.point]
+        through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
+        observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
+        return Cofactors(np.diagonal(Q).copy(), points, observed)
+
+    def _full_rows(self, which: IntArray) -> Array:
+        """Rows (m, 2, u) of rays at full weight."""
+        layout, m = self.layout, np.arange(len(which))
+        A = np.zeros((len(which), 2, len(self.columns) + 1))
+        for axis in range(2):
+            A[m, axis, layout.columns[:, which]] = (
+                layout.coefficients[layout.node][:, which] * self.lin.orientation[axis, layout.component][:, which]
+            )
+        if layout.camera is not None:
+            place = layout.camera.columns[layout.camera.pattern[which]]
+            place = np.where(place >= 0, place + layout.n_model, len(self.columns)).T
+            for axis in range(2):
+                A[m, axis, place] = self.lin.camera[axis][:, which]
+        return A[:, :, :-1]
+
+    def _inverse_factors(self) -> Array:
+        """``L^-1`` (p, 3, 3)."""
+        a, b, c, d, e, f = self.normals.inverse_factor
+        zero = np.zeros_like(a)
+        return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
+
+    def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
+        """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
+        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+        view = _AsSolution(_RaysOf(self.rays), lin, self.whitening, self.weight)
+        return ray_statistics(cast("Solution", view), cofactors)
+
+
+@dataclass(frozen=True)
+class _PointsOf:
+    """As much of an elimination plan as the points' own normal matrices need."""
+
+    point: IntArray
+    n_points: int
+
+
+@dataclass(frozen=True)
+class _RaysOf:
+    rays: Rays
+
+
+@dataclass(frozen=True)
+class _AsSolution:
+    """As much of a solution as the statistics of its rays need."""
+
+    network: _RaysOf
+    linearisation: Linearisation
+    whitening: Whitening
+    ray_weight: Array
+
+
+def local_layout(
+    design: Design, strip: IntArray, self_calibration: SelfCalibration | None, camera_columns: IntArray, rays: Rays
+) -> tuple[IntArray, Layout]:
+    """The unknowns that rays touch, by their number in the window, and a layout that counts them from 0.
+
+    Parameters
+    ----------
+    design : columns by their number in the window
+    strip : (n,) set of each ray
+    self_calibration : additional parameters, all of which count as touched
+    camera_columns : (m,) their numbers
+    """
+    touched = np.unique(design.columns)
+    touched = touched[touched >= 0].astype(np.int64)
+    local = np.where(design.columns >= 0, np.searchsorted(touched, design.columns), -1)
+    node, component = np.nonzero((design.columns >= 0).any(axis=0))
+    camera = None
+    if self_calibration is not None:
+        camera = self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
+    layout = Layout(
+        (),
+        strip,
+        node,
+        component,
+        np.ascontiguousarray(local[:, node, component].T.astype(np.int32)),
+        np.ascontiguousarray(design.coefficients.T),
+        camera,
+        len(touched),
+        len(camera_columns) if camera is not None else 0,
+        (),
+        _NO_PRIOR,
+    )
+    return np.concatenate([touched, camera_columns if camera is not None else camera_columns[:0]]), layout
+
+
+def join_designs(parts: Sequence[tuple[IntArray, Design]], n: int) -> Design:
+    """One design for n rays from designs of groups of them (places, design)."""
+    width = max(d.coefficients.shape[1] for _, d in parts)
+    columns = np.full((n, width, 6), -1, dtype=np.int32)
+    coefficients = np.zeros((n, width))
+    for place, d in parts:
+        k = d.coefficients.shape[1]
+        columns[place, :k] = d.columns
+        coefficients[place, :k] = d.coefficients
+    return Design(columns, coefficients)

@@ -1,0 +1,177 @@
+"""What the window takes and gives: settings, looks, refined orientation, points, reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .reliability import CRITICAL_W
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """Settings of the sliding window.
+
+    Attributes
+    ----------
+    model : trajectory model: "wander" (see `models.wander`), "dgr", "ppm", "lim"
+    segment_s : longest segment (distance of fixes for "lim"); 0 = a tenth of the wander's correlation time
+    window_s : length; 0 = `window_looks` times the time between the first and the last look at a point
+    window_looks : see there
+    grid_hz : rate of the published orientation
+    settle_s : so long after the end of a strip late tie points are waited for; then the strip is final
+    critical : of Baarda's |w|
+    snoop : whether observations are tested at all
+    retest : batches tested again per update, besides new ones
+    """
+
+    model: str = "wander"
+    segment_s: float = 0.0
+    window_s: float = 0.0
+    window_looks: float = 1.5
+    grid_hz: float = 20.0
+    settle_s: float = 3.0
+    critical: float = CRITICAL_W
+    snoop: bool = True
+    retest: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("segment_s", "window_s", "settle_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
+        for name in ("window_looks", "grid_hz", "critical"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: wanted more than 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image measurement of a point: strip and CCD line by name, line and sample in pixels with their sigmas."""
+
+    strip: str
+    ccd: str
+    line: float
+    sample: float
+    sigma_line_px: float
+    sigma_sample_px: float
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A measurement that was not used, and why; ``w`` is 0 where no test decided."""
+
+    point: str
+    look: Look
+    reason: str
+    w: float = 0.0
+
+
+@dataclass(frozen=True)
+class RefinedOrientation:
+    """Refined exterior orientation at n times.
+
+    Attributes
+    ----------
+    strip : whose model it comes from
+    time_s : (n,)
+    position_l, angles : (n, 3) m; omega, phi, kappa in rad
+    covariance : (n, 6, 6) of correction and measurement noise together
+    correction : (n, 6) added to the measured orientation
+    """
+
+    strip: str
+    time_s: Array
+    position_l: Array
+    angles: Array
+    covariance: Array
+    correction: Array
+
+
+@dataclass(frozen=True)
+class RayResidual:
+    """Residual of one look, measured minus computed, px; ``w`` is the larger normalised one."""
+
+    look: Look
+    v_line: float
+    v_sample: float
+    w: float
+    rejected: bool
+
+
+@dataclass(frozen=True)
+class AdjustedPoint:
+    """An object point as it came out.
+
+    Attributes
+    ----------
+    name, role : role is tie, control, planimetric, height or check
+    xyz_l, covariance : (3,) m, (3, 3) m^2
+    rays : looks that take part
+    final : whether it has left the window
+    residuals : of all its looks
+    """
+
+    name: str
+    role: str
+    xyz_l: Array
+    covariance: Array
+    rays: int
+    final: bool
+    residuals: tuple[RayResidual, ...]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the present strip or of the camera."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+
+    @property
+    def t(self) -> float:
+        return self.value / self.sigma if self.sigma > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class WindowReport:
+    """Figures of one update; sigma0 is 1 a priori.
+
+    Attributes
+    ----------
+    sigma0, redundancy : over about the length of the window; NaN without redundancy
+    sigma0_total, redundancy_total : since the start
+    observations, unknowns : in the window, what was marginalised counting as one observation an unknown
+    start_s, end_s : orientation before the start is final; newest ray
+    """
+
+    sigma0: float
+    redundancy: int
+    sigma0_total: float
+    redundancy_total: int
+    observations: int
+    unknowns: int
+    iterations: int
+    start_s: float
+    end_s: float
+    rays: int
+    points: int
+    control: int
+    strip: str
+    parameters: tuple[Parameter, ...]
+
+
+@dataclass
+class WindowUpdate:
+    """What one update gave."""
+
+    report: WindowReport | None = None
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
