@@ -1,0 +1,105 @@
+"""The analysis of a recording: everything a report says, as numbers."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from statistics import median
+from typing import Any
+
+from .. import convert
+from .evaluation import evaluate_flight
+from .flight import Flight, updates_with_new_rays
+
+_LARGEST_REJECTED = 200
+
+
+def analyse(flight: Flight, recording: str, size_bytes: int | None = None) -> dict[str, Any]:
+    """Numbers of the report.
+
+    Returns
+    -------
+    the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
+    ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status), ``parameters`` (of the newest
+    report that has any), ``rejected_observations`` (the largest first), ``latency_s`` (median, max), ``events``
+    """
+    result = {"recording": _recording(flight, recording, size_bytes), **evaluate_flight(flight)}
+    result["topics"] = {topic: _topic(flight, topic) for topic in sorted(flight.counts)}
+    result["nodes"] = {name: _node(status) for name, status in sorted(flight.status.items())}
+    newest = next((r for _, r in reversed(flight.reports) if r.parameters), None)
+    result["parameters"] = [] if newest is None else [_parameter(p) for p in newest.parameters]
+    ranked = sorted(flight.rejected, key=lambda r: (-abs(r.w), r.point, r.ccd))
+    result["rejected_observations"] = [_rejected(r) for r in ranked[:_LARGEST_REJECTED]]
+    reports = [r for _, r in flight.reports]
+    latency = [r.data_latency_s for r, new in zip(reports, updates_with_new_rays(reports), strict=True) if new]
+    if latency:
+        result["latency_s"] = {"median": median(latency), "max": max(latency)}
+    result["events"] = [
+        {"time_s": float(flight.seconds(stamp)), "level": _level(body), "node": body.name, "text": body.message}
+        for stamp, body in flight.events
+    ]
+    return finite(result)
+
+
+def _recording(flight: Flight, recording: str, size_bytes: int | None) -> dict[str, Any]:
+    start = datetime.fromtimestamp(flight.start_ns / convert.SECOND_NS, UTC)
+    return {
+        "file": recording,
+        "bytes": size_bytes,
+        "start": start.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+        "seconds": (flight.end_ns - flight.start_ns) / convert.SECOND_NS,
+        "messages": flight.counts.total(),
+        "project": flight.project.name if flight.project is not None else None,
+        "camera": flight.camera.name if flight.camera is not None else None,
+        "strips": len(flight.strips),
+        "tie_points": len({look.point for look in flight.looks}),
+        "rays": len(flight.looks),
+        "control_points": sum(convert.role_of(g) != "check" for g in flight.ground.values()),
+        "check_points": sum(convert.role_of(g) == "check" for g in flight.ground.values()),
+    }
+
+
+def _topic(flight: Flight, topic: str) -> dict[str, Any]:
+    seconds = (flight.end_ns - flight.start_ns) / convert.SECOND_NS
+    count = flight.counts[topic]
+    return {
+        "messages": count,
+        "rate_hz": count / seconds if seconds > 0 else None,
+        "gaps": flight.gaps[topic],
+        "unusable": flight.refused[topic],
+    }
+
+
+def _node(status: Any) -> dict[str, Any]:
+    losses = {
+        f"{topic.topic} {kind}": int(getattr(topic, kind))
+        for topic in status.topics
+        for kind in ("gaps", "duplicates", "late", "malformed", "dropped")
+        if getattr(topic, kind)
+    }
+    counters = {counter.name: int(counter.value) for counter in status.counters}
+    return {"state": status.state, "counters": counters | losses, "last_problem": status.last_problem}
+
+
+def _parameter(p: Any) -> dict[str, Any]:
+    return {"name": p.name, "unit": p.unit, "value": p.value, "sigma": p.sigma, "t": p.t, "status": p.status}
+
+
+def _rejected(r: Any) -> dict[str, Any]:
+    names = ("point", "strip", "ccd", "line", "sample", "w", "reason")
+    return {name: getattr(r, name) for name in names}
+
+
+def _level(log: Any) -> str:
+    return log.DESCRIPTOR.fields_by_name["level"].enum_type.values_by_number[log.level].name.lower()
+
+
+def finite(value: Any) -> Any:
+    """The same with None in place of numbers that JSON does not know."""
+    if isinstance(value, dict):
+        return {key: finite(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,332 @@
+"""Accuracy of a recorded flight: orientation and object points against truth and check points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.accuracy import Accuracy, accuracy, angle_difference
+from ...solver.frames import R_lc_from_navigation, opk_covariance_from_navigation
+from ...solver.rotation import matrix_from_navigation, quaternion_from_matrix
+from ...solver.space_intersection import ImageRays, Intersection, intersect
+from ...solver.trajectory import Trajectory
+from .. import convert
+from .flight import Flight, Poses, collect, rejected_key
+
+Array = NDArray[np.floating]
+
+#: Rows of the orientation table, in order of processing.
+ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final")
+#: Points are intersected with these orientations; "filtered" is direct georeferencing.
+INTERSECTED = {"direct_georeferencing": "filtered", "live": "live", "final": "final"}
+_LARGEST_GAP_S = 1.0
+_IMAGE_SIGMA_PX = 0.3  # where the project names none
+
+
+def evaluate(recording: str | Path) -> dict[str, Any]:
+    """Accuracy of a recording; see `evaluate_flight`.
+
+    Raises
+    ------
+    UserError : a file that is not a recording, or is broken
+    """
+    from .source import messages_of
+
+    return {"recording": str(recording), **evaluate_flight(collect(messages_of(recording)))}
+
+
+def evaluate_flight(flight: Flight) -> dict[str, Any]:
+    """Accuracy of a flight.
+
+    Returns
+    -------
+    dict with
+
+    - ``orientation``: by name of ORIENTATIONS ("measured": straight from GNSS and INS), against the true trajectory,
+      over the times the final orientation covers: ``n, rmse_m, mean_m, max_m, sigma_m`` (X, Y, Z), ``rmse_deg`` ..
+      (omega, phi, kappa), ``nees``;
+    - ``points``: ``direct_georeferencing`` (space intersection with the filtered trajectory), ``live`` and ``final``
+      (with these orientations), ``adjusted_live`` and ``adjusted`` (as published), against true points: ``n, rmse_m,
+      mean_m, max_m, sigma_m, nees``;
+    - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
+    - ``improvement``: RMSE of direct georeferencing (filtered) / final: ``points`` (3), ``orientation`` (6);
+    - ``sigma0`` over the flight, ``redundancy``, ``updates``, ``rejected``;
+    - ``missing``: what the recording does not hold, one line each.
+
+    ``sigma`` is the theoretical value (root mean of the stated variances); keys without data are absent.
+    """
+    result: dict[str, Any] = {"orientation": {}, "points": {}, "check": {}, "control": {}, "missing": missing(flight)}
+    errors = orientation_errors(flight)
+    for name, (_, error, covariance) in errors.items():
+        result["orientation"][name] = _orientation_row(error, covariance)
+    intersections = intersect_points(flight)
+    truth, check = flight.truth_points, _given(flight, "check")
+    for target, known in (("points", truth), ("check", check), ("control", _given(flight, "control"))):
+        for name, (ids, xyz, covariance) in {**intersections, **_adjusted(flight)}.items():
+            row = _point_row(ids, xyz, covariance, known)
+            if row is not None:
+                result[target][name] = row
+    _improvement(result)
+    if flight.reports:
+        last = flight.reports[-1][1]
+        result["sigma0"] = last.sigma0_total or float(np.sqrt(np.mean([r.sigma0**2 for _, r in flight.reports])))
+        result["redundancy"] = last.redundancy_total or last.redundancy
+        result["updates"] = len(flight.reports)
+        result["rejected"] = max(last.rejected_total, len(flight.rejected))
+    return result
+
+
+def missing(flight: Flight) -> list[str]:
+    """What a full evaluation needs and the recording does not hold."""
+    wanted = [
+        (flight.project is not None, "configuration/project"),
+        (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
+        ("filtered" in flight.poses, "trajectory/filtered"),
+        ("final" in flight.poses, "orientation/final: the recording has not been through the adjuster"),
+        ("truth" in flight.poses, "truth/trajectory: no error of the orientation (truth is known in simulations only)"),
+        (bool(flight.truth_points), "truth/point: no error of the object points"),
+        (bool(flight.reports), "adjustment/report"),
+        (bool(flight.points), "point/object"),
+        (bool(_given(flight, "check")), "check points (observation/control with role check)"),
+    ]
+    return [text for there, text in wanted if not there]
+
+
+def measured_poses(flight: Flight) -> Poses | None:
+    """Orientation straight from the sensors: INS attitude, GNSS positions interpolated and freed from the lever arm."""
+    if flight.project is None or len(flight.gnss) < 2 or not flight.attitude:
+        return None
+    frame = convert.local_frame(flight.project)
+    fixes = {convert.time_ns(g.timestamp): g for g in flight.gnss}
+    fix_ns = np.array(sorted(fixes), dtype=np.int64)
+    geodetic = np.array([[fixes[t].latitude, fixes[t].longitude, fixes[t].altitude] for t in fix_ns])
+    antenna = frame.from_geodetic(*geodetic.T)
+    variance = np.array([_diagonal3(fixes[t].position_covariance) for t in fix_ns])
+    attitude = {a.time_ns: a for a in flight.attitude if fix_ns[0] <= a.time_ns <= fix_ns[-1]}
+    time = np.array(sorted(attitude), dtype=np.int64)
+    if len(time) < 2:
+        return None
+    step = max(1, round(0.05 * convert.SECOND_NS / float(np.median(np.diff(time)))))
+    time = time[::step]
+    rpy = np.array([[attitude[t].roll, attitude[t].pitch, attitude[t].heading] for t in time])
+    cov_rpy = np.array([np.diag(_diagonal3(attitude[t].covariance)) for t in time])
+    position = np.stack([np.interp(time, fix_ns, antenna[:, i]) for i in range(3)], axis=1)
+    spread = np.stack([np.interp(time, fix_ns, variance[:, i]) for i in range(3)], axis=1)
+    R_ln = frame.R_ln(position)
+    lever_l = np.einsum("nij,njk,k->ni", R_ln, matrix_from_navigation(*rpy.T), convert.lever_arm_of(flight.project))
+    position = position - lever_l
+    R_lc = R_lc_from_navigation(frame, position, rpy, convert.R_bc_of(flight.project))
+    covariance = np.zeros((len(time), 6, 6))
+    covariance[:, :3, :3] = spread[:, :, None] * np.eye(3)
+    covariance[:, 3:, 3:] = opk_covariance_from_navigation(rpy, R_lc, R_ln, cov_rpy)
+    covariance[~np.isfinite(covariance).all(axis=(1, 2))] = np.nan
+    q = quaternion_from_matrix(R_lc)
+    none6 = np.full((len(time), 6), np.nan)
+    everywhere = np.ones(len(time), dtype=bool)
+    return Poses(time, position, q, convert.angles_of(q), covariance, none6, everywhere, np.full(len(time), ""))
+
+
+def _diagonal3(values: Any) -> Array:
+    return np.array(values).reshape(3, 3).diagonal() if len(values) == 9 else np.full(3, np.nan)
+
+
+def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Array, Array]]:
+    """Time (n,), error estimate minus truth (n, 6) in m and rad, and stated covariance (n, 6, 6), by name.
+
+    Valid samples on strips, in the time the final orientation covers, so that rows compare like with like.
+    """
+    truth = flight.poses.get("truth")
+    if truth is None or len(truth) < 2:
+        return {}
+    all_poses = dict(flight.poses)
+    measured = measured_poses(flight)
+    if measured is not None:
+        all_poses["measured"] = measured
+    span = all_poses.get("final", truth).time_ns
+    true_path = truth.trajectory(flight.start_ns)
+    result = {}
+    for name in ORIENTATIONS:
+        poses = all_poses.get(name)
+        if poses is None:
+            continue
+        t = poses.time_ns
+        use = poses.valid & flight.during_strips(t) & (t >= span[0]) & (t <= span[-1])
+        use &= true_path.covers(flight.seconds(t))
+        if not use.any():
+            continue
+        poses = poses.take(use)
+        true = true_path.at(flight.seconds(poses.time_ns))
+        error = np.hstack([poses.position_l - true.position_l, angle_difference(poses.angles, true.angles)])
+        result[name] = poses.time_ns, error, poses.covariance
+    return result
+
+
+def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
+    """Point ids and rays with the filtered orientation, without those the adjustment rejected; None without any."""
+    filtered, camera = flight.poses.get("filtered"), flight.camera
+    if filtered is None or camera is None or len(filtered) < 2:
+        return None
+    bad = {rejected_key(r) for r in flight.rejected}
+    path = filtered.trajectory(flight.start_ns)
+    default = (flight.project.image_sigma_px if flight.project is not None else 0.0) or _IMAGE_SIGMA_PX
+    kept, rows, seen = [], [], set()
+    for look in flight.looks:
+        strip, ccd = flight.strips.get(look.strip), camera.line_index.get(look.ccd)
+        if strip is None or ccd is None or look.key in bad or look.key in seen:
+            continue
+        seen.add(look.key)
+        time = (strip.first_line_time_ns - flight.start_ns) / convert.SECOND_NS + look.line / strip.line_rate_hz
+        inside = not strip.lines or -0.5 <= look.line <= strip.lines - 0.5
+        if inside and path.start_s <= time <= path.end_s and camera.lines[ccd].contains(look.sample):
+            kept.append(look.point)
+            sigmas = look.sigma_line or default, look.sigma_sample or default
+            rows.append((ccd, look.sample, time, 1.0 / strip.line_rate_hz, *sigmas))
+    if not rows:
+        return None
+    ids, point = np.unique(kept, return_inverse=True)
+    table = np.array(rows)
+    ccd = table[:, 0].astype(int)
+    xy, pitch = camera.image_coordinates(ccd, table[:, 1])
+    pose = path.at(table[:, 2])
+    nearest = np.clip(np.searchsorted(path.time_s, table[:, 2]), 0, len(path) - 1)
+    covariance = filtered.covariance[nearest]
+    return [str(i) for i in ids], ImageRays(
+        point.astype(np.int64), table[:, 2], table[:, 3], pose.position_l, pose.angles, pose.velocity_l,
+        pose.angle_rate, xy, pitch, camera.focal_length_mm[ccd], table[:, 4], table[:, 5], covariance,
+    )  # fmt: skip
+
+
+def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
+    """Point ids, coordinates (p, 3) and covariance (p, 3, 3) by space intersection, by name of INTERSECTED.
+
+    All rows use the same rays: those that the final orientation covers, where there is one.
+    """
+    usable = usable_rays(flight)
+    if usable is None:
+        return {}
+    ids, rays = usable
+    corrections = {name: _corrections(flight, pose, rays.time_s) for name, pose in INTERSECTED.items()}
+    common = np.ones(len(rays.time_s), dtype=bool)
+    for found in corrections.values():
+        if found is not None:
+            common &= np.isfinite(found[0]).all(axis=1)
+    tau = flight.project.wander_time_s if flight.project is not None and flight.project.wander_time_s > 0 else np.inf
+    result = {}
+    for name, found in corrections.items():
+        if found is None or not common.any():
+            continue
+        correction, covariance = found
+        names = list(ImageRays.__dataclass_fields__)
+        chosen = {field: getattr(rays, field)[common] for field in names if field != "orientation_covariance"}
+        chosen["position_l"] = chosen["position_l"] + correction[common, :3]
+        chosen["angles"] = chosen["angles"] + correction[common, 3:]
+        stated = covariance[common] if np.isfinite(covariance[common]).all() else None
+        points: Intersection = intersect(ImageRays(**chosen, orientation_covariance=stated), len(ids), tau)
+        ok = points.known
+        result[name] = [i for i, k in zip(ids, ok, strict=True) if k], points.xyz_l[ok], points.covariance[ok]
+    return result
+
+
+def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array] | None:
+    """Correction to the filtered orientation (n, 6), NaN where not covered, and covariance (n, 6, 6) at ray times."""
+    poses, filtered = flight.poses.get(name), flight.poses["filtered"]
+    if poses is None or len(poses) < 2:
+        return None
+    t = flight.seconds(poses.time_ns)
+    nearest = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
+    if name == "filtered":
+        return np.zeros((len(time_s), 6)), filtered.covariance[nearest]
+    base = flight.poses.get("smoothed", filtered)  # the less noisy one: what is interpolated has to be smooth
+    values = _difference(poses, base, flight.start_ns)
+    correction = np.stack([np.interp(time_s, t, values[:, i], np.nan, np.nan) for i in range(6)], axis=1)
+    if base is not filtered:
+        above, below = base.trajectory(flight.start_ns), filtered.trajectory(flight.start_ns)
+        known = above.covers(time_s) & below.covers(time_s)
+        a, b = above.at(time_s[known]), below.at(time_s[known])
+        correction[~known] = np.nan
+        correction[known, :3] += a.position_l - b.position_l
+        correction[known, 3:] += angle_difference(a.angles, b.angles)
+    before = np.clip(nearest - 1, 0, len(t) - 1)
+    correction[(t[nearest] - t[before] > _LARGEST_GAP_S) & (time_s < t[nearest])] = np.nan
+    return correction, poses.covariance[nearest]
+
+
+def corrections_of(flight: Flight, poses: Poses) -> Array:
+    """Correction functions dX, dY, dZ, domega, dphi, dkappa (n, 6): as published, else orientation minus filtered."""
+    filtered = flight.poses.get("filtered")
+    bare = np.atleast_1d(~np.isfinite(poses.correction).all(axis=1))
+    if not bare.any() or filtered is None or len(filtered) < 2:
+        return poses.correction
+    return np.where(bare.reshape(-1, 1), _difference(poses, filtered, flight.start_ns), poses.correction)
+
+
+def _difference(poses: Poses, base: Poses, start_ns: int) -> Array:
+    """Position and angles minus those of a base at the same times (n, 6); NaN where the base has none."""
+    path: Trajectory = base.trajectory(start_ns)
+    t = (poses.time_ns - start_ns) / convert.SECOND_NS
+    known = path.covers(t)
+    below = path.at(t[known])
+    values = np.full((len(poses), 6), np.nan)
+    values[known, :3] = poses.position_l[known] - below.position_l
+    values[known, 3:] = angle_difference(poses.angles[known], below.angles)
+    return values
+
+
+def _adjusted(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
+    rows = {}
+    for name, points in (("adjusted_live", flight.live_points), ("adjusted", flight.points)):
+        if points:
+            values = list(points.values())
+            xyz = np.array([[p.x, p.y, p.z] for p in values])
+            none = np.full(9, np.nan)
+            cov = np.array([p.covariance if len(p.covariance) == 9 else none for p in values]).reshape(-1, 3, 3)
+            rows[name] = [p.point for p in values], xyz, cov
+    return rows
+
+
+def _given(flight: Flight, role: str) -> dict[str, Array]:
+    """Given coordinates of check points or of full control points."""
+    return {id: np.array([g.x, g.y, g.z]) for id, g in flight.ground.items() if convert.role_of(g) == role}
+
+
+def _point_row(ids: list[str], xyz: Array, covariance: Array, known: dict[str, Array]) -> dict[str, Any] | None:
+    both = [i for i, id in enumerate(ids) if id in known]
+    if not both:
+        return None
+    error = xyz[both] - np.array([known[ids[i]] for i in both])
+    return _row(accuracy(error, covariance[both]), "m")
+
+
+def _row(a: Accuracy, unit: str, scale: float = 1.0, part: slice = slice(None)) -> dict[str, Any]:
+    row: dict[str, Any] = {"n": a.n}
+    for name, values in (("rmse", a.rmse), ("mean", a.mean), ("max", a.maximum), ("sigma", a.sigma)):
+        if values is not None:
+            row[f"{name}_{unit}"] = (values[part] * scale).tolist()
+    if a.nees is not None:
+        row["nees"] = a.nees
+    return row
+
+
+def _orientation_row(error: Array, covariance: Array) -> dict[str, Any]:
+    a = accuracy(error, covariance)
+    return _row(a, "m", part=slice(0, 3)) | _row(a, "deg", float(np.degrees(1.0)), slice(3, 6))
+
+
+def _improvement(result: dict[str, Any]) -> None:
+    points, orientation = result["points"], result["orientation"]
+    better: dict[str, Any] = {}
+    final = points.get("final") or points.get("adjusted")
+    if final and "direct_georeferencing" in points:
+        better["points"] = _ratio(points["direct_georeferencing"]["rmse_m"], final["rmse_m"])
+    if "filtered" in orientation and "final" in orientation:
+        rows = [orientation[n]["rmse_m"] + orientation[n]["rmse_deg"] for n in ("filtered", "final")]
+        better["orientation"] = _ratio(*rows)
+    if better:
+        result["improvement"] = better
+
+
+def _ratio(first: list[float], second: list[float]) -> list[float | None]:
+    return [a / b if b > 0 else None for a, b in zip(first, second, strict=True)]

@@ -1,0 +1,251 @@
+"""A flight as arrays: what a recording says about orientation, points, residuals and the adjustment's progress."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import messages as m
+from ...solver.camera import LineCamera
+from ...solver.trajectory import Trajectory
+from .. import convert
+from ..node import Message
+
+Array = NDArray[np.floating]
+SECOND_NS = convert.SECOND_NS
+
+#: Topics of poses, and the name a report gives them.
+POSE_TOPICS = {
+    "trajectory/filtered": "filtered",
+    "trajectory/smoothed": "smoothed",
+    "orientation/live": "live",
+    "orientation/final": "final",
+    "truth/trajectory": "truth",
+}
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Orientation over time, in order of time; n samples.
+
+    Attributes
+    ----------
+    time_ns : (n,) UTC
+    position_l : (n, 3) m; quaternion : (n, 4) ``R_lc`` xyzw; angles : (n, 3) omega, phi, kappa, rad
+    covariance : (n, 6, 6) X, Y, Z, omega, phi, kappa; m, rad; NaN where the message has none
+    correction : (n, 6) m, rad; NaN where the message has none
+    valid : (n,); strip : (n,) "" between strips
+    """
+
+    time_ns: NDArray[np.int64]
+    position_l: Array
+    quaternion: Array
+    angles: Array
+    covariance: Array
+    correction: Array
+    valid: NDArray[np.bool_]
+    strip: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def take(self, which: Any) -> Poses:
+        """A selection by index or mask."""
+        return Poses(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    def trajectory(self, start_ns: int) -> Trajectory:
+        """Interpolator over seconds since ``start_ns``; raises ValueError for fewer than two samples."""
+        return Trajectory((self.time_ns - start_ns) / SECOND_NS, self.position_l, self.quaternion)
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image measurement of a point: ids, line and sample in px, their sigma (0: the project's)."""
+
+    point: str
+    strip: str
+    ccd: str
+    line: float
+    sample: float
+    sigma_line: float
+    sigma_sample: float
+
+    @property
+    def key(self) -> tuple[str, str, str, int, int]:
+        """What names it in a list of rejected observations: line and sample to a hundredth of a pixel."""
+        return self.point, self.strip, self.ccd, round(100 * self.line), round(100 * self.sample)
+
+
+@dataclass
+class Flight:
+    """Everything a report needs, collected from the messages of one recording.
+
+    Attributes
+    ----------
+    start_ns : stamp of the first message that is not configuration; times in seconds count from it
+    poses : by name, see POSE_TOPICS; names without messages are absent
+    gnss, attitude : messages as measured, in order of arrival
+    live_points, points : first LIVE and last FINAL (or last LIVE, without one) message of each object point
+    ground : control and check points by id; truth_points : true coordinates by id
+    reports : adjustment reports in order; rejected : the rejected observations they name, once each
+    counts : messages by topic; gaps : missing sequence numbers by topic; refused : messages that hold no usable value
+    status : newest status of each node
+    """
+
+    start_ns: int = 0
+    end_ns: int = 0
+    project: Any = None
+    camera: LineCamera | None = None
+    strips: dict[str, Any] = field(default_factory=dict)
+    poses: dict[str, Poses] = field(default_factory=dict)
+    gnss: list[Any] = field(default_factory=list)
+    attitude: list[Any] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+    live_points: dict[str, Any] = field(default_factory=dict)
+    points: dict[str, Any] = field(default_factory=dict)
+    ground: dict[str, Any] = field(default_factory=dict)
+    truth_points: dict[str, Array] = field(default_factory=dict)
+    reports: list[tuple[int, Any]] = field(default_factory=list)
+    rejected: list[Any] = field(default_factory=list)
+    events: list[tuple[int, Any]] = field(default_factory=list)
+    status: dict[str, Any] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    gaps: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def seconds(self, time_ns: Any) -> Any:
+        """Seconds since the start of the flight."""
+        return (np.asarray(time_ns) - self.start_ns) / SECOND_NS
+
+    def strip_times(self, strip: str) -> tuple[int, int] | None:
+        """First and last line of a strip, UTC ns; None where the number of lines is not known."""
+        message = self.strips.get(strip)
+        if message is None or not message.lines or not message.line_rate_hz > 0:
+            return None
+        length = int((message.lines - 1) / message.line_rate_hz * SECOND_NS)
+        return message.first_line_time_ns, message.first_line_time_ns + length
+
+    def during_strips(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which times lie on a strip; all of them where no strip is known."""
+        spans = [span for span in map(self.strip_times, self.strips) if span is not None]
+        if not spans:
+            return np.ones(len(time_ns), dtype=bool)
+        inside = np.zeros(len(time_ns), dtype=bool)
+        for first, last in spans:
+            inside |= (time_ns >= first) & (time_ns <= last)
+        return inside
+
+
+def collect(messages: Iterable[Message]) -> Flight:
+    """Read the messages of a recording once; what cannot be used is counted, never raised."""
+    flight = Flight()
+    rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
+    last_sequence: dict[tuple[str, str], int] = {}
+    rejected: dict[Any, Any] = {}
+    configured_ns: list[int] = []
+    for message in messages:
+        topic, body, stamp = message.topic, message.body, message.stamp_ns
+        flight.counts[topic] += 1
+        if message.sequence >= 0:
+            key = topic, message.source
+            last = last_sequence.get(key)
+            if last is not None and message.sequence > last + 1:
+                flight.gaps[topic] += message.sequence - last - 1
+            last_sequence[key] = message.sequence if last is None else max(last, message.sequence)
+        if topic.startswith(("configuration/", "observation/control", "truth/point", "status/")):
+            configured_ns.append(stamp)
+        else:
+            flight.start_ns = min(flight.start_ns or stamp, stamp)
+            flight.end_ns = max(flight.end_ns, stamp)
+        try:
+            _take(flight, rows, rejected, topic, stamp, body)
+        except (ValueError, IndexError, np.linalg.LinAlgError):
+            flight.refused[topic] += 1
+    if not flight.start_ns and configured_ns:
+        flight.start_ns, flight.end_ns = min(configured_ns), max(configured_ns)
+    flight.poses = {name: _poses(samples, keep_first=name == "live") for name, samples in rows.items() if samples}
+    for point in flight.points.values():
+        for r in point.residuals:
+            if r.rejected:
+                named = m.RejectedObservation(point=point.point, strip=r.strip, ccd=r.ccd, line=r.line, sample=r.sample)
+                named.w, named.reason = r.w, "snooping"
+                rejected.setdefault(rejected_key(named), named)
+    flight.rejected = list(rejected.values())
+    return flight
+
+
+def updates_with_new_rays(reports: Iterable[Any]) -> list[bool]:
+    """Which adjustment reports answer rays that the one before had not seen; between strips there are none."""
+    newest, new = 0, []
+    for r in reports:
+        new.append(r.rays > 0 and r.window_end_ns > newest)
+        newest = max(newest, r.window_end_ns)
+    return new
+
+
+def rejected_key(r: Any) -> tuple[str, str, str, int, int]:
+    """What names a rejected observation; the same as `Look.key` of the measurement."""
+    return r.point, r.strip, r.ccd, round(100 * r.line), round(100 * r.sample)
+
+
+def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], topic: str, stamp: int, body: Any):
+    if topic in POSE_TOPICS:
+        rows[POSE_TOPICS[topic]].append(convert.pose_sample(body))
+    elif topic == "observation/tie":
+        for i in body.images:
+            flight.looks.append(Look(body.point, i.strip, i.ccd, i.line, i.sample, i.sigma_line, i.sigma_sample))
+    elif topic == "point/object":
+        if body.status == body.LIVE:
+            flight.live_points.setdefault(body.point, body)
+        known = flight.points.get(body.point)
+        if known is None or body.status >= known.status:
+            flight.points[body.point] = body
+    elif topic == "adjustment/report":
+        flight.reports.append((stamp, body))
+        for r in body.rejected:
+            rejected[rejected_key(r)] = r
+    elif topic == "sensor/gnss":
+        flight.gnss.append(body)
+    elif topic == "sensor/attitude":
+        flight.attitude.append(body)
+    elif topic == "observation/control":
+        flight.ground[body.point] = body
+    elif topic == "truth/point":
+        flight.truth_points[body.point] = np.array([body.x, body.y, body.z])
+    elif topic == "configuration/project":
+        flight.project = body
+    elif topic == "configuration/camera":
+        flight.camera = convert.camera_from(body)
+    elif topic == "configuration/strip":
+        known = flight.strips.get(body.id)
+        if known is None or body.lines or not known.lines:
+            flight.strips[body.id] = body
+    elif topic == "event/log":
+        flight.events.append((stamp, body))
+    elif topic.startswith("status/"):
+        flight.status[topic.removeprefix("status/")] = body
+
+
+def _poses(samples: list[convert.PoseSample], keep_first: bool) -> Poses:
+    """Samples in order of time; of two at the same time the first or the last is kept."""
+    time = np.array([s.time_ns for s in samples], dtype=np.int64)
+    ordered = samples if keep_first else samples[::-1]
+    _, index = np.unique(time if keep_first else time[::-1], return_index=True)
+    kept = [ordered[i] for i in index]
+    none6, none66 = np.full(6, np.nan), np.full((6, 6), np.nan)
+    quaternion = np.array([s.quaternion for s in kept])
+    return Poses(
+        np.array([s.time_ns for s in kept], dtype=np.int64),
+        np.array([s.position_l for s in kept]),
+        quaternion,
+        convert.angles_of(quaternion),
+        np.array([none66 if s.covariance is None else s.covariance for s in kept]),
+        np.array([none6 if s.correction is None or len(s.correction) != 6 else s.correction for s in kept]),
+        np.array([s.valid for s in kept]),
+        np.array([s.strip for s in kept]),
+    )

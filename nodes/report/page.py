@@ -1,0 +1,286 @@
+"""The report as one HTML page that needs nothing else: figures and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any
+
+from . import figures
+from .flight import Flight
+from .page_style import CSS
+from .style import styled, svg
+
+_MDEG = 1000.0
+_ORIENTATION = {
+    "measured": "measured (GNSS, INS)",
+    "filtered": "filtered trajectory",
+    "smoothed": "smoothed trajectory",
+    "live": "on-line, live",
+    "final": "on-line, final",
+}
+_POINTS = {
+    "direct_georeferencing": "direct georeferencing",
+    "live": "intersected with live orientation",
+    "final": "intersected with final orientation",
+    "adjusted_live": "adjusted, live",
+    "adjusted": "adjusted, final",
+}
+_SHOWN_REJECTED = 40
+_SHOWN_EVENTS = 60
+
+
+def page(flight: Flight, result: dict[str, Any]) -> str:
+    """The page of a flight and its `analyse` result."""
+    recording = result["recording"]
+    title = f"Flight report: {recording['project'] or recording['file']}"
+    with styled():
+        body = [
+            f"<h1>{escape(title)}</h1>",
+            f'<p class="soft">{escape(_about(recording))}</p>',
+            f'<p class="summary">{summary(result)}</p>',
+            _tiles(result),
+            _missing(result["missing"]),
+            _section("Flight", _figure(figures.trajectory_map(flight), _MAP_NOTE)),
+            _section("Accuracy", *_accuracy(result)),
+            _section("Errors against truth", _figure(figures.errors(flight), _ERRORS_NOTE)),
+            _section("Adjustment", _figure(figures.progress(flight), "")),
+            _section("Correction functions", _figure(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
+            _section("Residuals in image space", _figure(figures.residuals(flight), _RESIDUALS_NOTE)),
+            _section("Rejected observations", _rejected(result)),
+            _section("Parameters", _parameters(result)),
+            _section("Messages, nodes and events", *_operation(result)),
+        ]
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{CSS}</style></head>\n'
+        f"<body><main>\n{chr(10).join(part for part in body if part)}\n"
+        f"<footer>triline analyze, {escape(recording['file'])}. Angles in tables of the orientation are in "
+        "thousandths of a degree (mdeg).</footer>\n</main></body></html>\n"
+    )
+
+
+_MAP_NOTE = (
+    "Flown trajectory and strips with object points. Arrows and bars are adjusted minus given coordinates, enlarged."
+)
+_ERRORS_NOTE = (
+    "Estimate minus truth on the strips. The band is what the final orientation states of itself, three sigma."
+)
+_CORRECTIONS_NOTE = (
+    "What is added to the measured orientation. The dashed line is what would have been right (truth minus filtered)."
+)
+_RESIDUALS_NOTE = "Measured minus computed at the last estimate of each point. Rejected rays are marked at their place."
+
+
+def summary(result: dict[str, Any]) -> str:
+    """One line: how good it is."""
+    parts = []
+    points, better = result["points"] or result["check"], result.get("improvement", {})
+    against = "truth" if result["points"] else "check points"
+    direct, final = points.get("direct_georeferencing"), points.get("final") or points.get("adjusted")
+    if direct and final:
+        d, f = (" / ".join(f"{v:.2f}" for v in row["rmse_m"]) for row in (direct, final))
+        parts.append(
+            f"object points {d} m by direct georeferencing, <b>{f} m</b> after triangulation (X / Y / Z, {against})"
+        )
+    if "points" in better and all(better["points"]):
+        parts.append(f"{min(better['points']):.1f} times better at least")
+    if "sigma0" in result:
+        parts.append(f"sigma0 <b>{result['sigma0']:.3f}</b>")
+        parts.append(f"{result['rejected']} observations rejected")
+    return (
+        "; ".join(parts)[:1].upper() + "; ".join(parts)[1:] + "."
+        if parts
+        else "Nothing was adjusted in this recording."
+    )
+
+
+def _about(recording: dict[str, Any]) -> str:
+    parts = [
+        recording["file"],
+        recording["start"],
+        f"{recording['seconds']:.1f} s",
+        f"{recording['messages']} messages",
+    ]
+    if recording["camera"]:
+        parts.append(f"camera {recording['camera']}")
+    parts.append(f"{recording['strips']} strip{'s' if recording['strips'] != 1 else ''}")
+    return " · ".join(parts)
+
+
+def _tiles(result: dict[str, Any]) -> str:
+    recording = result["recording"]
+    tiles = []
+    if "sigma0" in result:
+        good = "good" if 0.9 <= result["sigma0"] <= 1.1 else "bad"
+        tiles.append((f"{result['sigma0']:.3f}", "sigma0, 1 expected", good))
+    final = result["orientation"].get("final", {})
+    if "nees" in final:
+        good = "good" if 0.5 <= final["nees"] <= 2.0 else "bad"
+        tiles.append((f"{final['nees']:.2f}", "normalised error squared of the final orientation, 1 expected", good))
+    better = result.get("improvement", {})
+    for key, text in (("points", "object points"), ("orientation", "orientation")):
+        if all(better.get(key) or [None]):
+            low, high = min(better[key]), max(better[key])
+            tiles.append(
+                (f"{low:.1f}–{high:.1f} ×", f"better {text} than direct georeferencing", "good" if low > 1 else "bad")
+            )
+    tiles.append((f"{recording['tie_points']}", f"object points in {recording['rays']} rays", ""))
+    tiles.append((f"{recording['control_points']} / {recording['check_points']}", "control / check points", ""))
+    if "latency_s" in result:
+        tiles.append((f"{1000 * result['latency_s']['median']:.0f} ms", "latency, newest ray to answer (median)", ""))
+    lost = sum(topic["gaps"] for topic in result["topics"].values())
+    tiles.append((str(lost), "messages missing by their numbers", "bad" if lost else "good"))
+    cells = (f'<div class="tile {c}"><b>{escape(v)}</b><span>{escape(t)}</span></div>' for v, t, c in tiles)
+    return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _missing(lines: list[str]) -> str:
+    if not lines:
+        return ""
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f'<div class="missing">Not in this recording:<ul>{items}</ul></div>'
+
+
+def _section(title: str, *parts: str) -> str:
+    content = "\n".join(part for part in parts if part)
+    return f"<section><h2>{escape(title)}</h2>\n{content}\n</section>" if content else ""
+
+
+def _figure(figure: Any, caption: str) -> str:
+    if figure is None:
+        return ""
+    note = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f"<figure>{svg(figure)}{note}</figure>"
+
+
+def _accuracy(result: dict[str, Any]) -> Iterable[str]:
+    if result["orientation"]:
+        yield "<h3>Exterior orientation against truth</h3>"
+        heads = [
+            ("RMSE [m]", "X Y Z"),
+            ("RMSE [mdeg]", "ω φ κ"),
+            ("σ stated [m]", "X Y Z"),
+            ("σ stated [mdeg]", "ω φ κ"),
+        ]
+        rows = [
+            (
+                _ORIENTATION[name],
+                row["n"],
+                [row["rmse_m"], _times(row["rmse_deg"]), row.get("sigma_m"), _times(row.get("sigma_deg"))],
+                row.get("nees"),
+                name == "final",
+            )
+            for name, row in result["orientation"].items()
+        ]
+        yield _accuracy_table(heads, rows, [3, 2, 3, 2])
+    for key, title in (
+        ("points", "Object points against truth"),
+        ("check", "Object points against check points"),
+        ("control", "Object points against control points"),
+    ):
+        if result[key]:
+            yield f"<h3>{title}</h3>"
+            heads = [("RMSE [m]", "X Y Z"), ("mean [m]", "X Y Z"), ("largest [m]", "X Y Z"), ("σ stated [m]", "X Y Z")]
+            rows = [
+                (
+                    _POINTS[name],
+                    row["n"],
+                    [row["rmse_m"], row["mean_m"], row["max_m"], row.get("sigma_m")],
+                    row.get("nees"),
+                    name == "adjusted",
+                )
+                for name, row in result[key].items()
+            ]
+            yield _accuracy_table(heads, rows, [3, 3, 3, 3])
+    if result["orientation"] or result["points"] or result["check"]:
+        yield (
+            '<p class="note">σ stated: root mean of the variances the estimates came with. NEES: mean normalised error '
+            "squared per component, 1 if the stated covariance is right. Direct georeferencing: intersection with the "
+            "filtered trajectory. Orientations are compared on the strips, over the time the final orientation covers; "
+            "all intersections use the same rays.</p>"
+        )
+
+
+def _times(values: Sequence[float] | None) -> list[float] | None:
+    return None if values is None else [_MDEG * v for v in values]
+
+
+def _accuracy_table(heads: list[tuple[str, str]], rows: list[Any], digits: list[int]) -> str:
+    top = '<tr><th rowspan="2">&nbsp;</th><th rowspan="2">n</th>'
+    top += "".join(f'<th class="group" colspan="3">{escape(head)}</th>' for head, _ in heads)
+    top += '<th rowspan="2" class="edge">NEES</th></tr><tr>'
+    for _, names in heads:
+        top += "".join(f"<th{_edge(i)}>{name}</th>" for i, name in enumerate(names.split()))
+    body = ""
+    for label, n, groups, nees, main in rows:
+        body += f"<tr{' class=main' if main else ''}><td>{escape(label)}</td><td>{n}</td>"
+        for values, d in zip(groups, digits, strict=True):
+            for i in range(3):
+                body += f"<td{_edge(i)}>{_number(None if values is None else values[i], d)}</td>"
+        body += f'<td class="edge">{_number(nees, 2)}</td></tr>'
+    return f'<div class="scroll"><table><thead>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _edge(i: int) -> str:
+    return ' class="edge"' if i == 0 else ""
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1) -> str:
+    head = "".join(f"<th{' class=left' if i < left else ''}>{escape(h)}</th>" for i, h in enumerate(heads))
+    body = "".join(
+        "<tr>"
+        + "".join(f"<td{' class=left' if i < left else ''}>{escape(str(v))}</td>" for i, v in enumerate(row))
+        + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _rejected(result: dict[str, Any]) -> str:
+    rows = result["rejected_observations"]
+    if not rows:
+        return "<p>None.</p>" if "sigma0" in result else ""
+    shown = [
+        (r["point"], r["strip"], r["ccd"], r["reason"], f"{r['line']:.2f}", f"{r['sample']:.2f}", f"{r['w']:.1f}")
+        for r in rows[:_SHOWN_REJECTED]
+    ]
+    more = (
+        f'<p class="note">The {_SHOWN_REJECTED} largest of {result["rejected"]}.</p>' if len(rows) > len(shown) else ""
+    )
+    return _table(("point", "strip", "CCD", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+
+
+def _parameters(result: dict[str, Any]) -> str:
+    rows = []
+    for p in result["parameters"]:
+        unit, scale = p["unit"], 1.0
+        if unit.startswith("rad"):
+            unit, scale = "mdeg" + unit[3:], figures.MDEG
+        value, sigma = (None if p[k] is None else scale * p[k] for k in ("value", "sigma"))
+        rows.append((p["name"], unit, p["status"], _figures(value), _figures(sigma), _number(p["t"], 1)))
+    return _table(("parameter", "unit", "status", "value", "sigma", "t"), rows, left=3) if rows else ""
+
+
+def _figures(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _operation(result: dict[str, Any]) -> Iterable[str]:
+    yield _table(
+        ("topic", "messages", "rate [Hz]", "missing numbers", "unusable"),
+        ((n, t["messages"], _number(t["rate_hz"], 1), t["gaps"], t["unusable"]) for n, t in result["topics"].items()),
+    )
+    if result["nodes"]:
+        rows = []
+        for name, node in result["nodes"].items():
+            counters = ", ".join(f"{key} {value}" for key, value in node["counters"].items() if value)
+            rows.append((name, node["state"], counters or "–", node["last_problem"] or "–"))
+        yield "<h3>Nodes, newest status</h3>" + _table(("node", "state", "counters", "last problem"), rows, left=4)
+    if result["events"]:
+        rows = [(f"{e['time_s']:.2f}", e["level"], e["node"], e["text"]) for e in result["events"][-_SHOWN_EVENTS:]]
+        yield "<h3>Events</h3>" + _table(("time [s]", "level", "node", "event"), rows, left=4)

@@ -1,0 +1,25 @@
+"""The messages of a recording that a report or a view needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from ...schemas.topics import TOPICS
+from ..node import Message
+from ..recording import RecordingReader
+
+#: Topics nothing is drawn or computed from here; they are most of the bytes.
+LEFT_OUT = frozenset({"sensor/imu", "sensor/lines/*"})
+WANTED = tuple(row.name for row in TOPICS if row.name not in LEFT_OUT)
+
+
+def messages_of(recording: str | Path) -> Iterator[Message]:
+    """Messages of a recording in the order of their stamps, without raw image lines and inertial data.
+
+    Raises
+    ------
+    UserError : not a recording
+    FileNotFoundError : no such file
+    """
+    return RecordingReader(recording).sorted_messages(WANTED)

@@ -1,0 +1,68 @@
+"""A time axis that leaves out what lies between strips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from .flight import Flight
+
+Array = NDArray[np.floating]
+_GAP = 0.025  # between strips, as a share of the time on strips
+_PAUSE_S = 2.0
+_SAMPLES = 1200  # of a curve; a page shows no more
+
+
+class StripTime:
+    """Seconds since the start of the flight to places on an axis where strips stand side by side.
+
+    With one strip, or none that is known, the axis is the time itself.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        known = [(flight.strip_times(id), id) for id in flight.strips]
+        spans = sorted((*(float(flight.seconds(t)) for t in span), id) for span, id in known if span is not None)
+        gap = _GAP * sum(end - start for start, end, _ in spans)
+        self.strips: list[tuple[float, float, float, str]] = []  # start, end, place of the start, name
+        place = 0.0
+        for start, end, id in spans if len(spans) > 1 else ():
+            self.strips.append((start, end, place, id))
+            place += end - start + gap
+        self._gap = gap
+
+    def curve(self, time_s: Array, values: Array) -> tuple[Array, Array]:
+        """Places and values of a curve, thinned out; NaN where it pauses, so that nothing is drawn across a pause."""
+        step = max(1, len(time_s) // _SAMPLES)
+        t, v = np.asarray(time_s, dtype=float)[::step], np.asarray(values, dtype=float)[::step]
+        if self.strips:
+            x = np.full(len(t), np.nan)
+            for start, end, place, _ in self.strips:
+                inside = (t >= start) & (t <= end)
+                x[inside] = t[inside] - start + place
+            kept = np.isfinite(x)
+            t, v, x = t[kept], v[kept], x[kept]
+        else:
+            x = t
+        pauses = np.flatnonzero(np.diff(t) > _PAUSE_S) + 1
+        return np.insert(x, pauses, np.nan), np.insert(v, pauses, np.nan, axis=0)
+
+    def dress(self, axes: Iterable[Axes], lowest: Iterable[Axes]) -> None:
+        """Borders and names of strips on all axes, ticks and label below the lowest ones."""
+        for ax in axes:
+            for _, _, place, _ in self.strips[1:]:
+                ax.axvline(place - self._gap / 2, color="#999999", lw=0.7, ls=(0, (2, 2)))
+            if self.strips:
+                ax.grid(False, axis="x")
+                for start, end, place, id in self.strips:
+                    middle = place + (end - start) / 2
+                    anchor = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "top"}
+                    ax.text(middle, 0.985, id, fontsize=7.5, color="#666666", **anchor)
+        for ax in lowest:
+            if self.strips:
+                ax.set_xticks([place for _, _, place, _ in self.strips], [f"{start:.0f}" for start, *_ in self.strips])
+                ax.set_xlabel("strips side by side; start of each [s]")
+            else:
+                ax.set_xlabel("time [s]")

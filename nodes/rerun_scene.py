@@ -1,0 +1,249 @@
+"""A canvas of Rerun, and the arrangement of its views. The only file that knows Rerun."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from .canvas import Canvas, Color, Layout, NullCanvas, Series
+from .errors import UserError
+from .viewer_process import ViewerProcess
+
+Array = NDArray[np.floating]
+
+APPLICATION = "triline"
+TIMELINE = "flight_time"
+_FLUSH_S = 5.0
+_BACKGROUND = [18, 20, 26]  # the colours of the scene are made for a dark ground, whatever the theme
+_FIELD_OF_VIEW = np.radians(55.0)  # of the viewer, vertical
+_ASPECT = 1.35  # of the 3D view, about
+_MARGIN = 1.06
+
+
+class RerunCanvas:
+    """Draws into a Rerun recording stream; `process` is the viewer it belongs to, if we started one."""
+
+    def __init__(self, stream: rr.RecordingStream, process: ViewerProcess | None = None) -> None:
+        self.stream = stream
+        self.process = process
+        stream.log("flight", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def at(self, time_s: float) -> None:
+        self.stream.set_time(TIMELINE, duration=time_s)
+
+    def points(
+        self, entity: str, xyz: Array, colors: Sequence[Color], radius: float, labels: Sequence[str] | None = None
+    ) -> None:
+        kind = rr.Points3D if xyz.shape[1] == 3 else rr.Points2D
+        size = rr.Radius.ui_points(radius)
+        shown = labels is not None
+        self.stream.log(entity, kind(xyz, colors=list(colors), radii=size, labels=labels, show_labels=shown))
+
+    def lines(
+        self, entity: str, strips: Sequence[Array], colors: Sequence[Color], radius: float,
+        labels: Sequence[str] | None = None,
+    ) -> None:  # fmt: skip
+        kind = rr.LineStrips3D if strips[0].shape[1] == 3 else rr.LineStrips2D
+        size = rr.Radius.ui_points(radius)
+        self.stream.log(
+            entity, kind(list(strips), colors=list(colors), radii=size, labels=labels, show_labels=labels is not None)
+        )
+
+    def arrows(
+        self, entity: str, origins: Array, vectors: Array, colors: Sequence[Color], radius: float,
+        labels: Sequence[str] | None = None,
+    ) -> None:  # fmt: skip
+        kind = rr.Arrows3D if origins.shape[1] == 3 else rr.Arrows2D
+        size = rr.Radius.ui_points(radius)
+        self.stream.log(entity, kind(origins=origins, vectors=vectors, colors=list(colors), radii=size, labels=labels))
+
+    def ellipsoids(self, entity: str, centres: Array, half_axes: Array, quaternions: Array, color: Color) -> None:
+        shape = rr.Ellipsoids3D(
+            centers=centres, half_sizes=half_axes, quaternions=quaternions, colors=[color],
+            line_radii=rr.Radius.ui_points(0.4), fill_mode=rr.components.FillMode.MajorWireframe,
+        )  # fmt: skip
+        self.stream.log(entity, shape)
+
+    def geographic_line(self, entity: str, lat_lon: Array, color: Color) -> None:
+        self.stream.log(entity, rr.GeoLineStrings(lat_lon=[lat_lon], colors=[color], radii=rr.Radius.ui_points(2.0)))
+
+    def geographic_points(self, entity: str, lat_lon: Array, colors: Sequence[Color], radius: float) -> None:
+        self.stream.log(entity, rr.GeoPoints(lat_lon=lat_lon, colors=list(colors), radii=rr.Radius.ui_points(radius)))
+
+    def style(self, entity: str, series: Series) -> None:
+        look = rr.SeriesLines(colors=[series.color], names=[series.name], widths=[series.width])
+        self.stream.log(entity, look, static=True)
+
+    def curve(self, entity: str, time_s: Sequence[float], values: Sequence[float]) -> None:
+        self.stream.send_columns(
+            entity, [rr.TimeColumn(TIMELINE, duration=list(time_s))], rr.Scalars.columns(scalars=list(values))
+        )
+
+    def event(self, entity: str, text: str, level: str) -> None:
+        self.stream.log(entity, rr.TextLog(text, level=level))
+
+    def document(self, entity: str, markdown: str) -> None:
+        self.stream.log(entity, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), static=True)
+
+    def layout(self, layout: Layout) -> None:
+        self.stream.send_blueprint(blueprint(layout))
+
+    def close(self) -> None:
+        self.stream.flush(timeout_sec=_FLUSH_S)
+        self.stream.disconnect()
+
+
+def open_canvas(mode: str) -> Canvas:
+    """A canvas by mode: ``native`` (a window), ``web`` (on the loopback interface), ``rrd:PATH`` (a file) or ``none``.
+
+    Raises
+    ------
+    UserError : the viewer cannot be started, or the file cannot be written
+    ValueError : an unknown mode
+    """
+    if mode == "none":
+        return NullCanvas()
+    if mode not in ("native", "web") and not (mode.startswith("rrd:") and len(mode) > 4):
+        raise ValueError(f"viewer mode {mode!r}, wanted native, web, rrd:PATH or none")
+    stream = rr.RecordingStream(APPLICATION)
+    if mode.startswith("rrd:"):
+        path = Path(mode[4:])
+        if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+            raise UserError(f"{path}: cannot be written there")
+        stream.save(path)
+        return RerunCanvas(stream)
+    process = ViewerProcess(web=mode == "web")
+    stream.connect_grpc(process.grpc_url)
+    return RerunCanvas(stream, process)
+
+
+def blueprint(layout: Layout) -> rrb.Blueprint:
+    """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
+    tabs = [_overview(layout), _corrections(), _adjustment(layout)]
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TopPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _overview(layout: Layout) -> rrb.Container:
+    images = [_image(ccd, title, layout) for ccd, title in layout.ccds.items()]
+    side = rrb.Tabs(
+        rrb.TextLogView(origin="/log", name="Events"),
+        rrb.TextDocumentView(origin="/about", name="About this view"),
+        *([_map(layout)] if layout.geographic_centre is not None else []),
+        active_tab=0,
+    )
+    curves = rrb.Grid(
+        _plot("sigma0", "sigma0 and its 95 % band", (0.7, 1.3), legend=False),
+        _plot("latency", "Latency [ms]"),
+        _plot("overview/position", "Final dX, dY, dZ [m]"),
+        _plot("overview/attitude", "Final attitude [mdeg]"),
+        grid_columns=2,
+    )
+    left = rrb.Vertical(_flight(layout), _legend(layout), side, row_shares=[10, 1.3, 3])
+    right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
+    return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
+
+
+def _corrections() -> rrb.Container:
+    units = {"dX": "m", "dY": "m", "dZ": "m", "domega": "mdeg", "dphi": "mdeg", "dkappa": "mdeg"}
+    views = [_plot(f"corrections/{name}", f"{name} [{unit}]") for name, unit in units.items()]
+    return rrb.Grid(*views, grid_columns=2, name="Correction functions")
+
+
+def _adjustment(layout: Layout) -> rrb.Container:
+    views = [_plot("window", "Window: rays, points, rejected")]
+    if layout.truth:
+        views += [
+            _plot("errors/position", "Position error against truth [m]"),
+            _plot("errors/attitude", "Attitude error against truth [mdeg]"),
+        ]
+    views += [_plot(f"parameters/{unit}", f"Parameters [{unit}]") for unit in layout.units]
+    return rrb.Grid(*views, grid_columns=2, name="Adjustment")
+
+
+def viewpoint(layout: Layout) -> tuple[Array, Array]:
+    """Eye and target of the 3D view: from the right of the flight, as near as all corners stay in view.
+
+    The default eye of the viewer does not find a strip kilometres long; this one is computed from what is planned.
+    """
+    along = layout.along / max(float(np.linalg.norm(layout.along)), 1e-9)
+    right = np.array([along[1], -along[0], 0.0])
+    backward = 0.86 * right - 0.2 * along + np.array([0.0, 0.0, 0.42])
+    backward /= np.linalg.norm(backward)
+    across = np.cross([0.0, 0.0, 1.0], backward)
+    across /= np.linalg.norm(across)
+    up = np.cross(backward, across)
+    target = (layout.corners.min(axis=0) + layout.corners.max(axis=0)) / 2
+    half = np.tan(_FIELD_OF_VIEW / 2)
+    distance = 1.0
+    for _ in range(5):  # nearest distance, then move the target so that the picture is centred, and again
+        offset = layout.corners - target
+        depth = offset @ backward
+        reach = np.maximum(np.abs(offset @ across) / (half * _ASPECT), np.abs(offset @ up) / half)
+        distance = _MARGIN * float((depth + reach).max())
+        x = (offset @ across) / (distance - depth)
+        y = (offset @ up) / (distance - depth)
+        target = target + distance * ((x.min() + x.max()) / 2 * across + (y.min() + y.max()) / 2 * up)
+    return target + distance * backward, target
+
+
+def _flight(layout: Layout) -> rrb.View:
+    eye, target = viewpoint(layout)
+    return rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /flight/**", "+ /points/**"],
+        name=layout.title,
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=500.0, color=[70, 75, 90, 120], stroke_width=0.6),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=[0.0, 0.0, 1.0]
+        ),
+    )
+
+
+def _legend(layout: Layout) -> rrb.View:
+    width = 100.0 * (8 if layout.truth else 7)
+    return rrb.Spatial2DView(
+        origin="/legend",
+        name="Legend",
+        titlebar=False,
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=[-60.0, width + 60.0], y_range=[-8.0, 28.0]),
+    )
+
+
+def _image(ccd: str, title: str, layout: Layout) -> rrb.View:
+    width, height = layout.image_size
+    return rrb.Spatial2DView(
+        origin=f"/image/{ccd}",
+        name=title,
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=[-0.08 * width, 1.02 * width], y_range=[-0.1 * height, 1.1 * height]),
+    )
+
+
+def _plot(entity: str, title: str, span: tuple[float, float] | None = None, legend: bool = True) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=f"/plots/{entity}",
+        name=title,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        background=rrb.archetypes.PlotBackground(color=_BACKGROUND, show_grid=True),
+        axis_y=None if span is None else rrb.ScalarAxis(range=span),
+    )
+
+
+def _map(layout: Layout) -> rrb.View:
+    return rrb.MapView(origin="/map", name="Map", zoom=14.0)

@@ -1,0 +1,187 @@
+"""The scene of an on-line triangulation: messages in, drawing out. What it is drawn on is a `Canvas`.
+
+The 3D view is in local coordinates minus a rounded origin near the control points. Orientations differ by metres over
+kilometres, so deviations from the filtered trajectory, ellipsoids and residuals are exaggerated; the view's title says
+by how much.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import convert
+from .canvas import Canvas, Layout
+from .convert import PoseSample
+from .node import Message
+from .scene_flight import FlightPart
+from .scene_image import ImagePart
+from .scene_map import MapPart
+from .scene_parts import LEGEND
+from .scene_plots import PlotsPart
+from .scene_points import PointsPart
+from .scene_state import SceneState
+
+Array = NDArray[np.floating]
+
+#: What the scene can show.
+TOPICS: tuple[str, ...] = (
+    "configuration/project",
+    "configuration/camera",
+    "configuration/strip",
+    "sensor/gnss",
+    "trajectory/filtered",
+    "observation/control",
+    "orientation/live",
+    "orientation/final",
+    "point/object",
+    "adjustment/report",
+    "event/log",
+)
+TRUTH_TOPICS: tuple[str, ...] = ("truth/trajectory",)
+_SHOWN = frozenset(TOPICS + TRUTH_TOPICS)
+_HOLD_NS = convert.SECOND_NS // 2
+
+
+class Scene:
+    """Takes messages one by one and draws what has changed when told to."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self.canvas = canvas
+        self.state = SceneState()
+        self.parts = (
+            FlightPart(self.state),
+            PointsPart(self.state),
+            ImagePart(self.state),
+            PlotsPart(self.state),
+            MapPart(self.state),
+        )
+        self._laid_out: Any = None
+        self._held: list[tuple[str, PoseSample]] = []
+        self._released = False
+        self._waiting_truth: deque[PoseSample] = deque(maxlen=5000)
+
+    def take(self, message: Message) -> None:
+        """Remember what a message says.
+
+        Raises
+        ------
+        ValueError : a message without usable values
+        """
+        topic, body = message.topic, message.body
+        if topic not in _SHOWN:
+            return
+        self.state.note(message)
+        if topic.startswith("configuration/"):
+            return
+        if topic.startswith(("trajectory/", "orientation/", "truth/")):
+            self._take_pose(topic, convert.pose_sample(body))
+            return
+        for part in self.parts:
+            part.take(message)
+
+    def _take_pose(self, topic: str, sample: PoseSample) -> None:
+        """Hand a pose to the parts; truth waits for the filtered pose it is compared with.
+
+        The first half second is held back: control points of the same stamp come after poses, and the display frame
+        depends on them.
+        """
+        if not self._released:
+            self._held.append((topic, sample))
+            if sample.time_ns - self._held[0][1].time_ns < _HOLD_NS:
+                return
+            self._release()
+            return
+        if topic == "truth/trajectory":
+            self._waiting_truth.append(sample)
+        else:
+            self._hand_out(topic, sample)
+        while self._waiting_truth and self._waiting_truth[0].time_ns <= self.state.filtered.newest_ns:
+            self._hand_out("truth/trajectory", self._waiting_truth.popleft())
+
+    def _hand_out(self, topic: str, sample: PoseSample) -> None:
+        self.state.note_pose(topic, sample)
+        for part in self.parts:
+            part.pose(topic, sample)
+
+    def draw(self) -> None:
+        """Draw what has changed since the last call."""
+        if self.state.start_ns is None:
+            return
+        self._lay_out()
+        self.canvas.at(self.state.now_s)
+        for part in self.parts:
+            part.draw(self.canvas)
+
+    def _release(self) -> None:
+        self._released = True
+        for topic, sample in self._held:
+            self._take_pose(topic, sample)
+        self._held.clear()
+
+    def close(self) -> None:
+        """Draw the rest and close the canvas."""
+        self._release()
+        self.state.closing = True
+        self.draw()
+        self.canvas.close()
+
+    def _lay_out(self) -> None:
+        """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
+        s = self.state
+        key = (tuple(s.extent), s.camera is not None, s.has_truth, tuple(s.units), s.frame is not None)
+        if key == self._laid_out or not s.extent:
+            return
+        self._laid_out = key
+        corners = self._corners()
+        centre = corners.mean(axis=0)
+        first = next(iter(s.extent.values()))
+        along = (first[1] - first[0]) / max(float(np.linalg.norm(first[1] - first[0])), 1.0)
+        middle = None
+        if s.frame is not None:
+            place = s.frame.to_geodetic(centre + s.origin)
+            middle = float(place[0]), float(place[1])
+        layout = Layout(
+            title=f"Deviations from filtered and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}",
+            corners=corners,
+            along=along,
+            ccds={ccd: f"Residuals {ccd}: samples to the right, lines up, bar = 1 px" for ccd in s.ccds},
+            image_size=s.image_size,
+            units=tuple(s.units),
+            truth=s.has_truth,
+            geographic_centre=middle,
+        )
+        self.canvas.layout(layout)
+        self._legend(s.has_truth)
+        east, north, up = s.origin
+        self.canvas.document(
+            "about",
+            f"Display origin: E {east:.0f} m, N {north:.0f} m, U {up:.0f} m in the local frame of "
+            f"*{s.project.name if s.project is not None else 'no project'}*.\n\n"
+            f"Live, final and true trajectory: deviation from the filtered one x {s.exaggeration:g}; ellipsoids: "
+            f"3 sigma of the final one x {s.exaggeration:g}.\n\n"
+            f"Residuals x {s.residual_scale:g}: thin arrows are those of single rays laid on the ground, in the "
+            "colour of their CCD line; thick arrows at control and check points are adjusted minus given coordinates.",
+        )
+
+    def _corners(self) -> Array:
+        """Ends of the strips in the air, with room for exaggerated deviations, and their swaths on the ground."""
+        s = self.state
+        room = 0.12 * s.height_m
+        places = []
+        for start, end in s.extent.values():
+            along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
+            left = np.array([-along[1], along[0], 0.0]) * s.swath_m / 2
+            for place in (start, end):
+                ground = np.array([place[0], place[1], s.ground_m])
+                above = np.array([0.0, 0.0, room])
+                places += [place + above, place - above, ground - left, ground + left]
+        return s.display(np.array(places))
+
+    def _legend(self, truth: bool) -> None:
+        rows = [row for row in LEGEND if truth or row[0] != "truth"]
+        places = np.array([[100.0 * i, 0.0] for i in range(len(rows))])
+        self.canvas.points("legend", places, [color for _, color in rows], 5.0, [text for text, _ in rows])

@@ -1,0 +1,175 @@
+"""Curves over time: sigma0, latency, correction functions, parameters, errors against truth; and the event log."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ..solver.accuracy import angle_difference
+from . import convert
+from .canvas import Canvas, Color, Series
+from .convert import PoseSample
+from .node import Message
+from .scene_parts import AXES, FILTERED, FINAL, LIVE, TRUTH, Part
+from .scene_state import SceneState
+
+Array = NDArray[np.floating]
+
+COMPONENTS = ("dX", "dY", "dZ", "domega", "dphi", "dkappa")
+_MDEG = 1000.0 * float(np.degrees(1.0))
+_SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
+_STEP_NS = int(0.2 * convert.SECOND_NS)
+_ALPHA = 0.05
+_TELLING = 30  # redundancy from which sigma0 says something
+_GREY = (140, 140, 150, 255)
+_LEVELS = {1: "DEBUG", 2: "INFO", 3: "WARN", 4: "ERROR", 5: "CRITICAL"}
+_NAMES = {"orientation/live": "live", "orientation/final": "final"}
+
+
+class PlotsPart(Part):
+    """Collects samples of curves and hands them over in batches."""
+
+    def __init__(self, state: SceneState) -> None:
+        super().__init__(state)
+        self._curves: dict[str, tuple[list[float], list[float]]] = {}
+        self._styles: dict[str, Series] = {}
+        self._styled: set[str] = set()
+        self._events: list[tuple[float, str, str]] = []
+        self._last: dict[str, int] = {}
+        self._newest_ray_ns = 0
+
+    # ---- taking
+
+    def pose(self, topic: str, sample: PoseSample) -> None:
+        if sample.time_ns - self._last.get(topic, 0) < _STEP_NS:
+            return
+        self._last[topic] = sample.time_ns
+        t = self.state.seconds(sample.time_ns)
+        if topic in _NAMES:
+            self._corrections(t, _NAMES[topic], sample)
+            true = self.state.truth.at(sample.time_ns)
+            if true is not None:
+                self._error(t, _NAMES[topic], sample.position_l, sample.quaternion, *true)
+        elif topic == "truth/trajectory":
+            filtered = self.state.filtered.at(sample.time_ns)
+            if filtered is not None:
+                self._error(t, "filtered", *filtered, sample.position_l, sample.quaternion)
+                needed = _difference(sample.position_l, sample.quaternion, *filtered) * _SCALE
+                for name, value in zip(COMPONENTS, needed, strict=True):
+                    self._add(f"corrections/{name}/truth", t, value, Series("truth - filtered", TRUTH, 1.0))
+
+    def _corrections(self, t: float, kind: str, sample: PoseSample) -> None:
+        if sample.correction is None or len(sample.correction) != 6:
+            return
+        values = sample.correction * _SCALE
+        color = LIVE if kind == "live" else FINAL
+        for name, value in zip(COMPONENTS, values, strict=True):
+            self._add(f"corrections/{name}/{kind}", t, value, Series(kind, color, 1.2 if kind == "live" else 2.2))
+        if kind == "final":
+            for i, (name, value) in enumerate(zip(COMPONENTS, values, strict=True)):
+                group = "position" if i < 3 else "attitude"
+                self._add(f"overview/{group}/{name}", t, value, Series(name, AXES[i % 3], 2.0))
+            if sample.covariance is not None:
+                self._band(t, values, 3 * np.sqrt(np.diag(sample.covariance)) * _SCALE)
+
+    def _band(self, t: float, values: Array, width: Array) -> None:
+        for i, name in enumerate(COMPONENTS):
+            for bound, sign in (("upper", 1.0), ("lower", -1.0)):
+                value = values[i] + sign * width[i]
+                shade = (60, 150, 90, 255)
+                series = Series(f"final {'+' if sign > 0 else '-'} 3 sigma", shade, 0.8)
+                self._add(f"corrections/{name}/{bound}", t, value, series)
+
+    def _error(self, t: float, kind: str, position: Array, quaternion: Array, true_p: Array, true_q: Array) -> None:
+        error = _difference(position, quaternion, true_p, true_q)
+        color = {"filtered": FILTERED, "live": LIVE, "final": FINAL}[kind]
+        self._add(f"errors/position/{kind}", t, float(np.linalg.norm(error[:3])), Series(kind, color))
+        self._add(f"errors/attitude/{kind}", t, _MDEG * float(np.linalg.norm(error[3:])), Series(kind, color))
+
+    def take(self, message: Message) -> None:
+        if message.topic == "adjustment/report":
+            self._report(self.state.seconds(message.stamp_ns), message.body)
+        elif message.topic == "event/log":
+            body = message.body
+            text = f"{body.name}: {body.message}" if body.name else body.message
+            self._events.append((self.state.seconds(message.stamp_ns), text, _LEVELS.get(body.level, "INFO")))
+
+    def _report(self, t: float, report: Any) -> None:
+        self._add("sigma0/one", t, 1.0, Series("1.0", TRUTH, 1.0))
+        if report.redundancy >= _TELLING:
+            self._add("sigma0/value", t, report.sigma0, Series("sigma0", FINAL, 2.0))
+            low, high = _sigma0_band(int(report.redundancy))
+            self._add("sigma0/low", t, low, Series("95 %, low", _GREY, 1.0))
+            self._add("sigma0/high", t, high, Series("95 %, high", _GREY, 1.0))
+        if report.rays > 0 and report.window_end_ns > self._newest_ray_ns:
+            self._newest_ray_ns = report.window_end_ns
+            self._add("latency/data", t, 1000 * report.data_latency_s, Series("newest ray to answer", FILTERED))
+        if report.compute_s > 0:
+            self._add("latency/compute", t, 1000 * report.compute_s, Series("update", LIVE))
+        self._add("window/rays", t, report.rays, Series("rays", FILTERED))
+        self._add("window/points", t, report.points, Series("points", FINAL))
+        self._add("window/rejected", t, report.rejected_total, Series("rejected, total", (255, 60, 230, 255)))
+        for k, parameter in enumerate(report.parameters):
+            self._parameter(t, k, parameter)
+
+    def _parameter(self, t: float, k: int, parameter: Any) -> None:
+        unit, scale = parameter.unit or "1", 1.0
+        if unit.startswith("rad"):
+            unit, scale = "mdeg" + unit[3:], _MDEG
+        if unit not in self.state.units:
+            self.state.units.append(unit)
+        entity = f"parameters/{entity_name(unit)}/{entity_name(parameter.name)}"
+        self._add(entity, t, scale * parameter.value, Series(parameter.name, _palette(k), 1.5))
+
+    def _add(self, entity: str, t: float, value: float, style: Series) -> None:
+        if not np.isfinite(value):
+            return
+        times, values = self._curves.setdefault(entity, ([], []))
+        times.append(t)
+        values.append(float(value))
+        self._styles.setdefault(entity, style)
+
+    # ---- drawing
+
+    def draw(self, canvas: Canvas) -> None:
+        for entity, (times, values) in self._curves.items():
+            if entity not in self._styled:
+                self._styled.add(entity)
+                canvas.style(f"plots/{entity}", self._styles[entity])
+            if times:
+                canvas.curve(f"plots/{entity}", times, values)
+                self._curves[entity] = [], []
+        for t, text, level in self._events:
+            canvas.at(t)
+            canvas.event("log", text, level)
+        self._events.clear()
+        canvas.at(self.state.now_s)
+
+
+def _difference(position: Array, quaternion: Array, base_p: Array, base_q: Array) -> Array:
+    """Position and angles (6,) minus those of a base."""
+    angles = convert.angles_of(np.array([quaternion, base_q]))
+    return np.concatenate([position - base_p, angle_difference(angles[0], angles[1])])
+
+
+@lru_cache(maxsize=4096)
+def _sigma0_band(redundancy: int) -> tuple[float, float]:
+    """Between which sigma0 lies in 95 % of all cases if the stochastic model is right."""
+    low, high = np.sqrt(chi2.ppf([_ALPHA / 2, 1 - _ALPHA / 2], redundancy) / redundancy)
+    return float(low), float(high)
+
+
+def entity_name(text: str) -> str:
+    """Text as one part of an entity path."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text) or "_"
+
+
+def _palette(k: int) -> Color:
+    """Colours that differ for neighbouring numbers."""
+    hues = ((230, 90, 80), (90, 200, 120), (90, 150, 250), (240, 200, 70), (200, 110, 240), (90, 220, 220))
+    return (*hues[k % len(hues)], 255)

@@ -1,0 +1,206 @@
+"""What all parts of a scene share: configuration, the display frame, scales, the newest poses."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..solver.camera import LineCamera
+from ..solver.frames import LocalFrame
+from ..solver.rotation import matrix_from_quaternion
+from . import convert
+from .convert import PoseSample
+from .node import Message
+
+Array = NDArray[np.floating]
+_HISTORY_S = 120.0
+_HISTORY_STEP_S = 0.05
+_IMAGE_HEIGHT = 0.16  # of an image-space view, as a share of its width
+_NO_LENGTH_S = 60.0  # of a strip whose end is not known
+
+
+class PoseHistory:
+    """Poses of the last two minutes, in order of time."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, Array, Array]] = deque(maxlen=round(_HISTORY_S / _HISTORY_STEP_S))
+
+    def add(self, sample: PoseSample) -> None:
+        """Keep a pose that is newer than all kept ones."""
+        if not self._samples or sample.time_ns > self._samples[-1][0]:
+            self._samples.append((sample.time_ns, sample.position_l, sample.quaternion))
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest pose; -1 without any."""
+        return self._samples[-1][0] if self._samples else -1
+
+    def at(self, time_ns: int) -> tuple[Array, Array] | None:
+        """Position and quaternion at a time, linear between neighbours; None outside what is kept."""
+        samples = self._samples
+        if not samples or not samples[0][0] <= time_ns <= samples[-1][0]:
+            return None
+        k = bisect_left(samples, time_ns, key=lambda sample: sample[0])
+        t1, p1, q1 = samples[k]
+        if t1 == time_ns or k == 0:
+            return p1, q1
+        t0, p0, q0 = samples[k - 1]
+        share = (time_ns - t0) / (t1 - t0)
+        q = q0 + share * (np.where(q0 @ q1 < 0, -q1, q1) - q0)
+        return p0 + share * (p1 - p0), q / np.linalg.norm(q)
+
+
+class SceneState:
+    """Configuration and display frame of a scene.
+
+    Attributes
+    ----------
+    start_ns : stamp of the first message that is not latched; None before it
+    now_s : newest stamp, seconds since then
+    closing : whether this is the last drawing
+    project, camera, frame, strips : configuration, as far as it has come; strip : id of the newest strip
+    origin : (3,) subtracted from local coordinates for display; decided by the first pose
+    extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
+    units : units of the parameters that have come
+    """
+
+    def __init__(self) -> None:
+        self.start_ns: int | None = None
+        self.now_s = 0.0
+        self.closing = False
+        self.project: Any = None
+        self.camera: LineCamera | None = None
+        self.frame: LocalFrame | None = None
+        self.strips: dict[str, Any] = {}
+        self.strip = ""
+        self.origin: Array = np.zeros(3)
+        self.ground_m = 0.0
+        self.height_m = 1000.0
+        self.extent: dict[str, Array] = {}
+        self.units: list[str] = []
+        self.has_truth = False
+        self.newest: PoseSample | None = None
+        self.speed_m_s = 70.0
+        self._control: list[Array] = []
+        self.filtered = PoseHistory()
+        self.truth = PoseHistory()
+
+    # ---- taking
+
+    def note(self, message: Message) -> None:
+        """Keep configuration, control and time."""
+        topic, body = message.topic, message.body
+        if topic == "configuration/project":
+            self.project, self.frame = body, convert.local_frame(body)
+        elif topic == "configuration/camera":
+            self.camera = convert.camera_from(body)
+        elif topic == "configuration/strip":
+            self.strips[body.id] = body
+            self.strip = body.id
+        elif topic == "observation/control":
+            self._control.append(np.array([body.x, body.y, body.z]))
+        else:
+            if self.start_ns is None:
+                self.start_ns = message.stamp_ns
+            self.now_s = max(self.now_s, self.seconds(message.stamp_ns))
+
+    def note_pose(self, topic: str, sample: PoseSample) -> None:
+        """Keep the newest filtered poses; the first one decides the display frame."""
+        if topic == "truth/trajectory":
+            self.has_truth = True
+            self.truth.add(sample)
+        if topic != "trajectory/filtered":
+            return
+        if self.newest is None:
+            self._decide_frame(sample)
+        elif sample.time_ns > self.newest.time_ns + 0.9 * _HISTORY_STEP_S * convert.SECOND_NS:
+            step = (sample.time_ns - self.newest.time_ns) / convert.SECOND_NS
+            speed = float(np.linalg.norm(sample.position_l - self.newest.position_l)) / step
+            self.speed_m_s += 0.1 * (speed - self.speed_m_s)
+        else:
+            return
+        self.newest = sample
+        self.filtered.add(sample)
+        self._plan(sample)
+
+    def _decide_frame(self, sample: PoseSample) -> None:
+        anchor = np.mean(self._control, axis=0) if self._control else sample.position_l
+        self.ground_m = float(np.median(self._control, axis=0)[2]) if self._control else 0.0
+        self.origin = np.array([100 * round(anchor[0] / 100), 100 * round(anchor[1] / 100), 0.0])
+        self.origin[2] = 10 * round(self.ground_m / 10)
+        self.height_m = max(float(sample.position_l[2]) - self.ground_m, 50.0)
+
+    def _plan(self, sample: PoseSample) -> None:
+        """Where the strip that is being flown will end, once it has begun."""
+        for id, strip in self.strips.items():
+            begun = sample.time_ns >= strip.first_line_time_ns
+            if not begun or id in self.extent or not strip.line_rate_hz > 0:
+                continue
+            length_s = strip.lines / strip.line_rate_hz if strip.lines else _NO_LENGTH_S
+            self.strip = id
+            end = sample.position_l + forward(sample.quaternion) * self.speed_m_s * length_s
+            self.extent[id] = np.array([sample.position_l, end])
+
+    # ---- asking
+
+    def seconds(self, stamp_ns: int) -> float:
+        """Seconds since the start."""
+        return (stamp_ns - (self.start_ns or stamp_ns)) / convert.SECOND_NS
+
+    def display(self, position_l: Array) -> Array:
+        """Display coordinates of local coordinates (..., 3)."""
+        return np.asarray(position_l) - self.origin
+
+    @property
+    def ccds(self) -> list[str]:
+        return [line.id for line in self.camera.lines] if self.camera is not None else []
+
+    @property
+    def gsd_m(self) -> float:
+        """Pixel on the ground across the flight, m."""
+        if self.camera is None:
+            return 0.1
+        line = self.camera.lines[0]
+        pitch = float(np.linalg.norm(line.xy_mm[1] - line.xy_mm[0]))
+        return self.height_m * pitch / float(self.camera.focal_length_mm[0])
+
+    @property
+    def swath_m(self) -> float:
+        """Width on the ground of the widest CCD line, m."""
+        if self.camera is None:
+            return self.height_m
+        widths = [float(np.linalg.norm(line.xy_mm[-1] - line.xy_mm[0])) for line in self.camera.lines]
+        return self.height_m * max(widths) / float(self.camera.focal_length_mm.min())
+
+    @property
+    def exaggeration(self) -> float:
+        """Of deviations between trajectories, and of sigmas: a metre becomes a 25th of the flying height or more."""
+        return round_number(self.height_m / 25)
+
+    @property
+    def residual_scale(self) -> float:
+        """Of residuals in object space: a pixel becomes a 25th of the flying height or more."""
+        return round_number(self.height_m / 25 / self.gsd_m)
+
+    @property
+    def image_size(self) -> tuple[float, float]:
+        """Width (samples) and height of an image-space view."""
+        width = max((line.pixels for line in self.camera.lines), default=1) if self.camera is not None else 1
+        return float(width), _IMAGE_HEIGHT * width
+
+
+def forward(quaternion: Array) -> Array:
+    """Horizontal direction of flight (3,) of an orientation."""
+    axis = matrix_from_quaternion(quaternion)[:, 0].copy()
+    axis[2] = 0.0
+    return axis / max(float(np.linalg.norm(axis)), 1e-9)
+
+
+def round_number(value: float) -> float:
+    """The next of 1, 2, 5, 10, 20, ... that is not less."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(next(f * power for f in (1, 2, 5, 10) if f * power >= value * (1 - 1e-9)))
