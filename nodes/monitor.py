@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..schemas import messages as m
 from . import convert
 from .node import Message, Node
 
+if TYPE_CHECKING:
+    from .program import ProgramOptions
 
 #: Counters of a topic that are zero on a good day.
 LOSSES: tuple[str, ...] = ("gaps", "duplicates", "late", "malformed", "dropped")
@@ -50,8 +55,8 @@ class Overview:
         if self.report is not None:
             r = self.report
             parts += [
-                f"sigma0 {r.sigma0:.2f}",
-                f"window {(r.window_end_ns - r.window_start_ns) / convert.SECOND_NS:.0f} s",
+                f"sigma0 {r.sigma0:.2f}" if r.redundancy > 0 else "sigma0 -",
+                f"window {_window_s(r):.0f} s",
                 f"{r.rays} rays",
                 f"{r.points} points",
                 f"{self.rejected} rejected",
@@ -121,15 +126,54 @@ def screen(overview: Overview, title: str) -> Any:
     lines: list[Any] = [nodes, Text(rates, style="dim")]
     if overview.report is not None:
         r = overview.report
-        good = 0.8 <= r.sigma0 <= 1.25
-        window = (r.window_end_ns - r.window_start_ns) / convert.SECOND_NS
+        good = r.redundancy <= 0 or 0.8 <= r.sigma0 <= 1.25
         lines.append(
             Text.assemble(
                 "sigma0 ",
-                (f"{r.sigma0:.3f}", "green" if good else "bold red"),
-                f"   window {window:.1f} s, {r.rays} rays, {r.points} points, {r.control} control",
+                (f"{r.sigma0:.3f}" if r.redundancy > 0 else "-", "green" if good else "bold red"),
+                f"   window {_window_s(r):.1f} s, {r.rays} rays, {r.points} points, {r.control} control",
                 f"   rejected {overview.rejected}   update {1e3 * r.compute_s:.0f} ms",
             )
         )
     lines += [Text(text, style="red" if level in ("error", "fatal") else "dim") for _, level, text in overview.events]
     return Panel(Group(*lines), title=title, title_align="left")
+
+
+def _window_s(report: Any) -> float:
+    """Length of the window in seconds; 0 while there are no rays in it."""
+    return (report.window_end_ns - report.window_start_ns) / convert.SECOND_NS if report.rays else 0.0
+
+
+@contextmanager
+def display(overview: Overview, title: str, quiet: bool = False) -> Iterator[Callable[[], None]]:
+    """Gives a function that shows the overview: one screen on a terminal, a line every 5 s elsewhere."""
+    if quiet:
+        yield lambda: None
+    elif sys.stdout.isatty():
+        from rich.live import Live
+
+        with Live(screen(overview, title), refresh_per_second=4) as live:
+            yield lambda: live.update(screen(overview, title))
+    else:
+        begun = last = time.monotonic()
+
+        def line() -> None:
+            nonlocal last
+            if time.monotonic() - last >= 5.0:
+                last = time.monotonic()
+                sys.stdout.write(f"{last - begun:4.0f} s  {overview.line()}\n")
+                sys.stdout.flush()
+
+        yield line
+
+
+def run(options: ProgramOptions) -> int:
+    """Watch a platform until told to stop."""
+    from .live import BusRunner, in_thread
+
+    monitor = Monitor()
+    title = f"platform {options.platform}"
+    with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title) as show:
+        while not options.stop.wait(0.25):
+            show()
+    return 0
