@@ -1,0 +1,112 @@
+"""The demo as a user runs it: separate processes on the bus, results, and what happens when nodes are killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from triline.nodes.recording import RecordingReader
+
+DEMO = [sys.executable, "-m", "triline.nodes.cli", "demo", "--headless", "--json"]
+RESULTS = ("trajectory/filtered", "trajectory/smoothed", "orientation/live", "orientation/final", "point/object")
+
+
+def bodies(path: Path, topic: str) -> list[tuple[int, bytes]]:
+    messages = RecordingReader(path).sorted_messages([topic])
+    return [(m.stamp_ns, m.body.SerializeToString(deterministic=True)) for m in messages]
+
+
+def process(recording: Path, output: Path) -> Path:
+    command = [sys.executable, "-m", "triline.nodes.cli", "process", str(recording), "-o", str(output), "-q"]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return output
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    done = subprocess.run(
+        [*DEMO, "--seconds", "25", "--seed", "3", "-o", str(folder)], capture_output=True, timeout=180
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    return folder, json.loads(done.stdout)
+
+
+def test_demo_leaves_recording_scene_and_report_with_better_orientation(demo):
+    folder, result = demo
+    assert result["restarts"] == 0 and not result["landed_early"]
+    assert (folder / "flight.rrd").stat().st_size > 10_000
+    assert "<html" in (folder / "report.html").read_text()[:500].lower()
+    points = result["points"]
+    for direct, final in zip(points["direct_georeferencing"]["rmse_m"], points["adjusted"]["rmse_m"], strict=True):
+        assert final < direct / 2
+    assert 0.85 < result["sigma0"] < 1.15
+
+
+def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path):
+    folder, _ = demo
+    processed = process(folder / "flight.mcap", tmp_path / "processed.mcap")
+    for topic in RESULTS:
+        live, again = bodies(folder / "flight.mcap", topic), bodies(processed, topic)
+        assert len(live) > 100
+        assert live == again, f"{topic} differs"
+
+
+def test_process_twice_is_byte_identical(demo, tmp_path):
+    folder, _ = demo
+    first = process(folder / "flight.mcap", tmp_path / "1.mcap")
+    second = process(folder / "flight.mcap", tmp_path / "2.mcap")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def node_pid(name: str, port: int) -> int:
+    """The process of a node of the demo on a port."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            except OSError:
+                continue
+            if words[3:5] == ["node", name] and str(port) in words:
+                return int(entry.name)
+    raise AssertionError(f"no process of {name}")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds processes in /proc")
+def test_nodes_killed_in_turn_are_started_again_and_the_flight_is_kept(tmp_path):
+    from bus_rig import free_port
+
+    port = free_port()
+    command = [*DEMO, "--seconds", "25", "--seed", "5", "-o", str(tmp_path), "--port", str(port)]
+    demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        until = time.monotonic() + 30
+        while not (tmp_path / "log" / "simulator.log").exists() and time.monotonic() < until:
+            time.sleep(0.2)
+        time.sleep(8)
+        for name in ("navigator", "adjuster", "viewer", "recorder"):
+            os.kill(node_pid(name, port), signal.SIGKILL)
+            time.sleep(5)
+        out, error = demo.communicate(timeout=120)
+    finally:
+        demo.kill()
+    assert demo.returncode == 0, error.decode()
+    result = json.loads(out)
+    assert result["restarts"] == 3  # a viewer that is gone is a window that was closed
+    assert len(result["recordings"]) == 2
+    # the recording that was cut off is readable, and goes on to within half a second of the kill
+    cut = min((Path(p) for p in result["recordings"]), key=lambda p: p.stat().st_mtime)
+    recovered = tmp_path / "recovered.mcap"
+    command = [sys.executable, "-m", "triline.nodes.cli", "recover", str(cut), "-o", str(recovered), "-q"]
+    assert subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+    attitude = bodies(recovered, "sensor/attitude")
+    assert len(attitude) > 3000
+    # the second recording explains itself and holds results of the restarted nodes
+    rest = max((Path(p) for p in result["recordings"]), key=lambda p: p.stat().st_mtime)
+    assert bodies(rest, "configuration/camera") and bodies(rest, "observation/control")
+    assert len(bodies(rest, "orientation/final")) > 50
