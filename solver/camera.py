@@ -13,7 +13,7 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Lens:
-    """One lens. ``distortion`` is Brown's ``k1, k2, k3, p1, p2`` (mm-based), applied when a line is built from parameters."""
+    """One lens; Brown's ``distortion`` k1, k2, k3, p1, p2 (mm-based) goes into lines that are built from parameters."""
 
     id: str
     focal_length_mm: float

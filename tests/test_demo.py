@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-
 from triline.nodes.recording import RecordingReader
 
 DEMO = [sys.executable, "-m", "triline.nodes.cli", "demo", "--headless", "--json"]

@@ -13,7 +13,7 @@ import pytest
 from small_block import simulated_block
 from triline.nodes.cli import main
 from triline.nodes.convert import gnss_message, ground_point_message, pose_message
-from triline.nodes.formats.block_recording import block_messages
+from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.formats.detect import Options, read_any
 from triline.nodes.formats.rows import RowLayout, repeated_messages, spread_by_default
 from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages

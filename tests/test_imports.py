@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from triline.nodes.cli import main
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
-from triline.nodes.formats.block_recording import block_from_messages, block_messages, not_carried, strip_shifts
+from triline.nodes.formats.block_messages import block_messages, not_carried, strip_shifts
+from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.detect import Options, read_any
 from triline.nodes.formats.geocal_xml import read_tie_points
@@ -259,6 +261,22 @@ def test_block_becomes_a_flight_in_the_order_of_what_could_be_known():
     assert begun == ended == {"S1", "S2"} and looks == len(block.image)
 
 
+def test_looks_outside_their_strip_come_within_it(tmp_path):
+    """They are for the adjuster to reject; their lines must not put a stamp anywhere."""
+    text = "point,strip,ccd,line,sample\n" + "".join(
+        f"G{i},S1,N,{u},5\n" for i, u in enumerate((5, -1e5, 1e5, 1e300, -1e18))
+    )
+    block = read_block(write_files(tmp_path, image_points=text))
+    messages = list(block_messages(block))
+    stamps = [(message.stamp_ns, rank(message.topic)) for message in messages]
+    assert stamps == sorted(stamps) and messages[0].topic == "configuration/project"
+    ties = {m.body.point: m for m in messages if m.topic == "observation/tie"}
+    assert [ties[f"G{i}"].body.images[0].line for i in range(5)] == [5, -1e5, 1e5, 1e300, -1e18]
+    assert ties["G0"].stamp_ns == 100_025_000_000
+    ends = [m.stamp_ns for m in messages if m.topic == "configuration/strip"]
+    assert all(ends[0] <= tie.stamp_ns < ends[1] for tie in ties.values())
+
+
 def test_overlapping_strips_are_set_apart_by_whole_seconds():
     block = simulated_block()
     shift = strip_shifts(block)
@@ -269,6 +287,8 @@ def test_overlapping_strips_are_set_apart_by_whole_seconds():
 
 def test_block_survives_the_recording(tmp_path):
     block = simulated_block("EPSG:32632")
+    sigma = 0.2 + 0.01 * np.arange(len(block.image))
+    block = replace(block, image=replace(block.image, sigma_px=sigma))
     write_block(tmp_path / "block", block)
     out = tmp_path / "flight.mcap"
     assert main(["import", str(tmp_path / "block"), "-o", str(out), "-q"]) == 0
@@ -279,8 +299,13 @@ def test_block_survives_the_recording(tmp_path):
     assert again.apriori.trajectory == {**block.apriori.trajectory, "drift_sigma_deg": (0.01, 0.01, 0.02)}
     assert {s.id: s.lines for s in again.strips} == {"S1": 9400, "S2": 9400}
     order = [again.point_ids.index(id) for id in block.point_ids]
-    names = [(again.image_name(i), round(float(again.image.line[i]), 3)) for i in range(len(again.image))]
-    wanted = [(block.image_name(i), round(float(block.image.line[i]), 3)) for i in range(len(block.image))]
+    names, wanted = (
+        [
+            (b.image_name(i), round(float(b.image.line[i]), 3), round(b.image.sigma_px[i], 6))
+            for i in range(len(b.image))
+        ]
+        for b in (again, block)
+    )
     assert sorted(names) == sorted(wanted) and len(order) == 12
     assert again.ground.role == block.ground.role
     t = again.strips[1].time_of(np.array([100.0]))

@@ -241,6 +241,13 @@ def test_pos_export_values():
 
 
 @real
+def test_pos_export_gives_east_before_north(tmp_path):
+    path = tmp_path / "pos.txt"
+    path.write_text(POS.read_text().replace("0.017    0.017", "0.011    0.022", 1))
+    np.testing.assert_allclose(read_pos_export(path).sigma_ned_m[0], [0.022, 0.011, 0.034])
+
+
+@real
 def test_pos_export_without_latitude(tmp_path):
     """The mapping frame of the header stands in."""
     rows = POS.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""The main job on real motion: a three-line camera on a recorded AVIRIS-NG flight, over the bus and through `process`."""
+"""The main job on real motion: a camera on a recorded AVIRIS-NG flight, over the bus and through `process`."""
 
 import json
 import subprocess
@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_rig import free_port
-
 from triline.nodes.processes import NodeGroup
 from triline.nodes.recording import RecordingReader
 from triline.nodes.report.evaluation import evaluate

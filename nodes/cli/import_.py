@@ -72,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     kind = args.format or kind_of_path(source)
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
+    if args.camera and kind in ("block", "ties", "camera"):
+        raise UserError(f"--camera does not go with {KINDS[kind]}")
     if output.exists() and source.exists() and output.samefile(source):
         raise UserError(f"{output}: is the input itself")
     if kind == "camera":

@@ -16,7 +16,7 @@ from ..recording import RecordingReader
 from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
 from .avirisng import is_avirisng, read_avirisng
 from .block_folder import is_block_folder, read_block
-from .block_recording import block_messages, not_carried
+from .block_messages import block_messages, not_carried
 from .geocal_xml import kind_of, read_tie_points
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import is_ros2, ros2_messages

@@ -1,0 +1,223 @@
+"""A block as the messages of a flight, in the order an on-line system would have had them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from heapq import merge
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import messages as m
+from ...schemas.topics import rank
+from ...solver.block import Block
+from ...solver.models.dgr import DgrOptions
+from ...solver.network import Strip
+from ...solver.rotation import angles_from_matrix, matrix_from_quaternion
+from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
+from ..node import Message
+
+#: Strips whose times overlap in the files are set apart by this much.
+GAP_S = 10.0
+#: A-priori sigmas of the trajectory that a project message carries.
+SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg")
+
+
+def block_messages(block: Block, source: str = "import") -> Iterator[Message]:
+    """All messages of a block, sorted by stamp and rank.
+
+    Time in the files counts from the Unix epoch. Strips whose times overlap are set one after the other by whole
+    seconds. Configuration and control come first; a pose has the time it is valid for; the looks at a point come strip
+    by strip, when the last one in the strip has been imaged.
+    """
+    times = _Times(block)
+    start = min((begin for begin, _ in times.extents), default=0)
+    first = [
+        Message("configuration/project", start, _project(block), source),
+        Message("configuration/camera", start, camera_message(block.camera), source),
+    ]
+    ground = block.ground
+    for id, xyz, covariance, role in zip(ground.id, ground.xyz_l, ground.covariance, ground.role, strict=True):
+        first.append(Message("observation/control", start, ground_point_message(id, xyz, covariance, role), source))
+    streams: list[Iterable[Message]] = [first, _tie_messages(block, times, source)]
+    for i in range(len(block.strips)):
+        streams += [_pass_messages(block, times, i, source), _pose_messages(block, times, i, source)]
+    yield from merge(*streams, key=lambda message: (message.stamp_ns, rank(message.topic)))
+
+
+def not_carried(block: Block) -> list[str]:
+    """What of a block has no place in the messages, in words."""
+    notes = []
+    keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, "wander_time_s")]
+    if keys:
+        notes.append(f"project.toml: trajectory.{', trajectory.'.join(keys)}: not carried by a recording")
+    for strip in block.strips:
+        if strip.line_time_s is not None:
+            u = np.arange(len(strip.line_time_s))
+            rate = strip.line_rate_hz
+            off = float(np.abs((strip.line_time_s - strip.line_time_s[0]) * rate - u).max())
+            notes.append(f"strip {strip.id}: line times become a constant rate, off by {off:.2f} lines at most")
+    return notes
+
+
+def strip_shifts(block: Block) -> NDArray[np.float64]:
+    """Seconds (strips,) to add to the times of each strip so that no two overlap; lenses of a strip stay together."""
+    names = [_file_name(strip) for strip in block.strips]
+    spans: dict[str, tuple[float, float]] = {}
+    for name, strip in zip(names, block.strips, strict=True):
+        ends = [strip.trajectory.start_s, strip.trajectory.end_s]
+        if strip.lines:
+            ends.extend(strip.time_of(np.array([0.0, strip.lines - 1.0])).tolist())
+        low, high = spans.get(name, (np.inf, -np.inf))
+        spans[name] = min(low, *ends), max(high, *ends)
+    shift: dict[str, float] = {}
+    after = max(0.0, -np.floor(min(low for low, _ in spans.values()))) if spans else 0.0
+    end = -np.inf
+    for name in sorted(spans, key=lambda n: spans[n][0]):
+        low, high = spans[name]
+        if low + after <= end:
+            after += np.ceil(end + GAP_S - low - after)
+        shift[name] = after
+        end = high + after
+    return np.array([shift[name] for name in names])
+
+
+def _file_name(strip: Strip) -> str:
+    return strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}")
+
+
+class _Times:
+    """Times of a block as stamps.
+
+    Attributes
+    ----------
+    shift : (strips,) seconds added to the times of each strip
+    extents : begin and end of each strip, ns; it ends after its last pose and line, which looks may come with
+    """
+
+    def __init__(self, block: Block):
+        self._reference_ns = block.time_reference_ns
+        self.shift = strip_shifts(block)
+        self.extents: list[tuple[int, int]] = []
+        for strip, seconds in zip(block.strips, self.shift, strict=True):
+            lines = strip.time_of(np.array([0.0, max(strip.lines - 1.0, 0.0)]))
+            both = self.ns(np.array([strip.trajectory.start_s, strip.trajectory.end_s, *lines]) + seconds)
+            self.extents.append((int(both.min()), int(both.max()) + 1))
+
+    def ns(self, time_s: Any) -> NDArray[np.int64]:
+        """Stamps of shifted times in seconds."""
+        t = np.asarray(time_s, dtype=float)
+        whole = np.floor(t)
+        return self._reference_ns + whole.astype(np.int64) * SECOND_NS + np.rint((t - whole) * 1e9).astype(np.int64)
+
+    def of_looks(self, block: Block) -> NDArray[np.int64]:
+        """(n,) stamps of the image points: when they were imaged, within their strip; the last of all without strip."""
+        strip, time = block.image.strip, block.image.time_s
+        stamps = np.full(len(strip), max(end for _, end in self.extents), dtype=np.int64)
+        for i, (begin, end) in enumerate(self.extents):
+            mine = np.flatnonzero(strip == i)
+            low, high = ((edge - self._reference_ns) * 1e-9 for edge in (begin, end))
+            inside = self.ns(np.clip(time[mine] + self.shift[i], low - 1.0, high + 1.0))
+            stamps[mine] = np.clip(inside, begin, end - 1)
+        return stamps
+
+
+def _project(block: Block) -> Any:
+    settings = block.apriori.trajectory
+    frame, known = block.frame, _sigmas(block)
+    project = m.Project(
+        name=block.name,
+        crs=frame.crs,
+        origin_latitude=frame.lat_deg,
+        origin_longitude=frame.lon_deg,
+        origin_height=frame.height_m,
+        image_sigma_px=block.apriori.image_sigma_px,
+    )
+    for key, values in known.items():
+        getattr(project, key).extend(values)
+    if "wander_time_s" in settings:
+        project.wander_time_s = float(np.asarray(settings["wander_time_s"], dtype=float))
+    return project
+
+
+def _sigmas(block: Block) -> dict[str, list[float]]:
+    """A-priori sigmas of the trajectory; shift, offset and drift by default where the project gives none."""
+    settings = block.apriori.trajectory
+    dgr = DgrOptions.from_settings(settings)
+    given = {key: settings[key] for key in SIGMAS if key in settings}
+    given |= {key: getattr(dgr, key) for key in SIGMAS[:3]}
+    return {key: np.broadcast_to(np.asarray(value, dtype=float), 3).tolist() for key, value in given.items()}
+
+
+def _pose_covariance(block: Block) -> NDArray[np.float64]:
+    """(6, 6) of each pose: all that is told to be wrong with the trajectory, taken together."""
+    known = {key: np.square(values) for key, values in _sigmas(block).items()}
+    position = known["offset_sigma_m"] + known.get("wander_sigma_m", 0.0)
+    attitude = known["shift_sigma_deg"] + known["drift_sigma_deg"] + known.get("wander_sigma_deg", 0.0)
+    return np.diag(np.concatenate([position, attitude * np.radians(1.0) ** 2]))
+
+
+def _pass_messages(block: Block, times: _Times, i: int, source: str) -> Iterator[Message]:
+    """Begin and end of a strip."""
+    strip = block.strips[i]
+    first_line = int(times.ns(strip.time_of(np.zeros(1)) + times.shift[i])[0])
+    for stamp, ended in zip(times.extents[i], (False, True), strict=True):
+        body = m.Strip(
+            id=strip.id,
+            first_line_time_ns=first_line,
+            line_rate_hz=strip.line_rate_hz,
+            lines=strip.lines,
+            ended=ended,
+        )
+        yield Message("configuration/strip", stamp, body, source)
+
+
+def _pose_messages(block: Block, times: _Times, i: int, source: str) -> Iterator[Message]:
+    strip = block.strips[i]
+    trajectory = strip.trajectory
+    angles = angles_from_matrix(matrix_from_quaternion(trajectory.quaternion))
+    velocity = trajectory.at(trajectory.time_s).velocity_l
+    covariance = _pose_covariance(block)
+    for k, stamp in enumerate(times.ns(trajectory.time_s + times.shift[i]).tolist()):
+        body = pose_message(
+            stamp,
+            trajectory.position_l[k],
+            angles[k],
+            covariance,
+            quaternion=trajectory.quaternion[k],
+            strip=strip.id,
+            velocity_l=velocity[k],
+        )
+        yield Message("trajectory/smoothed", stamp, body, source)
+
+
+def _tie_messages(block: Block, times: _Times, source: str) -> Iterator[Message]:
+    """One message a point and strip, in order of their stamps."""
+    image = block.image
+    if not len(image):
+        return
+    time_ns = times.of_looks(block)
+    order = np.lexsort((time_ns, image.strip, image.point))
+    key = np.stack([image.point[order], image.strip[order]])
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
+    after = np.append(first[1:], len(order))
+    stamps = time_ns[order[after - 1]]
+    for group in np.argsort(stamps, kind="stable"):
+        rows = order[first[group] : after[group]]
+        looks = []
+        for row in rows.tolist():
+            _, strip, ccd = block.image_name(row)
+            looks.append(
+                m.ImagePoint(
+                    strip=block.strips[image.strip[row]].id if image.strip[row] >= 0 else strip,
+                    ccd=ccd,
+                    line=image.line[row],
+                    sample=image.sample[row],
+                    sigma_line=image.sigma_px[row],
+                    sigma_sample=image.sigma_px[row],
+                    time_ns=int(time_ns[row]),
+                )
+            )
+        body = m.TiePoint(point=block.point_ids[image.point[rows[0]]], images=looks)
+        yield Message("observation/tie", int(stamps[group]), body, source)
