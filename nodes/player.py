@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,13 @@ from ..schemas.envelope import RawMessage
 from ..schemas.image_lines import LineBlock
 from ..schemas.topics import Family
 from . import registry
-from .bus import Bus
 from .errors import UserError
+from .pacing import SETTLE_S, Pacer
 from .program import ProgramOptions
 from .recording import RecordingReader
-from .runner import active_nodes
+from .runner import active_nodes, is_remade
 
 SECOND_NS = 1_000_000_000
-#: Time for others to take in configuration and control before the first measurement goes out.
-SETTLE_S = 1.0
 #: Between the end of a recording and its next round, platform time.
 LOOP_PAUSE_NS = SECOND_NS
 
@@ -49,80 +46,19 @@ class PlayResult:
     mean_late_s: float = 0.0
 
 
-class Pacer:
-    """Lets things happen at their time: ``due_s`` seconds after the start, divided by the rate.
-
-    Parameters
-    ----------
-    rate : speed, 1 = as it was; 0 = as fast as it goes
-    stop : ends every waiting
-    """
-
-    def __init__(self, rate: float, stop: threading.Event) -> None:
-        self._rate = rate
-        self._stop = stop
-        self._begun = time.perf_counter()
-        self.worst_late_s = 0.0
-        self._late_sum_s = 0.0
-        self._n = 0
-
-    @property
-    def mean_late_s(self) -> float:
-        return self._late_sum_s / max(self._n, 1)
-
-    def wait(self, due_s: float) -> bool:
-        """Wait until it is time; False where the waiting was ended."""
-        if self._rate:
-            target = self._begun + due_s / self._rate
-            remaining = target - time.perf_counter()
-            while remaining > 0:
-                if remaining > 0.002:
-                    self._stop.wait(remaining - 0.001)
-                else:
-                    time.sleep(min(remaining, 0.0002))
-                if self._stop.is_set():
-                    return False
-                remaining = target - time.perf_counter()
-            self.worst_late_s = max(self.worst_late_s, -remaining)
-            self._late_sum_s -= remaining
-            self._n += 1
-        return not self._stop.is_set()
-
-
-def publish_paced(
-    bus: Bus, messages: Iterable[Any], rate: float, stop: threading.Event, *, settle_s: float = SETTLE_S
-) -> Pacer:
-    """Publish `Message` objects at the pace of their stamps; used by programs that make messages, such as a simulator.
-
-    Latched messages at the beginning go out at once; the others follow ``settle_s`` later, so that all who listen know
-    the configuration by then.
-    """
-    pacer: Pacer | None = None
-    first_ns = 0
-    for message in messages:
-        if pacer is None:
-            if topics.find(message.topic).latched:
-                bus.publish(message)
-                continue
-            stop.wait(settle_s)
-            pacer, first_ns = Pacer(rate, stop), message.stamp_ns
-        if not pacer.wait((message.stamp_ns - first_ns) / SECOND_NS):
-            break
-        bus.publish(message)
-    return pacer or Pacer(rate, stop)
-
-
-def regenerated(reader: RecordingReader) -> set[str]:
-    """Topics of a recording that the estimating nodes make anew from the rest of it."""
-    recorded = {c.topic for c in reader.channels.values() if c.known}
+def regenerated(reader: RecordingReader) -> set[int]:
+    """Channels of a recording that the estimating nodes make anew from the rest of it."""
+    known = [channel for channel in reader.channels.values() if channel.known]
     classes = []
     for name in registry.ESTIMATING:
         try:
             classes.append(registry.node_class(name))
         except UserError:  # not installed: what it made stays in
             continue
-    made = {output for node in active_nodes(classes, recorded) for output in node.outputs}
-    return {t for t in recorded if t in made or t.startswith("status/")}
+    active = active_nodes(classes, {channel.topic for channel in known})
+    made = {output for node in active for output in node.outputs}
+    makers = {node.name for node in active}
+    return {channel.id for channel in known if is_remade(channel.topic, channel.source, made, makers)}
 
 
 def play(
@@ -157,9 +93,9 @@ def play(
     leave_out = set() if everything else regenerated(reader)
     numbers = []
     for number in reader.select():
-        topic = reader.channels[int(reader.index.channel[number])].topic
-        if topic in leave_out:
-            result.left_out[topic] += 1
+        channel = int(reader.index.channel[number])
+        if channel in leave_out:
+            result.left_out[reader.channels[channel].topic] += 1
         else:
             numbers.append(int(number))
     head, body = _split(reader, np.array(numbers, dtype=np.int64), from_ns, to_ns)
@@ -310,6 +246,7 @@ def run(options: ProgramOptions) -> int:
     first = first_stamp_ns(reader)
     with options.open_bus() as bus:
         bus.announce("player")
+        bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
         result = play(
             reader,
             bus.publish_raw,

@@ -300,7 +300,7 @@ def run(options: ProgramOptions) -> int:
     """
     from .flight_settings import simulated_flight
     from .live import StatusPublisher
-    from .player import publish_paced
+    from .pacing import publish_paced
 
     settings = dict(options.table)
     try:

@@ -351,7 +351,7 @@ def test_real_motion(tmp_path, capsys, as_sensors):
     if not as_sensors:
         pose = convert.pose_sample(of(read, "trajectory/smoothed")[200].body)
         assert pose.covariance is not None
-        assert np.sqrt(np.diag(pose.covariance))[:3] == pytest.approx(np.hypot([5, 5, 8], [3, 3, 4]), rel=1e-3)
+        assert np.sqrt(np.diag(pose.covariance))[:3] == pytest.approx(np.hypot([8, 8, 12], [3, 3, 4]), rel=1e-3)
         assert pose.strip == "S1"
 
 

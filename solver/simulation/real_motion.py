@@ -19,13 +19,14 @@ from .terrain import fractal_terrain
 
 Array = NDArray[np.floating]
 
-#: Errors put on a real motion seen from high altitude; noise is that of a smoothed trajectory.
+#: Errors put on a real motion at high altitude: a good inertial unit (0.005 deg are 1.7 m on the ground), positions
+#: without corrections; noise as a smoothed trajectory has it.
 HIGH_ALTITUDE_ERRORS = ErrorModel(
-    offset_sigma_m=(5.0, 5.0, 8.0),
+    offset_sigma_m=(8.0, 8.0, 12.0),
     wander_sigma_m=(3.0, 3.0, 4.0),
-    shift_sigma_deg=(0.01, 0.01, 0.02),
-    drift_sigma_deg=(0.005, 0.005, 0.005),
-    wander_sigma_deg=(0.002, 0.002, 0.004),
+    shift_sigma_deg=(0.005, 0.005, 0.01),
+    drift_sigma_deg=(0.003, 0.003, 0.003),
+    wander_sigma_deg=(0.001, 0.001, 0.002),
     wander_time_s=60.0,
     gnss_noise_m=(0.02, 0.02, 0.02),
     attitude_noise_deg=(0.0002, 0.0002, 0.0004),

@@ -146,9 +146,9 @@ def vaihingen() -> Testfield:
         parallel_and_cross(camera, 1505.0, 4, 2, 7500.0, sidelap=0.46),
         (
             Configuration("direct georeferencing", 0, None, Published(0.125, 0.18),
-                          "ours: sigmas of Table 5.11 for six strips; camera errors as assumed here"),
+                          "camera errors as assumed here, unknown to the sigma; those of the flight were smaller"),
             Configuration("DGR", 4, Job(model), Published(0.048, 0.064),
-                          "camera errors as assumed here, not those of the flight"),
+                          "camera errors as assumed here; those of the flight were smaller"),
             Configuration("DGR SC", 4, calibrated, Published(0.033, 0.058, sigma0_px=(0.18, 0.18)),
                           "published: errors of check points and of point definition; simulation has 2 cm and none"),
             Configuration("LIM-8 SC", 12, replace(calibrated, then=_lim(8, (0.03, 0.03), 0.001)),
@@ -184,7 +184,7 @@ def pavia(height_m: float) -> Testfield:
         (6500.0, 5500.0), 30.0, noise, model, camera, parameters, _AERIAL_ERRORS, lines,
         (
             Configuration("direct georeferencing", 0, None, direct,
-                          f"published: camera calibration of the vendor, {published}"),
+                          f"camera errors, published ({published}) and assumed here; the sigma does not know them"),
             Configuration("DGR SC", control, Job(model, self_calibration=parameters), calibrated,
                           "strips as assumed here; signalised points are measured better than sigma0 of all says"),
         ),
