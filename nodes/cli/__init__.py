@@ -25,7 +25,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "a valid recording from a broken one"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
     "import": ("import_", "block folder, sensor folder, SBET and others to a recording"),
-    "rectify": ("rectify", "orthoimage of a recording"),
     "study": ("study", "Monte Carlo and sensitivity studies"),
     "view": ("view", "open a recording in Rerun"),
 }

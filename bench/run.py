@@ -1,0 +1,32 @@
+"""All benchmarks, one after the other: ``make bench``. Each is a program of its own and can be run alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+#: What is measured, and the program that measures it with its arguments.
+BENCHMARKS = {
+    "bus and recorder under the load of three full image lines": ["bus_load.py"],
+    "batch adjustment against Ceres": ["ceres/compare.py"],
+    "batch adjustment: time and memory against size": ["adjustment_scaling.py"],
+    "inertial navigation": ["navigation.py"],
+    "sliding window": ["window.py"],
+}
+
+
+def main() -> int:
+    failed = []
+    for title, (program, *arguments) in BENCHMARKS.items():
+        print(f"\n=== {title}: bench/{program}", flush=True)
+        if subprocess.run([sys.executable, str(FOLDER / program), *arguments]).returncode:
+            failed.append(program)
+    if failed:
+        print(f"\nfailed: {', '.join(failed)}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
