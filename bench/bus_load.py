@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+
 from triline.nodes.bus import Bus
 from triline.nodes.convert import gnss_message
 from triline.nodes.node import Message

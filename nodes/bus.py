@@ -8,10 +8,11 @@ again and again. Nobody is a hub that all depend on.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor":
 
 Receive = Callable[[RawMessage], None]
 Malformed = Callable[[str, str], None]
-Answer = Callable[[dict[str, str]], "tuple[str, Any] | None"]
+Answer = Callable[[dict[str, str]], Any]
 
 
 def default_port() -> int:
@@ -67,6 +68,8 @@ def configuration(port: int | None = None, file: str | Path | None = None) -> ze
         "connect/retry": _RETRY,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": 4000,  # ms after which a frozen peer counts as gone
+        # us for which one who does not read may hold a publisher; then the link is closed, and made anew
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 2_000_000,
         "timestamping/enabled": True,
     }.items():
         config.insert_json5(key, json.dumps(value))
@@ -113,6 +116,12 @@ class Bus:
 
     # ---- publishing
 
+    def prepare(self, names: Iterable[str]) -> None:
+        """Declare topics ahead of their first message, so that nobody has to learn of them while it is on its way."""
+        for name in names:
+            if not name.endswith("*") and name not in self._publishers:
+                self._publishers[name] = self._declare_publisher(name)
+
     def publish(self, message: Message) -> None:
         """Publish a message; one without source or number gets this session's source and the next number."""
         sequence = message.sequence
@@ -124,11 +133,10 @@ class Bus:
 
     def publish_raw(self, raw: RawMessage) -> None:
         """Publish an encoded message with the envelope it has."""
-        publisher = self._publishers.get(raw.topic)
-        if publisher is None:
-            publisher = self._publishers[raw.topic] = self._declare_publisher(raw.topic)
+        if raw.topic not in self._publishers:
+            self._publishers[raw.topic] = self._declare_publisher(raw.topic)
         data = raw.data if isinstance(raw.data, bytes) else bytes(raw.data)
-        publisher.put(data, attachment=pack(raw.envelope))
+        self._publishers[raw.topic].put(data, attachment=pack(raw.envelope))
 
     def _declare_publisher(self, topic: str) -> Any:
         row = topics.find(topic)
@@ -173,8 +181,7 @@ class Bus:
             receive(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
 
         handler = zenoh.handlers.Callback(take, indirect=False)
-        row = next(row for row in topics.TOPICS if row.name == name or row.matches(name))
-        if row.latched:
+        if topics.find(name).latched:
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 self._session,
                 self.key(name),
@@ -206,19 +213,18 @@ class Bus:
         return {str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None}
 
     def answer(self, name: str, answer: Answer) -> None:
-        """Answer queries ``query/<name>?key=value;..``: ``answer`` gives (topic, message body), or None for none."""
+        """Answer queries ``query/<name>?key=value;..``: ``answer`` gives a message body, or None for none."""
         key = self.key(f"query/{name}")
 
         def take(query: Any) -> None:
             with query:
                 try:
-                    found = answer(dict(_parameters(str(query.parameters))))
+                    body = answer(dict(_parameters(str(query.parameters))))
                 except ValueError as error:
                     query.reply_err(str(error).encode(), encoding="text/plain")
                     return
-                if found is not None:
-                    topic, body = found
-                    encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(topics.find(topic).type_name)
+                if body is not None:
+                    encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(body.DESCRIPTOR.full_name)
                     query.reply(key, codec.encode(body), encoding=encoding)
 
         self._declared.append(self._session.declare_queryable(key, zenoh.handlers.Callback(take)))
@@ -243,10 +249,12 @@ class Bus:
     def close(self) -> None:
         """Withdraw everything and close the session; callbacks have ended when this returns."""
         for declared in (*self._declared, *self._publishers.values()):
-            declared.undeclare()
+            with contextlib.suppress(zenoh.ZError):  # a link that has just broken takes its declarations along
+                declared.undeclare()
         self._declared.clear()
         self._publishers.clear()
-        self._session.close()
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()
 
 
 def _parameters(text: str) -> list[tuple[str, str]]:

@@ -53,7 +53,22 @@ def build(cls: Any, tables: Tables, name: str | None = None) -> Any:
         if key not in known:
             wanted = f"wanted one of {', '.join(known)}" if known else "the node has nothing to configure"
             raise UserError(f"configuration [{table_name}]: {key} is not known, {wanted}")
+    for key, value in table.items():
+        wanted = _wanted(parameters[key].default, value)
+        if wanted:
+            raise UserError(f"configuration [{table_name}]: {key} is {value!r}, wanted {wanted}")
     try:
         return cls(**table)
     except (ValueError, TypeError) as error:
         raise UserError(f"configuration [{table_name}]: {error}") from None
+
+
+def _wanted(default: Any, value: Any) -> str:
+    """What a value should be to take the place of a default; empty if it can."""
+    if isinstance(default, bool):
+        return "" if isinstance(value, bool) else "true or false"
+    if isinstance(default, int | float):
+        return "" if isinstance(value, int | float) and not isinstance(value, bool) else "a number"
+    if isinstance(default, str):
+        return "" if isinstance(value, str) else "a text"
+    return ""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from ..schemas import codec, topics
@@ -16,7 +16,7 @@ from ..schemas.envelope import RawMessage
 from ..schemas.topics import Family, Queue
 from .bus import Bus
 from .node import Message, Node
-from .ordering import Sequencer, StreamCheck, TopicCounts
+from .ordering import Sequencer, StreamCheck, TopicCounts, order_key
 from .runner import StepDriver
 
 #: Waiting messages of lossless topics after which publishers are slowed down.
@@ -32,6 +32,8 @@ IDLE_RESULTS_S = 2.0
 #: Time in which latched topics arrive before the first message is worked off.
 JOIN_S = 0.5
 STATUS_PERIOD_S = 0.5
+#: Between the last message and the end of the session, for what is still on its way.
+LAST_WORDS_S = 0.2
 
 
 class Inbox:
@@ -86,6 +88,25 @@ class Inbox:
             self._condition.notify_all()
 
 
+class _Patience:
+    """Waiting time: a clock that stands still while this process works or is frozen.
+
+    What the others have sent in that time has not been looked at yet, so it must not count as their silence.
+    """
+
+    LONGEST_WAIT_S = 0.1
+
+    def __init__(self) -> None:
+        self._seen_s = time.monotonic()
+        self._waited_s = 0.0
+
+    def now_s(self) -> float:
+        seen_s = time.monotonic()
+        self._waited_s += min(seen_s - self._seen_s, self.LONGEST_WAIT_S)
+        self._seen_s = seen_s
+        return self._waited_s
+
+
 class BusRunner:
     """Runs a node on the bus until told to stop.
 
@@ -115,9 +136,10 @@ class BusRunner:
         self._lock = threading.Lock()
         self._malformed: Counter[str] = Counter()
         self._stop = stop or threading.Event()
+        self._patience = _Patience()
         self._worked_ns = 0
         self._status = StatusPublisher(bus, node.name)
-        results = any(topics.find(name).family is Family.RESULT for name in node.inputs if not name.endswith("*"))
+        results = any(topics.find(name).family is Family.RESULT for name in node.inputs)
         # Who publishes nothing needs no order, and must not slow down those who do.
         self._ordered = bool(node.outputs)
         self._idle_s = IDLE_RESULTS_S if results else IDLE_S
@@ -130,14 +152,15 @@ class BusRunner:
         """Work until `stop`, then work off what waits, finish the node and publish what follows."""
         for name in self.node.inputs:
             self.bus.subscribe(name, self._receive, self._malformed_envelope)
+        self.bus.prepare(self.node.outputs)
         self._declare_queries()
         self.bus.announce(self.node.name)
         self._status.publish("starting", self._statistics(), self.node, 0.0, 0, 0)
         self._join()
-        heard = time.monotonic()
+        heard = self._patience.now_s()
         while not self._stop.is_set():
             raws = self._inbox.take(0.02)
-            now = time.monotonic()
+            now = self._patience.now_s()
             if raws:
                 heard = now
             for raw in raws:
@@ -153,24 +176,23 @@ class BusRunner:
     def _join(self) -> None:
         """Work off what was sent before this node came: configuration and control, before everything else."""
         until = time.monotonic() + JOIN_S
-        later: list[RawMessage] = []
+        arrived: list[RawMessage] = []
         while time.monotonic() < until and not self._stop.is_set():
-            for raw in self._inbox.take(0.05):
-                if topics.find(raw.topic).latched:
-                    for accepted in self._check.accept(raw.topic, raw.envelope, raw):
-                        message = self._decode(accepted)
-                        if message is not None:
-                            later_ns = self._worked_ns
-                            self._work(message)
-                            self._worked_ns = later_ns
-                else:
-                    later.append(raw)
-        now = time.monotonic()
-        for raw in later:
-            self._arrive(raw, now)
+            arrived += self._inbox.take(0.05)
+        latched = [raw for raw in arrived if topics.find(raw.topic).latched]
+        for raw in sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)):
+            for accepted in self._check.accept(raw.topic, raw.envelope, raw):
+                message = self._decode(accepted)
+                if message is not None:
+                    self._work(message)
+        self._worked_ns = 0  # configuration does not tell how far the flight is
+        now = self._patience.now_s()
+        for raw in arrived:
+            if not topics.find(raw.topic).latched:
+                self._arrive(raw, now)
 
     def _end(self) -> None:
-        now = time.monotonic()
+        now = self._patience.now_s()
         for raw in self._inbox.take(0.0):
             self._arrive(raw, now)
         for message in self._sequencer.flush():
@@ -181,6 +203,7 @@ class BusRunner:
             self.bus.publish(output)
         self._tell(force=True, state="stopping")
         self._inbox.close()
+        time.sleep(LAST_WORDS_S)
 
     # ---- one message
 
@@ -209,6 +232,8 @@ class BusRunner:
             late = self._sequencer.push(accepted.topic, accepted.envelope, message, now)
             if late is not None:
                 self._check.counts[accepted.topic].late += 1
+                behind_s = ((self._sequencer.newest_ns or 0) - accepted.envelope.stamp_ns) / 1e9
+                self.node.problem("late", f"{accepted.topic} {accepted.envelope.sequence} came {behind_s:.3f} s behind")
                 self._work(late)
 
     def _decode(self, raw: RawMessage) -> Message | None:
@@ -236,18 +261,20 @@ class BusRunner:
         query = getattr(self.node, "query", None)
         for name in getattr(self.node, "queries", ("orientation",) if query is not None else ()):
 
-            def answer(parameters: dict[str, str], name: str = name) -> tuple[str, Any] | None:
+            def answer(parameters: dict[str, str], name: str = name) -> Any:
                 assert query is not None
                 with self._lock:
                     found = query(name, parameters)
-                return None if found is None else (found.topic, found.body)
+                return None if found is None else found.body
 
             self.bus.answer(name, answer)
 
     def _statistics(self) -> dict[str, TopicCounts]:
-        counts = dict(self._check.counts)
+        counts = {topic: replace(counted) for topic, counted in self._check.counts.items()}
         for topic, number in self._inbox.dropped.items():
-            counts.setdefault(topic, TopicCounts()).dropped = number
+            counted = counts.setdefault(topic, TopicCounts())
+            counted.dropped = number
+            counted.gaps = max(0, counted.gaps - number)  # what was thrown away here was not lost on the way
         return counts
 
     def _tell(self, force: bool = False, state: str | None = None) -> None:
@@ -316,9 +343,3 @@ class StatusPublisher:
         for name, value in sorted(node.counters.items()):
             status.counters.add(name=name, value=int(value))
         self._bus.publish(Message(f"status/{self._name}", stamp_ns, status, self._name))
-
-
-def stderr_report(text: str) -> None:
-    """Report on standard error, one line."""
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()

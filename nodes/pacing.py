@@ -63,6 +63,7 @@ def publish_paced(
     Latched messages at the beginning go out at once; the others follow ``settle_s`` later, so that all who listen know
     the configuration by then.
     """
+    bus.prepare(row.name for row in topics.TOPICS if row.latched)
     pacer: Pacer | None = None
     first_ns = 0
     for message in messages:

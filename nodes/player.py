@@ -84,7 +84,7 @@ def play(
     stop : ends it
     rate : speed, 0 = as fast as it goes
     from_ns, to_ns : platform time to play, ends included; configuration and control from before are played always
-    loop : again and again; stamps, times inside messages and strip names of later rounds are shifted
+    loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names
     everything : also what nodes make anew
     start : tells this run from others in the envelopes
     settle_s : waiting time after configuration and control, s
@@ -172,7 +172,10 @@ def _publish(
 
 
 def shifted(topic: str, data: bytes | memoryview, shift_ns: int, suffix: str) -> bytes | memoryview:
-    """A payload with all times shifted and a suffix on the names of strips; what cannot be decoded stays as it is."""
+    """A payload with all times shifted and a suffix on the names of strips and points.
+
+    What cannot be decoded stays as it is.
+    """
     try:
         body = codec.decode(topic, data)
     except ValueError:
@@ -197,7 +200,7 @@ def _shift(body: Any, shift_ns: int, suffix: str) -> None:
             else:
                 for part in (value,) if hasattr(value, "ListFields") else value:
                     _shift(part, shift_ns, suffix)
-        elif name == "strip":
+        elif name in ("strip", "point"):  # a strip, and what is seen from it, is not the same thing a round later
             setattr(body, name, value + suffix)
         elif name.endswith(("time_ns", "start_ns", "end_ns")):
             setattr(body, name, value + shift_ns)
@@ -237,11 +240,14 @@ def run(options: ProgramOptions) -> int:
     """Play the recording that the configuration names: [player] input, rate, from, to, loop, all."""
     table = dict(options.table)
     path = table.pop("input", None)
-    if not path:
+    if not path or not isinstance(path, str):
         raise UserError("the player needs a recording: --set input=FILE, or [player] input in the configuration")
     unknown = set(table) - {"rate", "from", "to", "loop", "all"}
     if unknown:
         raise UserError(f"configuration [player]: {', '.join(sorted(unknown))} is not known")
+    rate = table.get("rate", 1.0)
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 <= rate < 1e6:
+        raise UserError(f"configuration [player]: rate is {rate!r}, wanted a number of at least 0")
     reader = RecordingReader(Path(path))
     first = first_stamp_ns(reader)
     with options.open_bus() as bus:
@@ -251,7 +257,7 @@ def run(options: ProgramOptions) -> int:
             reader,
             bus.publish_raw,
             options.stop,
-            rate=float(table.get("rate", 1.0)),
+            rate=float(rate),
             from_ns=time_argument(str(table["from"]), first) if "from" in table else None,
             to_ns=time_argument(str(table["to"]), first) if "to" in table else None,
             loop=bool(table.get("loop", False)),

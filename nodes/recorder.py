@@ -15,7 +15,7 @@ from .bus import Bus
 from .errors import UserError
 from .live import StatusPublisher
 from .node import Node
-from .ordering import StreamCheck
+from .ordering import StreamCheck, order_key
 from .program import ProgramOptions
 from .recording import COMPRESSIONS, RecordingWriter
 
@@ -65,7 +65,7 @@ class Recorder(Node):
 
     Parameters
     ----------
-    output : path of the recording
+    output : path of the recording; where there is one already, a number is added to the name
     compression : ``none``, ``lz4`` or ``zstd``
     rotate_mb : start a new file after so many megabytes; 0 = one file
     """
@@ -110,6 +110,8 @@ class Recorder(Node):
         ------
         UserError : it cannot be written
         """
+        if self._path.is_dir():
+            raise UserError(f"{self._path}: is a folder, wanted a file")
         try:
             self._open()
         except OSError as error:
@@ -153,7 +155,7 @@ class Recorder(Node):
 
     def _open(self) -> None:
         number = len(self.files)
-        path = self._path if number == 0 else self._path.with_stem(f"{self._path.stem}_{number:04d}")
+        path = self._next_path()
         self._file = RecordingFile(path)
         try:
             self._writer = RecordingWriter(self._file, self._compression, platform=self.platform)  # type: ignore[arg-type]
@@ -169,6 +171,15 @@ class Recorder(Node):
         self.files.append(path)
         self._flushed_s = time.monotonic()
         self._unflushed = 0
+
+    def _next_path(self) -> Path:
+        """The path asked for, or the next number after it: a recording is never written over."""
+        number, path = len(self.files), self._path
+        while path in self.files or (path.exists() and path.stat().st_size):
+            number = max(number, 1)
+            path = self._path.with_stem(f"{self._path.stem}_{number:04d}")
+            number += 1
+        return path
 
     def _close(self) -> None:
         if self._writer is not None and self._file is not None:
@@ -291,7 +302,9 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     until = time.monotonic() + HEAD_S
     while time.monotonic() < until and not options.stop.is_set():
         head += backlog.take(0.05)
-    recorder.take(sorted(head, key=lambda raw: not topics.find(raw.topic).latched))
+    latched = [raw for raw in head if topics.find(raw.topic).latched]
+    recorder.take(sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)))
+    recorder.take([raw for raw in head if not topics.find(raw.topic).latched])
     while not options.stop.is_set():
         recorder.take(backlog.take(0.05))
         recorder.tend()

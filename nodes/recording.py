@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import mmap
 import zlib
-from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
@@ -26,6 +24,7 @@ from ..schemas.messages import file_descriptor_set
 from . import mcap_scan as scan
 from .errors import UserError
 from .node import Message
+from .recording_index import Channel, Index, IndexColumns
 
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 LIBRARY = "triline"
@@ -145,48 +144,6 @@ class RecordingWriter:
         self.close()
 
 
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """A channel of a recording; ``known`` where topic and type are in the topic table."""
-
-    id: int
-    topic: str
-    type_name: str
-    source: str
-    platform: str
-    start: int
-    known: bool
-
-
-@dataclass
-class Index:
-    """Where every message of a recording stands, in file order: arrays of one length."""
-
-    chunk: NDArray[np.int64]
-    place: NDArray[np.int64]
-    channel: NDArray[np.int64]
-    sequence: NDArray[np.int64]
-    receive_ns: NDArray[np.int64]
-    stamp_ns: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.chunk)
-
-
-@dataclass
-class _Columns:
-    """The index while it grows."""
-
-    columns: list[array[int]] = field(default_factory=lambda: [array("q") for _ in range(6)])
-
-    def add(self, *values: int) -> None:
-        for column, value in zip(self.columns, values, strict=True):
-            column.append(min(value, 0x7FFFFFFFFFFFFFFF))
-
-    def index(self) -> Index:
-        return Index(*(np.frombuffer(c, dtype=np.int64) if c else np.empty(0, np.int64) for c in self.columns))
-
-
 class RecordingReader:
     """Reads a recording, whole or damaged: what cannot be read is skipped, counted and named.
 
@@ -221,6 +178,7 @@ class RecordingReader:
         self.problems: Counter[str] = Counter()
         self.last_problem = ""
         self._schemas: dict[int, tuple[int, str]] = {}
+        self._data_end: scan.Record | None = None
         self._trust: dict[int, int] = {}
         self._chunks: list[scan.Chunk] = []
         self._content = lru_cache(maxsize=64)(self._decompress)
@@ -234,7 +192,7 @@ class RecordingReader:
     # ---- what stands where
 
     def _scan(self) -> Index:
-        columns = _Columns()
+        columns = IndexColumns()
         if not self._begins:
             self.damage.append(scan.Damage(0, len(scan.MAGIC), "a damaged beginning"))
         for record in scan.records(self._buffer):
@@ -250,7 +208,7 @@ class RecordingReader:
             self.problems["without a channel"] += columns.columns[2].count(channel)
         return columns.index()
 
-    def _note(self, record: scan.Record | scan.WholeChunk, columns: _Columns) -> None:
+    def _note(self, record: scan.Record | scan.WholeChunk, columns: IndexColumns) -> None:
         if isinstance(record, scan.WholeChunk):
             number = len(self._chunks)
             self._chunks.append(record.chunk)
@@ -260,7 +218,7 @@ class RecordingReader:
             self.complete = self._buffer[record.end : record.end + len(scan.MAGIC)] == scan.MAGIC
             self._check_summary(record)
         elif record.opcode == scan.DATA_END:
-            self._check_data(record)
+            self._data_end = record
         elif record.opcode == scan.HEADER:
             _, position = scan.text(record.content, 0)
             self.library, _ = scan.text(record.content, position)
@@ -273,11 +231,14 @@ class RecordingReader:
         else:
             self._note_inner(record.opcode, -1, record.offset, record.content, columns)
 
-    def _check_data(self, record: scan.Record) -> None:
-        """Whether the checksum over everything up to here is right; it also covers what stands between chunks."""
-        wanted = int.from_bytes(record.content[:4], "little")
-        if wanted and not self.damage and zlib.crc32(self._buffer[: record.offset]) != wanted:
-            raise ValueError("a wrong checksum of all data, outside the chunks")
+    def check_outside(self) -> str | None:
+        """What is wrong with the bytes outside chunks; takes as long as reading the whole file."""
+        if self._data_end is None or self.damage:
+            return None
+        wanted = int.from_bytes(self._data_end.content[:4], "little")
+        if wanted and zlib.crc32(self._buffer[: self._data_end.offset]) != wanted:
+            return f"a wrong checksum outside the chunks, before byte {self._data_end.offset}"
+        return None
 
     def _check_summary(self, footer: scan.Record) -> None:
         start = int.from_bytes(footer.content[:8], "little")
@@ -286,7 +247,7 @@ class RecordingReader:
         if start and wanted and zlib.crc32(covered) != wanted:
             raise ValueError("an index with a wrong checksum")
 
-    def _note_inner(self, opcode: int, chunk: int, place: int, body: memoryview, columns: _Columns) -> None:
+    def _note_inner(self, opcode: int, chunk: int, place: int, body: memoryview, columns: IndexColumns) -> None:
         if opcode == scan.MESSAGE:
             if len(body) < scan.MESSAGE_HEAD_SIZE:
                 raise ValueError("a message without a head")

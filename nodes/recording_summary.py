@@ -76,12 +76,15 @@ def time_span_ns(reader: RecordingReader) -> tuple[int, int] | None:
     return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
 
-def findings(reader: RecordingReader, *, decode: bool = True) -> list[str]:
+def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:
     """What is wrong with a recording, one line each, the worst first; empty if it is whole.
 
-    ``decode`` looks into every message, too.
+    ``decode`` looks into every message, ``outside`` at the bytes between chunks, too.
     """
     found = [str(damage) for damage in reader.damage]
+    wrong = reader.check_outside() if outside else None
+    if wrong is not None:
+        found.append(wrong)
     if not reader.complete and not reader.damage:
         found.append("the file has no end: it was cut off, or its writer was killed")
     if not any(channel.known for channel in reader.channels.values()):

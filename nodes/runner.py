@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,9 +62,9 @@ class StepDriver:
         return [self._stamped(output, elapsed) for output in outputs]
 
     def _stamped(self, output: Message, elapsed: float) -> Message:
-        if not any(topics.find(name).matches(output.topic) or name == output.topic for name in self.node.outputs):
+        if not any(topics.find(name).matches(output.topic) for name in self.node.outputs):
             raise ValueError(f"{self.node.name} gave {output.topic}, its outputs are {', '.join(self.node.outputs)}")
-        if self._clock and "compute_s" in output.body.DESCRIPTOR.fields_by_name and not output.body.compute_s:
+        if self._clock and getattr(output.body, "compute_s", None) == 0.0:
             output.body.compute_s = elapsed
         sequence = self._sequences[output.topic]
         self._sequences[output.topic] += 1
@@ -129,17 +129,24 @@ def active_nodes(nodes: Sequence[Node], recorded: Iterable[str]) -> list[Node]:
     return active
 
 
+def is_remade(topic: str, source: str, made: Container[str], makers: Container[str]) -> bool:
+    """Whether a recorded message is left out, because nodes make it anew.
+
+    ``made`` are the outputs of the nodes that run, ``makers`` their names. Events are left out where one of these told
+    them; what live nodes said of their own health is no input of anything.
+    """
+    if topics.find(topic).family is Family.STATUS:
+        return topic.startswith("status/") or source in makers
+    return topic in made
+
+
 def _drives(name: str) -> bool:
-    row = _row(name)
+    row = topics.find(name)
     return not row.latched and row.family is not Family.CONFIGURATION
 
 
-def _row(name: str) -> topics.Topic:
-    return next(row for row in topics.TOPICS if row.name == name or row.matches(name))
-
-
 def _is_made(name: str, available: set[str]) -> bool:
-    row = _row(name)
+    row = topics.find(name)
     return any(name == topic or (row.matches(topic) and row.name == name) for topic in available)
 
 
@@ -159,7 +166,8 @@ def process(
     progress : told the fraction that is done, now and then
     """
     summary = ProcessSummary()
-    recorded = {channel.topic for channel in reader.channels.values() if channel.known}
+    held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
+    recorded = {c.topic for c in reader.channels.values() if c.known and c.id in held}
     running = active_nodes(nodes, recorded)
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
@@ -168,7 +176,7 @@ def process(
 
     def listening(topic: str) -> list[StepDriver]:
         if topic not in listeners:
-            listeners[topic] = [d for d in drivers if any(_row(n).matches(topic) or n == topic for n in d.node.inputs)]
+            listeners[topic] = [d for d in drivers if any(topics.find(n).matches(topic) for n in d.node.inputs)]
         return listeners[topic]
 
     pending: list[tuple[Key, Message, RawMessage]] = []
@@ -215,9 +223,9 @@ def _inputs(
     """The usable inputs of a recording in order; decoded where a node listens."""
     numbers = []
     for number in reader.select():
-        topic = reader.channels[int(reader.index.channel[number])].topic
-        if topic in made or topic.startswith("status/"):  # what live nodes said of themselves is no input
-            summary.replaced[topic] += 1
+        channel = reader.channels[int(reader.index.channel[number])]
+        if is_remade(channel.topic, channel.source, made, summary.nodes):
+            summary.replaced[channel.topic] += 1
         else:
             numbers.append(number)
 
@@ -225,6 +233,10 @@ def _inputs(
         summary.dropped[kind] += 1
         summary.last_problem = text
 
+    foreign = len(reader.index) - len(reader.select())
+    if foreign:
+        summary.dropped["foreign"] = foreign
+        summary.last_problem = f"{foreign} messages on topics of other programs"
     check: StreamCheck[int] = StreamCheck(problem)
     kept = []
     for number in numbers:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
 from triline.nodes import convert
 from triline.nodes.node import Message
 from triline.schemas import messages as m

@@ -11,6 +11,7 @@ import pytest
 import sample_messages as sample
 import zenoh
 from bus_rig import Rig, free_port, simulated_flight, triline, wait_for
+
 from triline.nodes import convert
 from triline.nodes.bus import Bus, configuration
 from triline.nodes.errors import UserError
@@ -232,6 +233,43 @@ def test_a_full_lossless_queue_holds_its_publisher():
     assert [r.envelope.sequence for r in taken] == list(range(20))
 
 
+class Slow(Node):
+    """Only looks on, and takes its time."""
+
+    name, inputs, outputs = "slow", ("sensor/attitude", "sensor/lines/*"), ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[Message] = []
+
+    def step(self, message: Message):
+        time.sleep(0.01)
+        self.seen.append(message)
+        return ()
+
+
+def test_a_node_that_only_looks_on_slows_nobody():
+    port, stop = free_port(), threading.Event()
+    with Bus(port=port, source="slow") as bus, Bus(port=port, source="sender") as sender:
+        runner = BusRunner(Slow(), bus, stop=stop)
+        runner._inbox = Inbox(newest_depth=20)
+        thread = threading.Thread(target=runner.run)
+        thread.start()
+        wait_for(lambda: "slow" in sender.alive(), what="the node")
+        time.sleep(0.7)
+        begun = time.monotonic()
+        for i in range(1000):
+            sender.publish(sample.message("sensor/attitude", i))
+        assert time.monotonic() - begun < 2.0  # 10 s of work for the node
+        wait_for(lambda: runner.node.seen and runner.node.seen[-1].sequence == 999, 20, "the newest message")
+        stop.set()
+        thread.join()
+    counts = runner._statistics()["sensor/attitude"]
+    assert counts.dropped > 500
+    assert counts.dropped + len(runner.node.seen) == 1000
+    assert counts.gaps == 0
+
+
 # ---- the bus itself
 
 
@@ -247,8 +285,9 @@ def test_late_joiners_get_configuration_and_control_before_all_else(rig):
             return ()
 
     with Bus(port=rig.port, source="witness") as bus:
-        wait_for(lambda: "player" in bus.alive(), 20, "the player")
-        time.sleep(2.5)  # it is in the middle of its flight
+        heard: list[int] = []
+        bus.subscribe("sensor/attitude", lambda raw: heard.append(raw.envelope.sequence))
+        wait_for(lambda: heard and heard[-1] > 60, 30, "the middle of the flight")
         stop = threading.Event()
         thread = threading.Thread(target=BusRunner(Witness(), bus, stop=stop).run)
         thread.start()
@@ -300,7 +339,7 @@ def test_queries_are_answered(tmp_path):
             if "t" not in parameters:
                 raise ValueError("t is missing, wanted a time in ns")
             time_ns = int(parameters["t"])
-            return Message("orientation/live", time_ns, convert.pose_message(time_ns, (1, 2, 3), (0, 0, 0)))
+            return Message("query/orientation", time_ns, convert.pose_message(time_ns, (1, 2, 3), (0, 0, 0)))
 
     port, stop = free_port(), threading.Event()
     with Bus(port=port, source="chain") as bus, Bus(port=port, source="other") as other:

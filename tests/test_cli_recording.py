@@ -6,24 +6,25 @@ import itertools
 import json
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight
 from bus_rig import triline as command
+
+import triline
 from triline.nodes.bus import Bus
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message, Node
 from triline.nodes.player import iso, play, time_argument
 from triline.nodes.recording import RecordingReader, RecordingWriter
-from triline.nodes.runner import active_nodes, process
+from triline.nodes.runner import StepDriver, active_nodes, process
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.envelope import Envelope, RawMessage
-
-import triline
 
 
 def run(capsys, *arguments):
@@ -188,6 +189,23 @@ def test_process_skips_damage_and_bad_messages_with_a_count(tmp_path):
     gnss = [raw for raw in out if raw.topic == "sensor/gnss"]
     assert [raw.envelope.stamp_ns for raw in logs] == [raw.envelope.stamp_ns for raw in gnss]
     assert [raw.envelope.stamp_ns for raw in out] == sorted(raw.envelope.stamp_ns for raw in out)
+
+
+def test_nodes_may_take_and_give_image_lines(tmp_path):
+    class Negative(Node):
+        name, inputs, outputs = "negative", ("sensor/lines/*",), ("sensor/lines/*",)
+
+        def step(self, message: Message):
+            block = message.body
+            return [Message("sensor/lines/X", message.stamp_ns, replace(block, pixels=4095 - block.pixels, ccd="X"))]
+
+    path = write(tmp_path / "a.mcap", [sample.message("sensor/lines/F", i) for i in range(3)])
+    out: list[Message] = []
+    driver = StepDriver(Negative(), time.perf_counter)
+    for message in RecordingReader(path).messages():
+        out += driver.step(message)
+    assert [m.sequence for m in out] == [0, 1, 2]
+    np.testing.assert_array_equal(out[2].body.pixels, 4095 - sample.line_block(2).pixels)
 
 
 def test_only_nodes_with_something_to_work_on_run():

@@ -7,6 +7,7 @@ import itertools
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from triline.nodes.ordering import MAX_JUMP_NS, REBASE_AFTER, Sequencer, StreamCheck, order_key
 from triline.schemas import topics
 from triline.schemas.envelope import Envelope

@@ -11,6 +11,7 @@ import sample_messages as sample
 from google.protobuf.message import DecodeError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 from triline.nodes.ordering import order_key

@@ -10,8 +10,9 @@ import sample_messages as sample
 from bus_rig import free_port, wait_for
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
+
 from triline.nodes.bus import Bus
-from triline.nodes.player import play
+from triline.nodes.player import play, shifted
 from triline.nodes.recording import RecordingReader, RecordingWriter
 from triline.schemas import codec
 from triline.schemas.image_lines import LineBlock
@@ -83,8 +84,6 @@ def test_record_and_replay(name, tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_loop_shifts_every_time_in_a_message(name, tmp_path):
-    from triline.nodes.player import shifted
-
     data = codec.encode(sample.body(name))
     shift_ns = 3_000_000_007
     moved = shifted(name, shifted(name, data, shift_ns, ""), -shift_ns, "")
@@ -96,6 +95,15 @@ def test_loop_shifts_every_time_in_a_message(name, tmp_path):
     assert times or find(name).family is Family.STATUS or name in (
         "configuration/project", "configuration/camera", "observation/control", "truth/point", "point/object",
     )  # fmt: skip
+
+
+def test_loop_gives_strips_and_points_new_names():
+    tie = codec.decode(
+        "observation/tie", shifted("observation/tie", codec.encode(sample.body("observation/tie")), 1, "~2")
+    )
+    assert (tie.point, tie.images[0].strip, tie.images[0].ccd) == ("T0~2", "S1~2", "F")
+    lines = codec.decode("sensor/lines/F", shifted("sensor/lines/F", sample.line_block().encode(), 1, "~2"))
+    assert (lines.strip, lines.ccd) == ("S1~2", "F")
 
 
 def _times(body):

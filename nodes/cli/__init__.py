@@ -85,8 +85,18 @@ def main(argv: list[str] | None = None) -> int:
         print(f"triline {args.command}: {error.filename}: no such file or folder", file=sys.stderr)
     except (PermissionError, IsADirectoryError, NotADirectoryError) as error:
         print(f"triline {args.command}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
+    except MemoryError as error:
+        print(f"triline {args.command}: not enough memory: {str(error) or 'out of memory'}", file=sys.stderr)
     except BrokenPipeError:  # the reader of our output has gone, as in `triline info F | head`
         sys.stderr.close()
     except KeyboardInterrupt:
         print(f"triline {args.command}: interrupted", file=sys.stderr)
+    except OSError as error:  # a full disk, most often
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"triline {args.command}: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
+    except Exception as error:  # a fault of the program; -v shows where
+        if getattr(args, "verbose", False):
+            raise
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        print(f"triline {args.command}: fault in triline, please report it (-v shows where): {what}", file=sys.stderr)
     return 1

@@ -27,7 +27,8 @@ def run(args: argparse.Namespace) -> int:
 def _summary(recording: Recording) -> dict[str, Any]:
     reader = recording.reader
     span = time_span_ns(reader)
-    held = {channel.topic for channel in reader.channels.values() if channel.known}
+    rows = topic_summaries(reader)
+    held = {row.topic for row in rows if row.messages}  # a channel can be announced by a file whose chunks are gone
     summary: dict[str, Any] = {
         "file": str(reader.path),
         "bytes": reader.size,
@@ -38,8 +39,8 @@ def _summary(recording: Recording) -> dict[str, Any]:
         "start": iso(span[0]) if span else None,
         "end": iso(span[1]) if span else None,
         "duration_s": (span[1] - span[0]) / 1e9 if span else 0.0,
-        "topics": [vars(row) for row in topic_summaries(reader)],
-        "damage": findings(reader, decode=False),
+        "topics": [vars(row) for row in rows],
+        "damage": findings(reader, decode=False, outside=False),
     }
     if "configuration/project" in held:
         p = recording.project()

@@ -12,6 +12,7 @@ from pathlib import Path
 from .. import registry
 from ..config import build, load
 from ..errors import UserError
+from ..formats.new_file import refuse_unless_file
 from ..node import Node
 from ..recording import COMPRESSIONS, RecordingReader, RecordingWriter
 from ..runner import ProcessSummary, process
@@ -36,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
     tables = load(args.config)
     reader = RecordingReader(args.recording)
     _check(reader, args)
-    nodes: list[Node] = [build(registry.node_class(name.strip()), tables) for name in args.nodes.split(",")]
+    names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
+    nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
     part = args.output.with_name(args.output.name + ".part")
     try:
@@ -47,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
             summary = process(reader, nodes, writer.write_raw, told)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
+        if not summary.outputs:
+            raise UserError(f"{args.recording}: nothing came out: {_waiting(summary, nodes)}")
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
@@ -54,11 +58,11 @@ def run(args: argparse.Namespace) -> int:
         part.unlink(missing_ok=True)
     seconds = time.monotonic() - begun
     if args.json:
-        print(json.dumps(result(summary, args.output, seconds), indent=2))
+        print(json.dumps(result(summary, reader, args.output, seconds), indent=2))
         return 0
     for line in _lines(summary, reader, args.output, seconds):
         print(line)
-    if reader.damage and not args.quiet:
+    if reader.damage:  # quiet or not: something is missing in the result
         lost = sum(d.length for d in reader.damage)
         print(f"triline process: {args.recording}: skipped {len(reader.damage)} damaged places ({lost} bytes); "
               f"the first: {reader.damage[0]}", file=sys.stderr)  # fmt: skip
@@ -66,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
+    refuse_unless_file(args.output)
     if args.output.resolve() == args.recording.resolve():
         raise UserError(f"{args.output}: the output would overwrite the recording")
     if not any(channel.known for channel in reader.channels.values()):
@@ -76,15 +81,24 @@ def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
 
 
 def _held(reader: RecordingReader) -> str:
-    held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
+    present = set(reader.index.channel.tolist())
+    held = sorted({c.topic for c in reader.channels.values() if c.known and c.id in present})
+    if not held:
+        return f"no message is left of it ({reader.damage[0]})" if reader.damage else "it holds no message"
     return f"it holds {', '.join(held)}"
+
+
+def _waiting(summary: ProcessSummary, nodes: list[Node]) -> str:
+    """What the nodes that ran say of themselves."""
+    ran = [node for node in nodes if node.name in summary.nodes]
+    return "; ".join(f"{n.name} {n.state()}" + (f" ({n.last_problem})" if n.last_problem else "") for n in ran)
 
 
 def _platform(reader: RecordingReader) -> str:
     return next((c.platform for c in reader.channels.values() if c.platform), "demo")
 
 
-def result(summary: ProcessSummary, output: Path, seconds: float) -> dict[str, object]:
+def result(summary: ProcessSummary, reader: RecordingReader, output: Path, seconds: float) -> dict[str, object]:
     """The machine-readable result."""
     return {
         "output": str(output),
@@ -93,6 +107,8 @@ def result(summary: ProcessSummary, output: Path, seconds: float) -> dict[str, o
         "outputs": dict(sorted(summary.outputs.items())),
         "replaced": dict(sorted(summary.replaced.items())),
         "dropped": dict(sorted(summary.dropped.items())),
+        "damage": [str(damage) for damage in reader.damage],
+        "lost_bytes": sum(damage.length for damage in reader.damage),
         "counters": summary.counters,
         "problems": summary.problems,
         "flight_s": (summary.last_ns - summary.first_ns) / 1e9,

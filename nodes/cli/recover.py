@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from ..errors import UserError
+from ..formats.new_file import refuse_unless_file
 from ..recording import RecordingReader, RecordingWriter
 from ..recording_summary import topic_summaries
 
@@ -23,6 +24,7 @@ def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording, salvage=True)
     if args.output.exists() and args.output.samefile(args.recording):
         raise UserError(f"{args.output}: the output would overwrite the recording")
+    refuse_unless_file(args.output)
     numbers = reader.select()
     if not len(numbers):
         raise UserError(f"{args.recording}: nothing in it that could be recovered")

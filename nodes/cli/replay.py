@@ -22,7 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=_rate, default=1.0, metavar="R", help="speed; 0 = as fast as it goes")
     parser.add_argument("--from", dest="from_", metavar="T", help="first platform time: seconds from start or ISO time")
     parser.add_argument("--to", metavar="T", help="last platform time: seconds from start or ISO time")
-    parser.add_argument("--loop", action="store_true", help="again and again; later rounds have shifted stamps")
+    parser.add_argument(
+        "--loop",
+        action="store_true",
+        help="again and again; later rounds have shifted times and new names of strips and points",
+    )
     parser.add_argument("--all", action="store_true", help="also what nodes make anew: trajectories, orientations, ...")
     add_bus_arguments(parser)
 
@@ -34,9 +38,10 @@ def run(args: argparse.Namespace) -> int:
     stop = threading.Event()
     stop_on_signals(stop)
     if args.loop:
-        report("looping: stamps, times in messages and strip names of later rounds are shifted")
+        report("looping: later rounds have shifted stamps and times, and new names of strips and points (S1~2)")
     with Bus(args.platform, source="player", port=args.port, file=args.bus) as bus:
         bus.announce("player")
+        bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
         report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
         with progress("playing", args.quiet or args.json) as told:
             result = play(

@@ -1,0 +1,51 @@
+"""The index of a recording: where its channels and messages stand."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of a recording; ``known`` where topic and type are in the topic table."""
+
+    id: int
+    topic: str
+    type_name: str
+    source: str
+    platform: str
+    start: int
+    known: bool
+
+
+@dataclass
+class Index:
+    """Where every message of a recording stands, in file order: arrays of one length."""
+
+    chunk: NDArray[np.int64]
+    place: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    sequence: NDArray[np.int64]
+    receive_ns: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.chunk)
+
+
+@dataclass
+class IndexColumns:
+    """The index while it grows."""
+
+    columns: list[array[int]] = field(default_factory=lambda: [array("q") for _ in range(6)])
+
+    def add(self, *values: int) -> None:
+        for column, value in zip(self.columns, values, strict=True):
+            column.append(min(value, 0x7FFFFFFFFFFFFFFF))
+
+    def index(self) -> Index:
+        return Index(*(np.frombuffer(c, dtype=np.int64) if c else np.empty(0, np.int64) for c in self.columns))
