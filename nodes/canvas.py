@@ -29,6 +29,7 @@ class Layout:
     Attributes
     ----------
     title : of the 3D view; says what is exaggerated and by how much
+    grid_m : spacing of the grid on the ground
     corners : (n, 3) what has to be in view, m, display coordinates
     along : (3,) direction of flight; the eye stands to its right
     ccds : ids of the CCD lines, one image-space view each, and the view's title
@@ -39,6 +40,7 @@ class Layout:
     """
 
     title: str
+    grid_m: float
     corners: Array
     along: Array
     ccds: dict[str, str]

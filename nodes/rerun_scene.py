@@ -22,8 +22,10 @@ TIMELINE = "flight_time"
 _FLUSH_S = 5.0
 _BACKGROUND = [18, 20, 26]  # the colours of the scene are made for a dark ground, whatever the theme
 _FIELD_OF_VIEW = np.radians(55.0)  # of the viewer, vertical
+_ALWAYS = rrb.TimeRangeBoundary.infinite()  # plots show the whole flight, not what is near the time cursor
 _ASPECT = 1.35  # of the 3D view, about
 _MARGIN = 1.06
+_MAP_POINTS = 300.0  # height and width of the map, about
 
 
 class RerunCanvas:
@@ -207,7 +209,7 @@ def _flight(layout: Layout) -> rrb.View:
         contents=["+ /flight/**", "+ /points/**"],
         name=layout.title,
         background=_BACKGROUND,
-        line_grid=rrb.LineGrid3D(visible=True, spacing=500.0, color=[70, 75, 90, 120], stroke_width=0.6),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=layout.grid_m, color=[70, 75, 90, 120], stroke_width=0.6),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=[0.0, 0.0, 1.0]
         ),
@@ -241,9 +243,14 @@ def _plot(entity: str, title: str, span: tuple[float, float] | None = None, lege
         name=title,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         background=rrb.archetypes.PlotBackground(color=_BACKGROUND, show_grid=True),
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=_ALWAYS, end=_ALWAYS)),
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
     )
 
 
 def _map(layout: Layout) -> rrb.View:
-    return rrb.MapView(origin="/map", name="Map", zoom=14.0)
+    """The map, zoomed so that the strips fit: a tile of 256 points shows the Earth's girth / 2^zoom."""
+    latitude, _ = layout.geographic_centre or (0.0, 0.0)
+    extent = float(np.ptp(layout.corners[:, :2], axis=0).max())
+    girth = 40_075_017.0 * np.cos(np.radians(latitude))
+    return rrb.MapView(origin="/map", name="Map", zoom=float(np.log2(girth * _MAP_POINTS / 256 / max(extent, 100.0))))

@@ -20,7 +20,7 @@ from .node import Message
 from .scene_flight import FlightPart
 from .scene_image import ImagePart
 from .scene_map import MapPart
-from .scene_parts import LEGEND
+from .scene_parts import FILTERED, LEGEND
 from .scene_plots import PlotsPart
 from .scene_points import PointsPart
 from .scene_state import SceneState
@@ -34,6 +34,7 @@ TOPICS: tuple[str, ...] = (
     "configuration/strip",
     "sensor/gnss",
     "trajectory/filtered",
+    "trajectory/smoothed",
     "observation/control",
     "orientation/live",
     "orientation/final",
@@ -44,6 +45,7 @@ TOPICS: tuple[str, ...] = (
 TRUTH_TOPICS: tuple[str, ...] = ("truth/trajectory",)
 _SHOWN = frozenset(TOPICS + TRUTH_TOPICS)
 _HOLD_NS = convert.SECOND_NS // 2
+_NO_NAVIGATOR_NS = 30 * convert.SECOND_NS
 
 
 class Scene:
@@ -62,7 +64,7 @@ class Scene:
         self._laid_out: Any = None
         self._held: list[tuple[str, PoseSample]] = []
         self._released = False
-        self._waiting_truth: deque[PoseSample] = deque(maxlen=5000)
+        self._waiting_truth: deque[PoseSample] = deque(maxlen=20_000)
 
     def take(self, message: Message) -> None:
         """Remember what a message says.
@@ -74,6 +76,8 @@ class Scene:
         topic, body = message.topic, message.body
         if topic not in _SHOWN:
             return
+        if not all_finite(body):
+            raise ValueError("value is not finite")
         self.state.note(message)
         if topic.startswith("configuration/"):
             return
@@ -95,12 +99,28 @@ class Scene:
                 return
             self._release()
             return
-        if topic == "truth/trajectory":
+        if topic == "truth/trajectory" and self.state.measured == "truth":
+            self._hand_out("trajectory", sample)
+        elif topic == "truth/trajectory":
             self._waiting_truth.append(sample)
+            if not self.state.measured and sample.time_ns - self._waiting_truth[0].time_ns > _NO_NAVIGATOR_NS:
+                self._adopt_truth()
+        elif topic.startswith("trajectory/"):
+            name = topic.removeprefix("trajectory/")  # the first that comes is the one others are compared with
+            self.state.measured = self.state.measured or name
+            if name == self.state.measured:
+                self._hand_out("trajectory", sample)
         else:
             self._hand_out(topic, sample)
-        while self._waiting_truth and self._waiting_truth[0].time_ns <= self.state.filtered.newest_ns:
+        while self._waiting_truth and self._waiting_truth[0].time_ns <= self.state.trajectory.newest_ns:
             self._hand_out("truth/trajectory", self._waiting_truth.popleft())
+
+    def _adopt_truth(self) -> None:
+        """Draw the true trajectory as the flown one: a simulated recording that no navigator has seen."""
+        self.state.measured = "truth"
+        for sample in self._waiting_truth:
+            self._hand_out("trajectory", sample)
+        self._waiting_truth.clear()
 
     def _hand_out(self, topic: str, sample: PoseSample) -> None:
         self.state.note_pose(topic, sample)
@@ -121,11 +141,13 @@ class Scene:
         for topic, sample in self._held:
             self._take_pose(topic, sample)
         self._held.clear()
+        if self.state.closing and not self.state.measured:
+            self._adopt_truth()
 
     def close(self) -> None:
         """Draw the rest and close the canvas."""
-        self._release()
         self.state.closing = True
+        self._release()
         self.draw()
         self.canvas.close()
 
@@ -145,7 +167,8 @@ class Scene:
             place = s.frame.to_geodetic(centre + s.origin)
             middle = float(place[0]), float(place[1])
         layout = Layout(
-            title=f"Deviations from filtered and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}",
+            title=f"Deviations from {s.measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}",
+            grid_m=s.grid_m,
             corners=corners,
             along=along,
             ccds={ccd: f"Residuals {ccd}: samples to the right, lines up, bar = 1 px" for ccd in s.ccds},
@@ -161,7 +184,7 @@ class Scene:
             "about",
             f"Display origin: E {east:.0f} m, N {north:.0f} m, U {up:.0f} m in the local frame of "
             f"*{s.project.name if s.project is not None else 'no project'}*.\n\n"
-            f"Live, final and true trajectory: deviation from the filtered one x {s.exaggeration:g}; ellipsoids: "
+            f"Live, final and true trajectory: deviation from the {s.measured} one x {s.exaggeration:g}; ellipsoids: "
             f"3 sigma of the final one x {s.exaggeration:g}.\n\n"
             f"Residuals x {s.residual_scale:g}: thin arrows are those of single rays laid on the ground, in the "
             "colour of their CCD line; thick arrows at control and check points are adjusted minus given coordinates.",
@@ -182,6 +205,19 @@ class Scene:
         return s.display(np.array(places))
 
     def _legend(self, truth: bool) -> None:
-        rows = [row for row in LEGEND if truth or row[0] != "truth"]
+        rows = [(self.state.measured, FILTERED), *(row for row in LEGEND if truth or row[0] != "truth")]
         places = np.array([[100.0 * i, 0.0] for i in range(len(rows))])
         self.canvas.points("legend", places, [color for _, color in rows], 5.0, [text for text, _ in rows])
+
+
+def all_finite(body: Any) -> bool:
+    """Whether all numbers of a message and of the messages in it are finite."""
+    for field, value in body.ListFields():
+        if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
+            if not np.isfinite(value).all():
+                return False
+        elif field.cpp_type == field.CPPTYPE_MESSAGE:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                if not all_finite(part):
+                    return False
+    return True

@@ -14,7 +14,7 @@ from .scene_state import SceneState
 Array = NDArray[np.floating]
 
 _STYLE = {  # topic -> entity, colour, radius, label
-    "trajectory/filtered": ("flight/filtered", FILTERED, 1.6, "filtered"),
+    "trajectory": ("flight/trajectory", FILTERED, 1.6, "trajectory"),
     "orientation/live": ("flight/live", LIVE, 1.6, "live"),
     "orientation/final": ("flight/final", FINAL, 2.4, "final"),
     "truth/trajectory": ("flight/truth", TRUTH, 0.9, "truth"),
@@ -49,12 +49,12 @@ class FlightPart(Part):
 
     def _place(self, topic: str, sample: PoseSample) -> Array | None:
         """Display position: the filtered place plus the exaggerated deviation from it."""
-        if topic == "trajectory/filtered":
+        if topic == "trajectory":
             return self.state.display(sample.position_l)
         if sample.correction is not None:
             base = sample.position_l - sample.correction[:3]
         else:
-            found = self.state.filtered.at(sample.time_ns)
+            found = self.state.trajectory.at(sample.time_ns)
             if found is None:
                 return None
             base = found[0]
@@ -97,7 +97,7 @@ class FlightPart(Part):
     def _draw_looks(self, canvas: Canvas) -> None:
         """The ground that each CCD line images now, with the rays to its ends."""
         pose, camera = self.state.newest, self.state.camera
-        if pose is None or camera is None or self._head.get("trajectory/filtered") is None:
+        if pose is None or camera is None or self._head.get("trajectory") is None:
             return
         R = matrix_from_quaternion(pose.quaternion)
         fans, colors = [], []

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import convert
-from .canvas import Canvas
+from .canvas import Canvas, Color
 from .convert import PoseSample
 from .node import Message
 from .scene_parts import CHECK, CONTROL, FILTERED, FINAL, Part, Pieces
 from .scene_state import SceneState
 
+Array = NDArray[np.floating]
 _STEP_NS = convert.SECOND_NS
 
 
@@ -19,7 +21,7 @@ class MapPart(Part):
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
-        self._gnss = Pieces("map/gnss", 60, joined=True)
+        self._gnss = Pieces("map/gnss", 60)
         self._final = Pieces("map/final", 60, joined=True)
         self._ground = Pieces("map/ground", 600)
         self._last: dict[str, int] = {}
@@ -43,13 +45,15 @@ class MapPart(Part):
             self._ground.add((place, CHECK if convert.role_of(body) == "check" else CONTROL))
 
     def draw(self, canvas: Canvas) -> None:
-        def line(color):
-            return lambda entity, rows: canvas.geographic_line(entity, np.array(rows), color)
+        def fixes(entity: str, rows: list[Array]) -> None:
+            canvas.geographic_points(entity, np.array(rows), [FILTERED] * len(rows), 2.0)
 
-        self._gnss.draw(line(FILTERED))
-        self._final.draw(line(FINAL))
-        self._ground.draw(
-            lambda entity, rows: canvas.geographic_points(
-                entity, np.array([place for place, _ in rows]), [color for _, color in rows], 4.0
-            )
-        )
+        def line(entity: str, rows: list[Array]) -> None:
+            canvas.geographic_line(entity, np.array(rows), FINAL)
+
+        def ground(entity: str, rows: list[tuple[Array, Color]]) -> None:
+            canvas.geographic_points(entity, np.array([place for place, _ in rows]), [color for _, color in rows], 4.0)
+
+        self._gnss.draw(fixes)
+        self._final.draw(line)
+        self._ground.draw(ground)

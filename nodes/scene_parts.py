@@ -20,7 +20,6 @@ CHECK = (80, 190, 255, 255)
 REJECTED = (255, 60, 230, 255)
 AXES = ((255, 110, 110, 255), (120, 220, 120, 255), (120, 160, 255, 255))
 LEGEND = (
-    ("filtered", FILTERED),
     ("live", LIVE),
     ("final", FINAL),
     ("truth", TRUTH),

@@ -25,6 +25,7 @@ _MDEG = 1000.0 * float(np.degrees(1.0))
 _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
 _STEP_NS = int(0.2 * convert.SECOND_NS)
 _ALPHA = 0.05
+_WAITING = 1000
 _TELLING = 30  # redundancy from which sigma0 says something
 _GREY = (140, 140, 150, 255)
 _LEVELS = {1: "DEBUG", 2: "INFO", 3: "WARN", 4: "ERROR", 5: "CRITICAL"}
@@ -41,6 +42,7 @@ class PlotsPart(Part):
         self._styled: set[str] = set()
         self._events: list[tuple[float, str, str]] = []
         self._last: dict[str, int] = {}
+        self._untested: list[tuple[float, str, PoseSample]] = []  # orientations that came before their truth
         self._newest_ray_ns = 0
 
     # ---- taking
@@ -52,16 +54,29 @@ class PlotsPart(Part):
         t = self.state.seconds(sample.time_ns)
         if topic in _NAMES:
             self._corrections(t, _NAMES[topic], sample)
+            if sample.valid:
+                self._untested.append((t, _NAMES[topic], sample))
+        elif topic == "truth/trajectory":
+            base = self.state.trajectory.at(sample.time_ns)
+            if base is not None and self.state.on_strip(sample.time_ns):
+                self._error(t, self.state.measured, *base, sample.position_l, sample.quaternion)
+                needed = _difference(sample.position_l, sample.quaternion, *base) * _SCALE
+                series = Series(f"truth - {self.state.measured}", TRUTH, 1.0)
+                for name, value in zip(COMPONENTS, needed, strict=True):
+                    self._add(f"corrections/{name}/truth", t, value, series)
+            self._test(self.state.truth.newest_ns)
+
+    def _test(self, known_ns: int) -> None:
+        """Errors of the orientations that truth has caught up with."""
+        waiting, self._untested = self._untested[-_WAITING:], []
+        for row in waiting:
+            time_s, kind, sample = row
+            if sample.time_ns > known_ns:
+                self._untested.append(row)
+                continue
             true = self.state.truth.at(sample.time_ns)
             if true is not None:
-                self._error(t, _NAMES[topic], sample.position_l, sample.quaternion, *true)
-        elif topic == "truth/trajectory":
-            filtered = self.state.filtered.at(sample.time_ns)
-            if filtered is not None:
-                self._error(t, "filtered", *filtered, sample.position_l, sample.quaternion)
-                needed = _difference(sample.position_l, sample.quaternion, *filtered) * _SCALE
-                for name, value in zip(COMPONENTS, needed, strict=True):
-                    self._add(f"corrections/{name}/truth", t, value, Series("truth - filtered", TRUTH, 1.0))
+                self._error(time_s, kind, sample.position_l, sample.quaternion, *true)
 
     def _corrections(self, t: float, kind: str, sample: PoseSample) -> None:
         if sample.correction is None or len(sample.correction) != 6:
@@ -87,7 +102,7 @@ class PlotsPart(Part):
 
     def _error(self, t: float, kind: str, position: Array, quaternion: Array, true_p: Array, true_q: Array) -> None:
         error = _difference(position, quaternion, true_p, true_q)
-        color = {"filtered": FILTERED, "live": LIVE, "final": FINAL}[kind]
+        color = {"live": LIVE, "final": FINAL}.get(kind, FILTERED)
         self._add(f"errors/position/{kind}", t, float(np.linalg.norm(error[:3])), Series(kind, color))
         self._add(f"errors/attitude/{kind}", t, _MDEG * float(np.linalg.norm(error[3:])), Series(kind, color))
 

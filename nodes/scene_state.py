@@ -19,6 +19,7 @@ from .node import Message
 Array = NDArray[np.floating]
 _HISTORY_S = 120.0
 _HISTORY_STEP_S = 0.05
+_LARGEST_GAP_NS = convert.SECOND_NS
 _IMAGE_HEIGHT = 0.16  # of an image-space view, as a share of its width
 _NO_LENGTH_S = 60.0  # of a strip whose end is not known
 
@@ -40,7 +41,7 @@ class PoseHistory:
         return self._samples[-1][0] if self._samples else -1
 
     def at(self, time_ns: int) -> tuple[Array, Array] | None:
-        """Position and quaternion at a time, linear between neighbours; None outside what is kept."""
+        """Position and quaternion at a time, linear between neighbours; None outside what is kept and in long gaps."""
         samples = self._samples
         if not samples or not samples[0][0] <= time_ns <= samples[-1][0]:
             return None
@@ -49,6 +50,8 @@ class PoseHistory:
         if t1 == time_ns or k == 0:
             return p1, q1
         t0, p0, q0 = samples[k - 1]
+        if t1 - t0 > _LARGEST_GAP_NS:
+            return None
         share = (time_ns - t0) / (t1 - t0)
         q = q0 + share * (np.where(q0 @ q1 < 0, -q1, q1) - q0)
         return p0 + share * (p1 - p0), q / np.linalg.norm(q)
@@ -65,6 +68,8 @@ class SceneState:
     project, camera, frame, strips : configuration, as far as it has come; strip : id of the newest strip
     origin : (3,) subtracted from local coordinates for display; decided by the first pose
     extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
+    measured : the trajectory others are compared with, "filtered" or "smoothed"
+    trajectory, truth : the newest poses of both
     units : units of the parameters that have come
     """
 
@@ -86,7 +91,8 @@ class SceneState:
         self.newest: PoseSample | None = None
         self.speed_m_s = 70.0
         self._control: list[Array] = []
-        self.filtered = PoseHistory()
+        self.trajectory = PoseHistory()
+        self.measured = ""
         self.truth = PoseHistory()
 
     # ---- taking
@@ -109,11 +115,11 @@ class SceneState:
             self.now_s = max(self.now_s, self.seconds(message.stamp_ns))
 
     def note_pose(self, topic: str, sample: PoseSample) -> None:
-        """Keep the newest filtered poses; the first one decides the display frame."""
+        """keep the newest poses; the first one decides the display frame."""
         if topic == "truth/trajectory":
             self.has_truth = True
             self.truth.add(sample)
-        if topic != "trajectory/filtered":
+        if topic != "trajectory":
             return
         if self.newest is None:
             self._decide_frame(sample)
@@ -124,7 +130,8 @@ class SceneState:
         else:
             return
         self.newest = sample
-        self.filtered.add(sample)
+        if sample.valid:
+            self.trajectory.add(sample)
         self._plan(sample)
 
     def _decide_frame(self, sample: PoseSample) -> None:
@@ -137,19 +144,27 @@ class SceneState:
     def _plan(self, sample: PoseSample) -> None:
         """Where the strip that is being flown will end, once it has begun."""
         for id, strip in self.strips.items():
-            begun = sample.time_ns >= strip.first_line_time_ns
-            if not begun or id in self.extent or not strip.line_rate_hz > 0:
+            if id in self.extent or not self._flying(strip, sample.time_ns):
                 continue
-            length_s = strip.lines / strip.line_rate_hz if strip.lines else _NO_LENGTH_S
+            gone_s = (sample.time_ns - strip.first_line_time_ns) / convert.SECOND_NS  # more than 0 for who joins late
+            step = forward(sample.quaternion) * self.speed_m_s
+            start = sample.position_l - gone_s * step
+            self.extent[id] = np.array([start, start + _length_s(strip) * step])
             self.strip = id
-            end = sample.position_l + forward(sample.quaternion) * self.speed_m_s * length_s
-            self.extent[id] = np.array([sample.position_l, end])
+
+    def _flying(self, strip: Any, time_ns: int) -> bool:
+        gone_s = (time_ns - strip.first_line_time_ns) / convert.SECOND_NS
+        return strip.line_rate_hz > 0 and 0 <= gone_s <= _length_s(strip)
 
     # ---- asking
 
     def seconds(self, stamp_ns: int) -> float:
         """Seconds since the start."""
         return (stamp_ns - (self.start_ns or stamp_ns)) / convert.SECOND_NS
+
+    def on_strip(self, time_ns: int) -> bool:
+        """Whether a strip is flown at a time; always where no strip is known."""
+        return not self.strips or any(self._flying(strip, time_ns) for strip in self.strips.values())
 
     def display(self, position_l: Array) -> Array:
         """Display coordinates of local coordinates (..., 3)."""
@@ -177,13 +192,25 @@ class SceneState:
         return self.height_m * max(widths) / float(self.camera.focal_length_mm.min())
 
     @property
+    def _expected_m(self) -> float:
+        """Slow position errors that the project expects in the trajectory, one sigma; a metre where it says nothing."""
+        p = self.project
+        squares = [] if p is None else [v * v for v in (*p.offset_sigma_m, *p.wander_sigma_m)]
+        return float(np.sqrt(sum(squares) / 3)) or 1.0
+
+    @property
+    def grid_m(self) -> float:
+        """Spacing of the grid on the ground, m."""
+        return round_number(self.height_m / 3)
+
+    @property
     def exaggeration(self) -> float:
-        """Of deviations between trajectories, and of sigmas: a metre becomes a 25th of the flying height or more."""
-        return round_number(self.height_m / 25)
+        """Of deviations between trajectories, and of sigmas: what is expected becomes a 12th of the flying height."""
+        return round_number(self.height_m / 12 / self._expected_m)
 
     @property
     def residual_scale(self) -> float:
-        """Of residuals in object space: a pixel becomes a 25th of the flying height or more."""
+        """Of residuals in object space: a pixel becomes a 25th of the flying height."""
         return round_number(self.height_m / 25 / self.gsd_m)
 
     @property
@@ -191,6 +218,10 @@ class SceneState:
         """Width (samples) and height of an image-space view."""
         width = max((line.pixels for line in self.camera.lines), default=1) if self.camera is not None else 1
         return float(width), _IMAGE_HEIGHT * width
+
+
+def _length_s(strip: Any) -> float:
+    return strip.lines / strip.line_rate_hz if strip.lines else _NO_LENGTH_S
 
 
 def forward(quaternion: Array) -> Array:
@@ -201,6 +232,6 @@ def forward(quaternion: Array) -> Array:
 
 
 def round_number(value: float) -> float:
-    """The next of 1, 2, 5, 10, 20, ... that is not less."""
+    """The nearest of 1, 2, 5, 10, 20, ..., as ratios go."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
-    return float(next(f * power for f in (1, 2, 5, 10) if f * power >= value * (1 - 1e-9)))
+    return float(min((f * power for f in (1, 2, 5, 10)), key=lambda f: abs(np.log(f / max(value, 1e-9)))))

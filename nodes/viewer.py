@@ -68,11 +68,11 @@ class Viewer(Node):
     def step(self, message: Message) -> Iterable[Message]:
         if message.topic in self._hidden:
             return ()
-        if message.topic == "trajectory/filtered":
+        if message.topic.startswith("trajectory/"):
             time_ns = convert.time_ns(message.body.timestamp)  # poses may come in batches of one stamp
-            if 0 <= time_ns - self._last_pose_ns.get(message.source, 0) < _POSE_STEP_NS:
+            if 0 <= time_ns - self._last_pose_ns.get(message.topic, 0) < _POSE_STEP_NS:
                 return ()
-            self._last_pose_ns[message.source] = time_ns
+            self._last_pose_ns[message.topic] = time_ns
         if len(self._queue) >= self._queue_size:
             self.counters["view dropped"] += 1
         else:

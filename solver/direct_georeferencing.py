@@ -104,7 +104,11 @@ def _through_trajectory(problem: Problem, d_orientation: Array, J: Array, invers
         information = np.asarray(B.multiply(B).sum(axis=0)).ravel()
         variance = np.divide(1.0, information, out=np.zeros_like(information), where=information > 0)
         spread = np.asarray(M.multiply(M) @ variance).ravel()
-    else:
-        dense = (B.T @ B).toarray()
-        spread = np.asarray(M.multiply(M @ np.linalg.pinv(dense, hermitian=True)).sum(axis=1)).ravel()
+    else:  # continuity binds the unknowns of a set, never those of two
+        spread = np.zeros(shape[0])
+        by_column, normal = M.tocsc(), problem.prior.normal.tocsc()
+        for item in layout.sets:
+            own = csr_array(by_column[:, item.columns])
+            covariance = np.linalg.pinv(normal[item.columns, item.columns].toarray(), hermitian=True)
+            spread += np.asarray(own.multiply(own @ covariance).sum(axis=1)).ravel()
     return spread.reshape(-1, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from triline.nodes import convert
 from triline.nodes.node import Message
 from triline.schemas import messages as m
@@ -218,3 +219,20 @@ def _reports(add, rng, seconds, out):
             row.status = "estimated"
             body.parameters.append(row)
         add("adjustment/report", t, body)
+
+
+def spoilt_copy(body, rng):
+    """A copy with some of its numbers not finite."""
+    copy = type(body)()
+    copy.CopyFrom(body)
+    for field, value in copy.ListFields():
+        if field.cpp_type == field.CPPTYPE_DOUBLE and rng.random() < 0.3:
+            bad = float(rng.choice([np.nan, np.inf, -np.inf]))
+            if isinstance(value, float):
+                setattr(copy, field.name, bad)
+            else:
+                value[int(rng.integers(len(value)))] = bad
+        elif field.cpp_type == field.CPPTYPE_MESSAGE and not hasattr(value, "DESCRIPTOR"):
+            for i in range(len(value)):
+                value[i].CopyFrom(spoilt_copy(value[i], rng))
+    return copy

@@ -1,4 +1,4 @@
-"""Accuracy figures, the evaluation of a recording and its report."""
+"""The evaluation of a recording and its report."""
 
 from __future__ import annotations
 
@@ -8,19 +8,16 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
-from synthetic_flight import flight_messages
+from synthetic_flight import flight_messages, spoilt_copy
+
 from triline.nodes import convert
 from triline.nodes.cli import main
 from triline.nodes.recording import RecordingWriter
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses
-from triline.nodes.report.flight import collect
+from triline.nodes.report.flight import collect, updates_with_new_rays
 from triline.nodes.report.page import page
-from triline.solver.accuracy import accuracy, angle_difference, nees_band, normalised_error_squared
-from triline.solver.collinearity import project
-from triline.solver.sensors import preset
-from triline.solver.space_intersection import ImageRays, intersect
+from triline.nodes.report.strip_time import StripTime
 
 
 @pytest.fixture(scope="module")
@@ -35,120 +32,6 @@ def recording(messages, tmp_path_factory):
         for message in messages:
             writer.write(message)
     return path
-
-
-# ---- accuracy
-
-
-def test_accuracy_of_known_errors():
-    error = np.array([[3.0, -1.0], [-4.0, 1.0], [0.0, 3.0], [np.nan, 7.0]])
-    a = accuracy(error, np.broadcast_to(np.diag([25.0, 1.0]), (4, 2, 2)))
-    assert a.n == 3
-    np.testing.assert_allclose(a.rmse, [np.sqrt(25 / 3), np.sqrt(11 / 3)])
-    np.testing.assert_allclose(a.mean, [-1 / 3, 1.0])
-    np.testing.assert_allclose(a.maximum, [4.0, 3.0])
-    np.testing.assert_allclose(a.sigma, [5.0, 1.0])
-    assert a.nees == pytest.approx((25 / 25 + 11) / 3 / 2)
-
-
-def test_accuracy_without_covariance_and_without_errors():
-    assert accuracy(np.ones((4, 3))).nees is None
-    assert accuracy(np.empty((0, 3))).n == 0
-    with pytest.raises(ValueError, match="wanted"):
-        accuracy(np.ones((4, 3)), np.ones((4, 2, 2)))
-
-
-def test_normalised_errors_of_the_right_covariance_lie_in_their_band():
-    rng = np.random.default_rng(3)
-    root = np.diag([1.0, 1e-4, 50.0]) @ rng.normal(size=(3, 3))
-    error = rng.normal(size=(2000, 3)) @ root.T
-    covariance = np.broadcast_to(root @ root.T, (2000, 3, 3))
-    mean = float(normalised_error_squared(error, covariance).mean()) / 3
-    low, high = nees_band(2000, 3, alpha=0.001)
-    assert low < mean < high
-    assert 0.9 < low < 1.0 < high < 1.1
-    wrong = float(normalised_error_squared(error, 1.3 * covariance).mean()) / 3
-    assert not low < wrong < high
-
-
-def test_angle_difference_goes_the_short_way():
-    np.testing.assert_allclose(angle_difference([np.pi - 0.01, 0.2], [-np.pi + 0.01, 0.5]), [-0.02, -0.3])
-
-
-# ---- space intersection
-
-
-def _rays(rng, n_points, noise_px, orientation_root, common):
-    """Three looks at points 1500 m below; orientation errors are common to all looks of a point, or of each look."""
-    camera = preset("ads40")
-    times = np.array([-10.0, 0.0, 6.0])
-    truth = np.column_stack(
-        [rng.uniform(-100, 100, n_points), rng.uniform(-600, 600, n_points), rng.normal(0, 30, n_points)]
-    )
-    point = np.repeat(np.arange(n_points), 3)
-    time = np.tile(times, n_points)
-    position = np.stack([70.0 * time, np.zeros_like(time), np.full_like(time, 1500.0)], axis=1)
-    angles = np.tile([0.01, -0.02, 0.03], (len(time), 1))
-    focal = np.full(len(time), camera.focal_length_mm[0])
-    image = project(position, angles, truth[point], focal).xy_mm
-    pitch = np.tile([0.0, 0.0065], (len(time), 1))
-    motion_per_line = np.tile([-0.0065, 0.0], (len(time), 1))
-    error = rng.normal(size=(n_points if common else len(time), 6)) @ orientation_root.T
-    error = error[point] if common else error
-    noise = rng.normal(0, noise_px, (len(time), 2))
-    velocity = np.tile([70.0, 0.0, 0.0], (len(time), 1))
-    n = len(time)
-    period = 0.0065 / (focal[0] * 70.0 / 1500.0)
-    rays = ImageRays(
-        point, time, np.full(n, period), position + error[:, :3], angles + error[:, 3:], velocity, np.zeros((n, 3)),
-        image + noise[:, :1] * motion_per_line + noise[:, 1:] * pitch, pitch, focal,
-        np.full(n, noise_px or 0.3), np.full(n, noise_px or 0.3),
-        np.broadcast_to(orientation_root @ orientation_root.T, (n, 6, 6)),
-    )  # fmt: skip
-    return truth, rays
-
-
-def test_rays_without_errors_meet_in_the_point():
-    truth, rays = _rays(np.random.default_rng(0), 50, 0.0, np.zeros((6, 6)), True)
-    found = intersect(rays, 51)
-    np.testing.assert_allclose(found.xyz_l[:50], truth, atol=1e-6)
-    assert not found.known[50] and np.isnan(found.xyz_l[50]).all()
-    assert found.rays.tolist() == [3] * 50 + [0]
-
-
-def test_intersection_agrees_with_a_general_least_squares_solver():
-    _, rays = _rays(np.random.default_rng(1), 5, 0.5, np.zeros((6, 6)), True)
-    found = intersect(rays, 5)
-    for i in range(5):
-        mine = rays.point == i
-
-        def misfit(x, mine=mine):
-            p = project(rays.position_l[mine], rays.angles[mine], np.tile(x, (3, 1)), rays.focal_length_mm[mine])
-            return (rays.xy_mm[mine] - p.xy_mm).ravel() / (0.5 * 0.0065)
-
-        solved = least_squares(misfit, found.xyz_l[i] + 5.0, x_scale="jac")
-        # the line's advance in the image varies a little over the field, the test's pitch does not
-        np.testing.assert_allclose(found.xyz_l[i], solved.x, atol=0.01)
-        sigma = np.sqrt(np.diag(np.linalg.inv(solved.jac.T @ solved.jac)))
-        np.testing.assert_allclose(np.sqrt(np.diag(found.covariance[i])), sigma, rtol=0.05)
-
-
-@pytest.mark.parametrize("common", [True, False])
-def test_covariance_of_intersected_points_is_consistent(common):
-    root = np.diag([0.5, 0.4, 0.7, 1e-4, 1e-4, 2e-4]) @ np.tril(np.full((6, 6), 0.3) + 0.7 * np.eye(6))
-    truth, rays = _rays(np.random.default_rng(2), 1500, 0.3, root, common)
-    found = intersect(rays, 1500, correlation_time_s=np.inf if common else 1e-3)
-    nees = accuracy(found.xyz_l - truth, found.covariance).nees
-    low, high = nees_band(1500, 3, alpha=0.001)
-    assert nees is not None and low < nees < high
-
-
-def test_intersection_refuses_bad_calls():
-    _, rays = _rays(np.random.default_rng(0), 3, 0.3, np.zeros((6, 6)), True)
-    with pytest.raises(ValueError, match="correlation time"):
-        intersect(rays, 3, correlation_time_s=0.0)
-    with pytest.raises(ValueError, match="there are 2 points"):
-        intersect(rays, 2)
 
 
 # ---- evaluation
@@ -340,3 +223,67 @@ def test_bad_input_gets_one_line(tmp_path, capsys):
 def test_a_report_that_cannot_be_written_is_said(recording, tmp_path, capsys):
     assert main(["analyze", str(recording), "-o", str(tmp_path / "no" / "report.html")]) == 1
     assert "report.html: no such file" in capsys.readouterr().err
+
+
+def test_a_smoothed_trajectory_takes_the_place_of_a_filtered_one(messages):
+    renamed = [
+        type(m)("trajectory/smoothed", m.stamp_ns, m.body, m.source, m.sequence)
+        if m.topic == "trajectory/filtered"
+        else m
+        for m in messages
+    ]
+    usual, other = evaluate_flight(collect(messages)), evaluate_flight(collect(renamed))
+    assert other["points"]["direct_georeferencing"] == usual["points"]["direct_georeferencing"]
+    assert other["improvement"] == usual["improvement"] and other["missing"] == usual["missing"] == []
+
+
+# ---- axes and small parts
+
+
+def test_strips_stand_side_by_side_on_the_time_axis(messages):
+    flight = collect(m for m in messages if m.topic.startswith("configuration/"))
+    flight.start_ns = 0
+    second = type(flight.strips["S1"])()
+    second.CopyFrom(flight.strips["S1"])
+    for strip, first_s in ((flight.strips["S1"], 100), (second, 500)):
+        strip.first_line_time_ns, strip.line_rate_hz, strip.lines = first_s * 10**9, 100.0, 2001
+    t = np.arange(90.0, 600.0)
+    x, y = StripTime(flight).curve(t, t)
+    assert x[np.isfinite(x)].min() == 90.0  # one strip: the time itself
+    flight.strips["S2"] = second
+    x, y = StripTime(flight).curve(t, t)
+    first, later = (y >= 100) & (y <= 120), (y >= 500) & (y <= 520)
+    assert first.sum() == later.sum() == 21 and np.isnan(x).sum() == 1
+    np.testing.assert_allclose(x[first], y[first] - 100.0)
+    np.testing.assert_allclose(x[later] - x[later][0], y[later] - 500.0)
+    assert 20.0 < x[later][0] < 22.0
+
+
+def test_updates_without_new_rays_do_not_count_as_latency():
+    report = type("Report", (), {})
+    ends, rays = [5, 5, 9, 9, 12], [3, 3, 7, 7, 0]
+    reports = []
+    for end, n in zip(ends, rays, strict=True):
+        reports.append(report())
+        reports[-1].window_end_ns, reports[-1].rays = end, n
+    assert updates_with_new_rays(reports) == [True, False, True, False, False]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_that_are_not_finite_do_no_harm(messages, seed):
+    rng = np.random.default_rng(seed)
+    keep = () if seed else ("configuration/",)
+    spoilt = [
+        type(m)(m.topic, m.stamp_ns, spoilt_copy(m.body, rng), m.source, m.sequence)
+        if rng.random() < 0.1 and not m.topic.startswith(keep or ("configuration/project",))
+        else m
+        for m in messages
+        if m.topic != "trajectory/filtered" or rng.random() < 0.3
+    ]
+    flight = collect(spoilt)
+    result = analyse(flight, "spoilt.mcap")
+    json.dumps(result, allow_nan=False)
+    assert page(flight, result)
+    assert flight.refused["point/object"] and flight.refused["sensor/gnss"]
+    # what is left is as good as before
+    assert max(result["points"]["adjusted"]["max_m"]) < 1.0

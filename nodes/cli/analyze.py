@@ -32,6 +32,8 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     flight = collect(messages_of(recording))
     if not flight.counts:
         raise UserError(f"{recording}: nothing in it that can be analysed")
+    if output.exists() and output.samefile(recording):
+        raise UserError(f"{output}: is the recording itself")
     result = analyse(flight, recording.name, recording.stat().st_size)
     try:
         output.write_text(page(flight, result), encoding="utf-8")

@@ -29,6 +29,8 @@ def run(args: argparse.Namespace) -> int:
     from ..rerun_scene import RerunCanvas, open_canvas
 
     messages = messages_of(args.recording)
+    if args.rrd is not None and args.rrd.exists() and args.rrd.samefile(args.recording):
+        raise UserError(f"{args.rrd}: is the recording itself")
     mode = f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"
     signal.signal(signal.SIGTERM, _stop)
     canvas = open_canvas(mode)

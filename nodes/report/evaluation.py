@@ -20,8 +20,8 @@ Array = NDArray[np.floating]
 
 #: Rows of the orientation table, in order of processing.
 ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final")
-#: Points are intersected with these orientations; "filtered" is direct georeferencing.
-INTERSECTED = {"direct_georeferencing": "filtered", "live": "live", "final": "final"}
+#: Points are intersected with these orientations; "" stands for the trajectory before triangulation.
+INTERSECTED = {"direct_georeferencing": "", "live": "live", "final": "final"}
 _LARGEST_GAP_S = 1.0
 _IMAGE_SIGMA_PX = 0.3  # where the project names none
 
@@ -48,7 +48,8 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     - ``orientation``: by name of ORIENTATIONS ("measured": straight from GNSS and INS), against the true trajectory,
       over the times the final orientation covers: ``n, rmse_m, mean_m, max_m, sigma_m`` (X, Y, Z), ``rmse_deg`` ..
       (omega, phi, kappa), ``nees``;
-    - ``points``: ``direct_georeferencing`` (space intersection with the filtered trajectory), ``live`` and ``final``
+    - ``points``: ``direct_georeferencing`` (space intersection with the filtered trajectory, or the smoothed
+      one where a recording holds no other), ``live`` and ``final``
       (with these orientations), ``adjusted_live`` and ``adjusted`` (as published), against true points: ``n, rmse_m,
       mean_m, max_m, sigma_m, nees``;
     - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
@@ -69,14 +70,27 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
             row = _point_row(ids, xyz, covariance, known)
             if row is not None:
                 result[target][name] = row
-    _improvement(result)
-    if flight.reports:
-        last = flight.reports[-1][1]
-        result["sigma0"] = last.sigma0_total or float(np.sqrt(np.mean([r.sigma0**2 for _, r in flight.reports])))
-        result["redundancy"] = last.redundancy_total or last.redundancy
-        result["updates"] = len(flight.reports)
-        result["rejected"] = max(last.rejected_total, len(flight.rejected))
+    _improvement(result, flight.measured)
+    result.update(_totals(flight))
     return result
+
+
+def _totals(flight: Flight) -> dict[str, Any]:
+    """sigma0 over the flight (absent where nothing was redundant), redundancy, updates, rejected observations."""
+    if not flight.reports:
+        return {}
+    last = flight.reports[-1][1]
+    totals: dict[str, Any] = {
+        "redundancy": last.redundancy_total or last.redundancy,
+        "updates": len(flight.reports),
+        "rejected": max(last.rejected_total, len(flight.rejected)),
+    }
+    redundant = [r.sigma0 for _, r in flight.reports if r.redundancy > 0]
+    if last.sigma0_total > 0:
+        totals["sigma0"] = last.sigma0_total
+    elif redundant:
+        totals["sigma0"] = float(np.sqrt(np.mean(np.square(redundant))))
+    return totals
 
 
 def missing(flight: Flight) -> list[str]:
@@ -84,7 +98,7 @@ def missing(flight: Flight) -> list[str]:
     wanted = [
         (flight.project is not None, "configuration/project"),
         (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
-        ("filtered" in flight.poses, "trajectory/filtered"),
+        (bool(flight.measured), "trajectory/filtered or trajectory/smoothed: no direct georeferencing"),
         ("final" in flight.poses, "orientation/final: the recording has not been through the adjuster"),
         ("truth" in flight.poses, "truth/trajectory: no error of the orientation (truth is known in simulations only)"),
         (bool(flight.truth_points), "truth/point: no error of the object points"),
@@ -166,8 +180,8 @@ def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Arr
 
 def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
     """Point ids and rays with the filtered orientation, without those the adjustment rejected; None without any."""
-    filtered, camera = flight.poses.get("filtered"), flight.camera
-    if filtered is None or camera is None or len(filtered) < 2:
+    filtered, camera = flight.poses.get(flight.measured), flight.camera
+    if filtered is None or camera is None:
         return None
     bad = {rejected_key(r) for r in flight.rejected}
     path = filtered.trajectory(flight.start_ns)
@@ -175,11 +189,12 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
     kept, rows, seen = [], [], set()
     for look in flight.looks:
         strip, ccd = flight.strips.get(look.strip), camera.line_index.get(look.ccd)
-        if strip is None or ccd is None or look.key in bad or look.key in seen:
+        if strip is None or not strip.line_rate_hz > 0 or ccd is None or look.key in bad or look.key in seen:
             continue
         seen.add(look.key)
         time = (strip.first_line_time_ns - flight.start_ns) / convert.SECOND_NS + look.line / strip.line_rate_hz
         inside = not strip.lines or -0.5 <= look.line <= strip.lines - 0.5
+        inside = inside and bool(np.isfinite([look.sigma_line, look.sigma_sample]).all())
         if inside and path.start_s <= time <= path.end_s and camera.lines[ccd].contains(look.sample):
             kept.append(look.point)
             sigmas = look.sigma_line or default, look.sigma_sample or default
@@ -232,12 +247,13 @@ def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]
 
 def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array] | None:
     """Correction to the filtered orientation (n, 6), NaN where not covered, and covariance (n, 6, 6) at ray times."""
-    poses, filtered = flight.poses.get(name), flight.poses["filtered"]
+    filtered = flight.poses[flight.measured]
+    poses = flight.poses.get(name) if name else filtered
     if poses is None or len(poses) < 2:
         return None
     t = flight.seconds(poses.time_ns)
     nearest = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
-    if name == "filtered":
+    if poses is filtered:
         return np.zeros((len(time_s), 6)), filtered.covariance[nearest]
     base = flight.poses.get("smoothed", filtered)  # the less noisy one: what is interpolated has to be smooth
     values = _difference(poses, base, flight.start_ns)
@@ -256,9 +272,9 @@ def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array
 
 def corrections_of(flight: Flight, poses: Poses) -> Array:
     """Correction functions dX, dY, dZ, domega, dphi, dkappa (n, 6): as published, else orientation minus filtered."""
-    filtered = flight.poses.get("filtered")
+    filtered = flight.poses.get(flight.measured)
     bare = np.atleast_1d(~np.isfinite(poses.correction).all(axis=1))
-    if not bare.any() or filtered is None or len(filtered) < 2:
+    if not bare.any() or filtered is None:
         return poses.correction
     return np.where(bare.reshape(-1, 1), _difference(poses, filtered, flight.start_ns), poses.correction)
 
@@ -315,14 +331,14 @@ def _orientation_row(error: Array, covariance: Array) -> dict[str, Any]:
     return _row(a, "m", part=slice(0, 3)) | _row(a, "deg", float(np.degrees(1.0)), slice(3, 6))
 
 
-def _improvement(result: dict[str, Any]) -> None:
+def _improvement(result: dict[str, Any], measured: str) -> None:
     points, orientation = result["points"], result["orientation"]
     better: dict[str, Any] = {}
     final = points.get("final") or points.get("adjusted")
     if final and "direct_georeferencing" in points:
         better["points"] = _ratio(points["direct_georeferencing"]["rmse_m"], final["rmse_m"])
-    if "filtered" in orientation and "final" in orientation:
-        rows = [orientation[n]["rmse_m"] + orientation[n]["rmse_deg"] for n in ("filtered", "final")]
+    if measured in orientation and "final" in orientation:
+        rows = [orientation[n]["rmse_m"] + orientation[n]["rmse_deg"] for n in (measured, "final")]
         better["orientation"] = _ratio(*rows)
     if better:
         result["improvement"] = better

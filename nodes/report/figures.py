@@ -30,7 +30,7 @@ _SIGMAS = 3.0
 
 def trajectory_map(flight: Flight) -> Figure | None:
     """Strips, ground points by status, and what the adjustment left at control and check points."""
-    poses = flight.poses.get("filtered") or flight.poses.get("final") or flight.poses.get("truth")
+    poses = flight.poses.get(flight.measured) or flight.poses.get("final") or flight.poses.get("truth")
     if poses is None:
         return None
     low, high = poses.position_l.min(axis=0), poses.position_l.max(axis=0)
@@ -38,7 +38,7 @@ def trajectory_map(flight: Flight) -> Figure | None:
     if len(points["xyz"]):
         low, high = np.minimum(low, points["xyz"].min(axis=0)), np.maximum(high, points["xyz"].max(axis=0))
     extent = np.maximum(high - low, 1.0)[:2]
-    turned = extent[1] > 1.4 * extent[0]  # a flight to the north lies on its side, so that it fills the page
+    turned = extent[1] > 1.15 * extent[0]  # a flight to the north lies on its side, so that it fills the page
     fig = figure(float(np.clip(1.2 + 8.6 * min(extent) / max(extent), 3.2, 7.5)))
     ax = fig.add_subplot()
     ax.set_aspect("equal")
@@ -64,7 +64,7 @@ def trajectory_map(flight: Flight) -> Figure | None:
     else:
         ax.set_xlabel("east [km]")
         ax.set_ylabel("north [km]")
-    ax.set_title("Flight and ground points, local frame")
+    ax.set_title("Flight and ground points, local frame", pad=18)
     fig.legend(loc="outside lower center", ncols=7)
     return fig
 
@@ -109,7 +109,7 @@ def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: boo
         ax.quiver(x, y, scale * dx, scale * dy, color=color, **arrows)
         ax.vlines(x, y, y + scale * left[:, 2], color=color, lw=2.2, alpha=0.45, zorder=4)
     if scale > 0:
-        scale_note(ax, f"adjusted − given: arrow planimetry, bar height; largest {largest:.3f} m")
+        scale_note(ax, f"adjusted − given: arrow planimetry, bar height; largest {largest:.3f} m", "left")
 
 
 def _point_arrays(flight: Flight) -> dict[str, Any]:
@@ -131,7 +131,9 @@ def residuals_by_ccd(flight: Flight) -> dict[str, Array]:
         for r in point.residuals:
             rows.setdefault(r.ccd, []).append((r.line, r.sample, r.v_line, r.v_sample, r.w, r.rejected))
     order = list(flight.camera.line_index) if flight.camera is not None else sorted(rows)
-    return {ccd: np.array(rows[ccd], dtype=float) for ccd in order if ccd in rows}
+    arrays = {ccd: np.array(rows[ccd], dtype=float) for ccd in order if ccd in rows}
+    finite = {ccd: values[np.isfinite(values).all(axis=1)] for ccd, values in arrays.items()}
+    return {ccd: values for ccd, values in finite.items() if len(values)}
 
 
 def residuals(flight: Flight) -> Figure | None:
@@ -280,8 +282,8 @@ def errors(flight: Flight) -> Figure | None:
     fig = figure(5.9)
     axes = fig.subplots(3, 2, sharex=True)
     axis = StripTime(flight)
-    styles = {"filtered": (FILTERED, 0.9), "live": (LIVE, 0.9), "final": (FINAL, 1.5)}
-    reference = next((name for name in ("final", "live", "filtered") if name in found), None)
+    styles = {flight.measured: (FILTERED, 0.9), "live": (LIVE, 0.9), "final": (FINAL, 1.5)}
+    reference = next((name for name in ("final", "live", flight.measured) if name in found), None)
     for i, ax in enumerate(axes.T.ravel()):
         span = 0.0
         if reference is not None:

@@ -17,6 +17,7 @@ from .. import convert
 from ..node import Message
 
 Array = NDArray[np.floating]
+Key = tuple[str, str, str, int, int]
 SECOND_NS = convert.SECOND_NS
 
 #: Topics of poses, and the name a report gives them.
@@ -76,9 +77,9 @@ class Look:
     sigma_sample: float
 
     @property
-    def key(self) -> tuple[str, str, str, int, int]:
-        """What names it in a list of rejected observations: line and sample to a hundredth of a pixel."""
-        return self.point, self.strip, self.ccd, round(100 * self.line), round(100 * self.sample)
+    def key(self) -> Key:
+        """What names it in a list of rejected observations."""
+        return _key(self)
 
 
 @dataclass
@@ -117,6 +118,11 @@ class Flight:
     counts: Counter[str] = field(default_factory=Counter)
     gaps: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def measured(self) -> str:
+        """Name of the trajectory before triangulation: "filtered", else "smoothed"; "" without either."""
+        return next((name for name in ("filtered", "smoothed") if len(self.poses.get(name, ())) >= 2), "")
 
     def seconds(self, time_ns: Any) -> Any:
         """Seconds since the start of the flight."""
@@ -188,9 +194,15 @@ def updates_with_new_rays(reports: Iterable[Any]) -> list[bool]:
     return new
 
 
-def rejected_key(r: Any) -> tuple[str, str, str, int, int]:
+def rejected_key(r: Any) -> Key:
     """What names a rejected observation; the same as `Look.key` of the measurement."""
-    return r.point, r.strip, r.ccd, round(100 * r.line), round(100 * r.sample)
+    return _key(r)
+
+
+def _key(r: Any) -> Key:
+    """Ids, and line and sample to a hundredth of a pixel; (0, 0) where they are not finite."""
+    line, sample = (round(100 * v) if np.isfinite(v) else 0 for v in (r.line, r.sample))
+    return r.point, r.strip, r.ccd, line, sample
 
 
 def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], topic: str, stamp: int, body: Any):
@@ -200,22 +212,26 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         for i in body.images:
             flight.looks.append(Look(body.point, i.strip, i.ccd, i.line, i.sample, i.sigma_line, i.sigma_sample))
     elif topic == "point/object":
+        _finite(body, body.x, body.y, body.z)
         if body.status == body.LIVE:
             flight.live_points.setdefault(body.point, body)
         known = flight.points.get(body.point)
         if known is None or body.status >= known.status:
             flight.points[body.point] = body
     elif topic == "adjustment/report":
-        flight.reports.append((stamp, body))
+        flight.reports.append(
+            (stamp, _finite(body, body.sigma0, body.sigma0_total, body.data_latency_s, body.compute_s))
+        )
         for r in body.rejected:
             rejected[rejected_key(r)] = r
     elif topic == "sensor/gnss":
-        flight.gnss.append(body)
+        flight.gnss.append(_finite(body, body.latitude, body.longitude, body.altitude, *body.position_covariance))
     elif topic == "sensor/attitude":
-        flight.attitude.append(body)
+        flight.attitude.append(_finite(body, body.roll, body.pitch, body.heading, *body.covariance))
     elif topic == "observation/control":
-        flight.ground[body.point] = body
+        flight.ground[body.point] = _finite(body, body.x, body.y, body.z)
     elif topic == "truth/point":
+        _finite(body, body.x, body.y, body.z)
         flight.truth_points[body.point] = np.array([body.x, body.y, body.z])
     elif topic == "configuration/project":
         flight.project = body
@@ -229,6 +245,13 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         flight.events.append((stamp, body))
     elif topic.startswith("status/"):
         flight.status[topic.removeprefix("status/")] = body
+
+
+def _finite(body: Any, *values: float) -> Any:
+    """The message, if all of the values are finite; raises ValueError otherwise."""
+    if not np.isfinite(values).all():
+        raise ValueError("value is not finite")
+    return body
 
 
 def _poses(samples: list[convert.PoseSample], keep_first: bool) -> Poses:

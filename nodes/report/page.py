@@ -21,8 +21,8 @@ _ORIENTATION = {
 }
 _POINTS = {
     "direct_georeferencing": "direct georeferencing",
-    "live": "intersected with live orientation",
-    "final": "intersected with final orientation",
+    "live": "intersected, live orientation",
+    "final": "intersected, final orientation",
     "adjusted_live": "adjusted, live",
     "adjusted": "adjusted, final",
 }
@@ -67,7 +67,7 @@ _ERRORS_NOTE = (
     "Estimate minus truth on the strips. The band is what the final orientation states of itself, three sigma."
 )
 _CORRECTIONS_NOTE = (
-    "What is added to the measured orientation. The dashed line is what would have been right (truth minus filtered)."
+    "What is added to the measured orientation. The dashed line is what would have been right (truth minus measured)."
 )
 _RESIDUALS_NOTE = "Measured minus computed at the last estimate of each point. Rejected rays are marked at their place."
 
@@ -196,9 +196,9 @@ def _accuracy(result: dict[str, Any]) -> Iterable[str]:
     if result["orientation"] or result["points"] or result["check"]:
         yield (
             '<p class="note">σ stated: root mean of the variances the estimates came with. NEES: mean normalised error '
-            "squared per component, 1 if the stated covariance is right. Direct georeferencing: intersection with the "
-            "filtered trajectory. Orientations are compared on the strips, over the time the final orientation covers; "
-            "all intersections use the same rays.</p>"
+            "squared per component, 1 if the stated covariance is right; sensors state their noise only. Direct "
+            "georeferencing: intersection with the trajectory before triangulation. Orientations are compared on the "
+            "strips, over the time the final orientation covers; all intersections use the same rays.</p>"
         )
 
 
@@ -244,9 +244,17 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1) -
 def _rejected(result: dict[str, Any]) -> str:
     rows = result["rejected_observations"]
     if not rows:
-        return "<p>None.</p>" if "sigma0" in result else ""
+        return "<p>None.</p>" if "rejected" in result else ""
     shown = [
-        (r["point"], r["strip"], r["ccd"], r["reason"], f"{r['line']:.2f}", f"{r['sample']:.2f}", f"{r['w']:.1f}")
+        (
+            r["point"],
+            r["strip"],
+            r["ccd"],
+            r["reason"],
+            _number(r["line"], 2),
+            _number(r["sample"], 2),
+            _number(r["w"], 1),
+        )
         for r in rows[:_SHOWN_REJECTED]
     ]
     more = (

@@ -11,7 +11,7 @@ h2 { font-size: 18px; margin: 38px 0 8px; padding-top: 10px; border-top: 2px sol
 h3 { font-size: 15px; margin: 20px 0 4px; }
 p { margin: 6px 0; } .soft, figcaption, .note { color: var(--soft); } .note, figcaption { font-size: 13px; }
 .summary { font-size: 17px; margin: 12px 0 18px; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px; margin: 14px 0; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(200px, 1fr)); gap: 10px; margin: 14px 0; }
 .tile { background: var(--tint); border-left: 4px solid var(--line); padding: 9px 12px; }
 .tile.good { border-color: var(--good); } .tile.bad { border-color: var(--bad); }
 .tile b { display: block; font-size: 20px; line-height: 1.25; } .tile span { font-size: 12.5px; color: var(--soft); }
@@ -19,8 +19,9 @@ figure { margin: 12px 0 4px; } figure svg { width: 100%; height: auto; display: 
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 13px; margin: 6px 0 4px;
   font-variant-numeric: tabular-nums; }
-th, td { padding: 4px 7px; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { font-weight: 600; background: var(--tint); } th:first-child, td:first-child, .left { text-align: left; }
+th, td { padding: 4px 5px; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th { font-weight: 600; background: var(--tint); }
+tr:first-child > th:first-child, td:first-child, .left { text-align: left; }
 tr.main td { font-weight: 600; background: #edf7f1; } td.wrap { white-space: normal; }
 th.group { text-align: center; border-left: 1px solid var(--line); } .edge { border-left: 1px solid var(--line); }
 .missing { background: #fff6e5; border-left: 4px solid #e0a100; padding: 8px 14px; font-size: 13.5px; }

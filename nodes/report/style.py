@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -56,6 +56,7 @@ def svg(fig: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def scale_note(ax: Axes, text: str) -> None:
-    """A note in the upper right corner, outside the axes."""
-    ax.text(1.0, 1.01, text, transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color="#444444")
+def scale_note(ax: Axes, text: str, side: Literal["left", "right"] = "right") -> None:
+    """A note above an upper corner of the axes."""
+    place = 0.0 if side == "left" else 1.0
+    ax.text(place, 1.01, text, transform=ax.transAxes, ha=side, va="bottom", fontsize=8, color="#444444")
