@@ -12,6 +12,7 @@ BENCHMARKS = {
     "bus and recorder under the load of three full image lines": ["bus_load.py"],
     "batch adjustment against Ceres": ["ceres/compare.py"],
     "batch adjustment: time and memory against size": ["adjustment_scaling.py"],
+    "batch job: snooping, elimination, covariances": ["adjustment_job.py"],
     "inertial navigation": ["navigation.py"],
     "sliding window": ["window.py"],
 }

@@ -16,6 +16,7 @@ from ..solver.layout import CorrectionSet
 from ..solver.network import Control
 from ..solver.reliability import reliability
 from ..solver.selfcalibration import SelfCalibration
+from ..solver.snooping import control_tests
 from ..solver.statistics import PointAccuracy, mean_sigma, strongest_correlations
 
 Array = NDArray[np.floating]
@@ -25,6 +26,9 @@ MOST_LISTED = 20
 
 #: Undetermined combinations that the notes name.
 MOST_NAMED = 4
+
+#: More undetermined combinations than a block with a defect has.
+MANY_WEAK = 30
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,10 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
         "sigma0_px": result.test.sigma0 * adjustment.image_sigma_px,
         "image_sigma_px": adjustment.image_sigma_px,
         "chi_square_test": {"low": result.test.low, "high": result.test.high, "passed": result.test.passed},
+        "sigma0_groups": {
+            group: {"observations": n, "redundancy": r, "sigma0": float(np.sqrt(v / r)) if r > 1e-3 else None}
+            for group, (n, v, r) in result.groups.items()
+        },
         "n_observations": solution.n_observations,
         "n_unknowns": solution.n_unknowns,
         "redundancy": redundancy,
@@ -219,26 +227,73 @@ def notes_of(adjustment: Adjustment) -> list[str]:
             "sigmas are those of the a-priori weights"
         )
     elif not result.test.passed:
-        low = "too large" if result.sigma0 > result.test.high else "too small"
-        notes.append(
-            f"sigma0 {result.sigma0:.3f} outside [{result.test.low:.3f}, {result.test.high:.3f}] (95 %): {low} for the "
-            "a-priori sigmas; errors left in the data or the model, or sigmas that do not fit"
-            if low == "too large"
-            else f"sigma0 {result.sigma0:.3f} outside [{result.test.low:.3f}, {result.test.high:.3f}] (95 %): {low}; "
-            "the a-priori sigmas are pessimistic"
-        )
+        notes.append(_sigma0_note(result))
+    notes += _test_notes(adjustment)
     notes += _control_notes(network)
-    if result.weak is None:
-        notes.append("too many unknowns to search for undetermined combinations")
-    elif result.weak:
-        shown = "; ".join(c.words for c in result.weak[:MOST_NAMED])
-        more = f"; and {len(result.weak) - MOST_NAMED} more" if len(result.weak) > MOST_NAMED else ""
-        free = len(solution.factor.undetermined) > 0
-        notes.append(("not determined: " if free else "resting on a-priori weights alone: ") + shown + more)
+    notes += _weakness_notes(result)
     lost = int(((solution.points.rank < 3) & (network.rays_per_point > 0)).sum())
     if lost:
         notes.append(f"{lost} object points are not determined by their rays and have no coordinates in points.csv")
     return notes
+
+
+def _sigma0_note(result: BatchResult) -> str:
+    """Why the chi-square test may have failed."""
+    test, image = result.test, result.image_test
+    said = f"sigma0 {test.sigma0:.3f} outside [{test.low:.3f}, {test.high:.3f}] (95 %)"
+    if test.sigma0 > test.high:
+        return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit"
+    if image.sigma0 >= image.low:
+        return f"{said}: the a-priori weights of the trajectory are loose; of the image points it is {image.sigma0:.3f}"
+    return f"{said}: the errors are smaller than the a-priori sigmas"
+
+
+def _weakness_notes(result: BatchResult) -> list[str]:
+    if result.weak is None:
+        return ["too many unknowns to search for undetermined combinations"]
+    if not result.weak:
+        return []
+    free = len(result.solution.factor.undetermined) > 0
+    shown = "; ".join(c.words for c in result.weak[:MOST_NAMED])
+    if len(result.weak) > MANY_WEAK:  # flexible models are meant to lean on their weights where rays are few
+        count = f"{len(result.weak)} combinations of the {result.solution.layout.n_unknowns} unknowns"
+        return [f"{count} rest on a-priori weights, as flexible models do between rays; least determined: {shown}"]
+    more = f"; and {len(result.weak) - MOST_NAMED} more" if len(result.weak) > MOST_NAMED else ""
+    return [("not determined: " if free else "resting on a-priori weights alone: ") + shown + more]
+
+
+def _test_notes(adjustment: Adjustment) -> list[str]:
+    """What the tests of single observations say beside what was left out."""
+    result, critical = adjustment.result, adjustment.job.critical
+    network, notes = result.network, []
+    if result.given_up:
+        notes.append(
+            f"data snooping would leave out {100 * result.given_up:.0f} % of the image points: model or a-priori sigma "
+            "does not fit, so nothing was left out; a richer model (ppm, lim) or --reweight may help"
+        )
+    elif not adjustment.job.snoop:
+        failing = int((result.rays.largest_w[result.solution.ray_weight > 0] > critical).sum())
+        if failing > 0.01 * len(network.rays):
+            notes.append(f"{failing} image points have |w| > {critical:g}; --snoop leaves out outliers")
+    w = control_tests(result.solution, result.cofactors)
+    worst = [(p, a) for p, a in np.argwhere(np.abs(w) > critical)]
+    worst.sort(key=lambda key: -abs(w[key]))
+    if worst:
+        names = ", ".join(f"{network.point_ids[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
+        more = " ..." if len(worst) > 5 else ""
+        notes.append(f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}")
+    return notes
+
+
+def worst_strip(adjustment: Adjustment) -> str:
+    """Where to look when nothing fits: the strip with the largest median residual, in words."""
+    result = adjustment.result
+    network = result.network
+    size = np.linalg.norm(result.rays.v_px, axis=1)
+    median = {s.id: float(np.median(size[network.rays.strip == i])) for i, s in enumerate(network.strips)
+              if (network.rays.strip == i).any()}  # fmt: skip
+    worst = max(median, key=lambda id: median[id])
+    return f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
 
 
 def _control_notes(network: Any) -> list[str]:

@@ -87,9 +87,9 @@ def _parameters(c: Content) -> Iterator[str]:
 
 def _components(c: Content) -> Iterator[str]:
     for group, v in c["variance_components"].items():
-        said = f"a-priori times {v['sigma_factor']:.3f} +- {v['sigma_factor_sigma']:.3f}"
-        if not v["estimated"]:
-            said = "a-priori kept, too little redundancy"
+        said = "a-priori kept, too little redundancy"
+        if v["estimated"]:
+            said = f"a-priori times {v['sigma_factor']:.3f} +- {_number(v['sigma_factor_sigma'])}"
         yield f"sigma of {group}: {said} ({v['observations']} observations, redundancy {v['redundancy']:.1f})"
 
 
@@ -123,7 +123,13 @@ def _details(c: Content) -> Iterator[str]:
 
 
 def _three(values: Sequence[float | None]) -> str:
-    return "".join(f"{'-':>9s}" if v is None else f"{v:9.4f}" for v in values)
+    return "".join(f" {'-' if v is None else _metres(v):>8s}" for v in values)
+
+
+def _metres(value: float) -> str:
+    """Four decimals, fewer where the number is large."""
+    digits = 4 if abs(value) < 100 else 2 if abs(value) < 1e4 else 0
+    return f"{value:.{digits}f}"
 
 
 def _list(values: Sequence[float], digits: int) -> str:

@@ -73,12 +73,13 @@ def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
         "line": rays.line[order],
         "sample": rays.sample[order],
     }
-    detectable = np.where(np.isfinite(r.detectable), r.detectable, np.nan)
+    detectable, outer = (np.where(np.isfinite(values), values, np.nan) for values in (r.detectable, r.outer))
     for prefix, values, digits in (
         ("v", s.v_px, 5),
         ("w", s.w, 4),
         ("redundancy", r.redundancy, 5),
         ("detectable", detectable, 4),
+        ("outer", outer, 4),
     ):
         unit = "_px" if prefix in ("v", "detectable") else ""
         for k, coordinate in enumerate(("line", "sample")):

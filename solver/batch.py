@@ -22,14 +22,14 @@ from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
 from .robust import WeightFunction, huber
 from .selfcalibration import SelfCalibration
-from .snooping import Rejected, Round, Snooping, snoop
+from .snooping import Rejected, Round, Snooping, image_scale, snoop
 from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
 from .variance_components import LEAST_REDUNDANCY, Component, Scales, estimate_components, group_sums, scaled
 
 Array = NDArray[np.floating]
 
 #: Reduced unknowns up to which a network is searched for undetermined combinations (an eigenproblem of this size).
-MOST_UNKNOWNS = 1500
+MOST_UNKNOWNS = 1000
 
 #: Robust weight from which on a ray counts as left out.
 ROBUST_OUT = 0.02
@@ -106,12 +106,13 @@ class BatchResult:
     cofactors, rays : of the last solution; for sigma0 = 1
     test : sigma0 with its chi-square limits
     rejected : observations left out
+    given_up : share of the image points that data snooping would have left out, where that is too many; else 0
     removed, kept : additional parameters that are gone, and those that stay in spite of a failed criterion
     components : variance components; () if they were not asked for
     image_factor : what the a-priori image sigma was multiplied by
     weak : combinations of unknowns that rest on a-priori weights alone; None where the network was too large to search
     georeferenced : object points without adjustment
-    measured_redundancy : share of image points and control in the redundancy
+    groups : number, ``v^T P v`` and redundancy of image, control, position and attitude
     iterations : steps of all adjustments
     """
 
@@ -120,13 +121,14 @@ class BatchResult:
     rays: RayStatistics
     test: GlobalTest
     rejected: tuple[Rejected, ...]
+    given_up: float
     removed: tuple[Removal, ...]
     kept: dict[str, str]
     components: tuple[Component, ...]
     image_factor: float
     weak: tuple[Combination, ...] | None
     georeferenced: Georeferenced
-    measured_redundancy: float
+    groups: dict[str, tuple[int, float, float]]
     iterations: int
 
     @property
@@ -136,6 +138,18 @@ class BatchResult:
     @property
     def network(self) -> Network:
         return self.solution.network
+
+    @property
+    def measured_redundancy(self) -> float:
+        """Share of image points and control in the redundancy."""
+        return self.groups["image"][2] + self.groups["control"][2]
+
+    @property
+    def image_test(self) -> GlobalTest:
+        """sigma0 of the image points alone. A-priori equations that say what nothing contradicts, as the continuity of
+        a smooth trajectory, lower the common sigma0; this one they leave alone."""
+        _, squares, redundancy = self.groups["image"]
+        return global_test(squares, max(round(redundancy), 0))
 
     @property
     def sigma0(self) -> float:
@@ -194,13 +208,14 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
         ray_statistics(solution, Q),
         global_test(solution.cost, max(solution.redundancy, 0)),
         found.rejected if found else _robust_rejected(solution),
+        found.given_up if found else 0.0,
         outcome.removed,
         outcome.kept,
         outcome.components,
         outcome.scales.factor["image"],
         weaknesses(solution),
         georeference(stages[0].network, job.model, _taking_part(solution)),
-        sum(group_sums(solution, Q)[group][2] for group in ("image", "control")),
+        group_sums(solution, Q),
         outcome.steps,
     )
 
@@ -324,11 +339,9 @@ def _refuse_hopeless(network: Network) -> None:
 def _robust_scale(solution: Solution) -> float:
     """Image sigma in units of the a-priori one: from the median of |w|, which outliers hardly move."""
     of = ray_statistics(solution, cofactors(solution))
-    w, redundancy = (a[solution.ray_weight > 0] for a in (of.w, of.redundancy))
-    w = np.abs(w[w != 0.0])
-    if redundancy.sum() < LEAST_REDUNDANCY or not len(w):
+    if of.redundancy[solution.ray_weight > 0].sum() < LEAST_REDUNDANCY:
         return 1.0
-    return float(np.clip(np.median(w) / 0.6745, 1e-2, 1e2))
+    return float(np.clip(image_scale(of, solution.ray_weight), 1e-2, 1e2))
 
 
 def _taking_part(solution: Solution) -> Array:

@@ -136,7 +136,7 @@ def examine(evidence: Evidence, limits: Limits = Limits()) -> Verdict:
 
     worst = int(np.argmin(e.pivot))
     if e.pivot[worst] < limits.pivot:
-        text = f"{e.pivot[worst]:.1e} below {limits.pivot:.0e}, the other unknowns can do the same"
+        text = f"{e.pivot[worst]:.1e} below {limits.pivot:.0e}, not to be told from {e.partner[worst]}"
         return Verdict(_removal(e, worst, Criterion.PIVOT, e.pivot[worst], limits.pivot, text))
 
     kept: dict[str, str] = {}

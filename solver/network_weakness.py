@@ -47,7 +47,7 @@ _PARAMETERS = {
     "s": "scale",
     "dc": "camera constant",
 }
-_NAME = re.compile(r"^(?P<what>.+?)(?: (?:at|of|in) (?P<node>(?:fix|segment) \d+))? of (?P<set>strip .+)$")
+_NAME = re.compile(r"^(?P<what>.+?)(?: (?:at|of|in) (?P<node>(?:fix|segment|border) \d+))? of (?P<set>strip .+)$")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from .adjustment import AdjustmentOptions, Problem, Solution, State, pose_proble
 from .covariance import point_cofactors, point_unknown_cofactors
 from .determinability import Evidence, Limits, Removal, examine
 from .network import Network
+from .network_weakness import PART, describe
 
 Array = NDArray[np.floating]
 
@@ -164,5 +165,13 @@ def _partners(solution: Solution, of_orientation: Array, of_points: Array) -> tu
             partner.append(f"{'XYZ'[p % 3]} of point {network.point_ids[p // 3]}")
         else:
             value[i] = of_orientation[e, i]
-            partner.append(names[e])
+            partner.append(describe((names[e],), 0))
+    null = solution.factor.undetermined.vectors
+    for i in range(m):  # where the system is singular, what the parameter cannot be told from
+        own = np.abs(null[len(names) - m + i])
+        if own.max(initial=0.0) > 0.3:
+            part = np.abs(null[:, int(np.argmax(own))])
+            part[len(names) - m + i] = 0.0
+            members = [k for k in np.argsort(-part, kind="stable")[:3] if part[k] > PART]
+            partner[i] = describe(tuple(names[k] for k in members), 0) if members else "nothing"
     return tuple(partner), value

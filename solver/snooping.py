@@ -3,6 +3,9 @@
 Several observations go in one round only where they cannot have caused each other's failure: at most one of an object
 point, and none that is much smaller than the largest of all. What was left out is tested against the adjustment without
 it and returns if it agrees: an outlier that was masked, or that made good neighbours look bad, is undone that way.
+
+The test takes model and a-priori sigmas for right. Where most image points fail they are not, and nothing is left out.
+Control is what the block stands on: a coordinate goes only if it fails clearly while the image points fit.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from scipy import stats
 
 from .adjustment import AdjustmentOptions, Solution, solve
 from .covariance import Cofactors, cofactors
+from .normal_equations import weigh_control
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W, normalised_residuals
 
@@ -23,6 +27,13 @@ Array = NDArray[np.floating]
 
 #: A failing observation goes in the same round as the largest only if it has at least this share of it.
 TOGETHER = 0.5
+
+#: Share of the image points left out beyond which it is the model or the sigmas that are wrong.
+MOST_LEFT_OUT = 0.35
+
+#: A control coordinate goes beyond so many times the critical value, and only if the sigma of the image points, from
+#: the median of their w, is less than so many times the a-priori one.
+CONTROL_CLEAR, CONTROL_FIT = 2.0, 1.5
 
 #: Rounds after which the search ends in any case; blocks with a few per cent of outliers take ten.
 MOST_ROUNDS = 100
@@ -58,13 +69,22 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Snooping:
-    """Outcome: the adjustment without the rejected observations, its cofactors and residuals."""
+    """Outcome.
+
+    Attributes
+    ----------
+    solution, cofactors, statistics : the adjustment without the rejected observations, its cofactors and residuals
+    rejected : what was left out
+    rounds : of tests
+    given_up : share of the image points that would have gone where that is too many; then the search left out nothing
+    """
 
     solution: Solution
     cofactors: Cofactors
     statistics: RayStatistics
     rejected: tuple[Rejected, ...]
     rounds: int
+    given_up: float = 0.0
 
 
 def joint_limit(critical: float) -> float:
@@ -106,15 +126,25 @@ def snoop(
     if not critical > 0:
         raise ValueError(f"critical value {critical}, wanted more than 0")
     search = _Search(solution, critical, before)
+    beginning = search.result(0)
     for number in range(1, MOST_ROUNDS + 1):
         largest, out = search.leave_out()
         back = 0 if out else search.bring_back()
         if progress:
             progress(Round(number, largest, out, back))
+        if search.share > MOST_LEFT_OUT:
+            return replace(beginning, rounds=number, given_up=search.share)
         if not (out or back):
             return search.result(number)
         search.solve(options)
     return search.result(MOST_ROUNDS)
+
+
+def image_scale(statistics: RayStatistics, ray_weight: Array) -> float:
+    """Sigma of the image points in units of the a-priori one, from the median of |w|, which outliers hardly move."""
+    w = np.abs(statistics.w[ray_weight > 0])
+    w = w[w != 0.0]
+    return float(np.median(w)) / 0.6745 if len(w) else 1.0
 
 
 class _Search:
@@ -126,14 +156,16 @@ class _Search:
         self.point = solution.network.rays.point
         self.weight = solution.ray_weight.copy()
         self.control_weight = solution.problem.control.weight.copy()
+        self.given_weight = weigh_control(solution.network.control, solution.network.n_points).weight
         self.out: dict[int, float] = {}
         self.control_out: dict[tuple[int, int], float] = {}
-        self.returned: set[int] = set()
+        self.returned: set[int | tuple[int, int]] = set()
         for r in before.rejected if before else ():
             if r.reason == "snooping" and r.ray >= 0:
                 self.out[r.ray] = r.w
             elif r.reason == "snooping":
                 self.control_out[r.point, r.axis] = r.w
+        self.out_before = len(self.out)
         self._take(solution)
 
     def _take(self, solution: Solution) -> None:
@@ -157,6 +189,8 @@ class _Search:
         joint = self.statistics.joint
         w = np.where(in_use & (joint > self.joint_limit), self.statistics.largest_w, 0.0)
         control_w = np.abs(self.control_w)
+        if image_scale(self.statistics, self.weight) > CONTROL_FIT:
+            control_w = np.zeros_like(control_w)
         of_control = float(control_w.max(initial=0.0))
         limit = max(self.critical, TOGETHER * max(float(w.max(initial=0.0)), of_control))
         largest = max(float(self.statistics.largest_w[in_use].max(initial=0.0)), of_control)
@@ -164,7 +198,8 @@ class _Search:
         worst_control = control_w.max(axis=1)
         first = failing[_largest_of_group(self.point[failing], joint[failing])]
         # a control coordinate goes instead of a ray of its point if it fails more clearly
-        p, axis = np.nonzero((control_w > limit) & (control_w == worst_control[:, None]))
+        clearly = max(limit, CONTROL_CLEAR * self.critical)
+        p, axis = np.nonzero((control_w > clearly) & (control_w == worst_control[:, None]))
         ray_w = np.zeros(len(control_w))
         ray_w[self.point[first]] = np.sqrt(joint[first])
         clear = worst_control[p] >= ray_w[p]
@@ -179,7 +214,27 @@ class _Search:
         return largest, len(first) + len(p)
 
     def bring_back(self) -> int:
-        """Of the rays left out, those that agree with the others return, one of a point; each only once."""
+        """Of what was left out, what agrees with the rest returns, each only once and one ray of a point at a time."""
+        return self._bring_back_rays() or self._bring_back_control()
+
+    def _bring_back_control(self) -> int:
+        points, control = self.cofactors.points, self.solution.problem.control
+        known = self.solution.points.rank == 3
+        back = []
+        for key in self.control_out:
+            i, a = key
+            sigma2 = 1.0 / self.given_weight[key]
+            miss = self.solution.state.points_l[key] - control.xyz_l[key]
+            agrees = known[i] and miss**2 <= self.critical**2 * (sigma2 + points[i, a, a])
+            if agrees and key not in self.returned:
+                back.append(key)
+        for key in back:
+            del self.control_out[key]
+            self.returned.add(key)
+            self.control_weight[key] = self.given_weight[key]
+        return len(back)
+
+    def _bring_back_rays(self) -> int:
         candidates = np.array([i for i in self.out if i not in self.returned], dtype=np.int64)
         if not len(candidates):
             return 0
@@ -193,6 +248,11 @@ class _Search:
             self.returned.add(int(i))
         self.weight[first] = 1.0
         return len(first)
+
+    @property
+    def share(self) -> float:
+        """Of the image points that this search has left out."""
+        return (len(self.out) - self.out_before) / max(len(self.point), 1)
 
     def result(self, rounds: int) -> Snooping:
         rank = self.solution.points.rank

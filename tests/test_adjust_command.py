@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
-from triline.nodes.formats.block_recording import block_messages
+from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.recording import RecordingWriter
 from triline.solver.frames import LocalFrame
 from triline.solver.models.dgr import DgrOptions
@@ -346,6 +347,32 @@ def test_block_without_any_usable_ray_is_refused(folder, tmp_path, capsys):
     image["line"] = 1e8
     image.to_csv(lost / "image_points.csv", index=False)
     assert "can be used" in refusal(capsys, lost)
+
+
+def test_block_that_does_not_fit_at_all_is_refused_with_the_strip_to_blame(folder, tmp_path, capsys):
+    turned = tmp_path / "turned"
+    shutil.copytree(folder, turned)
+    trajectory = pd.read_csv(turned / "trajectory.csv")
+    trajectory.loc[trajectory.strip == "S2", "kappa_deg"] += 90.0
+    trajectory.to_csv(turned / "trajectory.csv", index=False)
+    message = refusal(capsys, turned, "-q")
+    assert "does not converge" in message and "strip S2" in message
+
+
+def test_one_control_point_a_kilometre_off_is_left_out(folder, tmp_path):
+    wrong = tmp_path / "wrong"
+    shutil.copytree(folder, wrong)
+    ground = pd.read_csv(wrong / "ground_points.csv")
+    ground.loc[ground.role == "control", "X_m"] += [1000.0, 0.0, 0.0, 0.0, 0.0]
+    ground.to_csv(wrong / "ground_points.csv", index=False)
+    assert adjust(wrong, "--snoop", "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    left_out = {(r["point"], r["coordinate"]) for r in result["rejected_control"]}
+    by_ray = {r["point"] for r in result["rejected"]}
+    culprit = ground.point[ground.role == "control"].iloc[0]
+    assert (culprit, "X") in left_out or culprit in by_ray
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.08)
+    assert max(result["check"]["rmse_m"]) < 0.3
 
 
 def test_unknown_option_is_a_usage_error(folder):

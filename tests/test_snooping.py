@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+
 from triline.solver.adjustment import adjust, solve
 from triline.solver.batch import Job, run
 from triline.solver.covariance import cofactors
@@ -16,7 +17,7 @@ from triline.solver.robust import danish, huber, igg3
 from triline.solver.selfcalibration import tls
 from triline.solver.sensors import preset
 from triline.solver.simulation.network import Noise, parallel_and_cross, scatter_points, simulate_network
-from triline.solver.snooping import joint_limit, snoop
+from triline.solver.snooping import control_tests, joint_limit, snoop
 
 CAMERA = preset("ads40")
 MODEL = DgrOptions((0.1, 0.1, 0.2), (0.005, 0.005, 0.008), (0.005, 0.005, 0.008))
@@ -156,6 +157,30 @@ def test_blunder_in_a_control_point_is_found_there_and_not_in_its_rays():
     assert blamed == {(int(network.control.point[2]), 1)}
     assert sum(r.ray >= 0 for r in outcome.rejected) <= 2
     assert outcome.solution.sigma0 == pytest.approx(1.0, abs=0.08)
+
+
+def wandering(seed):
+    """A block whose trajectories have slow errors that DGR cannot follow."""
+    rng = np.random.default_rng(seed)
+    ground = scatter_points(150, (-1500, 1500, -1200, 1200), lambda x, y: 60 * np.sin(x / 400 + y / 700), rng)
+    lines = parallel_and_cross(CAMERA, 2000.0, 2, 2, 3000.0)
+    noise = Noise(wander_m=0.5, wander_deg=0.02)
+    return simulate_network(CAMERA, lines, ground, dict.fromkeys(range(6), "control"), [], MODEL, rng, noise).network
+
+
+def test_model_that_does_not_fit_is_not_taken_for_blunders():
+    result = run(wandering(1), Job(MODEL, snoop=True))
+    assert result.given_up > 0.35 and result.rejected == ()
+    assert (result.solution.ray_weight == 1.0).all()
+    assert not result.test.passed
+
+
+def test_control_is_left_out_only_where_the_image_points_fit():
+    """Control at odds with a poor model stays: the block stands on it."""
+    network = wandering(2)
+    outcome = snoop(adjust(network, MODEL))
+    assert all(r.ray >= 0 for r in outcome.rejected)
+    assert np.abs(control_tests(outcome.solution, outcome.cofactors)).max() > 2 * CRITICAL_W
 
 
 def test_masked_ray_that_was_wronged_returns():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
+
 from triline.solver.reliability import noncentrality, normalised_residuals, reliability
 from triline.solver.statistics import (
     correlations,

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from triline.solver.adjustment import adjust
 from triline.solver.batch import Job, run
 from triline.solver.covariance import cofactors, point_cofactors

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...solver.adjustment import Iteration
 from ...solver.batch import Event, Job, NotAdjustableError, Phase
 from ...solver.batch import run as run_job
@@ -20,7 +22,7 @@ from ...solver.models.base import ModelOptions
 from ...solver.robust import WEIGHT_FUNCTIONS
 from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
 from ...solver.snooping import Round
-from ..adjustment_result import Adjustment, result_of
+from ..adjustment_result import Adjustment, result_of, worst_strip
 from ..adjustment_summary import summary_lines
 from ..adjustment_tables import write_tables
 from ..errors import UserError
@@ -30,6 +32,9 @@ from ..recording import RecordingReader
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result"""
+
+#: Beyond this sigma0 an adjustment that has not converged is no result.
+HOPELESS = 100.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -150,7 +155,8 @@ def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
     """
     start = time.perf_counter()
     try:
-        result = run_job(network_from_block(block), job, tell)
+        with np.errstate(all="ignore"):  # what is not finite is looked for where it matters
+            result = run_job(network_from_block(block), job, tell)
     except NotAdjustableError as error:
         raise UserError(f"{block.name}: {error}") from None
     except ValueError as error:
@@ -158,7 +164,10 @@ def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
     finally:
         if isinstance(tell, _Teller):
             tell.close()
-    return Adjustment(block, job, result, time.perf_counter() - start)
+    adjustment = Adjustment(block, job, result, time.perf_counter() - start)
+    if not result.solution.converged and result.test.sigma0 > HOPELESS:
+        raise UserError(f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {worst_strip(adjustment)}")
+    return adjustment
 
 
 def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False) -> None:

@@ -140,15 +140,16 @@ def vaihingen() -> Testfield:
     model = _dgr((0.11, 0.20), (0.004, 0.008), (0.004, 0.008))
     parameters = tls(camera)
     calibrated = Job(model, self_calibration=parameters)
+    smaller = {name: 0.4 * value for name, value in _AERIAL_ERRORS.items()}
     return Testfield(
         "ADS40 Vaihingen/Enz, 1500 m above ground", "vaihingen", 0.156, 201, 0, (7500.0, 4800.0), 60.0,
-        Noise(0.18, (0.02, 0.02, 0.02), jitter_deg=0.05), model, camera, parameters, _AERIAL_ERRORS,
+        Noise(0.18, (0.02, 0.02, 0.02), jitter_deg=0.05), model, camera, parameters, smaller,
         parallel_and_cross(camera, 1505.0, 4, 2, 7500.0, sidelap=0.46),
         (
             Configuration("direct georeferencing", 0, None, Published(0.125, 0.18),
-                          "camera errors as assumed here, unknown to the sigma; those of the flight were smaller"),
+                          "camera errors as assumed here, unknown to the sigma"),
             Configuration("DGR", 4, Job(model), Published(0.048, 0.064),
-                          "camera errors as assumed here; those of the flight were smaller"),
+                          "camera errors as assumed here, unknown to the sigma"),
             Configuration("DGR SC", 4, calibrated, Published(0.033, 0.058, sigma0_px=(0.18, 0.18)),
                           "published: errors of check points and of point definition; simulation has 2 cm and none"),
             Configuration("LIM-8 SC", 12, replace(calibrated, then=_lim(8, (0.03, 0.03), 0.001)),
@@ -206,7 +207,7 @@ def yoriichio_si290() -> Testfield:
         "SI-290 Yoriichio, 1800 m", "si290", 0.10, 39, 550, (8500.0, 2300.0), 60.0, noise, actual, camera, tls(camera),
         {}, parallel_and_cross(camera, 1800.0, 2, 2, 8500.0, speed_m_s=50.0, sidelap=0.3),
         (
-            Configuration("DGR", 20, Job(model, reweight=True), Published(0.33, 0.58),
+            Configuration("DGR", 20, Job(model, reweight=True), Published(0.33, 0.58, 0.19, 0.61),
                           "wander of the trajectory chosen for this row"),
             Configuration("LIM-45", 20, Job(model, lim, reweight=True),
                           Published(0.12, 0.21, 0.08, 0.28, (1.0, 1.0)),
