@@ -31,6 +31,7 @@ CASES = {
 def run(case: tuple) -> dict:
     """Simulate and adjust one network; in a process of its own."""
     import numpy as np
+
     from triline.solver.adjustment import pose_problem, solve
     from triline.solver.camera import three_line_camera
     from triline.solver.covariance import cofactors

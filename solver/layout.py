@@ -80,7 +80,7 @@ class Layout:
         coefficients = self.coefficients[:, rays]
         total = np.zeros((6, coefficients.shape[1]))
         for node, component, columns in zip(self.node, self.component, self.columns, strict=True):
-            value = padded[columns[rays]]
+            value = padded.take(columns[rays])
             value *= coefficients[node]
             total[component] += value
         return total

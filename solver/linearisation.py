@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ class Whitening:
         return Whitening(self.g * np.sqrt(weight))
 
     def apply(self, xy: Array) -> Array:
-        """Whitened (2, n) of (2, n) in mm."""
+        """Whitened (2, ..., n) of (2, ..., n) in mm."""
         return np.stack([self.g[0] * xy[0], self.g[1] * xy[0] + self.g[2] * xy[1]])
 
 
@@ -99,25 +100,9 @@ def whiten(covariance: Array) -> Whitening:
     return Whitening(np.stack([1.0 / l11, -l21 / (l11 * l22), 1.0 / l22]))
 
 
-def misclosures(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> tuple[Array, Array, Array, Array]:
-    """Residuals (2, n) in mm, and projection derivatives (2, 6, n) and (2, 3, n), and depth (n,), unwhitened."""
-    n = len(rays)
-    residual, depth = np.empty((2, n)), np.empty(n)
-    d_orientation, d_point = np.empty((2, 6, n)), np.empty((2, 3, n))
-    for low in range(0, n, CHUNK):
-        part = slice(low, min(low + CHUNK, n))
-        correction = layout.corrections(theta, part)
-        xy, d_orientation[:, :, part], d_point[:, :, part], depth[part] = collinearity(
-            rays.position_l[part].T + correction[:3],
-            rays.angles[part].T + correction[3:],
-            points_l[rays.point[part]].T,
-            rays.focal_length_mm[part],
-        )
-        np.subtract(rays.xy_mm[part].T - layout.displacement(theta, part), xy, out=residual[:, part])
-    return residual, d_orientation, d_point, depth
-
-
-def linearise(rays: Rays, layout: Layout, whitening: Whitening, theta: Array, points_l: Array) -> Linearisation:
+def linearise(
+    rays: Rays, layout: Layout, whitening: Whitening, theta: Array, points_l: Array, camera: Array | None = None
+) -> Linearisation:
     """Whitened observation equations of all rays at the given values.
 
     Parameters
@@ -127,30 +112,65 @@ def linearise(rays: Rays, layout: Layout, whitening: Whitening, theta: Array, po
     whitening : weights
     theta : (n_unknowns,) of the reduced system
     points_l : (p, 3)
+    camera : (2, slots, n) of another linearisation with the same weights; it does not depend on the values
     """
     n = len(rays)
-    camera = layout.camera.coefficients if layout.camera is not None else np.empty((2, 0, n))
-    result = Linearisation(np.empty((2, n)), np.empty((2, 6, n)), np.empty_like(camera), np.empty((2, 3, n)))
-    for low in range(0, n, CHUNK):
-        part = slice(low, min(low + CHUNK, n))
-        correction = layout.corrections(theta, part)
-        xy, d_orientation, d_point, _ = collinearity(
-            rays.position_l[part].T + correction[:3],
-            rays.angles[part].T + correction[3:],
-            points_l[rays.point[part]].T,
-            rays.focal_length_mm[part],
-        )
+    result = Linearisation(
+        np.empty((2, n)),
+        np.empty((2, 6, n)),
+        whitening.apply(_camera(layout, n)) if camera is None else camera,
+        np.empty((2, 3, n)),
+    )
+    for part, _, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
         g = whitening.g[:, part]
-        for target, raw in (
-            (result.residual, rays.xy_mm[part].T - layout.displacement(theta, part) - xy),
-            (result.orientation, d_orientation),
-            (result.point, d_point),
-            (result.camera, camera[..., part]),
-        ):
-            np.multiply(raw[0], g[0], out=target[0, ..., part])
-            np.multiply(raw[1], g[2], out=target[1, ..., part])
-            target[1, ..., part] += raw[0] * g[1]
+        _whiten_into(result.residual, residual, g, part)
+        _whiten_into(result.orientation, d_orientation, g, part)
+        _whiten_into(result.point, d_point, g, part)
     return result
+
+
+def linearise_and_weigh(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> tuple[Whitening, Linearisation]:
+    """Weights from the image motion at the given values, and the observation equations with them; see `linearise`."""
+    n = len(rays)
+    whitening, camera = Whitening(np.empty((3, n))), _camera(layout, n)
+    result = Linearisation(np.empty((2, n)), np.empty((2, 6, n)), np.empty(camera.shape), np.empty((2, 3, n)))
+    for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
+        g = whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
+        _whiten_into(result.residual, residual, g, part)
+        _whiten_into(result.orientation, d_orientation, g, part)
+        _whiten_into(result.point, d_point, g, part)
+        _whiten_into(result.camera, camera[:, :, part], g, part)
+    return whitening, result
+
+
+def _camera(layout: Layout, n: int) -> Array:
+    """Effect of the additional parameters (2, slots, n), unwhitened."""
+    return layout.camera.coefficients if layout.camera is not None else np.empty((2, 0, n))
+
+
+def _by_chunks(
+    rays: Rays, layout: Layout, theta: Array, points_l: Array
+) -> Iterator[tuple[slice, Rays, Array, Array, Array, Array]]:
+    """Range, rays, residual in mm, derivatives and depth of one chunk after the other."""
+    for low in range(0, len(rays), CHUNK):
+        part = slice(low, min(low + CHUNK, len(rays)))
+        own = rays.part(part)
+        correction = layout.corrections(theta, part)
+        xy, d_orientation, d_point, depth = collinearity(
+            own.position_l.T + correction[:3],
+            own.angles.T + correction[3:],
+            points_l.take(own.point, axis=0).T,
+            own.focal_length_mm,
+        )
+        residual = own.xy_mm.T - layout.displacement(theta, part) - xy
+        yield part, own, residual, d_orientation, d_point, depth
+
+
+def _whiten_into(target: Array, raw: Array, g: Array, part: slice) -> None:
+    """``target[..., part] = G raw`` for (2, ..., m)."""
+    np.multiply(raw[0], g[0], out=target[0, ..., part])
+    np.multiply(raw[1], g[2], out=target[1, ..., part])
+    target[1, ..., part] += raw[0] * g[1]
 
 
 def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tuple[Whitening, Linearisation]:

@@ -111,6 +111,10 @@ class Rays:
     def __len__(self) -> int:
         return len(self.point)
 
+    def part(self, which: slice) -> Rays:
+        """A range of the rays, as views."""
+        return Rays(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+
 
 @dataclass(frozen=True)
 class Control:

@@ -172,6 +172,7 @@ def reduce_normals(
     add_cells(matrix, rhs, lin, layout, elimination)
     if damping:
         matrix.damp(damping)
+    matrix.keep_scale()
     points = point_normals(lin, elimination, control, points_l, damping)
     for cluster, D in couplings(lin, layout, elimination, points):
         rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
@@ -204,14 +205,14 @@ def _add_batch(
 ) -> None:
     low = batch[0].low
     rays = elimination.by_cell[low : batch[-1].high]
-    orientation = lin.orientation[:, :, rays]
-    coefficients = layout.coefficients[:, rays]
+    orientation = lin.orientation.take(rays, axis=2)
+    coefficients = layout.coefficients.take(rays, axis=1)
     T, slots = len(layout.node), lin.camera.shape[1]
     J = np.empty((2, T + slots + 1, len(rays)))
     for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
         np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
-    J[:, T:-1] = lin.camera[:, :, rays]
-    J[:, -1] = lin.residual[:, rays]
+    J[:, T:-1] = lin.camera.take(rays, axis=2)
+    J[:, -1] = lin.residual.take(rays, axis=1)
     for cell in batch:
         x, y = J[:, :, cell.low - low : cell.high - low]
         block = x @ x.T + y @ y.T
@@ -244,7 +245,7 @@ def _coupling_terms(
 ) -> Array:
     """``L^-1 Jp^T J`` of rays: (3, q, n) by the terms they have."""
     T, slots = len(layout.node), lin.camera.shape[1]
-    a, b, c, d, e, f = points.inverse_factor[:, point[rays]]
+    a, b, c, d, e, f = points.inverse_factor.take(point[rays], axis=1)
     j0, j1, j2 = lin.point[:, 0, rays], lin.point[:, 1, rays], lin.point[:, 2, rays]
     orientation, camera = lin.orientation[:, :, rays], lin.camera[:, :, rays]
     coefficients = layout.coefficients[:, rays]

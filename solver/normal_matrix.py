@@ -52,6 +52,10 @@ class NormalMatrix(Protocol):
         """Multiply the diagonal by ``1 + damping``."""
         ...
 
+    def keep_scale(self) -> None:
+        """Remember the diagonal as it is now: the scale that the rounding of what is subtracted later is judged by."""
+        ...
+
     def factorise(self) -> Factor: ...
 
 
@@ -60,6 +64,7 @@ class DenseMatrix:
 
     def __init__(self, n: int):
         self.values = np.zeros((n, n))
+        self.reference: Array | None = None
 
     def add(self, columns: IntArray, block: Array) -> None:
         _add_at(self.values, columns, columns, block)
@@ -72,8 +77,12 @@ class DenseMatrix:
     def damp(self, damping: float) -> None:
         self.values[np.diag_indices_from(self.values)] *= 1.0 + damping
 
+    def keep_scale(self) -> None:
+        self.reference = np.diagonal(self.values).copy()
+
     def factorise(self) -> Factor:
-        return DenseFactor(self.values)
+        """Factor, which overwrites the matrix."""
+        return DenseFactor(self.values, self.reference)
 
 
 class BandedMatrix:
@@ -87,6 +96,7 @@ class BandedMatrix:
         self.below: list[Array] = [np.zeros((low, m)) for m, low in pairwise(size)]
         self.border: list[Array] = [np.zeros((edge, m)) for m in size]
         self.corner = np.zeros((edge, edge))
+        self.reference: Array | None = None
 
     def add(self, columns: IntArray, block: Array) -> None:
         bounds = self.structure.bounds
@@ -141,10 +151,15 @@ class BandedMatrix:
         for block in (*self.diagonal, self.corner):
             block[np.diag_indices_from(block)] *= 1.0 + damping
 
+    def keep_scale(self) -> None:
+        self.reference = np.concatenate([np.diagonal(block) for block in (*self.diagonal, self.corner)])
+
     def factorise(self) -> Factor:
-        return BandedFactor(
-            self.structure.position, self.structure.bounds, self.diagonal, self.below, self.border, self.corner
-        )
+        if self.reference is None:
+            self.keep_scale()
+        assert self.reference is not None
+        s = self.structure
+        return BandedFactor(s.position, s.bounds, self.diagonal, self.below, self.border, self.corner, self.reference)
 
 
 def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:

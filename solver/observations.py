@@ -66,7 +66,11 @@ class AntennaPosition:
         H[:, 6:9] = -skew(arm)
         if layout.with_lever_arm:
             H[:, layout.lever_arm] = s.R_eb
-        return self.position_e - s.r_e - arm, H, self.covariance_e
+        innovation = self.position_e - s.r_e - arm
+        if layout.with_wander:
+            H[:, layout.wander] = np.eye(3, 6)
+            innovation = innovation - estimate.wander_e[:3]
+        return innovation, H, self.covariance_e
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,11 @@ class AntennaVelocity:
         H[:, layout.gyro] = gyro if layout.k == 3 else np.hstack([gyro, gyro * rate])
         if layout.with_lever_arm:
             H[:, layout.lever_arm] = s.R_eb @ skew(turning)
-        return self.velocity_e - s.v_e - swing, H, self.covariance_e
+        innovation = self.velocity_e - s.v_e - swing
+        if layout.with_wander:  # a velocity has the rate of the slow error
+            H[:, layout.wander] = np.eye(3, 6, 3)
+            innovation = innovation - estimate.wander_e[3:]
+        return innovation, H, self.covariance_e
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from . import earth
 from .alignment import AlignmentError, AttitudePrior, align
 from .filter_pass import FilterPass, run_filter
-from .inertial_checks import Finding, check, gap_findings, outage_findings
+from .inertial_checks import check
+from .inertial_cleaning import Finding, gap_findings, outage_findings
 from .inertial_data import GnssData, InertialData, InertialGrade
-from .navigation import Innovation, NavigationSettings, Start, bias_variances
+from .navigation import Innovation, NavigationSettings, Start, sensor_covariance
 from .navigation_trajectory import NavigationTrajectory
 from .observations import Heading, Observation, ZeroVelocity
 from .smoother import smooth
@@ -177,8 +178,7 @@ def _biases(g: InertialGrade) -> str:
 def restart(start: Start, settings: NavigationSettings) -> Start:
     """The same start for another grade of the inertial sensor."""
     P = start.P.copy()
-    i = np.arange(9, len(P))
-    P[i, i] = bias_variances(settings)
+    P[9:, 9:] = sensor_covariance(settings, start.estimate.state.r_e)
     return Start(start.estimate, P, start.how, start.notes)
 
 
@@ -195,7 +195,8 @@ def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
     for kind in sorted({i.kind for i in innovations}):
         of_kind = [i for i in innovations if i.kind == kind]
         nis = np.array([i.nis / len(i.value) for i in of_kind])
-        subject = "gnss.sigma" if kind in ("position", "velocity") else kind
+        of_gnss = kind in ("position", "velocity")
+        subject, source = ("gnss.sigma", f"gnss.{kind}") if of_gnss else (kind, kind)
         if len(nis) >= 30:
             middle = float(np.median(nis)) / 0.79  # median of chi-square of 3 degrees of freedom over 3
             if middle > 4.0 or middle < 0.1:
@@ -204,12 +205,12 @@ def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
         rejected = sum(i.status == "rejected" for i in of_kind)
         if rejected:
             text = f"{rejected} of {len(of_kind)} {kind} observations rejected as outliers"
-            findings.append(Finding("outliers", subject, text, False))
+            findings.append(Finding("outliers", source, text, False))
         restored = [i.time_s for i in of_kind if i.status == "restored"]
         if restored:
             times = ", ".join(f"{t:.1f}" for t in restored[:5])
             text = f"filter and {kind} disagreed for long, filter restored at {times} s"
-            findings.append(Finding("restored", subject, text, False))
+            findings.append(Finding("restored", source, text, False))
     return findings
 
 

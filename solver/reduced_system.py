@@ -15,10 +15,11 @@ Blocks = list[Array]
 
 _potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
 
-#: Pivots (or eigenvalues) of the matrix scaled to a unit diagonal below this are taken as zero.
-SINGULAR = 1e-11
+#: Eigenvalues of the scaled matrix below this are taken as zero: where only its own diagonal is known for a scale, and
+#: where that before the points were eliminated is, of which elimination leaves rounding.
+SINGULAR, ROUNDING = 1e-11, 1e-13
 #: What the diagonal of a singular banded matrix is raised by.
-RAISED = 1e-10
+RAISED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Undetermined:
     ----------
     vectors : (n_unknowns, m) null vectors, largest element 1 in units of the unknowns' scale ``scale``
     eigenvalues : (m,) of the scaled matrix
-    scale : (n_unknowns,) sigma each unknown would have alone; vectors * scale is in the unknowns' own units
+    scale : (n_unknowns,) scale of each unknown; vectors * scale is in the unknowns' own units
     """
 
     vectors: Array
@@ -44,7 +45,6 @@ class Factor(Protocol):
     """A factorised reduced system."""
 
     undetermined: Undetermined
-    pivots: Array
 
     def solve(self, rhs: Array) -> Array: ...
     def cofactors(self, columns: IntArray) -> Array: ...
@@ -56,37 +56,39 @@ class DenseFactor:
 
     Directions without information are held: the solution has no part in them, and their cofactors are zero.
 
+    Parameters
+    ----------
+    matrix : (n, n)
+    reference : (n,) diagonal that the matrix had before the points were eliminated; its own if it is not given
+
     Attributes
     ----------
     undetermined : null space, empty for a regular matrix
-    pivots : (n,) squared pivots of the matrix scaled to a unit diagonal, in the given order of unknowns; each is
-        ``1 - R^2`` of its unknown against those before it
     """
 
-    def __init__(self, matrix: Array):
+    def __init__(self, matrix: Array, reference: Array | None = None):
         n = len(matrix)
         diagonal = np.diagonal(matrix).copy()
-        self.scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+        self.scale = _scale(diagonal if reference is None else reference)
+        limit, sound = (SINGULAR, SINGULAR) if reference is None else (ROUNDING, 10 * ROUNDING)
         scaled = matrix.T  # column by column as LAPACK wants it, and in place
         scaled *= self.scale[:, None]
         scaled *= self.scale
-        none = Undetermined(np.empty((n, 0)), np.empty(0), self.scale)
         factor, info = _potrf(scaled, lower=1, clean=0, overwrite_a=1)
-        pivots = np.diagonal(factor) ** 2
         self._factor: Array | None = None
         self._inverse: Array | None = None
-        if info == 0 and (n == 0 or pivots.min() > SINGULAR):
+        # an eigenvalue can be smaller than the pivots; between the two limits eigenvalues decide
+        if info == 0 and (n == 0 or (np.diagonal(factor) ** 2).min() > sound):
             self._factor = factor
-            self.undetermined, self.pivots = none, pivots
+            self.undetermined = Undetermined(np.empty((n, 0)), np.empty(0), self.scale)
             return
         scaled[np.diag_indices(n)] = diagonal * self.scale**2  # the upper triangle is as it was
         values, vectors = np.linalg.eigh(scaled, UPLO="U")
-        good = values > SINGULAR * max(float(values[-1]), 1.0)
+        good = values > limit * max(float(values[-1]), 1.0)
         kept = vectors[:, good]
         self._inverse = (kept / values[good]) @ kept.T * self.scale[:, None] * self.scale
         null = vectors[:, ~good]
         self.undetermined = Undetermined(null / np.abs(null).max(axis=0, initial=1e-300), values[~good], self.scale)
-        self.pivots = np.where(np.arange(n) < (info - 1 if info > 0 else n), pivots, 0.0)
 
     def solve(self, rhs: Array) -> Array:
         """``matrix^-1 rhs`` for (n,) or (n, m)."""
@@ -121,47 +123,51 @@ class BandedFactor:
     position : (n,) place of each unknown in the order of the band
     bounds : (T + 1,) limits of the blocks; the border stands behind
     diagonal, below, border, corner : blocks of the matrix; not changed
+    reference : (n,) diagonal before the points were eliminated, in the order of the band
     """
 
     def __init__(
-        self, position: IntArray, bounds: IntArray, diagonal: Blocks, below: Blocks, border: Blocks, corner: Array
+        self,
+        position: IntArray,
+        bounds: IntArray,
+        diagonal: Blocks,
+        below: Blocks,
+        border: Blocks,
+        corner: Array,
+        reference: Array,
     ):
         self.position, self.bounds = position, bounds
         n, last = len(position), len(diagonal)
-        d = np.concatenate([np.diagonal(block) for block in (*diagonal, corner)])
-        scale = np.where(d > 0, 1.0 / np.sqrt(np.where(d > 0, d, 1.0)), 1.0)
+        scale = _scale(reference)
         self._scale = scale  # in the order of the band
         self.scale = scale[position]
         parts = [scale[bounds[i] : bounds[i + 1]] for i in range(last)] + [scale[bounds[-1] :]]
-        scaled = [parts[i][:, None] * diagonal[i] * parts[i] for i in range(last)]
-        under = [parts[i + 1][:, None] * below[i] * parts[i] for i in range(last - 1)]
-        edge = [parts[-1][:, None] * border[i] * parts[i] for i in range(last)]
+        scaled: Blocks = [parts[i][:, None] * diagonal[i] * parts[i] for i in range(last)]
+        under: Blocks = [parts[i + 1][:, None] * below[i] * parts[i] for i in range(last - 1)]
+        edge: Blocks = [parts[-1][:, None] * border[i] * parts[i] for i in range(last)]
         end = parts[-1][:, None] * corner * parts[-1]
         self._z: tuple[Blocks, Blocks, Blocks, Array] | None = None
         self._null = np.empty((n, 0))
-        good, pivots = self._factorise(scaled, under, edge, end, 0.0)
-        self.pivots = pivots[position]
         values = np.empty(0)
-        if not good:
-            _, _ = self._factorise(scaled, under, edge, end, RAISED)
+        if not self._factorise(scaled, under, edge, end, 0.0, 10 * ROUNDING):
+            self._factorise(scaled, under, edge, end, RAISED, 0.0)
             values, self._null = self._null_vectors(n)
+            if not len(values):
+                self._factorise(scaled, under, edge, end, 0.0, 0.0)
         vectors = self._null[position]
         vectors = vectors / np.abs(vectors).max(axis=0, initial=1e-300)
         self.undetermined = Undetermined(vectors, values, self.scale)
 
     def _factorise(
-        self, diagonal: Blocks, below: Blocks, border: Blocks, corner: Array, raised: float
-    ) -> tuple[bool, Array]:
-        """Factor the scaled blocks; whether all pivots are sound, and the squared pivots (n,)."""
+        self, diagonal: Blocks, below: Blocks, border: Blocks, corner: Array, raised: float, limit: float
+    ) -> bool:
+        """Factor the scaled blocks with their diagonal raised; whether all squared pivots are above the limit."""
         self._L, self._C, self._B = [], [], []
-        pivots: list[Array] = []
         here, edge, end = diagonal[0], border[0], corner
         for i in range(len(diagonal)):
-            L, sound = _cholesky(here, raised)
+            L, sound = _cholesky(here, raised, limit)
             if not sound:
-                pivots += [np.zeros(len(d)) for d in (*diagonal[i:], corner)]
-                return False, np.concatenate(pivots)
-            pivots.append(np.diagonal(L) ** 2)
+                return False
             B = solve_triangular(L, edge.T, lower=True, check_finite=False).T
             self._L.append(L)
             self._B.append(B)
@@ -170,9 +176,8 @@ class BandedFactor:
                 C = solve_triangular(L, below[i].T, lower=True, check_finite=False).T
                 self._C.append(C)
                 here, edge = diagonal[i + 1] - C @ C.T, border[i + 1] - B @ C.T
-        self._E, sound = _cholesky(end, raised)
-        pivots.append(np.diagonal(self._E) ** 2 if sound else np.zeros(len(end)))
-        return sound, np.concatenate(pivots)
+        self._E, sound = _cholesky(end, raised, limit)
+        return sound
 
     def _null_vectors(self, n: int) -> tuple[Array, Array]:
         """Eigenvalues and vectors of the scaled matrix that count as zero, from the raised factor."""
@@ -186,7 +191,7 @@ class BandedFactor:
             T = V.T @ self._solve(V)
             values, turn = np.linalg.eigh(0.5 * (T + T.T))
             eigenvalues = 1.0 / values - RAISED
-            zero = eigenvalues < 10 * RAISED
+            zero = eigenvalues < ROUNDING
             if wanted == n or not zero.all():
                 return np.maximum(eigenvalues[zero], 0.0), (V @ turn)[:, zero]
             wanted *= 2
@@ -279,15 +284,20 @@ class BandedFactor:
         return (d * self._scale**2)[self.position]
 
 
-def _cholesky(matrix: Array, raised: float) -> tuple[Array, bool]:
-    """Lower factor of a matrix with its diagonal raised, and whether its pivots are sound."""
+def _scale(diagonal: Array) -> Array:
+    """What makes a diagonal 1."""
+    positive = diagonal > 0
+    return np.where(positive, 1.0 / np.sqrt(np.where(positive, diagonal, 1.0)), 1.0)
+
+
+def _cholesky(matrix: Array, raised: float, limit: float) -> tuple[Array, bool]:
+    """Lower factor of a matrix with its diagonal raised, and whether its squared pivots are above a limit."""
     if not len(matrix):
         return matrix, True
     work = matrix.copy()
     work[np.diag_indices_from(work)] += raised
     factor, info = _potrf(work, lower=1, clean=1)
-    pivots = np.diagonal(factor) ** 2
-    return factor, bool(info == 0 and pivots.min() > (0.0 if raised else SINGULAR))
+    return factor, bool(info == 0 and (np.diagonal(factor) ** 2).min() > limit)
 
 
 def _inverse_of(factor: Array | None) -> Array:

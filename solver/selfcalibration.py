@@ -35,6 +35,9 @@ SIGMA = {
     "b": 1e-5,
 }
 
+#: Default a-priori sigmas of the PRISM set: 0.02 mm, about three pixels, at the end of a line of 100 mm.
+PRISM_SIGMA = {"dx": 0.02, "dy": 0.02, "b": 2e-7, "s": 4e-4}
+
 #: An a-priori sigma that leaves a parameter free, times its default, and one that fixes it.
 FREE, FIXED = 1e4, 1e-9
 
@@ -211,7 +214,8 @@ def prism(camera: LineCamera) -> SelfCalibration:
         names += [*shifts, f"b_{line.id}", f"s_{line.id}"]
         shape = [names.index(f"b_{line.id}"), names.index(f"s_{line.id}")]
         columns += [[names.index(shifts[2 * n]), names.index(shifts[2 * n + 1]), *shape] for n in range(len(starts))]
-    return _set("prism30" if len(names) == 30 else f"prism{len(names)}", names, _PRISM, columns, chips)
+    name = "prism30" if len(names) == 30 else f"prism{len(names)}"
+    return _set(name, names, _PRISM, columns, chips).with_sigma(PRISM_SIGMA)
 
 
 def lens(camera: LineCamera) -> SelfCalibration:

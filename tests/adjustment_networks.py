@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from triline.solver.adjustment import Solution
 from triline.solver.camera import three_line_camera
 from triline.solver.models import ModelOptions

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-import triline.solver.models as models
 from adjustment_networks import simulate
+
+import triline.solver.models as models
 from triline.solver.adjustment import adjust
 from triline.solver.models import MODELS, Extent
 from triline.solver.models.dgr import DgrOptions

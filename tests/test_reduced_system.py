@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-import triline.solver.normal_matrix as normal_matrix
 from adjustment_networks import CAMERA, simulate
+
+import triline.solver.normal_matrix as normal_matrix
 from triline.solver.adjustment import adjust, pose_problem
 from triline.solver.covariance import cofactors
 from triline.solver.models.lim import LimOptions

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from adjustment_networks import CAMERA, simulate
+
 from triline.solver.adjustment import adjust
 from triline.solver.camera import Lens, LineCamera, straight_line
 from triline.solver.covariance import point_cofactors

@@ -1,10 +1,10 @@
 """Batch adjustment against Ceres (sparse Schur complement, automatic derivatives): same residuals, start and cost.
 
-    python bench/ceres/compare.py [--threads 1] [--repeat 5] [CASE ...]
+    python bench/ceres/compare.py [--repeat 5] [CASE ...]
 
 Builds bench/ceres/adjust.cpp with Debian's libceres-dev. Times are the smallest of the repetitions: ours from the
 network to the solution (layout, elimination plan, iterations, factor at the solution), Ceres' from its summary (without
-building the problem), with the faster of SuiteSparse and Eigen.
+building the problem), with the faster of SuiteSparse and Eigen. Both use one thread.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-#: name: model, with TLS-18, points, parallel strips, cross strips, length of the block in m
+#: name: model, segments or fixes, with TLS-18, points, parallel strips, cross strips, length of the block in m
 CASES = {
-    "DGR, 5 000 rays": ("dgr", False, 880, 4, 1, 5000.0),
-    "DGR + TLS-18, 8 000 rays": ("dgr", True, 1400, 4, 1, 5000.0),
-    "LIM-18 + TLS-18, 8 000 rays": ("lim", True, 1400, 4, 1, 5000.0),
-    "PPM-8, 8 000 rays": ("ppm", False, 1400, 4, 1, 5000.0),
-    "DGR, 125 000 rays": ("dgr", False, 19700, 8, 3, 12000.0),
-    "DGR + TLS-18, 125 000 rays": ("dgr", True, 19700, 8, 3, 12000.0),
+    "DGR, 5 000 rays": ("dgr", 0, False, 880, 4, 1, 5000.0),
+    "DGR + TLS-18, 8 000 rays": ("dgr", 0, True, 1400, 4, 1, 5000.0),
+    "LIM-18, 8 000 rays": ("lim", 18, False, 1400, 4, 1, 5000.0),
+    "LIM-18 + TLS-18, 8 000 rays": ("lim", 18, True, 1400, 4, 1, 5000.0),
+    "PPM-8, 8 000 rays": ("ppm", 8, False, 1400, 4, 1, 5000.0),
+    "PPM-8 + TLS-18, 8 000 rays": ("ppm", 8, True, 1400, 4, 1, 5000.0),
+    "DGR, 125 000 rays": ("dgr", 0, False, 19700, 8, 3, 12000.0),
+    "DGR + TLS-18, 125 000 rays": ("dgr", 0, True, 19700, 8, 3, 12000.0),
 }
 
 
@@ -52,8 +54,7 @@ def write_problem(path: Path, problem, whitening) -> None:
     rays, n = network.rays, len(network.rays)
     model = {"dgr": 0, "ppm": 1, "lim": 2}[problem.model.name]
     size = {0: 9, 1: 18, 2: 6}[model]
-    own = layout.columns[:, :] if model else layout.columns
-    block_of = own.min(axis=0).astype(np.int64) // size
+    block_of = layout.columns.min(axis=0).astype(np.int64) // size
     n_lines = len(network.camera.lines) if layout.camera is not None else 0
     camera = np.zeros((n, 20))
     place = {}
@@ -102,8 +103,9 @@ def write_problem(path: Path, problem, whitening) -> None:
             np.ascontiguousarray(b).tofile(file)
 
 
-def compare(name: str, peer: Path, folder: Path, repeat: int, threads: int) -> dict:
+def compare(name: str, peer: Path, folder: Path, repeat: int) -> dict:
     import numpy as np
+
     from triline.solver.adjustment import pose_problem, solve
     from triline.solver.camera import three_line_camera
     from triline.solver.models.dgr import DgrOptions
@@ -112,8 +114,12 @@ def compare(name: str, peer: Path, folder: Path, repeat: int, threads: int) -> d
     from triline.solver.selfcalibration import tls
     from triline.solver.simulation.network import regular_block
 
-    model, with_aps, points, strips, cross, length = CASES[name]
-    options = {"dgr": DgrOptions(), "ppm": PpmOptions(segments=8), "lim": LimOptions(fixes=18, merge=False)}[model]
+    model, parts, with_aps, points, strips, cross, length = CASES[name]
+    options = DgrOptions()
+    if model == "ppm":
+        options = PpmOptions(segments=parts)
+    elif model == "lim":
+        options = LimOptions(fixes=parts, merge=False)
     camera = three_line_camera("ads40", 62.7, 12000, 0.0065, {"F": 26.0, "N": 0.0, "B": -16.0})
     aps = tls(camera) if with_aps else None
     errors = {"k1": 3e-6, "xp_F": 0.004, "sy_B": 1e-4} if with_aps else None
@@ -139,7 +145,7 @@ def compare(name: str, peer: Path, folder: Path, repeat: int, threads: int) -> d
     theirs = []
     for library in ("suite", "eigen"):  # whichever sparse factorisation is faster on this machine
         for _ in range(repeat):
-            command = [str(peer), str(path), str(threads), library]
+            command = [str(peer), str(path), "1", library]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
             theirs.append(json.loads(done.stdout))
     path.unlink()
@@ -162,19 +168,18 @@ def compare(name: str, peer: Path, folder: Path, repeat: int, threads: int) -> d
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", metavar="CASE", help="; ".join(CASES))
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     for library in ("OPENBLAS", "OMP"):  # before NumPy is imported; the peer inherits it
-        os.environ[f"{library}_NUM_THREADS"] = str(given.threads)
+        os.environ[f"{library}_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as folder:
         peer = build(Path(folder))
         rows = []
         for name in given.cases or CASES:
             if name not in CASES:
                 sys.exit(f"no case {name!r}; there are: {'; '.join(CASES)}")
-            rows.append(compare(name, peer, Path(folder), given.repeat, given.threads))
+            rows.append(compare(name, peer, Path(folder), given.repeat))
             if not given.json:
                 r = rows[-1]
                 print(

@@ -13,7 +13,8 @@ __all__ = ["COMPONENTS", "MODELS", "CorrectionModel", "Design", "Extent", "Model
 def _find() -> dict[str, type[ModelOptions]]:
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
-    return {options.name: options for options in sorted(ModelOptions.__subclasses__(), key=lambda o: o.name)}
+    ours = [options for options in ModelOptions.__subclasses__() if options.__module__.startswith(f"{__name__}.")]
+    return {options.name: options for options in sorted(ours, key=lambda o: o.name)}
 
 
 #: Options class of each model, by the name the command line uses.

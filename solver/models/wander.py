@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 NOTHING = 1e-7
 #: A trajectory without slow errors.
 NO_SLOW_ERRORS = SlowErrors()
+#: Length of a segment as a share of the correlation time: what is left out is then below 1 % of the wander.
+SEGMENT_SHARE = 1.0 / 15.0
 #: Columns of offset, shift and drift before those of the borders.
 GLOBALS = 9
 
@@ -48,7 +50,7 @@ class WanderOptions(ModelOptions):
     Attributes
     ----------
     slow : a-priori sigmas of offset, shift, drift and wander
-    segment_s : longest time between borders; 0 = a tenth of the correlation time
+    segment_s : longest time between borders; 0 = `SEGMENT_SHARE` of the correlation time
     """
 
     name: ClassVar[str] = "wander"
@@ -89,7 +91,7 @@ class Wander(CorrectionModel):
         self.extent = extent
         self.options = options
         slow = options.slow
-        self.step_s = options.segment_s or 0.1 * slow.wander_time_s
+        self.step_s = options.segment_s or SEGMENT_SHARE * slow.wander_time_s
         segments = max(1, int(np.ceil((extent.end_s - extent.start_s) / self.step_s - 1e-9)))
         self.borders = extent.start_s + self.step_s * np.arange(segments + 1)
         kinds = ["offset"] * 3 + ["shift"] * 3 + ["drift"] * 3
