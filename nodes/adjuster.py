@@ -13,7 +13,6 @@ from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
 from .adjuster_poses import OrientationStore, PoseBuffer
-from .navigator import slow_errors_of
 from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
@@ -113,7 +112,8 @@ class Adjuster(Node):
     def query(self, name: str, parameters: dict[str, str]) -> Message | None:
         """Refined orientation at a time: ``query/orientation?t=..``, seconds (or nanoseconds) since the Unix epoch.
 
-        The newest answer for that time: final where there is one, else live. None for a time without one.
+        The best answer for that time: of the whole strip once it is over (the backward pass), else final, else live.
+        None for a time without one.
         """
         if name != "orientation":
             return None
@@ -148,7 +148,7 @@ class Adjuster(Node):
         if topic == "configuration/project":
             if body == self._project:
                 return []
-            slow_errors_of(body)
+            convert.slow_errors_of(body)
             self._project = body
         else:
             if body == self._camera:
@@ -161,7 +161,7 @@ class Adjuster(Node):
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         camera = convert.camera_from(self._camera)
         parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
-        self._window = Window(camera, slow_errors_of(self._project), self.options, parameters)
+        self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
         self._poses.clear()
         for strip in self._strips.values():
             self._begin(strip)
@@ -287,6 +287,12 @@ class Adjuster(Node):
             )
             self._store.add_final([message.body for message in messages])
             outputs += messages
+        if update.whole is not None:
+            for orientation in update.whole.orientation:
+                messages = out.orientations(
+                    "orientation/final", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
+                )
+                self._store.add_whole([message.body for message in messages])
         outputs += [out.object_point(point, self._stamp_ns) for point in update.points]
         if update.report is not None:
             outputs.append(

@@ -20,6 +20,7 @@ from ..solver.rotation import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
+from ..solver.slow_errors import SlowErrors
 
 Array = NDArray[np.floating]
 
@@ -194,6 +195,31 @@ def R_bc_of(project: Any) -> Array:
 def lever_arm_of(project: Any) -> Array:
     """Perspective centre to antenna, body frame, m."""
     return np.array(project.lever_arm_m) if project.lever_arm_m else np.zeros(3)
+
+
+def slow_errors_of(project: Any) -> SlowErrors:
+    """A-priori slow errors of a Project message; what is absent is zero.
+
+    Raises
+    ------
+    ValueError : naming the value that cannot be
+    """
+
+    def three(values: Any, factor: float = 1.0) -> tuple[float, float, float]:
+        if not values:
+            return (0.0, 0.0, 0.0)
+        a, b, c = (float(v) * factor for v in values)
+        return (a, b, c)
+
+    to_rad = float(np.radians(1.0))
+    return SlowErrors(
+        three(project.offset_sigma_m),
+        three(project.shift_sigma_deg, to_rad),
+        three(project.drift_sigma_deg, to_rad),
+        three(project.wander_sigma_m),
+        three(project.wander_sigma_deg, to_rad),
+        project.wander_time_s or SlowErrors.wander_time_s,
+    )
 
 
 def gnss_message(

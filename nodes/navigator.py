@@ -10,67 +10,31 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..solver.frames import LocalFrame
-from ..solver.kinematic import KinematicFilter, KinematicOptions
-from ..solver.navigation_pose import NavigationEngine, NavigationPose
+from ..solver.inertial_navigator import InertialNavigator
+from ..solver.kinematic import KinematicFilter
+from ..solver.navigation_pose import NavigationPose
 from ..solver.rotation import R_ENU_NED
-from ..solver.slow_errors import SlowErrors
 from . import convert
+from .navigation_engines import inertial_engine, kinematic_engine
 from .node import Message, Node
-
-
-def slow_errors_of(project: Any) -> SlowErrors:
-    """A-priori slow errors of a Project message; what is absent is zero.
-
-    Raises
-    ------
-    ValueError : naming the value that cannot be
-    """
-
-    def three(values: Any, factor: float = 1.0) -> tuple[float, float, float]:
-        if not values:
-            return (0.0, 0.0, 0.0)
-        a, b, c = (float(v) * factor for v in values)
-        return (a, b, c)
-
-    to_rad = float(np.radians(1.0))
-    return SlowErrors(
-        three(project.offset_sigma_m),
-        three(project.shift_sigma_deg, to_rad),
-        three(project.drift_sigma_deg, to_rad),
-        three(project.wander_sigma_m),
-        three(project.wander_sigma_deg, to_rad),
-        project.wander_time_s or SlowErrors.wander_time_s,
-    )
-
-
-def kinematic_engine(project: Any) -> NavigationEngine:
-    """The engine for attitude and GNSS input."""
-    slow = slow_errors_of(project)
-    options = KinematicOptions(
-        lever_arm_b=convert.lever_arm_of(project),
-        R_bc=convert.R_bc_of(project),
-        offset_sigma_m=np.array(slow.offset_m),
-        wander_sigma_m=np.array(slow.wander_m),
-        wander_time_s=slow.wander_time_s,
-        attitude_sigma=slow.attitude_sigma,
-    )
-    return KinematicFilter(convert.local_frame(project), options)
 
 
 class Navigator(Node):
     """Runs a navigation engine.
 
-    The engine is made when the project is known; another engine (inertial) takes its place by its own factory here.
-    Poses carry the stamp of the message that made them possible; the time they are valid for stands in the body.
+    Attitude and GNSS go through the kinematic filter. With the first raw inertial sample the inertial filter takes
+    over; measured attitudes are then counted and left aside. Poses carry the stamp of the message that made them
+    possible; the time they are valid for stands in the body.
     """
 
     name = "navigator"
-    inputs = ("configuration/project", "sensor/attitude", "sensor/gnss")
+    inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss")
     outputs = ("trajectory/filtered", "trajectory/smoothed", "event/log")
 
     def __init__(self) -> None:
         super().__init__()
-        self._engine: NavigationEngine | None = None
+        self._engine: KinematicFilter | InertialNavigator | None = None
+        self._configuration: Any = None
         self._reference_ns = 0
         self._seen: Counter[str] = Counter()
         self._stamp_ns = 0
@@ -82,7 +46,9 @@ class Navigator(Node):
     def step(self, message: Message) -> Iterable[Message]:
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         try:
-            if message.topic == "sensor/attitude":
+            if message.topic == "sensor/imu":
+                poses = self._inertial(message.body)
+            elif message.topic == "sensor/attitude":
                 poses = self._attitude(message.body)
             elif message.topic == "sensor/gnss":
                 poses = self._gnss(message.body)
@@ -99,7 +65,9 @@ class Navigator(Node):
         return self._messages(self._engine.finish())
 
     def state(self) -> str:
-        return "running" if self._engine is not None else "waiting for configuration/project"
+        if self._engine is None:
+            return "waiting for configuration/project"
+        return self._engine.status if isinstance(self._engine, InertialNavigator) else "running"
 
     def _configure(self, message: Message) -> Iterable[Message]:
         content = message.body.SerializeToString(deterministic=True)
@@ -107,6 +75,7 @@ class Navigator(Node):
             return ()
         try:
             self._engine = kinematic_engine(message.body)
+            self._configuration = message.body
         except ValueError as error:
             self.problem("bad configuration", f"{message.topic}: {error}")
             return (self._log(message.stamp_ns, f"configuration/project cannot be used: {error}", warning=True),)
@@ -116,9 +85,27 @@ class Navigator(Node):
         self._reference_ns = message.stamp_ns
         return ()
 
+    def _inertial(self, body: Any) -> list[NavigationPose]:
+        if self._engine is None:
+            self.problem("before configuration", "sensor/imu came before configuration/project")
+            return []
+        force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
+        if not (np.isfinite(force).all() and np.isfinite(rate).all()):
+            raise ValueError("specific force or angular rate is not finite")
+        if max(map(abs, force)) > 500.0 or max(map(abs, rate)) > 50.0:
+            raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
+        if not 0 < body.interval_ns <= convert.SECOND_NS:
+            raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
+        if not isinstance(self._engine, InertialNavigator):
+            self._engine, self._seen = inertial_engine(self._configuration, body), Counter()
+        return self._engine.add_inertial(self._seconds(body.time_ns), body.interval_ns * 1e-9, force, rate)
+
     def _attitude(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:
             self.problem("before configuration", "sensor/attitude came before configuration/project")
+            return []
+        if isinstance(self._engine, InertialNavigator):
+            self.counters["attitude beside inertial data"] += 1
             return []
         rpy = (body.roll, body.pitch, body.heading)
         if not np.isfinite(rpy).all():
@@ -149,14 +136,30 @@ class Navigator(Node):
         frame = self._frame
         antenna_l = frame.from_geodetic(*geodetic)
         R_l_enu = frame.R_ln(antenna_l) @ R_ENU_NED
-        return self._engine.add_gnss(
-            self._seconds(convert.time_ns(body.timestamp)), antenna_l, R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
-        )
+        time_s = self._seconds(convert.time_ns(body.timestamp))
+        covariance_l = R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
+        if isinstance(self._engine, KinematicFilter):
+            return self._engine.add_gnss(time_s, antenna_l, covariance_l)
+        velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
+        return self._engine.add_gnss(time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
+
+    @staticmethod
+    def _velocity(body: Any, R_l_enu: Any) -> tuple[Any, Any]:
+        """Velocity (3,) and its covariance (3, 3) in the local frame; None, None where the receiver gives none."""
+        covariance = np.array(body.velocity_covariance)
+        velocity = np.array([body.velocity_enu.x, body.velocity_enu.y, body.velocity_enu.z])
+        if covariance.shape != (9,) or not np.isfinite(covariance).all() or covariance[::4].min() <= 0:
+            return None, None
+        if not np.isfinite(velocity).all():
+            raise ValueError(f"velocity {velocity.tolist()} is not finite")
+        return R_l_enu @ velocity, R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
 
     def _seconds(self, time_ns: int) -> float:
         return (time_ns - self._reference_ns) * 1e-9
 
     def _messages(self, poses: list[NavigationPose]) -> list[Message]:
+        if self._engine is None:
+            return []
         out = [
             Message(
                 "trajectory/smoothed" if p.smoothed else "trajectory/filtered",
@@ -168,7 +171,6 @@ class Navigator(Node):
             )
             for p in poses
         ]  # fmt: skip
-        assert self._engine is not None
         for kind, n in self._engine.counters.items():
             self.counters[kind] += n - self._seen[kind]
             self._seen[kind] = n
