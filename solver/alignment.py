@@ -1,31 +1,32 @@
 """Alignment: attitude, velocity and position to start a navigation from.
 
-In the non-rotating frame that is Earth-fixed at ``t0`` (see `strapdown`), the antenna at the fixes ``t0 + tau`` is at::
-
-    r(tau) - int int gamma = r0 + v0 tau + R0 (p(tau) + R(tau) lever_arm)
-
-with the body integrals ``p, R`` known from inertial data alone. That is a straight line plus a rotated curve: with
-the line taken out, ``R0`` is the rotation between two sets of vectors, found at once however wrong a first guess
-would have been (orthogonal Procrustes, Wahba's problem). Gauss-Newton then refines everything, sensor biases
-included, with the full covariance of GNSS and inertial noise. What makes the heading visible (turns, changes of
-speed, at rest the rotation of the Earth) needs no cases of its own: it all is in the curve, and the covariance tells
-whether it was enough.
+What makes the attitude visible (turns, changes of speed, at rest the rotation of the Earth) needs no cases of its own:
+a window of data is fitted as a whole (see `alignment_window`), and the covariance tells whether it was enough. A window
+that is not is followed by a longer one; in the end a given attitude is taken as it is, the course stands for the
+heading, or the alignment is refused in words.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
 
 from . import earth
-from .filter_pass import rates_at
-from .inertial_data import GnssData, InertialData, InertialGrade, cut
-from .navigation import Estimate, NavigationSettings, Start, bias_variances
-from .navigation_trajectory import gravitation
+from .alignment_window import (
+    COURSE_SIGMA,
+    SUSPICIOUS_CHI2,
+    Curve,
+    WindowFit,
+    curve,
+    fit_window,
+    noise_root,
+    wahba,
+    without_outliers,
+)
+from .inertial_data import GnssData, InertialData, InertialGrade
+from .navigation import Estimate, NavigationSettings, Start, sensor_covariance
 from .rotation import (
     matrix_from_navigation,
     navigation_from_matrix,
@@ -33,12 +34,11 @@ from .rotation import (
     skew,
     vector_from_quaternion,
 )
-from .strapdown import OMEGA_IE, Block, State, earth_rotation, integrate_one, rotation_matrix
+from .strapdown import OMEGA_IE, State, rotation_matrix
 
 Array = NDArray[np.floating]
 
 HEADING_SIGMA = np.radians(2.0)  # an alignment is good enough below this
-COURSE_SIGMA = np.radians(12.0)  # drift angle: how far a vehicle's nose may be off its course
 SLOWEST_COURSE_M_S = 4.0
 _WINDOWS_S = (6.0, 10.0, 16.0, 25.0, 40.0, 60.0, 90.0, 130.0, 190.0, 280.0)
 LARGEST_CHI2 = 25.0  # squares of a fit may be so many times what they should be
@@ -91,229 +91,6 @@ def static_attitude(force: ArrayLike, rate: ArrayLike, lat: float, grade: Inerti
     return np.array([roll, pitch, heading]), np.array([level, level, min(sigma, np.pi / np.sqrt(3.0))])
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Body integrals from ``t0`` to the m fixes of a window (see `strapdown.Block`), and what GNSS says there."""
-
-    tau: Array  # (m,)
-    R: Array  # (m, 3, 3)
-    p: Array  # (m, 3)
-    v: Array
-    A: Array  # (m, 3, 3)
-    B: Array
-    Jp: Array
-    Jv: Array
-    Bp: Array
-    rate: Array  # (m, 3) angular rate, body
-    y: Array  # (m, 3) antenna less gravitation, non-rotating frame
-    covariance: Array  # (m, 3, 3) of the fixes
-    velocity: Array | None  # (m, 3) antenna velocity less gravitation, non-rotating frame
-    velocity_covariance: Array | None
-
-    def until(self, m: int) -> Curve:
-        columns: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return Curve(**{name: None if c is None else c[:m] for name, c in columns.items()})
-
-
-def curve(inertial: InertialData, gnss: GnssData, t0: float) -> Curve:
-    """The curve from corrected inertial data without gaps and the fixes after ``t0``."""
-    tau = gnss.time_s - t0
-    pieces = cut(inertial, np.concatenate([[t0], gnss.time_s]))[0]
-    middle = pieces.time_s - 0.5 * pieces.dt_s
-    zero = np.zeros(3)
-    blocks, total, last = [], Block.empty(), int(np.searchsorted(middle, t0))
-    for t in gnss.time_s:
-        end = int(np.searchsorted(middle, t))
-        if end > last:
-            total = total.then(integrate_one(pieces[last:end], zero, zero))
-        blocks.append(total)
-        last = end
-    C = np.array([earth_rotation(t).T for t in tau])  # Earth-fixed to non-rotating
-    r_e = gnss.position_e
-    g = _apply(C, gravitation(r_e))
-    # gravitation is linear between fixes, and constant before the first
-    h = np.diff(tau, prepend=0.0)[:, None]
-    g0 = np.concatenate([g[:1], g[:-1]])
-    G1 = np.cumsum(h * (g0 + g) / 2.0, axis=0)
-    G2 = np.cumsum(h * (G1 - h * (g0 + g) / 2.0) + h**2 * (2.0 * g0 + g) / 6.0, axis=0)
-    velocity = covariance_v = None
-    v_e, s_v = gnss.velocity_e, gnss.sigma_velocity_n
-    if v_e is not None and s_v is not None and np.isfinite(v_e).all():
-        velocity = _apply(C, v_e + np.cross(OMEGA_IE, r_e)) - G1
-        A = C @ gnss.R_en * s_v[:, None, :]
-        covariance_v = A @ np.swapaxes(A, -1, -2)
-    P = C @ gnss.covariance_e() @ np.swapaxes(C, -1, -2)
-    names = ("R", "p", "v", "A", "B", "Jp", "Jv", "Bp")
-    integrals: dict[str, Array] = {name: np.array([getattr(b, name) for b in blocks]) for name in names}
-    return Curve(
-        tau,
-        rate=rates_at(inertial, gnss.time_s),
-        y=_apply(C, r_e) - G2,
-        covariance=P,
-        velocity=velocity,
-        velocity_covariance=covariance_v,
-        **integrals,
-    )
-
-
-def _apply(R: Array, v: Array) -> Array:
-    return (R @ v[..., None])[..., 0]
-
-
-def wahba(c: Curve, settings: NavigationSettings) -> Array:
-    """``R0`` (3, 3) from the curve with the best straight line taken out of both sides; biases neglected."""
-    arm = np.asarray(settings.lever_arm_b)
-    w = 1.0 / np.sqrt(np.einsum("mii->m", c.covariance) / 3.0)
-    x = c.p + c.R @ arm
-    X, Y = x * w[:, None], c.y * w[:, None]
-    D = np.column_stack([w, w * c.tau])
-    if c.velocity is not None and c.velocity_covariance is not None:
-        wv = 1.0 / np.sqrt(np.einsum("mii->m", c.velocity_covariance) / 3.0)
-        X = np.vstack([X, wv[:, None] * (c.v + _apply(c.R, np.cross(c.rate, arm)))])
-        Y = np.vstack([Y, wv[:, None] * c.velocity])
-        D = np.vstack([D, np.column_stack([0.0 * wv, wv])])
-    Q = np.linalg.qr(D)[0]
-    X, Y = X - Q @ (Q.T @ X), Y - Q @ (Q.T @ Y)
-    U, _, Vt = np.linalg.svd(Y.T @ X)
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-
-
-def _noise(c: Curve, settings: NavigationSettings, down_i: Array) -> Array:
-    """Covariance of all observations of the curve: GNSS noise, and the inertial noise that is common to later fixes."""
-    g, t = settings.grade, c.tau
-    m = len(t)
-    lo, hi = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    d = hi - lo
-    level = np.eye(3) - np.outer(down_i, down_i)  # a tilt moves the level components
-    Sa, Sg = g.accel_noise**2, g.gyro_noise**2 * 9.8**2
-    pp_a = lo**2 * (3.0 * hi - lo) / 6.0
-    # int_0^lo ((lo - s)^2 / 2) ((hi - s)^2 / 2) ds with u = lo - s
-    pp_g = (lo**5 / 5.0 + d * lo**4 / 2.0 + d**2 * lo**3 / 3.0) / 4.0
-    K = np.einsum("ab,ij->aibj", Sa * pp_a, np.eye(3)) + np.einsum("ab,ij->aibj", Sg * pp_g, level)
-    K = K.reshape(3 * m, 3 * m)
-    for i in range(m):
-        K[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += c.covariance[i]
-    if c.velocity is None or c.velocity_covariance is None:
-        return K
-    T_p, T_v = t[:, None], t[None, :]
-    s = np.minimum(T_p, T_v)
-    after = T_p - s
-    pv_a = s * after + s**2 / 2.0  # int_0^s (T_p - u) du
-    u = T_v - s
-    # int_0^s ((T_p - x)^2 / 2) (T_v - x) dx, with x measured back from s
-    pv_g = (s**4 / 4 + (2 * after + u) * s**3 / 3 + (after**2 + 2 * after * u) * s**2 / 2 + after**2 * u * s) / 2.0
-    vv_g = lo**3 / 3.0 + d * lo**2 / 2.0
-    PV = np.einsum("ab,ij->aibj", Sa * pv_a, np.eye(3)) + np.einsum("ab,ij->aibj", Sg * pv_g, level)
-    VV = np.einsum("ab,ij->aibj", Sa * lo, np.eye(3)) + np.einsum("ab,ij->aibj", Sg * vv_g, level)
-    PV, VV = PV.reshape(3 * m, 3 * m), VV.reshape(3 * m, 3 * m)
-    for i in range(m):
-        VV[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += c.velocity_covariance[i]
-    return np.block([[K, PV], [PV.T, VV]])
-
-
-@dataclass(frozen=True)
-class WindowFit:
-    """Least-squares fit of a window.
-
-    Attributes
-    ----------
-    r0, v0 : (3,) non-rotating frame at the start, metres, m/s
-    R0 : (3, 3) body to that frame
-    gyro, accel : (3,) biases
-    P : (15, 15) covariance of ``dr0, dv0, psi`` and biases
-    reduced_chi2 : of the fit
-    cost : weighted sum of squares
-    """
-
-    r0: Array
-    v0: Array
-    R0: Array
-    gyro: Array
-    accel: Array
-    P: Array
-    reduced_chi2: float
-    cost: float
-
-
-def fit_window(
-    c: Curve,
-    settings: NavigationSettings,
-    R0: Array,
-    root: Array,
-    prior: tuple[Array, Array] | None = None,
-    course: tuple[int, float] | None = None,
-    R_ne: Array | None = None,
-    rounds: int = 12,
-    arm_sigma_m: float | None = None,
-) -> WindowFit:
-    """Gauss-Newton fit of position, velocity, attitude and biases at the start of a window.
-
-    Parameters
-    ----------
-    R0 : (3, 3) first approximation of the attitude
-    root : lower Cholesky factor of the covariance of all observations
-    prior : attitude (3, 3) known beforehand with the covariance (3, 3) of its rotation error in the same axes
-    course : index of a fix, heading there (radians)
-    R_ne : (3, 3) Earth-fixed to north-east-down, for ``course``
-    rounds : most iterations
-    arm_sigma_m : of the lever arm, if not that of the settings
-    """
-    arm = arm0 = np.asarray(settings.lever_arm_b, dtype=float)
-    arm_sigma = max(settings.lever_arm_sigma_m if arm_sigma_m is None else arm_sigma_m, 1e-5)
-    m = len(c.tau)
-    y = c.y.ravel() if c.velocity is None else np.concatenate([c.y.ravel(), c.velocity.ravel()])
-    sigma_b, k = np.sqrt(bias_variances(settings)), settings.layout.k
-    sigma = np.concatenate([sigma_b[:3], sigma_b[k : k + 3], np.full(3, arm_sigma)])
-    r0, gyro, accel = c.y[0].copy(), np.zeros(3), np.zeros(3)
-    v0 = (c.y[-1] - c.y[0] - R0 @ (c.p[-1] - c.p[0])) / (c.tau[-1] - c.tau[0])
-    tau, eye = c.tau[:, None], np.broadcast_to(np.eye(3), (m, 3, 3))
-    swing = skew(c.rate)
-    N, cost = np.eye(18), np.inf
-    for _ in range(rounds):
-        turned = c.R @ arm
-        x = (c.p + c.Jp @ gyro - c.Bp @ accel + turned) @ R0.T
-        model = r0 + tau * v0 + x
-        sensors = R0 @ (c.Jp + skew(turned) @ c.A), -(R0 @ c.Bp), R0 @ c.R
-        J = np.concatenate([eye, tau[:, None] * eye, -skew(x), *sensors], axis=-1)
-        if c.velocity is not None:
-            x = (c.v + c.Jv @ gyro - c.B @ accel + _apply(c.R, np.cross(c.rate, arm))) @ R0.T
-            model = np.concatenate([model, v0 + x])
-            sensors = R0 @ c.Jv, -(R0 @ c.B), R0 @ c.R @ swing
-            Jv = np.concatenate([0.0 * eye, eye, -skew(x), *sensors], axis=-1)
-            J = np.concatenate([J, Jv])
-        A: list[Array] = [solve_triangular(root, J.reshape(-1, 18), lower=True), np.eye(18)[9:] / sigma[:, None]]
-        off = np.concatenate([gyro, accel, arm - arm0])
-        r: list[Array] = [solve_triangular(root, y - model.ravel(), lower=True), -off / sigma]
-        if prior is not None:
-            W = np.linalg.inv(np.linalg.cholesky(prior[1]))
-            A.append(W @ np.eye(18)[6:9])
-            r.append(W @ vector_from_quaternion(quaternion_from_matrix(prior[0] @ R0.T)))
-        if course is not None and R_ne is not None:
-            i, heading = course
-            forward = R_ne @ (R0 @ c.R[i, :, 0])
-            miss = (heading - np.arctan2(forward[1], forward[0]) + np.pi) % (2 * np.pi) - np.pi
-            h2 = max(forward[0] ** 2 + forward[1] ** 2, 1e-3)
-            turn = (np.array([-forward[1], forward[0], 0.0]) / h2 @ -skew(forward)) @ R_ne
-            A.append(turn[None] @ np.eye(18)[6:9] / COURSE_SIGMA)
-            r.append(np.array([miss / COURSE_SIGMA]))
-        all_r = np.concatenate(r)
-        cost = float(all_r @ all_r)
-        design = np.vstack(A)
-        scale = np.linalg.norm(design, axis=0)
-        Q, T = np.linalg.qr(design / scale)
-        T = T + np.diag(np.where(np.abs(np.diag(T)) < 1e-9, 1e-6, 0.0))
-        inverse = np.linalg.inv(T) / scale[:, None]
-        N, dx = inverse @ inverse.T, inverse @ (Q.T @ all_r)
-        angle = float(np.linalg.norm(dx[6:9]))
-        if angle > 0.5:  # far from the solution: turn only so far
-            dx *= 0.5 / angle
-        r0, v0, R0 = r0 + dx[:3], v0 + dx[3:6], rotation_matrix(dx[6:9]) @ R0
-        gyro, accel, arm = gyro + dx[9:12], accel + dx[12:15], arm + dx[15:]
-        if angle < 1e-6:
-            break
-    return WindowFit(r0, v0, R0, gyro, accel, N[:15, :15], cost / max(1, len(y) - 9), cost)
-
-
 def align(
     inertial: InertialData,
     gnss: GnssData,
@@ -332,7 +109,7 @@ def align(
     start_s : start of the navigation; default the beginning of the inertial data
     prior : attitude known beforehand; where the data contradict it, they win, and a note says so
     patience_s : after so much data without a clear heading, a prior is taken as it is, and without one the course
-        stands for the heading
+        stands for the heading; where data end before, they do so then, unless it is infinite
 
     Raises
     ------
@@ -357,21 +134,29 @@ def align(
     for m in sorted(m for m in sizes if m >= 4):
         c = whole.until(m)
         root = noise_root(c, settings)
-        free, clear = _best_fit(c, settings, root, R_ne, None, known)
+        more = _level(data, inside[:m], t0, settings) if known is None else known[0]
+        free, clear = _best_fit(c, settings, root, R_ne, None, more)
+        if free.reduced_chi2 > SUSPICIOUS_CHI2:
+            trimmed = without_outliers(c, settings)
+            trimmed_root = noise_root(trimmed, settings)
+            again, clear_again = _best_fit(trimmed, settings, trimmed_root, R_ne, None, more)
+            if again.reduced_chi2 < 0.5 * free.reduced_chi2:
+                c, root, free, clear = trimmed, trimmed_root, again, clear_again
         heading_sigma, chi2 = _heading_sigma(free, R_ne), free.reduced_chi2
         fits = chi2 < LARGEST_CHI2
-        shown = clear and fits and heading_sigma < (HEADING_SIGMA if known is None else 2.5 * HEADING_SIGMA)
+        shown = clear and fits and heading_sigma < HEADING_SIGMA
         if shown and known is None:
             return _start(free, settings, t0, "in motion" if _moves(inside[:m]) else "at rest", [])
-        if shown and known is not None:
+        if known is not None and clear and fits and heading_sigma < 2.5 * HEADING_SIGMA:
             off, angle = _off(free, known)
-            if off < 5.0:
+            if off > 5.0:
+                return _start(free, settings, t0, "in motion", [_contradiction(angle, "inertial and GNSS data show")])
+            if shown:
                 fit = fit_window(c, settings, known[0], root, known, None, R_ne)
                 return _start(fit, settings, t0, "given attitude", [], known)
-            return _start(free, settings, t0, "in motion", [_contradiction(angle, "inertial and GNSS data show")])
-        if c.tau[-1] < patience_s and m < len(whole.tau):
+        if c.tau[-1] < patience_s and (m < len(whole.tau) or np.isinf(patience_s)):
             continue
-        course = _course(inside[:m])
+        course = _course(inside[np.isin(inside.time_s, t0 + c.tau)]) if len(c.tau) < m else _course(inside[:m])
         if known is not None and fits:
             fit = fit_window(c, settings, known[0], root, known, None, R_ne)
             off = 0.0 if course is None else abs(_heading_miss(fit, c, course, R_ne))
@@ -408,9 +193,16 @@ def _contradiction(angle: float, whose: str) -> str:
     return f"the initial attitude is {np.degrees(angle):.0f} deg off what {whose}: it was not used"
 
 
-def noise_root(c: Curve, settings: NavigationSettings) -> Array:
-    """Lower Cholesky factor of the covariance of all observations of a curve."""
-    return np.linalg.cholesky(_noise(c, settings, c.y[0] / -np.linalg.norm(c.y[0])))
+def _level(data: InertialData, gnss: GnssData, t0: float, settings: NavigationSettings) -> Array | None:
+    """Attitude at the start of a window at rest, body to Earth-fixed; None in motion."""
+    if _moves(gnss):
+        return None
+    part = data[(data.time_s > t0) & (data.time_s <= gnss.time_s[-1])]
+    length = float(part.dt_s.sum())
+    lat, lon = float(gnss.lat[0]), float(gnss.lon[0])
+    means = part.dv.sum(axis=0) / length, part.dtheta.sum(axis=0) / length
+    angles, _ = static_attitude(*means, lat, settings.grade, length)
+    return earth.R_en(lat, lon) @ matrix_from_navigation(*angles)
 
 
 def _best_fit(
@@ -419,13 +211,13 @@ def _best_fit(
     root: Array,
     R_ne: Array,
     course: tuple[int, float] | None,
-    known: tuple[Array, Array] | None,
+    more: Array | None,
 ) -> tuple[WindowFit, bool]:
     """Best fit from several headings; whether it is clearly better than any that points elsewhere."""
     first = wahba(c, settings)
-    starts = [rotation_matrix(a * R_ne[2]) @ first for a in (0.0, np.pi / 2, np.pi, -np.pi / 2)]
-    if known is not None:
-        starts.append(known[0])
+    starts: list[Array] = [rotation_matrix(a * R_ne[2]) @ first for a in (0.0, np.pi / 2, np.pi, -np.pi / 2)]
+    if more is not None:
+        starts.append(more)
     fits = sorted((fit_window(c, settings, R, root, None, course, R_ne) for R in starts), key=lambda f: f.cost)
     best = fits[0]
     apart = [f for f in fits[1:] if np.trace(f.R0 @ best.R0.T) < 1.0 + 2.0 * np.cos(np.radians(10.0))]
@@ -453,8 +245,7 @@ def _start(
     if known is not None:  # what was given counts in full, what the window's data added as above
         given = np.linalg.inv(known[1])
         P[6:9, 6:9] = np.linalg.inv(given + _positive(np.linalg.inv(fit.P[6:9, 6:9]) - given) / _WIDER**2)
-    i = np.arange(9, lay.n)
-    P[i, i] = bias_variances(settings)
+    P[9:, 9:] = sensor_covariance(settings, fit.r0)
     estimate = Estimate(
         t0, State(fit.r0, v_e, fit.R0), np.zeros(lay.k), np.zeros(lay.k), np.array(settings.lever_arm_b)
     )
@@ -471,7 +262,7 @@ def _off(fit: WindowFit, known: tuple[Array, Array]) -> tuple[float, float]:
     """How far a prior attitude is off: in sigmas, and as an angle."""
     turn = vector_from_quaternion(quaternion_from_matrix(fit.R0 @ known[0].T))
     P = fit.P[6:9, 6:9] + known[1]
-    return float(np.sqrt(turn @ np.linalg.solve(P, turn) / 3.0)), float(np.linalg.norm(turn))
+    return float(np.sqrt(turn @ np.linalg.solve(P, turn))), float(np.linalg.norm(turn))
 
 
 def _turn_axes(R_nb: Array) -> Array:

@@ -78,7 +78,7 @@ class LocalFrame:
             return xyz.copy()
         lon, lat, h = self._to_wgs84.transform(xyz[..., 0], xyz[..., 1], xyz[..., 2])
         out = self.from_geodetic(lat, lon, h)
-        if not np.isfinite(out).all():
+        if not np.isfinite(out).all() or np.any(np.abs(lat) > 90.0):
             raise CrsError(f"coordinates outside the area of {self.crs!r}")
         return out
 

@@ -11,128 +11,29 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from .alignment import Curve, WindowFit, curve, fit_window, noise_root, wahba
-from .inertial_data import GAP_FACTOR, GnssData, InertialData
+from .alignment_window import (
+    SUSPICIOUS_CHI2,
+    Curve,
+    WindowFit,
+    curve,
+    fit_window,
+    noise_root,
+    wahba,
+    without_outliers,
+)
+from .inertial_cleaning import Finding
+from .inertial_data import GnssData, InertialData
 from .navigation import NavigationSettings
 
 Array = NDArray[np.floating]
 
 WINDOW_S = 20.0
-_BAD = 2.2  # squares of a fit that are so many times too large are suspicious
+_BAD = SUSPICIOUS_CHI2
 _GOOD = 1.5  # a cause is named if it brings them down to this,
 _BETTER = 10.0  # or makes them so many times smaller
 _NAMES = ("forward", "right", "down")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something wrong with the data.
-
-    Attributes
-    ----------
-    code : short name of the kind
-    subject : what it is in: ``imu.time``, ``imu.rate``, ``imu.force``, ``imu.axes``, ``gnss.time``, ``gnss.sigma``,
-        ``gnss.position``
-    text : one line: the cause, and the figure that shows it
-    fatal : navigating on would give nonsense
-    """
-
-    code: str
-    subject: str
-    text: str
-    fatal: bool
-
-
-def clean_inertial(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array, Array, Array, list[Finding]]:
-    """Times that increase and values that are finite: takes out what is neither, and a first interval that is garbage.
-
-    Parameters
-    ----------
-    time_s : (n,)
-    a, b : (n, 3) rates and forces, or increments
-
-    Returns
-    -------
-    time_s, a, b : what is left
-    findings
-    """
-    t, a, b = (np.asarray(x, dtype=float) for x in (time_s, a, b))
-    findings = []
-    good = np.isfinite(t) & np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    if not good.all():
-        findings.append(
-            Finding("not finite", "imu.rate", f"{int((~good).sum())} samples are not numbers: dropped", False)
-        )
-        t, a, b = t[good], a[good], b[good]
-    if len(t) > 8:
-        step = np.diff(t)
-        nominal = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-        early = np.flatnonzero((step[:4] <= 0) | (step[:4] > max(20.0 * nominal, nominal + 0.2)))
-        if len(early) and nominal > 0:
-            k = int(early[-1]) + 1
-            what = (
-                f"the first interval lasts {step[k - 1]:.3f} s, the others {nominal:.4f} s: first {k} sample(s) dropped"
-            )
-            findings.append(Finding("first interval", "imu.time", what, False))
-            t, a, b = t[k:], a[k:], b[k:]
-        t, a, b, back = _increasing(t, a, b)
-        if back:
-            findings.append(
-                Finding("time order", "imu.time", f"{back} samples repeat or go back in time: dropped", False)
-            )
-    return t, a, b, findings
-
-
-def _increasing(t: Array, a: Array, b: Array) -> tuple[Array, Array, Array, int]:
-    newest = np.maximum.accumulate(t)
-    keep = np.concatenate([[True], t[1:] > newest[:-1]])
-    return t[keep], a[keep], b[keep], int((~keep).sum())
-
-
-def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
-    """Fixes with positions on Earth, times that increase and sigmas above zero.
-
-    A sigma that is zero or not a number is replaced by the median of the good ones of its component.
-    """
-    findings = []
-    position = np.column_stack([gnss.lat, gnss.lon, gnss.height_m])
-    good = np.isfinite(gnss.time_s) & np.isfinite(position).all(axis=1)
-    if not good.all():
-        findings.append(
-            Finding("no position", "gnss.position", f"{int((~good).sum())} fixes without a position: dropped", False)
-        )
-    gnss = gnss[good]
-    if len(gnss):
-        newest = np.maximum.accumulate(gnss.time_s)
-        keep = np.concatenate([[True], gnss.time_s[1:] > newest[:-1]])
-        if not keep.all():
-            text = f"{int((~keep).sum())} fixes repeat or go back in time: dropped"
-            findings.append(Finding("time order", "gnss.time", text, False))
-            gnss = gnss[keep]
-    if len(gnss) and (np.abs(gnss.lat).max() > np.pi / 2 or np.abs(gnss.lon).max() > 2 * np.pi):
-        text = "latitude beyond 90 deg or longitude beyond 360 deg: not degrees, or the columns are swapped"
-        findings.append(Finding("not geodetic", "gnss.position", text, True))
-    sigma = gnss.sigma_ned_m.copy()
-    for i, name in enumerate(("north", "east", "down")):
-        bad = ~(np.isfinite(sigma[:, i]) & (sigma[:, i] > 0.0))
-        if bad.all() and len(bad):
-            text = f"sigma {name} is zero or not a number in all {len(bad)} fixes: wanted metres above zero"
-            findings.append(Finding("sigma", "gnss.sigma", text, True))
-        elif bad.any():
-            middle = float(np.median(sigma[~bad, i]))
-            sigma[bad, i] = middle
-            text = f"sigma {name} is zero or not a number in {int(bad.sum())} of {len(bad)} fixes: {middle:.3g} m taken"
-            findings.append(Finding("sigma", "gnss.sigma", text, False))
-    velocity, sigma_v = gnss.velocity_n, gnss.sigma_velocity_n
-    if velocity is not None and sigma_v is not None:
-        usable = np.isfinite(velocity).all(axis=1) & np.isfinite(sigma_v).all(axis=1) & (sigma_v > 0).all(axis=1)
-        if not usable.all():
-            text = f"{int((~usable).sum())} velocities without a value or a sigma above zero: not used"
-            findings.append(Finding("velocity", "gnss.velocity", text, False))
-            velocity = np.where(usable[:, None], velocity, np.nan)
-    return replace(gnss, sigma_ned_m=sigma, velocity_n=velocity), findings
 
 
 def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, *, increments: bool) -> list[Finding]:
@@ -160,7 +61,7 @@ def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, 
     if not windows:
         return _upside_down(inertial)
     given = _misfit(windows, settings)
-    if given > _BAD:
+    if given > _BAD and _misfit_without_outliers(windows, settings) > _BAD:
         cause = _other_unit(windows, settings, given, inertial.interval_s, increments)
         cause = cause or _other_time(gnss, windows, settings, given)
         cause = cause or _other_axes(windows, settings)
@@ -226,10 +127,12 @@ def _windows(inertial: InertialData, gnss: GnssData, most: int = 3) -> list[_Win
     out, taken = [], []
     length = min(WINDOW_S, 0.8 * float(t[-1] - t[0]))
     starts = np.arange(max(t[0], inertial.time_s[0]) + 0.01, min(t[-1], inertial.time_s[-1]) - length, length / 4.0)
-    turning = []
+    turning, usual = [], float(np.median(np.diff(t)))
     for s in starts:
         k = np.flatnonzero((t[1:] >= s) & (t[1:] <= s + length))
-        turning.append(float(np.linalg.norm(np.diff(v[k], axis=0), axis=1).sum()) if len(k) >= 6 else -1.0)
+        # an outlier is not a turn: what is beyond a vehicle's means does not count
+        change = np.linalg.norm(np.diff(v[k], axis=0), axis=1)
+        turning.append(float(change[change < 12.0 * usual].sum()) if len(k) >= 6 else -1.0)
     for i in np.argsort(turning)[::-1]:
         s = float(starts[i])
         if turning[i] < 0 or any(abs(s - x) < length for x in taken):
@@ -262,6 +165,12 @@ def _misfit(windows: list[_Window], settings: NavigationSettings, arm_sigma_m: f
     """How many times too large the squares of the best fit are; median of the windows."""
     fits = [_fit(w.curve(), settings, arm_sigma_m) for w in windows if len(w.gnss) >= 5]
     return float(np.median([f.reduced_chi2 for f in fits])) if len(fits) == len(windows) else np.inf
+
+
+def _misfit_without_outliers(windows: list[_Window], settings: NavigationSettings) -> float:
+    return float(
+        np.median([_fit(without_outliers(w.curve(), settings, 0.3), settings, 0.0).reduced_chi2 for w in windows])
+    )
 
 
 def _fit(c: Curve, settings: NavigationSettings, arm_sigma_m: float) -> WindowFit:
@@ -401,31 +310,3 @@ def _upside_down(inertial: InertialData) -> list[Finding]:
 
 def _times(given: float, better: float) -> str:
     return f"misfit {np.sqrt(given / max(better, 1e-9)):.0f} times smaller"
-
-
-def gap_findings(inertial: InertialData) -> list[Finding]:
-    """Gaps in the inertial data, by name where they are few."""
-    gaps = inertial.gaps()
-    if not gaps:
-        return []
-    long = [g for g in gaps if g[1] - g[0] > max(5.0 * inertial.interval_s, 0.1)]
-    lost = sum(max(1, round((b - a) / inertial.interval_s)) for a, b in gaps)
-    shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in (long or gaps)[:5])
-    more = f" and {len(long or gaps) - 5} more" if len(long or gaps) > 5 else ""
-    text = f"{len(gaps)} gap(s), {lost} sample(s) lost ({shown} s{more}): bridged, with the noise that this costs"
-    return [Finding("gap", "imu.time", text, False)]
-
-
-def outage_findings(gnss: GnssData, start_s: float, end_s: float) -> list[Finding]:
-    """Times without fixes that are much longer than the usual interval."""
-    t = np.concatenate([[start_s], gnss.time_s[(gnss.time_s > start_s) & (gnss.time_s < end_s)], [end_s]])
-    if len(t) < 4:
-        return []
-    step = np.diff(t)
-    usual = float(np.median(step))
-    long = np.flatnonzero(step > max(GAP_FACTOR * 1.5 * usual, usual + 1.0))
-    if not len(long):
-        return []
-    shown = ", ".join(f"{t[i]:.1f}-{t[i + 1]:.1f}" for i in long[:5])
-    more = f" and {len(long) - 5} more" if len(long) > 5 else ""
-    return [Finding("outage", "gnss.time", f"{len(long)} outage(s) ({shown} s{more}): coasted", False)]

@@ -136,7 +136,7 @@ class InertialData:
 
 def _cross(a: Array, b: Array) -> Array:
     """Cross product of (..., 3); several times faster than `numpy.cross` on short arrays."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out = np.empty(a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -299,6 +299,15 @@ class InertialGrade:
             accel_bias_mgal * 1e-5,
             bias_time_s,
         )
+
+    @classmethod
+    def of_noise(cls, gyro_noise: float, accel_noise: float) -> InertialGrade:
+        """Grade of a unit of which only the noise is known (rad/sqrt(s), m/s/sqrt(s); 0 = not even that).
+
+        Biases are those of a tactical unit, or of a MEMS unit, whichever has a noise closer to it.
+        """
+        like = TACTICAL if 0.0 < gyro_noise < np.sqrt(TACTICAL.gyro_noise * MEMS.gyro_noise) else MEMS
+        return replace(like, gyro_noise=gyro_noise or like.gyro_noise, accel_noise=accel_noise or like.accel_noise)
 
 
 #: Fibre-optic or ring-laser unit of an airborne mapping system.

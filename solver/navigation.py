@@ -10,17 +10,18 @@ on the rotation group stand around it here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from . import earth
 from .inertial_data import TACTICAL, InertialGrade
 from .observations import Observation
-from .rotation import vector_from_quaternion
 from .strapdown import Block, State, process_noise, propagate, rotation_matrix, transition
+from .wander import damping_rate, second_order_gauss_markov
 
 Array = NDArray[np.floating]
 
@@ -36,6 +37,9 @@ class NavigationSettings:
     grade : error model of the inertial sensor
     lever_arm_b : (3,) antenna from the inertial sensor, body axes, metres
     lever_arm_sigma_m : standard deviation of the lever arm; 0 takes it as known, else it is estimated
+    wander_sigma_ned_m : slow errors of GNSS positions north, east, down (see `wander`); zero has none, else they are
+        estimated beside the position
+    wander_time_s : their correlation time
     scale_factors : estimate scale factors (their sigmas are in the grade)
     step_s : longest time between two covariances
     soft_gate, hard_gate : an innovation that is rarer than ``soft_gate`` (probability) is weighted down to it; one
@@ -49,6 +53,8 @@ class NavigationSettings:
     grade: InertialGrade = TACTICAL
     lever_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lever_arm_sigma_m: float = 0.0
+    wander_sigma_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wander_time_s: float = 60.0
     scale_factors: bool = False
     step_s: float = 0.5
     soft_gate: float = 1e-3
@@ -60,7 +66,7 @@ class NavigationSettings:
 
     @property
     def layout(self) -> Layout:
-        return Layout(6 if self.scale_factors else 3, self.lever_arm_sigma_m > 0.0)
+        return Layout(6 if self.scale_factors else 3, self.lever_arm_sigma_m > 0.0, max(self.wander_sigma_ned_m) > 0.0)
 
 
 @dataclass(frozen=True)
@@ -69,10 +75,11 @@ class Layout:
 
     k: int  # per sensor: 3 biases, or 3 biases and 3 scale factors
     with_lever_arm: bool
+    with_wander: bool = False  # slow errors of GNSS and their rates, Earth-fixed
 
     @property
     def n(self) -> int:
-        return 9 + 2 * self.k + (3 if self.with_lever_arm else 0)
+        return self.lever_arm.stop + (6 if self.with_wander else 0)
 
     @property
     def gyro(self) -> slice:
@@ -84,7 +91,12 @@ class Layout:
 
     @property
     def lever_arm(self) -> slice:
-        return slice(9 + 2 * self.k, self.n)
+        first = 9 + 2 * self.k
+        return slice(first, first + (3 if self.with_lever_arm else 0))
+
+    @property
+    def wander(self) -> slice:
+        return slice(self.lever_arm.stop, self.n)
 
 
 @dataclass(slots=True)
@@ -97,6 +109,7 @@ class Estimate:
     state : position, velocity, attitude
     gyro, accel : (k,) biases (rad/s, m/s^2) and scale factors
     lever_arm_b : (3,) metres
+    wander_e : (6,) slow error of GNSS positions and its rate, Earth-fixed, metres, m/s
     """
 
     time_s: float
@@ -104,26 +117,15 @@ class Estimate:
     gyro: Array
     accel: Array
     lever_arm_b: Array
+    wander_e: Array = field(default_factory=lambda: np.zeros(6))
 
     def corrected(self, x: Array, layout: Layout) -> Estimate:
         """The estimate with errors (n,) put in."""
         s = self.state
         state = State(s.r_e + x[POSITION], s.v_e + x[VELOCITY], rotation_matrix(x[ATTITUDE]) @ s.R_eb)
         arm = self.lever_arm_b + x[layout.lever_arm] if layout.with_lever_arm else self.lever_arm_b
-        return Estimate(self.time_s, state, self.gyro + x[layout.gyro], self.accel + x[layout.accel], arm)
-
-    def minus(self, other: Estimate, layout: Layout) -> Array:
-        """Errors (n,) that lead from another estimate to this one."""
-        from .rotation import quaternion_from_matrix
-
-        x = np.zeros(layout.n)
-        x[POSITION] = self.state.r_e - other.state.r_e
-        x[VELOCITY] = self.state.v_e - other.state.v_e
-        x[ATTITUDE] = vector_from_quaternion(quaternion_from_matrix(self.state.R_eb @ other.state.R_eb.T))
-        x[layout.gyro], x[layout.accel] = self.gyro - other.gyro, self.accel - other.accel
-        if layout.with_lever_arm:
-            x[layout.lever_arm] = self.lever_arm_b - other.lever_arm_b
-        return x
+        wander = self.wander_e + x[layout.wander] if layout.with_wander else self.wander_e
+        return Estimate(self.time_s, state, self.gyro + x[layout.gyro], self.accel + x[layout.accel], arm, wander)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +170,25 @@ def bias_variances(settings: NavigationSettings) -> Array:
     return np.concatenate(out)
 
 
+def sensor_covariance(settings: NavigationSettings, r_e: Array) -> Array:
+    """A-priori covariance (n - 9, n - 9) of all but position, velocity and attitude, at a place (3,) Earth-fixed."""
+    lay = settings.layout
+    variances = bias_variances(settings)
+    P = np.zeros((lay.n - 9, lay.n - 9))
+    i = np.arange(len(variances))
+    P[i, i] = variances
+    if lay.with_wander:
+        P[-6:, -6:] = np.kron(np.diag([1.0, damping_rate(settings.wander_time_s) ** 2]), _wander_e(settings, r_e))
+    return P
+
+
+def _wander_e(settings: NavigationSettings, r_e: Array) -> Array:
+    """Covariance (3, 3) of the slow errors of GNSS, Earth-fixed."""
+    g = earth.geodetic_from_ecef(r_e)
+    A = earth.R_en(g[0], g[1]) * np.asarray(settings.wander_sigma_ned_m)
+    return A @ A.T
+
+
 class ErrorStateFilter:
     """One navigator's filter: an estimate, its covariance, and the two steps.
 
@@ -190,6 +211,7 @@ class ErrorStateFilter:
         self.rejections = 0
         self._doubts, self._doubted_s = 0, -np.inf
         self._gates: dict[int, float] = {}
+        self._wander = _wander_e(settings, start.estimate.state.r_e) if self.layout.with_wander else np.zeros((3, 3))
 
     @property
     def P(self) -> Array:
@@ -216,7 +238,9 @@ class ErrorStateFilter:
         gyro[:3] *= decay
         accel[:3] *= decay
         self.kf.predict(F=F, Q=Q)
-        self.estimate = Estimate(e.time_s + block.duration_s, new, gyro, accel, e.lever_arm_b)
+        w = self.layout.wander
+        wander = F[w, w] @ e.wander_e if self.layout.with_wander else e.wander_e
+        self.estimate = Estimate(e.time_s + block.duration_s, new, gyro, accel, e.lever_arm_b, wander)
         return F
 
     def transition(self, state: State, block: Block) -> tuple[Array, Array, float]:
@@ -233,6 +257,10 @@ class ErrorStateFilter:
             i = np.arange(first, first + 3)
             F[i, i] = decay
             Q[i, i] = sigma**2 * -np.expm1(-2.0 * T / g.bias_time_s)
+        if lay.with_wander:
+            F2, Q2, _ = second_order_gauss_markov(1.0, self.settings.wander_time_s, T)
+            F[lay.wander, lay.wander] = np.kron(F2, np.eye(3))
+            Q[lay.wander, lay.wander] = np.kron(Q2, self._wander)
         return F, Q, decay
 
     def update(self, observation: Observation, *, use: bool = True) -> tuple[Innovation, Array]:
@@ -298,9 +326,3 @@ class ErrorStateFilter:
         if m not in self._gates:
             self._gates[m] = float(chi2.isf(self.settings.soft_gate, m))
         return self._gates[m]
-
-
-def with_lever_arm(settings: NavigationSettings, arm: ArrayLike) -> NavigationSettings:
-    """Settings with another lever arm."""
-    x, y, z = np.asarray(arm, dtype=float).tolist()
-    return replace(settings, lever_arm_b=(x, y, z))

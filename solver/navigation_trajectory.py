@@ -192,6 +192,13 @@ class NavigationTrajectory:
         r_e, v_e, R_eb = self._carry(k, row[:, 0] + dt, R, v, p)
         return NavigationStates(t, r_e, v_e, R_eb)
 
+    def at_rows(self, rows: NDArray[np.intp]) -> NavigationStates:
+        """States at the ends of given pieces (rows of the integrals)."""
+        c = self._carried
+        R = matrix_from_quaternion(c.quaternion[rows])
+        r_e, v_e, R_eb = self._carry(c.block[rows], c.duration_s[rows], R, c.v[rows], c.p[rows])
+        return NavigationStates(c.time_s[rows], r_e, v_e, R_eb)
+
     def covariance(self, time_s: ArrayLike) -> Array:
         """Covariance of ``dr, dv, psi`` (m, 9, 9), Earth-fixed, at times (m,)."""
         k, s = self._share(time_s)

@@ -291,8 +291,10 @@ def propagate(state: State, duration_s: float, R: Array, v: Array, p: Array) -> 
     gamma0 = gravitation_e(r0)
     ballistic = r0 + T * v0 + R_ib @ p
     gamma1 = C.T @ gravitation_e(C @ (ballistic + (0.5 * T * T) * gamma0))
-    r1 = C @ (ballistic + (T * T / 6.0) * (2.0 * gamma0 + gamma1))
-    v1 = C @ (v0 + R_ib @ v + (0.5 * T) * (gamma0 + gamma1)) - _cross(OMEGA_IE, r1)
+    # linear between both ends, less the curvature that the Earth's rotation gives it
+    curvature = _cross(OMEGA_IE, _cross(OMEGA_IE, gamma0))
+    r1 = C @ (ballistic + (T * T / 6.0) * (2.0 * gamma0 + gamma1) - (T**4 / 24.0) * curvature)
+    v1 = C @ (v0 + R_ib @ v + (0.5 * T) * (gamma0 + gamma1) - (T**3 / 12.0) * curvature) - _cross(OMEGA_IE, r1)
     R1 = C @ R_ib @ R
     R1 = 0.5 * (R1 @ (3.0 * _EYE - R1.T @ R1))  # keeps it a rotation over hours
     return State(r1, v1, R1)

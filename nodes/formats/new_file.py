@@ -10,14 +10,23 @@ from pathlib import Path
 from ..errors import UserError
 
 
+def refuse_unless_file(target: Path) -> None:
+    """Raise UserError for what a new file must not take the place of: a folder, a device such as /dev/null."""
+    if target.is_dir():
+        raise UserError(f"{target}: is a folder, wanted a file")
+    if target.exists() and not target.is_file():
+        raise UserError(f"{target}: is a device, wanted a file")
+
+
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
     """A path to write to that takes the place of ``target`` at the end, and goes away if something fails before.
 
     Raises
     ------
-    UserError : the folder of ``target`` is not there
+    UserError : the folder of ``target`` is not there, or ``target`` is not a file
     """
+    refuse_unless_file(target)
     if not target.parent.is_dir():
         raise UserError(f"{target}: no folder {target.parent}")
     part = target.with_name(f".{target.name}.part")

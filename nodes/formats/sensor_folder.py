@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.alignment import AttitudePrior
-from ...solver.inertial_checks import Finding, clean_gnss, clean_inertial
+from ...solver.inertial_cleaning import Finding, clean_gnss, clean_inertial
 from ...solver.inertial_data import MEMS, GnssData, InertialData, InertialGrade
 from ...solver.navigation import NavigationSettings
 from ...solver.navigation_trajectory import CameraMount
@@ -57,6 +57,7 @@ class Platform:
     lever_arm_sigma_m : 0 takes the lever arm as known
     grade : of the inertial sensor
     initial : attitude at the first inertial sample, where given
+    wander_sigma_ned_m, wander_time_s : slow errors of the GNSS positions, and their correlation time
     """
 
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -65,12 +66,19 @@ class Platform:
     lever_arm_sigma_m: float = 0.0
     grade: InertialGrade = MEMS
     initial: AttitudePrior | None = None
+    wander_sigma_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wander_time_s: float = 60.0
 
     @property
     def settings(self) -> NavigationSettings:
         scale = self.grade.gyro_scale > 0.0 or self.grade.accel_scale > 0.0
         return NavigationSettings(
-            self.grade, lever_arm_b=self.lever_arm_m, lever_arm_sigma_m=self.lever_arm_sigma_m, scale_factors=scale
+            self.grade,
+            lever_arm_b=self.lever_arm_m,
+            lever_arm_sigma_m=self.lever_arm_sigma_m,
+            wander_sigma_ned_m=self.wander_sigma_ned_m,
+            wander_time_s=self.wander_time_s,
+            scale_factors=scale,
         )
 
     @property
@@ -93,6 +101,7 @@ class SensorFolder:
     attitude : or None without attitude.csv
     platform : of platform.toml, or defaults
     notes : remarks on reading
+    offset_s : what is added to the times where they are written
     """
 
     path: Path
@@ -104,6 +113,7 @@ class SensorFolder:
     attitude: AttitudeTable | None
     platform: Platform
     notes: list[str] = field(default_factory=list)
+    offset_s: float = 0.0
 
     def cleaned(self) -> tuple[InertialData, GnssData, list[Finding]]:
         """Data for the navigator, and what was taken out of them.
@@ -118,14 +128,16 @@ class SensorFolder:
             raise UserError(f"{self.path}: gnss.csv is missing, wanted GNSS positions")
         time, rotation, force, findings = clean_inertial(self.time_s, self.rotation, self.force)
         if len(time) < 10:
-            raise UserError(f"{self.path / 'imu.csv'}: only {len(time)} usable samples, wanted at least 10")
+            why = "".join(f"; {finding.text}" for finding in findings)
+            raise UserError(f"{self.path / 'imu.csv'}: only {len(time)} usable samples, wanted at least 10{why}")
         make = InertialData.from_increments if self.increments else InertialData.from_rates
         gnss, more = clean_gnss(self.gnss)
         findings += more
         for finding in (f for f in more if f.fatal):
-            raise UserError(self.named(finding))
+            raise UserError(f"{self.path}: {self.named(finding)}")
         if len(gnss) < 2:
-            raise UserError(f"{self.path / 'gnss.csv'}: only {len(gnss)} usable fixes, wanted at least 4")
+            why = "".join(f"; {finding.text}" for finding in more)
+            raise UserError(f"{self.path / 'gnss.csv'}: only {len(gnss)} usable fixes, wanted at least 4{why}")
         return make(time, rotation, force), gnss, findings
 
     def named(self, finding: Finding) -> str:
@@ -145,8 +157,8 @@ class SensorFolder:
         return finding.text if where is None else f"{where[0]}: {','.join(where[1])}: {finding.text}"
 
 
-def read_sensor_folder(path: str | Path) -> SensorFolder:
-    """Read a sensor folder.
+def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> SensorFolder:
+    """Read a sensor folder; another platform.toml may take the place of its own.
 
     Raises
     ------
@@ -159,7 +171,7 @@ def read_sensor_folder(path: str | Path) -> SensorFolder:
     time, rotation, force, increments = _read_imu(folder / "imu.csv", notes)
     gnss = _read_gnss(folder / "gnss.csv", notes)
     attitude = _read_attitude(folder / "attitude.csv", notes)
-    platform = _read_platform(folder / "platform.toml", notes)
+    platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
         initial = _initial_of(attitude, float(time[0]))
         platform = Platform(**{**vars(platform), "initial": initial})
@@ -188,29 +200,44 @@ def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
     if not path.is_file():
         return None
     columns = [Column(name) for name in ("time_s", *POSITION)]
-    columns += [Column(name, blank=True) for name in SIGMA]
-    columns += [Column(name, optional=True, blank=True) for name in (*VELOCITY, *SIGMA_VELOCITY)]
+    # as text, because what is no number (nan, empty) is the checks' business here, not the reader's
+    columns += [Column(name, kind="text", blank=True) for name in SIGMA]
+    columns += [Column(name, kind="text", optional=True, blank=True) for name in (*VELOCITY, *SIGMA_VELOCITY)]
     table = read_table(path, columns, notes)
     position = table.stack(*POSITION)
-    velocity = _optional(path, table, VELOCITY)
-    sigma_v = _optional(path, table, SIGMA_VELOCITY)
+    velocity = _parsed(table, VELOCITY) if _all_there(path, table, VELOCITY) else None
+    sigma_v = _parsed(table, SIGMA_VELOCITY) if _all_there(path, table, SIGMA_VELOCITY) else None
     if velocity is not None and sigma_v is None:
         notes.append(
             f"{path.name}: velocities without sigmas ({','.join(SIGMA_VELOCITY)}): {_VELOCITY_SIGMA_M_S} m/s taken"
         )
         sigma_v = np.full_like(velocity, _VELOCITY_SIGMA_M_S)
     lat, lon = np.radians(position[:, 0]), np.radians(position[:, 1])
-    return GnssData(table["time_s"], lat, lon, position[:, 2], table.stack(*SIGMA), velocity, sigma_v)
+    return GnssData(table["time_s"], lat, lon, position[:, 2], _parsed(table, SIGMA), velocity, sigma_v)
 
 
-def _optional(path: Path, table: Table, names: tuple[str, ...]) -> Array | None:
+def _all_there(path: Path, table: Table, names: tuple[str, ...]) -> bool:
+    """Whether all of some optional columns are there; some but not all is an error."""
     there = [name for name in names if name in table]
-    if not there:
-        return None
     missing = [name for name in names if name not in table]
-    if missing:
+    if there and missing:
         raise UserError(f"{path}:1: {missing[0]}: column missing beside {there[0]}, wanted {','.join(names)}")
-    return table.stack(*names)
+    return bool(there)
+
+
+def _parsed(table: Table, names: tuple[str, ...]) -> Array:
+    """Columns of text as numbers; empty is NaN."""
+    out = np.full((len(table), len(names)), np.nan)
+    for k, name in enumerate(names):
+        words = table[name]
+        bad = np.zeros(len(words), dtype=bool)
+        for i, word in enumerate(words):
+            try:
+                out[i, k] = float(word) if word else np.nan
+            except ValueError:
+                bad[i] = True
+        table.refuse(bad, name, lambda row, words=words: f"{words[row]!r} is not a number, wanted a number")
+    return out
 
 
 def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
@@ -220,9 +247,10 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
     columns += [Column(name, optional=True, above=0.0) for name in SIGMA_ANGLES]
     table = read_table(path, columns, notes)
     angles = np.radians(table.stack(*ANGLES))
-    sigma = _optional(path, table, SIGMA_ANGLES)
-    if sigma is None:
-        sigma = np.tile([0.5, 0.5, 1.0], (len(angles), 1))
+    sigma = np.tile([0.5, 0.5, 1.0], (len(angles), 1))
+    if _all_there(path, table, SIGMA_ANGLES):
+        sigma = table.stack(*SIGMA_ANGLES)
+    else:
         notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg taken")
     return AttitudeTable(table["time_s"], angles, np.radians(sigma))
 
@@ -235,7 +263,8 @@ def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:
     return AttitudePrior(attitude.angles[i], np.hypot(attitude.sigma[i], np.radians(5.0) * off))
 
 
-def _read_platform(path: Path, notes: list[str]) -> Platform:
+def read_platform(path: Path, notes: list[str]) -> Platform:
+    """Read platform.toml; what it does not say has a default, and a note where that matters."""
     if not path.is_file():
         notes.append(f"{path.name}: absent: no lever arm, a MEMS unit taken")
         return Platform()
@@ -243,13 +272,17 @@ def _read_platform(path: Path, notes: list[str]) -> Platform:
     zero = (0.0, 0.0, 0.0)
     arms = [keys.numbers(name, 3, zero) for name in ("lever_arm_m", "camera_lever_arm_m", "boresight_deg")]
     sigma = keys.number("lever_arm_sigma_m", 0.0)
-    imu, initial = keys.table("imu"), keys.table("initial")
+    imu, initial, gnss = keys.table("imu"), keys.table("initial"), keys.table("gnss")
+    wander = gnss.numbers("wander_sigma_m", 3, zero)
+    wander_time_s = gnss.number("wander_time_s", 60.0, positive=True)
+    if min(wander) < 0.0:
+        raise gnss.refuse("wander_sigma_m", "3 numbers of at least 0: north, east, down")
     grade = _grade(imu, notes, path.name)
     prior = _prior(initial) if initial.values else None
-    for table in (keys, imu, initial):
+    for table in (keys, imu, initial, gnss):
         notes.extend(f"{path.name}: key {name!r} is not known and was ignored" for name in table.unread())
-    a, b, c = ((float(x), float(y), float(z)) for x, y, z in arms)
-    return Platform(a, b, c, sigma, grade, prior)
+    a, b, c, w = ((float(x), float(y), float(z)) for x, y, z in (*arms, wander))
+    return Platform(a, b, c, sigma, grade, prior, w, wander_time_s)
 
 
 def _grade(imu: Keys, notes: list[str], file: str) -> InertialGrade:

@@ -1,0 +1,108 @@
+"""Raw inertial and GNSS data of a recording, as a sensor folder holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.inertial_cleaning import Finding
+from ...solver.inertial_data import TACTICAL, GnssData, InertialGrade
+from ...solver.rotation import R_ENU_NED
+from .. import convert
+from ..errors import UserError
+from ..recording import RecordingReader
+from .sensor_folder import Platform, SensorFolder, read_platform
+
+_FIELDS = {
+    "imu.time": "sensor/imu: time_ns",
+    "imu.force": "sensor/imu: force_x,force_y,force_z",
+    "imu.rate": "sensor/imu: rate_x,rate_y,rate_z",
+    "imu.axes": "sensor/imu: force_x,force_y,force_z,rate_x,rate_y,rate_z",
+    "imu.noise": "sensor/imu: force_sigma,rate_sigma",
+    "gnss.time": "sensor/gnss: timestamp",
+    "gnss.sigma": "sensor/gnss: position_covariance",
+    "gnss.position": "sensor/gnss: latitude,longitude,altitude",
+    "gnss.velocity": "sensor/gnss: velocity_enu,velocity_covariance",
+}
+
+
+@dataclass(frozen=True)
+class RecordedSensors(SensorFolder):
+    """Sensor data of a recording; times count from ``offset_s`` (Unix seconds)."""
+
+    def named(self, finding: Finding) -> str:
+        where = _FIELDS.get(finding.subject)
+        return finding.text if where is None else f"{where}: {finding.text}"
+
+
+def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -> RecordedSensors:
+    """Read inertial data, fixes and the mounting from a recording.
+
+    Parameters
+    ----------
+    platform_file : platform.toml with what a recording does not hold (biases of the unit, initial attitude)
+
+    Raises
+    ------
+    UserError : not a recording, or no inertial data in it
+    """
+    reader = RecordingReader(path)
+    imu = [message.body for message in reader.sorted_messages(["sensor/imu"])]
+    gnss = [message.body for message in reader.sorted_messages(["sensor/gnss"])]
+    if not imu:
+        raise UserError(f"{path}: no sensor/imu in this recording, wanted raw inertial data")
+    if not gnss:
+        raise UserError(f"{path}: no sensor/gnss in this recording, wanted GNSS positions")
+    start_ns = imu[0].time_ns // convert.SECOND_NS * convert.SECOND_NS
+    time_s = (np.array([b.time_ns for b in imu], dtype=np.int64) - start_ns) * 1e-9
+    rate = np.array([(b.rate_x, b.rate_y, b.rate_z) for b in imu])
+    force = np.array([(b.force_x, b.force_y, b.force_z) for b in imu])
+    notes: list[str] = []
+    if platform_file is not None:
+        platform = read_platform(platform_file, notes)
+    else:
+        project = reader.first("configuration/project")
+        arm = np.zeros(3) if project is None else convert.lever_arm_of(project)
+        x, y, z = (float(v) for v in arm)
+        wander = (0.0, 0.0, 0.0)
+        if project is not None and len(project.wander_sigma_m) == 3:
+            east, north, up = project.wander_sigma_m
+            wander = (float(north), float(east), float(up))
+        platform = Platform(lever_arm_m=(x, y, z), grade=_grade(imu, notes), wander_sigma_ned_m=wander)
+        if project is not None and project.wander_time_s > 0.0:
+            platform = replace(platform, wander_time_s=project.wander_time_s)
+    fixes = _fixes(gnss, start_ns)
+    offset_s = start_ns / convert.SECOND_NS
+    return RecordedSensors(Path(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
+
+
+def _grade(imu: list[Any], notes: list[str]) -> InertialGrade:
+    """Noise as the samples say; biases, which they do not say, as units of such noise have them."""
+    root = np.sqrt(np.median([b.interval_ns for b in imu]) * 1e-9)
+    gyro, accel = (float(np.median([getattr(b, n) for b in imu]) * root) for n in ("rate_sigma", "force_sigma"))
+    grade = InertialGrade.of_noise(gyro, accel)
+    name = "tactical" if grade.gyro_bias == TACTICAL.gyro_bias else "MEMS"
+    notes.append(f"sensor/imu: biases are not in a recording: those of a {name} unit taken (--platform gives others)")
+    return grade
+
+
+def _fixes(gnss: list[Any], start_ns: int) -> GnssData:
+    time_s = np.array([convert.time_ns(b.timestamp) - start_ns for b in gnss], dtype=np.int64) * 1e-9
+    place = np.array([(b.latitude, b.longitude, b.altitude) for b in gnss])
+    sigma = _sigmas([b.position_covariance for b in gnss])
+    velocity = sigma_v = None
+    if any(len(b.velocity_covariance) == 9 for b in gnss):
+        velocity = np.array([(b.velocity_enu.x, b.velocity_enu.y, b.velocity_enu.z) for b in gnss]) @ R_ENU_NED
+        sigma_v = _sigmas([b.velocity_covariance for b in gnss])
+    lat, lon = np.radians(place[:, 0]), np.radians(place[:, 1])
+    return GnssData(time_s, lat, lon, place[:, 2], sigma, velocity, sigma_v)
+
+
+def _sigmas(covariances: list[Any]) -> NDArray[np.floating]:
+    """Standard deviations (m, 3) north, east, down of covariances east, north, up; NaN where there is none."""
+    variance = np.array([[c[4], c[0], c[8]] if len(c) == 9 else [np.nan] * 3 for c in covariances], dtype=float)
+    return np.sqrt(np.where(variance >= 0.0, variance, np.nan))

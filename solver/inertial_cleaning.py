@@ -1,0 +1,149 @@
+"""Cleaning of inertial and GNSS data: what cannot be used is taken out, and what was found is said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .inertial_data import GAP_FACTOR, GnssData, InertialData
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong with the data.
+
+    Attributes
+    ----------
+    code : short name of the kind
+    subject : what it is in: ``imu.time``, ``imu.rate``, ``imu.force``, ``imu.axes``, ``gnss.time``, ``gnss.sigma``,
+        ``gnss.position``
+    text : one line: the cause, and the figure that shows it
+    fatal : navigating on would give nonsense
+    """
+
+    code: str
+    subject: str
+    text: str
+    fatal: bool
+
+
+def clean_inertial(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array, Array, Array, list[Finding]]:
+    """Times that increase and values that are finite: takes out what is neither, and a first interval that is garbage.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    a, b : (n, 3) rates and forces, or increments
+
+    Returns
+    -------
+    time_s, a, b : what is left
+    findings
+    """
+    t, a, b = (np.asarray(x, dtype=float) for x in (time_s, a, b))
+    findings = []
+    good = np.isfinite(t) & np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    if not good.all():
+        findings.append(
+            Finding("not finite", "imu.rate", f"{int((~good).sum())} samples are not numbers: dropped", False)
+        )
+        t, a, b = t[good], a[good], b[good]
+    if len(t) > 8:
+        step = np.diff(t)
+        nominal = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+        early = np.flatnonzero((step[:4] <= 0) | (step[:4] > max(20.0 * nominal, nominal + 0.2)))
+        if len(early) and nominal > 0:
+            k = int(early[-1]) + 1
+            what = (
+                f"the first interval lasts {step[k - 1]:.3f} s, the others {nominal:.4f} s: first {k} sample(s) dropped"
+            )
+            findings.append(Finding("first interval", "imu.time", what, False))
+            t, a, b = t[k:], a[k:], b[k:]
+        t, a, b, back = _increasing(t, a, b)
+        if back:
+            findings.append(
+                Finding("time order", "imu.time", f"{back} samples repeat or go back in time: dropped", False)
+            )
+    return t, a, b, findings
+
+
+def _increasing(t: Array, a: Array, b: Array) -> tuple[Array, Array, Array, int]:
+    newest = np.maximum.accumulate(t)
+    keep = np.concatenate([[True], t[1:] > newest[:-1]])
+    return t[keep], a[keep], b[keep], int((~keep).sum())
+
+
+def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
+    """Fixes with positions on Earth, times that increase and sigmas above zero.
+
+    A sigma that is zero or not a number is replaced by the median of the good ones of its component.
+    """
+    findings = []
+    position = np.column_stack([gnss.lat, gnss.lon, gnss.height_m])
+    good = np.isfinite(gnss.time_s) & np.isfinite(position).all(axis=1)
+    if not good.all():
+        findings.append(
+            Finding("no position", "gnss.position", f"{int((~good).sum())} fixes without a position: dropped", False)
+        )
+    gnss = gnss[good]
+    if len(gnss):
+        newest = np.maximum.accumulate(gnss.time_s)
+        keep = np.concatenate([[True], gnss.time_s[1:] > newest[:-1]])
+        if not keep.all():
+            text = f"{int((~keep).sum())} fixes repeat or go back in time: dropped"
+            findings.append(Finding("time order", "gnss.time", text, False))
+            gnss = gnss[keep]
+    if len(gnss) and (np.abs(gnss.lat).max() > np.pi / 2 or np.abs(gnss.lon).max() > 2 * np.pi):
+        text = "latitude beyond 90 deg or longitude beyond 360 deg: not degrees, or the columns are swapped"
+        findings.append(Finding("not geodetic", "gnss.position", text, True))
+    sigma = gnss.sigma_ned_m.copy()
+    for i, name in enumerate(("north", "east", "down")):
+        bad = ~(np.isfinite(sigma[:, i]) & (sigma[:, i] > 0.0))
+        if bad.all() and len(bad):
+            text = f"sigma {name} is zero or not a number in all {len(bad)} fixes: wanted metres above zero"
+            findings.append(Finding("sigma", "gnss.sigma", text, True))
+        elif bad.any():
+            middle = float(np.median(sigma[~bad, i]))
+            sigma[bad, i] = middle
+            text = f"sigma {name} is zero or not a number in {int(bad.sum())} of {len(bad)} fixes: {middle:.3g} m taken"
+            findings.append(Finding("sigma", "gnss.sigma", text, False))
+    velocity, sigma_v = gnss.velocity_n, gnss.sigma_velocity_n
+    if velocity is not None and sigma_v is not None:
+        usable = np.asarray((np.isfinite(velocity) & np.isfinite(sigma_v) & (sigma_v > 0)).all(axis=1))
+        if not usable.all():
+            text = f"{int((~usable).sum())} velocities without a value or a sigma above zero: not used"
+            findings.append(Finding("velocity", "gnss.velocity", text, False))
+            velocity = np.where(usable[:, None], velocity, np.nan)
+    return replace(gnss, sigma_ned_m=sigma, velocity_n=velocity), findings
+
+
+def gap_findings(inertial: InertialData) -> list[Finding]:
+    """Gaps in the inertial data, by name where they are few."""
+    gaps = inertial.gaps()
+    if not gaps:
+        return []
+    long = [g for g in gaps if g[1] - g[0] > max(5.0 * inertial.interval_s, 0.1)]
+    lost = sum(max(1, round((b - a) / inertial.interval_s)) for a, b in gaps)
+    shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in (long or gaps)[:5])
+    more = f" and {len(long or gaps) - 5} more" if len(long or gaps) > 5 else ""
+    text = f"{len(gaps)} gap(s), {lost} sample(s) lost ({shown} s{more}): bridged, with the noise that this costs"
+    return [Finding("gap", "imu.time", text, False)]
+
+
+def outage_findings(gnss: GnssData, start_s: float, end_s: float) -> list[Finding]:
+    """Times without fixes that are much longer than the usual interval."""
+    t = np.concatenate([[start_s], gnss.time_s[(gnss.time_s > start_s) & (gnss.time_s < end_s)], [end_s]])
+    if len(t) < 4:
+        return []
+    step = np.diff(t)
+    usual = float(np.median(step))
+    long = np.flatnonzero(step > max(GAP_FACTOR * 1.5 * usual, usual + 1.0))
+    if not len(long):
+        return []
+    shown = ", ".join(f"{t[i]:.1f}-{t[i + 1]:.1f}" for i in long[:5])
+    more = f" and {len(long) - 5} more" if len(long) > 5 else ""
+    return [Finding("outage", "gnss.time", f"{len(long)} outage(s) ({shown} s{more}): coasted", False)]

@@ -1,0 +1,438 @@
+"""On-line navigation: the filter and smoother of a recording, fed sample by sample.
+
+Inertial samples are integrated in short spans, each ends with a pose; a `NavigationChain` carries the filter over
+them and takes in fixes where they belong, however late they come. Only the stream decides what is computed: a replay
+gives the same poses as the live run.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .alignment import AlignmentError, AttitudePrior, align
+from .frames import LocalFrame
+from .gnss_fix import local_fix, stacked
+from .inertial_data import GAP_FACTOR, GnssData, InertialData, concatenate
+from .navigation import Estimate, Innovation, NavigationSettings, Start
+from .navigation_chain import NavigationChain
+from .navigation_pose import NavigationEvent, NavigationPose
+from .navigation_trajectory import CameraMount, NavigationStates, camera_poses
+from .rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
+from .strapdown import State
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class OnlineOptions:
+    """How an on-line navigator answers.
+
+    Attributes
+    ----------
+    pose_step_s : distance of poses
+    lag_s : smoothed poses come so much later
+    smooth_every_s : how often they come
+    rewind_s : how late a fix may be
+    step_s : longest distance of nodes
+    valid_position_m, valid_attitude_rad : a pose with larger standard deviations is not valid
+    patience_s : so long the alignment waits for turns before it takes a given attitude or the course
+    longest_alignment_s : of this much past data the alignment makes use
+    offset_sigma_m : constant error of GNSS positions, local X, Y, Z, that no data show; it is added to the covariance
+    """
+
+    pose_step_s: float = 0.02
+    lag_s: float = 5.0
+    smooth_every_s: float = 1.0
+    rewind_s: float = 2.0
+    step_s: float = 0.25
+    valid_position_m: float = 3.0
+    valid_attitude_rad: float = float(np.radians(2.0))
+    patience_s: float = 25.0
+    longest_alignment_s: float = 130.0
+    offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.lag_s >= self.rewind_s:
+            raise ValueError(f"lag_s {self.lag_s} is shorter than rewind_s {self.rewind_s}: late fixes would be lost")
+
+
+class InertialNavigator:
+    """Navigation engine for raw inertial data and GNSS.
+
+    Parameters
+    ----------
+    frame : local frame of the poses
+    settings : sensors and treatment
+    mount : of the camera
+    options : how it answers
+    prior : attitude at the first sample, where known
+    """
+
+    def __init__(
+        self,
+        frame: LocalFrame,
+        settings: NavigationSettings,
+        mount: CameraMount | None = None,
+        options: OnlineOptions | None = None,
+        prior: AttitudePrior | None = None,
+    ):
+        self.frame, self.settings = frame, settings
+        self.mount, self.options = mount or CameraMount(), options or OnlineOptions()
+        self.counters: Counter[str] = Counter()
+        self.status = "aligning"
+        self._prior = prior
+        self._events: list[NavigationEvent] = []
+        self._last_s = -np.inf  # stamp of the last inertial sample
+        self._interval = 0.0
+        self._previous: tuple[Array, Array, float] | None = None  # sample before the open ones
+        self._published = -np.inf
+        self._published_smooth = -np.inf
+        self._replaying = False
+        self._forget()
+
+    def _forget(self) -> None:
+        """Back to the alignment."""
+        self._chain: NavigationChain | None = None
+        self._raw: list[InertialData] = []  # kept while aligning
+        self._fixes: list[tuple[float, GnssData]] = []
+        self._waiting: list[tuple[float, GnssData]] = []
+        self._open: list[tuple[float, float, Array, Array, float, float]] = []
+        self._next_pose = -np.inf
+        self._next_try = -np.inf
+        self._next_smooth = -np.inf
+        self._restored: list[float] = []
+        self._pose_due = False
+        self.status = "aligning"
+
+    @property
+    def aligned(self) -> bool:
+        return self._chain is not None
+
+    @property
+    def innovations(self) -> list[Innovation]:
+        """Of the observations that may still change."""
+        return [i for node in (self._chain.nodes if self._chain else []) for i in node.innovations]
+
+    # ------------------------------------------------------------------------------------------------ inertial data
+
+    def add_inertial(self, time_s: float, interval_s: float, force: ArrayLike, rate: ArrayLike) -> list[NavigationPose]:
+        """Mean specific force (m/s^2) and angular rate (rad/s), body axes, over the interval that ends at a time.
+
+        Raises
+        ------
+        ValueError : values that are not finite, or an interval that is not positive
+        """
+        f, w = np.asarray(force, dtype=float), np.asarray(rate, dtype=float)
+        return self.add_increments(time_s, interval_s, f * interval_s, w * interval_s)
+
+    def add_increments(
+        self, time_s: float, interval_s: float, dv: ArrayLike, dtheta: ArrayLike
+    ) -> list[NavigationPose]:
+        """Velocity (m/s) and angle (rad) increments, body axes, over the interval that ends at a time."""
+        v, th = np.asarray(dv, dtype=float), np.asarray(dtheta, dtype=float)
+        if not (interval_s > 0.0 and np.isfinite(time_s) and np.isfinite(v).all() and np.isfinite(th).all()):
+            raise ValueError(f"inertial sample at {time_s} s over {interval_s} s is not finite")
+        if time_s <= self._last_s:
+            self.counters["inertial out of order"] += 1
+            return []
+        poses: list[NavigationPose] = []
+        gap = time_s - interval_s - self._last_s
+        step = time_s - self._last_s
+        if np.isfinite(self._last_s) and step > GAP_FACTOR * interval_s:
+            self.counters["inertial gap"] += 1
+            if gap > self.settings.longest_gap_s:
+                self._event(time_s, f"inertial data missing for {gap:.1f} s: aligning anew")
+                self._forget()
+                self._previous = None
+            else:
+                poses += self._bridge(time_s, interval_s, v, th)
+        elif np.isfinite(self._last_s):
+            interval_s = step  # stamps are better than the nominal interval
+        poses += self._sample(time_s, interval_s, th, v, 0.0, 0.0)
+        return poses
+
+    def add_attitude(self, time_s: float, rpy: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]:
+        """Attitude of another system is not used beside raw inertial data; it is counted."""
+        self.counters["attitude not used"] += 1
+        return []
+
+    def _bridge(self, time_s: float, interval_s: float, v: Array, th: Array) -> list[NavigationPose]:
+        before = self._newest()
+        if before is None:
+            return []
+        zero = np.zeros(2)
+        pair = InertialData(
+            np.array([self._last_s, time_s]),
+            np.array([before[2], interval_s]),
+            np.array([before[0], th]),
+            np.array([before[1], v]),
+            zero,
+            zero,
+        ).bridged(self.settings.gap_rate_sigma, self.settings.gap_force_sigma)
+        poses: list[NavigationPose] = []
+        for i in range(1, len(pair) - 1):
+            poses += self._sample(
+                float(pair.time_s[i]),
+                float(pair.dt_s[i]),
+                pair.dtheta[i],
+                pair.dv[i],
+                float(pair.gyro_psd[i]),
+                float(pair.accel_psd[i]),
+            )
+        return poses
+
+    def _newest(self) -> tuple[Array, Array, float] | None:
+        if self._open:
+            _, dt, th, v, _, _ = self._open[-1]
+            return th, v, dt
+        return self._previous
+
+    def _sample(
+        self, time_s: float, dt: float, th: Array, v: Array, psd_g: float, psd_a: float
+    ) -> list[NavigationPose]:
+        self._last_s = time_s
+        self._open.append((time_s, dt, th, v, psd_g, psd_a))
+        step = self.options.pose_step_s
+        if time_s < self._next_pose - 1e-6 and not self._pose_due:
+            return []
+        self._next_pose = (np.floor(time_s / step + 1e-6) + 1.0) * step
+        return self._close_chunk()
+
+    def _close_chunk(self, answer: bool = True) -> list[NavigationPose]:
+        """Integrate the open samples, take in fixes that waited for them, and answer."""
+        if not self._open:
+            return []
+        t, dt, th, v, pg, pa = (np.array(column) for column in zip(*self._open, strict=True))
+        raw = InertialData(t, dt, th, v, pg, pa)
+        self._open = []
+        if self._chain is None:
+            self._raw.append(raw)
+            self._previous = th[-1], v[-1], float(dt[-1])
+            return []
+        pieces = raw.corrected(self._previous)
+        self._previous = th[-1], v[-1], float(dt[-1])
+        self._chain.append(pieces)
+        ready = [w for w in self._waiting if w[0] <= self._last_s]
+        self._waiting = [w for w in self._waiting if w[0] > self._last_s]
+        for time_s, fix in ready:
+            self._insert(time_s, fix)
+        self._pose_due = False
+        if self._chain is None or self._replaying or not answer:
+            return []
+        return [*self._filtered(), *self._smoothed(self.options.lag_s)]
+
+    # ---------------------------------------------------------------------------------------------------------- GNSS
+
+    def add_gnss(
+        self,
+        time_s: float,
+        antenna_l: ArrayLike,
+        covariance: ArrayLike,
+        velocity_l: ArrayLike | None = None,
+        velocity_covariance: ArrayLike | None = None,
+    ) -> list[NavigationPose]:
+        """A fix of the antenna, in the local frame, with covariance (3, 3); on request its velocity.
+
+        Raises
+        ------
+        ValueError : values that are not finite, or a covariance that is not positive definite
+        """
+        fix = local_fix(self.frame, time_s, antenna_l, covariance, velocity_l, velocity_covariance)
+        if time_s < self._last_s - self.options.rewind_s:
+            self.counters["gnss too late"] += 1
+            return []
+        if self._chain is None:
+            self._fixes.append((time_s, fix))
+            self._fixes.sort(key=lambda f: f[0])
+            return self._align(time_s)
+        if any(abs(time_s - w) < 1e-6 for w, _ in self._waiting):
+            self.counters["gnss duplicate"] += 1
+            return []
+        if time_s > self._last_s:
+            self._waiting.append((time_s, fix))
+            self._waiting.sort(key=lambda f: f[0])
+            return []
+        self._close_chunk(answer=False)  # smoothing can wait for the next sample, the fix cannot
+        if self._chain is None or not self._insert(time_s, fix) or self._chain is None:
+            return []
+        poses = self._filtered()
+        self._pose_due = not poses  # if no sample has come since the last pose, the next one brings the fix out
+        return poses
+
+    def _insert(self, time_s: float, fix: GnssData) -> bool:
+        """Take a fix into the chain; whether it was of use."""
+        assert self._chain is not None
+        wrong = self._chain.insert(time_s, fix)
+        if wrong:
+            self.counters[f"gnss {wrong}"] += 1
+            return False
+        self._watch()
+        return True
+
+    def _watch(self) -> None:
+        """Align anew where the filter had to be restored again and again."""
+        if self._replaying or self._chain is None:
+            return
+        for i in self.innovations:
+            if i.status == "restored" and i.time_s not in self._restored:
+                self._restored.append(i.time_s)
+                self._event(i.time_s, f"filter and GNSS {i.kind} disagreed for long: covariance enlarged")
+        now = self._chain.end_s
+        self._restored = [t for t in self._restored if t > now - 60.0]
+        if len(self._restored) >= 4:
+            self._event(now, "filter and GNSS keep disagreeing: aligning anew")
+            self.counters["aligned anew"] += 1
+            self._prior = None
+            self._forget()
+
+    # ----------------------------------------------------------------------------------------------------- alignment
+
+    def _align(self, time_s: float) -> list[NavigationPose]:
+        o = self.options
+        if self._open:
+            self._close_chunk()
+        if not self._raw:
+            return self._unaligned(time_s)
+        while len(self._raw) > 1 and self._last_s - self._raw[0].time_s[0] > o.longest_alignment_s:
+            self._raw.pop(0)
+            self._prior = None  # it was for the first sample
+        start = float(self._raw[0].time_s[0] - self._raw[0].dt_s[0])
+        self._fixes = [f for f in self._fixes if f[0] >= start]
+        if len(self._fixes) < 4 or self._last_s - self._fixes[0][0] < 4.0 or self._last_s < self._next_try:
+            return self._unaligned(time_s)
+        self._next_try = self._last_s + max(1.0, 0.25 * (self._last_s - self._fixes[0][0]))
+        raw = concatenate(self._raw)
+        covered = [f for f in self._fixes if f[0] <= self._last_s]
+        gnss = stacked([f for _, f in covered])
+        seen = float(gnss.time_s[-1] - start)
+        try:
+            patience = o.patience_s if seen >= o.patience_s else np.inf
+            found = align(raw, gnss, self.settings, start_s=start, prior=self._prior, patience_s=patience)
+        except AlignmentError as error:
+            self.status = f"aligning: {error}"
+            return self._unaligned(time_s)
+        waiting = [f for f in self._fixes if f[0] > self._last_s]
+        self._begin(found.estimate, found.P, raw, covered)
+        self._waiting = waiting
+        text = f"aligned {found.how} after {seen:.0f} s"
+        self._event(time_s, "; ".join([text, *found.notes]))
+        self.status = "navigating"
+        return self._filtered()
+
+    def _begin(self, estimate: Estimate, P: Array, raw: InertialData, fixes: list[tuple[float, GnssData]]) -> None:
+        """Start the filter at the beginning of the kept data and take it to the present."""
+        self._chain = NavigationChain(self.settings, Start(estimate, P), self.options.step_s)
+        self._raw, self._fixes = [], []
+        self._previous, self._waiting, self._replaying = None, list(fixes), True
+        self._next_pose = -np.inf
+        end = self._last_s
+        for i in range(len(raw)):
+            self._sample(
+                float(raw.time_s[i]), float(raw.dt_s[i]), raw.dtheta[i], raw.dv[i], float(raw.gyro_psd[i]),
+                float(raw.accel_psd[i]),
+            )  # fmt: skip
+        self._close_chunk()
+        self._last_s, self._replaying = end, False
+        self._next_smooth = end + self.options.smooth_every_s
+        self._published_smooth = max(self._published_smooth, estimate.time_s)
+
+    def _unaligned(self, time_s: float) -> list[NavigationPose]:
+        """A pose that is not valid: the place of the antenna, nothing known of the attitude."""
+        if time_s <= self._published or not self._fixes:
+            return []
+        self._published = time_s
+        fix = self._fixes[-1][1]
+        position = self.frame.from_geodetic(np.degrees(fix.lat[0]), np.degrees(fix.lon[0]), fix.height_m[0])
+        size = float(np.linalg.norm(self.settings.lever_arm_b)) + float(np.linalg.norm(self.mount.lever_arm_b))
+        angles = np.zeros(3)
+        covariance = np.diag([*(fix.sigma_ned_m[0] ** 2 + size**2), *(3 * [np.pi**2 / 3.0])])
+        covariance[:3, :3] = R_ENU_NED @ covariance[:3, :3] @ R_ENU_NED.T
+        q = quaternion_from_matrix(matrix_from_angles(*angles))
+        return [NavigationPose(time_s, position, angles, q, np.zeros(3), covariance, False, self.status, False)]
+
+    # --------------------------------------------------------------------------------------------------------- poses
+
+    def _filtered(self) -> list[NavigationPose]:
+        """Pose at the end of the inertial data."""
+        assert self._chain is not None
+        time_s, state, P = self._chain.tip()
+        if time_s <= self._published:
+            return []
+        self._published = time_s
+        return self._poses(_states([time_s], [state]), P[None, :9, :9], smoothed=False)
+
+    def _smoothed(self, lag_s: float) -> list[NavigationPose]:
+        """Poses that have become old enough."""
+        chain, o = self._chain, self.options
+        assert chain is not None
+        end = chain.nodes[-1].time_s
+        until = end - lag_s
+        if (end < self._next_smooth - 1e-9 and lag_s > 0.0) or len(chain.nodes) < 3 or until <= self._published_smooth:
+            return []
+        self._next_smooth = end + o.smooth_every_s
+        trajectory = chain.smoothed()
+        ends = trajectory.sample_times
+        rows = np.flatnonzero((ends > self._published_smooth + 1e-9) & (ends <= until + 1e-9))
+        poses: list[NavigationPose] = []
+        if len(rows):
+            states = trajectory.at_rows(rows)
+            poses = self._poses(states, trajectory.covariance(states.time_s), smoothed=True)
+            self._published_smooth = float(ends[rows[-1]])
+        chain.forget(min(self._published_smooth, end - o.rewind_s) - 2.0 * o.step_s)
+        return poses
+
+    def _poses(self, states: NavigationStates, P: Array, smoothed: bool) -> list[NavigationPose]:
+        o, frame = self.options, self.frame
+        poses = camera_poses(states, P, frame, self.mount)
+        covariance = poses.covariance + np.diag([*np.square(o.offset_sigma_m), 0.0, 0.0, 0.0])
+        velocity = states.v_e @ frame.R_el
+        q = quaternion_from_matrix(matrix_from_angles(*poses.angles.T))
+        limit = np.array([*(3 * [o.valid_position_m]), *(3 * [o.valid_attitude_rad])]) ** 2
+        large = np.einsum("mii->mi", covariance) > limit
+        out = []
+        for i in range(len(states.time_s)):
+            valid = not large[i].any()
+            reason = "" if valid else ("position uncertain" if large[i, :3].any() else "attitude uncertain")
+            out.append(
+                NavigationPose(
+                    float(states.time_s[i]),
+                    poses.position_l[i],
+                    poses.angles[i],
+                    q[i],
+                    velocity[i],
+                    covariance[i],
+                    valid,
+                    reason,
+                    smoothed,
+                )
+            )
+        return out
+
+    def finish(self) -> list[NavigationPose]:
+        """The stream has ended: what the smoother still holds."""
+        if self._chain is None:
+            return []
+        poses = self._close_chunk()
+        self._chain.close()
+        return [*poses, *self._smoothed(0.0)]
+
+    def take_events(self) -> list[NavigationEvent]:
+        """Events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def _event(self, time_s: float, text: str) -> None:
+        self._events.append(NavigationEvent(time_s, text))
+
+
+def _states(time_s: list[float], states: list[State]) -> NavigationStates:
+    return NavigationStates(
+        np.array(time_s),
+        np.array([s.r_e for s in states]),
+        np.array([s.v_e for s in states]),
+        np.array([s.R_eb for s in states]),
+    )
