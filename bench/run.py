@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parent
 BENCHMARKS = {
     "bus and recorder under the load of three full image lines": ["bus_load.py"],
     "batch adjustment against Ceres": ["ceres/compare.py"],
-    "batch adjustment: time and memory against size": ["adjustment_scaling.py"],
+    "batch adjustment: time and memory against size": ["adjustment_scaling.py", "-o", "out/bench"],
     "batch job: snooping, elimination, covariances": ["adjustment_job.py"],
     "inertial navigation": ["navigation.py"],
     "sliding window": ["window.py"],

@@ -10,11 +10,11 @@ from ...solver.simulation.consistency import MODELS, Consistency, consistency
 from ..errors import UserError
 from .progress import progress
 
-EXAMPLE = "triline study consistency --seeds 50"
+EXAMPLE = "triline study consistency --seeds 200"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seeds", type=int, default=50, metavar="N", help="simulated blocks a model (50)")
+    parser.add_argument("--seeds", type=int, default=200, metavar="N", help="simulated blocks a model (200)")
 
 
 def run(args: argparse.Namespace) -> int:
