@@ -9,6 +9,7 @@ import numpy as np
 
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.window import Window
+from ..solver.window_output import light
 from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
@@ -84,6 +85,7 @@ class Adjuster(Node):
         self._refusals: list[Refusal] = []
         self._rejected_total = 0
         self._updates = 0
+        self._light = "good"
         self._next_live = -np.inf
 
     # -- node ----------------------------------------------------------------------------------------------------------
@@ -301,6 +303,10 @@ class Adjuster(Node):
                 )
             )
             self._updates += 1
+            colour, why = light(update.report)
+            if colour != self._light:
+                self._light = colour
+                outputs.append(self._log(f"{colour}: {why}" if why else colour, warning=colour != "good"))
         outputs += [self._log(text) for text in update.events]
         return outputs
 

@@ -70,11 +70,15 @@ class PoseBuffer:
 
 
 class OrientationStore:
-    """Refined orientation of the last minutes, final where there is, live elsewhere."""
+    """Refined orientation of the last minutes: of whole strips where there is, else final, else live."""
 
     def __init__(self) -> None:
+        self._whole: tuple[list[int], list[Any]] = ([], [])
         self._final: tuple[list[int], list[Any]] = ([], [])
         self._live: tuple[list[int], list[Any]] = ([], [])
+
+    def add_whole(self, bodies: list[Any]) -> None:
+        self._add(self._whole, bodies)
 
     def add_final(self, bodies: list[Any]) -> None:
         self._add(self._final, bodies)
@@ -96,7 +100,7 @@ class OrientationStore:
 
     def at(self, time_ns: int) -> Any:
         """Pose message at a time, interpolated between its neighbours; None outside."""
-        for times, poses in (self._final, self._live):
+        for times, poses in (self._whole, self._final, self._live):
             i = bisect_right(times, time_ns) - 1
             if i >= 0 and times[i] == time_ns:
                 return poses[i]

@@ -43,6 +43,8 @@ class KinematicOptions:
     attitude_sigma : (3,) slow error of omega, phi, kappa, rad; added to the white noise of the samples
     jerk_psd : spectral density of the jerk, m^2/s^5; too large costs little, too small lags behind motion
     lag_s : of the smoothed trajectory
+    hold_s : in an outage the smoothed trajectory waits for the fixes after it, so long at most: a gap bridged from both
+        sides is far better known than one extrapolated
     lateness_s : a fix that is late by no more than this is filtered in again
     coast_limit_s, sigma_limit_m : longer without a fix, or a filter sigma (slow errors apart) above: not valid
     gate, hard_gate : normalised innovation squared of a position above which a fix is weighted down, or refused
@@ -58,6 +60,7 @@ class KinematicOptions:
     attitude_sigma: Array = field(default_factory=lambda: np.zeros(3))
     jerk_psd: float = 1.0
     lag_s: float = 1.0
+    hold_s: float = 22.0
     lateness_s: float = 2.0
     coast_limit_s: float = 2.5
     sigma_limit_m: float = 2.0
@@ -112,10 +115,12 @@ class KinematicFilter:
         self._H = np.zeros((3, N_STATES))
         self._H[:, P] = self._H[:, W] = np.eye(3)
         self._last_fix_s = -np.inf
+        self._gap_from_s = self._bridged_at_s = -np.inf
         self._refused = 0
         self._smoothed_to = -np.inf
         self._transitions: dict[int, tuple[Array, Array]] = {}
         self._ahead_cov = np.zeros((len(_AHEAD_S), 3, 3))
+        self._ahead_white_m = np.zeros(len(_AHEAD_S))  # without the slow errors
         self._coasting = False
 
     # -- input ---------------------------------------------------------------------------------------------------------
@@ -133,8 +138,11 @@ class KinematicFilter:
         if time_s - last > self.options.attitude_gap_s and last > -np.inf:
             self.counters["attitude gap"] += 1
             self._event(time_s, f"attitude gap of {time_s - last:.2f} s")
+        left: list[NavigationPose] = []
+        if time_s - last > self.options.coast_limit_s and last > -np.inf:
+            left = self._start_anew(time_s)
         self._attitude.append(time_s, rpy, np.asarray(covariance, dtype=float))
-        poses: list[NavigationPose] = []
+        poses = left
         while self._pending and self._pending[0][0] <= time_s:
             poses += self._take_fix(*self._pending.pop(0))
         if not self._epochs:
@@ -204,12 +212,22 @@ class KinematicFilter:
         for epoch in after:
             self._advance(epoch.time_s, epoch.z if epoch.accepted else None, epoch.R, judge=False)
         self._look_ahead()
-        return self._smooth(self._epochs[-1].time_s - self.options.lag_s)
+        return self._smooth(self._due(self._epochs[-1].time_s))
 
     def _coast(self, time_s: float) -> list[NavigationPose]:
         self._advance(time_s, None, None, judge=False)
         self._look_ahead()
-        return self._smooth(time_s - self.options.lag_s)
+        return self._smooth(self._due(time_s))
+
+    def _due(self, now_s: float) -> float:
+        """Time up to which the smoothed trajectory is due."""
+        o = self.options
+        due = now_s - o.lag_s
+        if now_s - self._last_fix_s > o.coast_limit_s:
+            return min(due, max(self._last_fix_s, now_s - o.hold_s))
+        if now_s < self._bridged_at_s:
+            return min(due, max(self._gap_from_s, now_s - o.hold_s))
+        return due
 
     def _start(self, time_s: float, z: Array, R: Array) -> None:
         o = self.options
@@ -251,9 +269,20 @@ class KinematicFilter:
             if accepted:
                 kf.update(z, R=R, H=self._H)
                 kf.P = 0.5 * (kf.P + kf.P.T)
+                if time_s - self._last_fix_s > o.coast_limit_s:
+                    self._gap_from_s, self._bridged_at_s = self._last_fix_s, time_s + o.lag_s
                 self._last_fix_s = max(self._last_fix_s, time_s)
                 self._refused = 0 if judge else self._refused
         self._epochs.append(_Epoch(time_s, z, R, kf.x.copy(), kf.P.copy(), F, Q, accepted))
+
+    def _start_anew(self, time_s: float) -> list[NavigationPose]:
+        """Nothing was measured for long: finish what was, and wait for the next fix."""
+        left = self.finish()
+        self._epochs = []
+        self._attitude = AttitudeHistory()
+        self._pending = [fix for fix in self._pending if fix[0] >= time_s]
+        self._smoothed_to = -np.inf
+        return left
 
     def _restart(self, time_s: float, z: Array, R: Array, size: float) -> None:
         self.counters["position jump"] += 1
@@ -280,9 +309,9 @@ class KinematicFilter:
         for i, dt in enumerate(_AHEAD_S):
             F, Q = self._transition(float(dt))
             self._ahead_cov[i] = F[P] @ last.P @ F[P].T + Q[P, P]
+            HF = self._H @ F
+            self._ahead_white_m[i] = np.sqrt(np.trace(HF @ last.P @ HF.T + self._H @ Q @ self._H.T))
         self._ahead_cov += np.diag(np.square(np.broadcast_to(self.options.offset_sigma_m, 3)))
-        last_white = self._H @ last.P @ self._H.T
-        self._white_m = float(np.sqrt(np.trace(last_white)))
         self._maker.move(last.time_s, last.x[P], last.x[V])
         self._state_scalars = last.x[:9].tolist()
 
@@ -314,7 +343,8 @@ class KinematicFilter:
             i += 1
         share = (dt - _AHEAD_S[i]) / (_AHEAD_S[i + 1] - _AHEAD_S[i])
         cov = (1.0 - share) * self._ahead_cov[i] + share * self._ahead_cov[i + 1]
-        valid, reason = self._validity(time_s, self._white_m)
+        white_m = (1.0 - share) * self._ahead_white_m[i] + share * self._ahead_white_m[i + 1]
+        valid, reason = self._validity(time_s, float(white_m))
         return self._maker.pose(time_s, position, velocity, cov, rpy, self._attitude.covariance, valid, reason)
 
     def _smooth(self, to_s: float) -> list[NavigationPose]:

@@ -7,12 +7,11 @@ What is known of the slow errors beforehand makes the problem regular without an
 says how uncertain it is.
 
 A point that is seen again in a later strip after it has become final is a new point there: the tie to the earlier strip
-is not used. That loses information and invents none.
+is not used. That loses information and invents none. A control point seen from two strips is weighted in both; strips
+share no unknowns but the additional parameters, so only those could take it for two surveys of the point.
 """
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,34 +20,39 @@ from .camera import LineCamera
 from .measured_trajectory import MeasuredTrajectory
 from .selfcalibration import SelfCalibration
 from .slow_errors import SlowErrors
+from .window_backward import LeftPoints, Step, backward
 from .window_batch import Batch
+from .window_intake import Intake
 from .window_output import CostHistory, Orienter, adjusted_points, parameters
-from .window_points import BatchMaker, ControlPoint, PointLooks
+from .window_points import BatchMaker, ControlPoint
 from .window_results import (
     Look,
     Parameter,
     RefinedOrientation,
-    Refusal,
     WindowOptions,
     WindowReport,
     WindowUpdate,
 )
 from .window_snooping import snoop
-from .window_state import Marginal, WindowState
-from .window_strip import WindowStrip
+from .window_state import WindowState
+from .window_strip import WindowStrip, segment_length
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0
-#: Change of a correction, m and rad, beyond which a batch is linearised again: its square over the flying height is far
-#: below a pixel.
-MOVED_M, MOVED_RAD = 0.5, 0.5e-3
+#: Change of a correction, m and rad, beyond which a batch is linearised again. What the linear equations then miss goes
+#: with its square, over the flying height: a hundredth of a pixel.
+MOVED_M, MOVED_RAD = 1.5, 1e-3
 #: Every so many updates it is looked whether a batch has moved, if new data did not move far.
 LOOKED_AFTER = 16
-#: Time after which a look whose orientation has not come is given up, s.
-PATIENCE_S = 2.0
+#: Rays tested again in one update at most, if there is more than one batch.
+MOST_RETESTED = 100
+#: So many batches at most are linearised again then.
+MOST_AGAIN = 6
+#: Steps kept for the backward pass; of a strip that never ends the earliest part is not refined again.
+MOST_STEPS = 600
 
 
 class Window:
@@ -77,7 +81,8 @@ class Window:
         self.trajectory = MeasuredTrajectory()
         self.state = WindowState()
         self.strips: dict[str, WindowStrip] = {}
-        self.marginals: list[Marginal] = []
+        self._steps: list[Step] = []
+        self._left: list[LeftPoints] = []
         self._self_calibration = self_calibration
         self._camera_columns = np.empty(0, dtype=np.int64)
         if self_calibration is not None:
@@ -86,23 +91,18 @@ class Window:
             m = len(self._camera_columns)
             columns = self._camera_columns[:, None].astype(np.int32)
             self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
-        self._control: dict[str, ControlPoint] = {}
+        self._intake = Intake(camera, self.strips, self.trajectory)
+        self._points, self._control = self._intake.points, self._intake.control
         self._maker = BatchMaker(
             camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
         )
-        self._points: dict[str, PointLooks] = {}
-        self._arrived: dict[str, None] = {}
-        self._waiting: dict[str, None] = {}
         self._batches: list[Batch] = []
-        self._done: deque[tuple[float, str]] = deque()
-        self._done_names: set[str] = set()
         self._history = CostHistory()
         self._now_s = -np.inf
         self._serial = 0
         self._newest_ray_s = -np.inf
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory)
-        self._refused: list[Refusal] = []
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -131,47 +131,12 @@ class Window:
 
     def add_control(self, name: str, xyz_l: ArrayLike, sigma_m: ArrayLike, role: str) -> None:
         """Known coordinates (3,), before or after the point's looks; sigma infinite where a coordinate is not given."""
-        self._control[name] = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
-        if name in self._points:
-            self._arrived[name] = None
+        point = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
+        self._intake.add_control(name, point)
 
     def add_look(self, name: str, look: Look) -> str:
         """A look at a point; returns why it is refused, "" if it is taken."""
-        reason = self._judge(look)
-        time_s = float(self.strips[look.strip].time_of(look.line)) if not reason else 0.0
-        if not reason and time_s < self.strips[look.strip].final_to_s:
-            reason = "too late"
-        if not reason and name in self._done_names:
-            reason = "point is final"
-        if not reason and name in self._points and look in self._points[name].looks:
-            reason = "duplicate"
-        if reason:
-            self._refused.append(Refusal(name, look, reason))
-            return reason
-        point = self._points.setdefault(name, PointLooks())
-        point.looks.append(look)
-        point.time_s.append(time_s)
-        point.weight.append(1.0)
-        self._arrived[name] = None
-        if point.batch is None:
-            self._waiting[name] = None
-        return ""
-
-    def _judge(self, look: Look) -> str:
-        values = (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px)
-        if not np.isfinite(values).all():
-            return "value is not finite"
-        if min(values[2:]) <= 0:
-            return "sigma is not positive"
-        if look.ccd not in self.camera.line_index:
-            return "unknown ccd"
-        if look.strip not in self.strips:
-            return "unknown strip"
-        if not self.camera.lines[self.camera.line_index[look.ccd]].contains(look.sample):
-            return "beyond the ccd line"
-        if not self.strips[look.strip].contains(look.line):
-            return "outside strip"
-        return ""
+        return self._intake.add_look(name, look)
 
     # -- update --------------------------------------------------------------------------------------------------------
 
@@ -189,8 +154,7 @@ class Window:
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
-        result.refused += self._refused
-        self._refused = []
+        result.refused += self._intake.take_refused()
         result.report = self._report(iterations)
         return result
 
@@ -202,19 +166,17 @@ class Window:
         for strip in self.strips.values():
             strip.end(0)
         self._let_go(np.inf, result)
-        result.refused += self._refused
-        self._refused = []
+        result.refused += self._intake.take_refused()
         result.report = self._report(iterations)
         return result
 
     def _take_arrived(self) -> list[Batch]:
         """Batches of the points that have new looks with a measured orientation; others wait."""
         ready: dict[int, list[str]] = {}
-        step = self.options.segment_s or 0.1 * self.slow.wander_time_s
+        step = segment_length(self.slow, self.options)
         again: list[Batch] = []
-        for name in self._with_orientation(list(self._arrived)):
+        for name in self._intake.ready(self._now_s):
             point = self._points[name]
-            del self._arrived[name]
             if point.batch is not None:
                 again.append(point.batch)
                 continue
@@ -225,8 +187,7 @@ class Window:
             known |= dict(zip(batch.names, batch.points_l, strict=True))
             self._remove(batch)
             for name in batch.names:
-                self._points[name].batch = None
-                self._waiting[name] = None
+                self._intake.place(name, None)
                 ready.setdefault(int(min(self._points[name].time_s) // step), []).append(name)
         fresh = []
         for names in ready.values():
@@ -238,8 +199,7 @@ class Window:
             if batch is None:
                 continue
             for name in batch.names:
-                self._points[name].batch = batch
-                self._waiting.pop(name, None)
+                self._intake.place(name, batch)
             self._batches.append(batch)
             self.state.add(batch.columns, batch.information)
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
@@ -247,23 +207,6 @@ class Window:
         if not self._length_s and fresh:
             self._length_s = self.options.window_looks * self._look_time(fresh[0])
         return fresh
-
-    def _with_orientation(self, names: list[str]) -> list[str]:
-        """Points all of whose looks have a measured orientation; looks for which none will come are refused."""
-        times = [np.asarray(self._points[name].time_s) for name in names]
-        if not times:
-            return []
-        covered = np.split(self.trajectory.covers(np.concatenate(times)), np.cumsum([len(t) for t in times])[:-1])
-        ready = []
-        for name, t, good in zip(names, times, covered, strict=True):
-            lost = np.flatnonzero(~good & (t < min(self._now_s - PATIENCE_S, self.trajectory.end_s)))
-            point = self._points[name]
-            for i in lost[::-1]:
-                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
-                del point.looks[i], point.time_s[i], point.weight[i]
-            if len(lost) + int(good.sum()) == len(t):
-                ready.append(name)
-        return ready
 
     def _look_time(self, batch: Batch) -> float:
         """Time between the first and the last look at a point, from view angles, height and speed."""
@@ -293,12 +236,23 @@ class Window:
             self.state.solve()
             iterations += 1
         if self.options.snoop:
-            due = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: b.tested)[: self.options.retest]
+            due = self._due_for_test()
             refused, rounds = snoop(fresh + due, self.state, self._points, self.options.critical, self._serial)
             iterations += rounds
             result.refused += refused
         self._orienter.forget()
         return iterations
+
+    def _due_for_test(self) -> list[Batch]:
+        """Batches tested longest ago; the more rays they have, the fewer."""
+        waiting = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: b.tested)[: self.options.retest]
+        due, rays = [], 0
+        for batch in waiting:
+            if due and rays + len(batch.rays) > MOST_RETESTED:
+                break
+            due.append(batch)
+            rays += len(batch.rays)
+        return due
 
     def _follow(self, fresh: list[Batch]) -> bool:
         """Linearise batches again whose unknowns or points have moved far; whether there were any.
@@ -313,6 +267,8 @@ class Window:
         due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
         for batch in others:
             theta = self.state.values(batch.columns)
+            if not far and len(due) >= MOST_AGAIN:
+                break
             if id(batch) not in new and batch.has_moved(theta, MOVED_M, MOVED_RAD):
                 batch.back_substitute(theta)
                 due.append((batch, theta))
@@ -342,14 +298,12 @@ class Window:
             if rounds:
                 self._orienter.forget()
         for batch in leaving:
-            result.points += adjusted_points(batch, self.state, self._points, self._control, final=True)
+            points = adjusted_points(batch, self.state, self._points, self._control, final=True)
+            result.points += points
+            self._left.append(LeftPoints.of(batch, points))
         for batch in leaving:
             self.state.fix(batch.columns, batch.information)
-            for name in batch.names:
-                del self._points[name]
-                self._arrived.pop(name, None)
-                self._done.append((batch.newest_s, name))
-                self._done_names.add(name)
+            self._intake.finish(batch)
         if leaving:
             gone = {id(b) for b in leaving}
             self._batches = [b for b in self._batches if id(b) not in gone]
@@ -358,11 +312,19 @@ class Window:
             if not len(numbers):
                 continue
             final = self._final(strip, to_s)
+            design = noise = None
             if final is not None:
                 result.final.append(final)
+                design, noise = strip.design(final.time_s), self._orienter.noise(strip, final.time_s)
             strip.final_to_s = to_s
-            self.marginals.append(self.state.marginalise(numbers))
+            self._steps.append(Step(self.state.marginalise(numbers), final, design, noise, self._left))
+            self._left = []
             self._orienter.forget()
+        if self._steps and all(strip.is_gone(self.state) for strip in self.strips.values()):
+            self.state.solve()
+            result.whole = backward(self._steps, self.state)
+            self._steps = []
+        del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, result)
 
     def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
@@ -383,16 +345,9 @@ class Window:
         """Drop what nothing can need any more: single looks that found no partner, old poses, strips that are over."""
         if not np.isfinite(limit_s) and limit_s < 0:
             return
-        for name in list(self._waiting):
-            point = self._points[name]
-            if not point.time_s or max(point.time_s) <= limit_s:
-                result.refused += [Refusal(name, look, "too few looks") for look in point.looks]
-                del self._points[name], self._waiting[name]
-                self._arrived.pop(name, None)
-        while self._done and self._done[0][0] < limit_s - self._length_s:
-            self._done_names.discard(self._done.popleft()[1])
+        result.refused += self._intake.forget(limit_s, limit_s - self._length_s)
         used = min((b.oldest_s for b in self._batches), default=np.inf)
-        waiting = min((min(self._points[n].time_s, default=np.inf) for n in self._waiting), default=np.inf)
+        waiting = self._intake.oldest_waiting_s
         finals = min((s.final_to_s for s in self.strips.values() if not s.is_gone(self.state)), default=np.inf)
         self.trajectory.forget(min(limit_s - self._length_s, used, waiting, finals) - 1.0)
 

@@ -26,6 +26,7 @@ from .selfcalibration import SelfCalibration
 if TYPE_CHECKING:
     from .adjustment import Solution
     from .elimination import Elimination
+    from .window_state import WindowState
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -67,6 +68,8 @@ class Batch:
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
     tested : number of the update that tested it last
     active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
+    judged : cofactors and statistics of the last test, and the solution of the window they are for
     """
 
     names: list[str]
@@ -82,6 +85,7 @@ class Batch:
     active_rays: int = field(init=False, default=0)
     active_control: int = field(init=False, default=0)
     determined: int = field(init=False, default=0)
+    judged: tuple[int, Cofactors, RayStatistics] | None = field(init=False, repr=False, default=None)
     origin_l: Array = field(init=False, repr=False)
     theta: Array = field(init=False)
     lin: Linearisation = field(init=False)
@@ -89,8 +93,7 @@ class Batch:
     normals: PointNormals = field(init=False)
     information: Information = field(init=False)
     _rows: Array = field(init=False, repr=False)
-    _coupling: Array = field(init=False, repr=False)
-    _reach: Array | None = field(init=False, repr=False, default=None)
+    coupling: Array = field(init=False, repr=False)
 
     @property
     def n_points(self) -> int:
@@ -155,23 +158,18 @@ class Batch:
         self.determined = int(normals.rank.sum())
         rows = 2 * self.active_rays + self.control.n_observations - self.determined
         self.normals, self.information = normals, Information(matrix, rhs, square, rows)
-        self._rows, self._coupling = A, D
+        self.judged = None
+        self._rows, self.coupling = A, D
 
     def back_substitute(self, theta: Array) -> None:
         """Put the points where they belong for values (u,) of the unknowns."""
-        rest = self.normals.y.T - self._coupling @ theta
+        rest = self.normals.y.T - self.coupling @ theta
         self.points_l = self.origin_l + self.normals.back(rest.T).T
 
     def has_moved(self, theta: Array, far_m: float, far_rad: float) -> bool:
-        """Whether a correction may have changed by more than this since the linearisation."""
-        far = np.array([far_m] * 3 + [far_rad] * 3)
-        if self._reach is None:
-            reach = np.zeros(len(self.columns) + 1)
-            largest = np.abs(self.layout.coefficients).max(axis=1)
-            for t, (node, component) in enumerate(zip(self.layout.node, self.layout.component, strict=True)):
-                reach[np.unique(self.layout.columns[t])] = largest[node] / far[component]
-            self._reach = reach[:-1]
-        return bool((np.abs(theta - self.theta) * self._reach).max(initial=0.0) > 1.0)
+        """Whether a correction of a ray has changed by more than this since the linearisation."""
+        change = np.abs(self.layout.corrections(theta - self.theta))
+        return bool(change[:3].max() > far_m or change[3:].max() > far_rad)
 
     def points_moved(self) -> float:
         """How far a point has moved at most since the linearisation, m."""
@@ -184,9 +182,9 @@ class Batch:
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
-        L = self._inverse_factors()
+        L = inverse_factors(self.normals)
         n, p = len(self.rays), self.n_points
-        D, u = self._coupling, len(self.columns)
+        D, u = self.coupling, len(self.columns)
         inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
         points = np.swapaxes(L, 1, 2) @ inner @ L
         root = np.where(self.weight > 0, 1.0, 0.0)
@@ -216,17 +214,27 @@ class Batch:
                 A[m, axis, place] = self.lin.camera[axis][:, which]
         return A[:, :, :-1]
 
-    def _inverse_factors(self) -> Array:
-        """``L^-1`` (p, 3, 3)."""
-        a, b, c, d, e, f = self.normals.inverse_factor
-        zero = np.zeros_like(a)
-        return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
+    def judge(self, state: WindowState) -> tuple[Cofactors, RayStatistics]:
+        """Points, cofactors and statistics at the present solution; computed once for each solution."""
+        if self.judged is None or self.judged[0] != state.solution:
+            theta = state.values(self.columns)
+            self.back_substitute(theta)
+            cofactors = self.cofactors(state.covariance(self.columns))
+            self.judged = state.solution, cofactors, self.statistics(theta, cofactors)
+        return self.judged[1], self.judged[2]
 
     def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
         """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
         lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
         view = _AsSolution(_RaysOf(self.rays), lin, self.whitening, self.weight)
         return ray_statistics(cast("Solution", view), cofactors)
+
+
+def inverse_factors(normals: PointNormals) -> Array:
+    """``L^-1`` (p, 3, 3) of the points' normal matrices ``L L^T``."""
+    a, b, c, d, e, f = normals.inverse_factor
+    zero = np.zeros_like(a)
+    return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True)

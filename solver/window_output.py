@@ -13,7 +13,7 @@ from .models.base import COMPONENTS
 from .selfcalibration import SelfCalibration
 from .window_batch import Batch
 from .window_points import ControlPoint, PointLooks
-from .window_results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation
+from .window_results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, WindowReport
 from .window_state import WindowState
 from .window_strip import WindowStrip
 
@@ -48,6 +48,10 @@ class Orienter:
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
         )
 
+    def noise(self, strip: WindowStrip, times: Array) -> Array:
+        """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
+        return self._trajectory.at(times).covariance + strip.left_out_variance(times)[:, :, None] * np.eye(6)
+
     def _chunk(self, strip: WindowStrip, times: Array) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""
         design = strip.design(times)
@@ -69,10 +73,7 @@ def adjusted_points(
     batch: Batch, state: WindowState, points: Mapping[str, PointLooks], control: Mapping[str, ControlPoint], final: bool
 ) -> list[AdjustedPoint]:
     """The points of a batch that are determined, with covariance and residuals."""
-    theta = state.values(batch.columns)
-    batch.back_substitute(theta)
-    cofactors = batch.cofactors(state.covariance(batch.columns))
-    statistics = batch.statistics(theta, cofactors)
+    cofactors, statistics = batch.judge(state)
     v, w, rejected = statistics.v_px.tolist(), statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
     out = []
@@ -108,6 +109,23 @@ class CostHistory:
         if gained <= 0:
             return float("nan"), 0
         return float(np.sqrt(max(cost - old_cost, 0.0) / gained)), gained
+
+
+#: sigma0 over the window above which observations and a-priori sigmas contradict each other, and the redundancy needed.
+CONTRADICTION, ENOUGH = 1.5, 30
+
+
+def light(report: WindowReport) -> tuple[str, str]:
+    """The operator's light: good, weak or failed, and why."""
+    if not report.strip:
+        return "good", "no strip is flown"
+    if report.redundancy >= ENOUGH and report.sigma0 > CONTRADICTION:
+        return "failed", f"observations contradict each other: sigma0 {report.sigma0:.1f}"
+    if report.points == 0:
+        return "weak", "no tie points: the orientation is the measured one"
+    if report.control == 0:
+        return "weak", "no control in the window: position rests on GNSS and earlier control"
+    return "good", ""
 
 
 def parameters(

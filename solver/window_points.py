@@ -49,7 +49,8 @@ class PointLooks:
     looks : as they came
     time_s : (m,)
     weight : (m,) 0 for rejected ones
-    returned : looks that were taken back once
+    returned, reported : looks that were taken back once; looks whose rejection was reported
+    tried_again : whether the point was given a second chance after it was rejected as a whole
     batch : where the point is, None while it waits for a second look
     out : control coordinates that were rejected
     """
@@ -58,6 +59,8 @@ class PointLooks:
     time_s: list[float] = field(default_factory=list)
     weight: list[float] = field(default_factory=list)
     returned: set[int] = field(default_factory=set)
+    reported: set[int] = field(default_factory=set)
+    tried_again: bool = False
     batch: Batch | None = None
     out: set[int] = field(default_factory=set)
 
@@ -101,7 +104,7 @@ class BatchMaker:
         return rays, covariance, weight, not bool(measured.smoothed.all())
 
     def _measured(self, time_s: Array, strip: IntArray) -> tuple[MeasuredPoses, Array]:
-        """Measured orientation of rays, and the covariance (n, 6, 6) of its white noise with what the model leaves out."""
+        """Measured orientation of rays, and the covariance (n, 6, 6) of its noise with what the model leaves out."""
         measured = self.trajectory.at(time_s)
         covariance = measured.covariance.copy()
         ids = list(self.strips)
@@ -128,9 +131,9 @@ class BatchMaker:
         columns, layout = local_layout(design, rays.strip, self.self_calibration, self.camera_columns, rays)
         theta = self.state.values(columns)
         control = self._weights(names, points)
-        points_l = self._place(names, rays, weight, layout.corrections(theta), known)
-        known_l = np.isfinite(points_l).all(axis=1).tolist()
-        lost = [n for n, good in zip(names, known_l, strict=True) if not good]
+        points_l = self._place(names, rays, weight, layout.corrections(theta), layout.displacement(theta), known)
+        placed = np.isfinite(points_l)
+        lost = [name for i, name in enumerate(names) if not placed[i].all()]
         if lost:
             good = [i for i, n in enumerate(names) if n not in lost]
             if not good:
@@ -149,10 +152,18 @@ class BatchMaker:
                 weight[i, list(points[i].out)] = 0.0
         return ControlWeights(weight, xyz, int((weight > 0).sum()))
 
-    def _place(self, names: list[str], rays: Rays, weight: Array, correction: Array, known: dict[str, Array]) -> Array:
+    def _place(
+        self,
+        names: list[str],
+        rays: Rays,
+        weight: Array,
+        correction: Array,
+        displacement: Array | float,
+        known: dict[str, Array],
+    ) -> Array:
         """Where points are (p, 3): as known, at full control, or where their rays meet; NaN where neither holds."""
         angles = rays.angles + correction[3:].T
-        image = np.column_stack([rays.xy_mm, -rays.focal_length_mm])
+        image = np.column_stack([(rays.xy_mm.T - displacement).T, -rays.focal_length_mm])
         direction = np.einsum("nij,nj->ni", matrix_from_angles(*angles.T), image)
         use = np.flatnonzero(weight > 0)
         xyz, _ = intersect_rays((rays.position_l + correction[:3].T)[use], direction[use], rays.point[use], len(names))

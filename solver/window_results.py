@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .models import MODELS
 from .reliability import CRITICAL_W
 
 Array = NDArray[np.floating]
@@ -19,7 +20,7 @@ class WindowOptions:
     Attributes
     ----------
     model : trajectory model: "wander" (see `models.wander`), "dgr", "ppm", "lim"
-    segment_s : longest segment (distance of fixes for "lim"); 0 = a tenth of the wander's correlation time
+    segment_s : longest segment (distance of fixes for "lim"); 0 = a fifteenth of the correlation time
     window_s : length; 0 = `window_looks` times the time between the first and the last look at a point
     window_looks : see there
     grid_hz : rate of the published orientation
@@ -37,9 +38,11 @@ class WindowOptions:
     settle_s: float = 3.0
     critical: float = CRITICAL_W
     snoop: bool = True
-    retest: int = 2
+    retest: int = 4
 
     def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f"unknown trajectory model {self.model!r}; known: {', '.join(MODELS)}")
         for name in ("segment_s", "window_s", "settle_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
@@ -166,12 +169,21 @@ class WindowReport:
     parameters: tuple[Parameter, ...]
 
 
+@dataclass(frozen=True)
+class WholeStrips:
+    """Orientation and points with the information of whole strips, from the backward pass after their end."""
+
+    orientation: list[RefinedOrientation]
+    points: list[AdjustedPoint]
+
+
 @dataclass
 class WindowUpdate:
-    """What one update gave."""
+    """What one update gave; ``whole`` when strips have ended."""
 
     report: WindowReport | None = None
     final: list[RefinedOrientation] = field(default_factory=list)
     points: list[AdjustedPoint] = field(default_factory=list)
     refused: list[Refusal] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
+    whole: WholeStrips | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +29,8 @@ def snoop(
     """Leave out looks and control coordinates that fail; take back looks that agree with the rest after all.
 
     A look goes if one of its two w exceeds the critical value and the joint test fails too; of several at one point the
-    one with the largest joint value. Looks left out come back once, when their prediction passes both tests.
+    one with the largest joint value. Looks left out come back once, when their prediction passes both tests; points of
+    which nothing was left are tried once more as a whole when their batch is tested again.
 
     Parameters
     ----------
@@ -39,18 +42,22 @@ def snoop(
     refused : looks left out now
     rounds : solutions computed
     """
-    limit = joint_limit(critical)
+    limit = _joint_limit(critical)
     refused: list[Refusal] = []
     rounds = 0
     for batch in batches:
+        if batch.tested >= 0 and _try_again(batch, state, points):
+            rounds = 1
         batch.tested = serial
+    if rounds:
+        state.solve()
     pending = batches
     for _ in range(MOST_ROUNDS):
         judged = [(batch, *_judge(batch, state)) for batch in pending]
         worst = max((float(w[batch.weight > 0].max(initial=0.0)) for batch, w, _, _ in judged), default=0.0)
         worst = max([worst, *(float(c.max(initial=0.0)) for _, _, _, c in judged)])
         least = max(critical, TOGETHER * worst)
-        changed = []
+        changed, next_time = False, []
         for batch, w, joint, control_w in judged:
             out = np.flatnonzero((batch.weight > 0) & (joint > limit) & (w > least))
             out = _worst_of_point(batch.rays.point[out], joint[out], out)
@@ -61,6 +68,8 @@ def snoop(
                 if len(out) or fails.any()
                 else _agreeing(batch, points, w, joint, critical, limit)
             )
+            if (w[(batch.weight > 0) & (joint > limit)] > critical).any() or (control_w > critical).any() or len(back):
+                next_time.append(batch)
             if not (len(out) or len(back) or fails.any()):
                 continue
             state.add(batch.columns, batch.information, -1)
@@ -70,21 +79,38 @@ def snoop(
                 _leave_out_control(batch, points, fails & (control_w == control_w.max()))
             batch.eliminate()
             state.add(batch.columns, batch.information)
-            changed.append(batch)
+            changed = True
         if not changed:
             break
         state.solve()
         rounds += 1
-        pending = changed
+        pending = next_time
     return refused, rounds
+
+
+_joint_limit = cache(joint_limit)
+
+
+def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> bool:
+    """Give points that were rejected as a whole their weight back for one more test; whether there were any."""
+    lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0
+    lost &= np.array([not points[name].tried_again for name in batch.names])
+    if not lost.any():
+        return False
+    for i in np.flatnonzero(lost):
+        point = points[batch.names[i]]
+        point.tried_again = True
+        point.weight[:] = [1.0] * len(point.weight)
+    state.add(batch.columns, batch.information, -1)
+    batch.weight[lost[batch.rays.point]] = 1.0
+    batch.eliminate()
+    state.add(batch.columns, batch.information)
+    return True
 
 
 def _judge(batch: Batch, state: WindowState) -> tuple[Array, Array, Array]:
     """Larger |w| (n,), joint value (n,) of the rays, and |w| (p, 3) of control coordinates."""
-    theta = state.values(batch.columns)
-    batch.back_substitute(theta)
-    cofactors = batch.cofactors(state.covariance(batch.columns))
-    statistics = batch.statistics(theta, cofactors)
+    cofactors, statistics = batch.judge(state)
     weight = batch.control.weight
     v = -batch.control.residual(batch.points_l)
     q = 1.0 - weight * np.einsum("pii->pi", cofactors.points)
@@ -132,7 +158,9 @@ def _note(batch: Batch, points: dict[str, PointLooks], out: IntArray, back: IntA
     for ray in out:
         name, source = batch.names[batch.rays.point[ray]], int(batch.rays.source[ray])
         points[name].weight[source] = 0.0
-        refused.append(Refusal(name, points[name].looks[source], "snooping", float(w[ray])))
+        if source not in points[name].reported:
+            points[name].reported.add(source)
+            refused.append(Refusal(name, points[name].looks[source], "snooping", float(w[ray])))
     for ray in back:
         name, source = batch.names[batch.rays.point[ray]], int(batch.rays.source[ray])
         points[name].weight[source] = 1.0

@@ -46,6 +46,7 @@ class WindowState:
     theta : (n,) values
     square : cost of everything so far at theta = 0 of the present unknowns
     redundancy : observations so far less unknowns so far
+    solution : number of solutions computed so far
     """
 
     def __init__(self) -> None:
@@ -58,6 +59,8 @@ class WindowState:
         self.square = 0.0
         self.redundancy = 0
         self._factor: DenseFactor | None = None
+        self._inverted = False
+        self.solution = 0
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -127,11 +130,13 @@ class WindowState:
     def factor(self) -> DenseFactor:
         if self._factor is None:
             self._factor = DenseFactor(self._fixed + self._live)
+            self._inverted = False
         return self._factor
 
     def solve(self) -> None:
         """Values from all information."""
         self.theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        self.solution += 1
 
     def cost(self) -> float:
         """Weighted squares of everything so far, at the present solution."""
@@ -139,25 +144,32 @@ class WindowState:
 
     def covariance(self, numbers: IntArray) -> Array:
         """Cofactors (m, m) of present unknowns."""
-        place = self.places(numbers)
-        if 2 * len(place) > len(self):
-            return self.factor.cofactors(place)
+        place, factor = self.places(numbers), self.factor
+        if self._inverted or 4 * len(place) > len(self):
+            self._inverted = True
+            return factor.cofactors(place)
         unit = np.zeros((len(self), len(place)))
         unit[place, np.arange(len(place))] = 1.0
-        return self.factor.solve(unit)[place]
+        return factor.solve(unit)[place]
 
     def marginalise(self, numbers: IntArray) -> Marginal:
-        """Take unknowns out; batches that touch them must have been fixed before."""
+        """Take unknowns out; batches that touch them must have been fixed before.
+
+        Raises
+        ------
+        ValueError : an unknown about which nothing is known, not even beforehand
+        """
         gone = self.places(numbers)
         stay = np.setdiff1d(np.arange(len(self)), gone)
         order = np.concatenate([gone, stay])
         m = len(gone)
         fixed = self._fixed[np.ix_(order, order)]
-        scale = 1.0 / np.sqrt(np.diagonal(fixed))
+        diagonal = np.diagonal(fixed)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         (dpotrf,) = get_lapack_funcs(("potrf",), (fixed,))
         R, failed = dpotrf(fixed * scale[:, None] * scale, lower=0, clean=1)
         if failed:
-            raise ValueError(f"unknown {int(self.numbers[order[failed - 1]])} leaves the window undetermined")
+            raise ValueError(f"unknown {int(self.numbers[order[failed - 1]])} is undetermined and cannot leave")
         d = solve_triangular(R.T, scale * self._fixed_rhs[order], lower=True, check_finite=False)
         R = R / scale
         marginal = Marginal(

@@ -10,7 +10,7 @@ from .models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoOb
 from .models.dgr import DgrOptions
 from .models.lim import LimOptions
 from .models.ppm import PpmOptions
-from .models.wander import NOTHING, Wander, WanderOptions
+from .models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
 from .slow_errors import SlowErrors
 from .window_results import WindowOptions
 from .window_state import WindowState
@@ -24,6 +24,11 @@ UNKNOWN_LENGTH_S = 600.0
 _SAMPLING = 0.05
 
 
+def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
+    """Longest segment, s."""
+    return options.segment_s or SEGMENT_SHARE * slow.wander_time_s
+
+
 def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
     """Settings of the model that `options` names, with a-priori sigmas from the slow errors.
 
@@ -33,7 +38,7 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
     ------
     ValueError : an unknown model
     """
-    step = options.segment_s or 0.1 * slow.wander_time_s
+    step = segment_length(slow, options)
     pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
 
     def triple(values: Array) -> tuple[float, float, float]:
@@ -110,11 +115,11 @@ class WindowStrip:
         self._prior = self.model.pseudo_observations()
         self._row_done = np.zeros(len(self._prior), dtype=bool)
         self._entered = np.zeros(self.model.n_unknowns, dtype=bool)
-        self._first_use, self._last_use = self._uses(options.segment_s or 0.1 * slow.wander_time_s)
+        self._first_use, self._last_use = self._uses(segment_length(slow, options))
         self._need = np.array([self._first_use[c[c >= 0]].max() for c in self._prior.columns])
 
     def _uses(self, step_s: float) -> tuple[Array, Array]:
-        """First and last time (n_unknowns,) at which each unknown takes part."""
+        """Times (n_unknowns,) before and after which an unknown takes no part; up to one sample on the safe side."""
         extent = self.model.extent
         t = np.linspace(extent.start_s, extent.end_s, int((extent.end_s - extent.start_s) / (_SAMPLING * step_s)) + 2)
         columns = self.model.design(t).columns.reshape(len(t), -1)
@@ -122,7 +127,8 @@ class WindowStrip:
         last = np.full(self.model.n_unknowns + 1, -np.inf)
         np.minimum.at(first, columns, t[:, None])
         np.maximum.at(last, columns, t[:, None])
-        return first[:-1], last[:-1]
+        sample = t[1] - t[0]
+        return first[:-1] - sample, np.minimum(last[:-1] + sample, extent.end_s)
 
     def time_of(self, line: ArrayLike) -> Array:
         return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz

@@ -15,10 +15,22 @@ from .selfcalibration import SelfCalibration
 from .simulation.error_models import ErrorModel
 from .simulation.scenario import Simulation
 from .slow_errors import SlowErrors
+from .space_intersection import ImageRays, intersect
+from .trajectory import Trajectory
 from .window import Window
-from .window_results import AdjustedPoint, Look, RefinedOrientation, Refusal, WindowOptions, WindowReport
+from .window_results import (
+    AdjustedPoint,
+    Look,
+    RefinedOrientation,
+    Refusal,
+    WindowOptions,
+    WindowReport,
+    WindowUpdate,
+)
 
 Array = NDArray[np.floating]
+
+Event = NavigationPose | Callable[[Window], None]
 
 #: Platform time between updates, s.
 UPDATE_S = 0.2
@@ -83,16 +95,18 @@ class OnlineResult:
 
     Attributes
     ----------
-    live, final : orientation, in the order of publication
-    live_points, final_points : by name; the first answer, and the last
+    live, final, whole : orientation, in the order of publication; the last from the backward pass
+    live_points, final_points, whole_points : by name; the first answer, the last, that of the backward pass
     update_s : processor time of each update
     window : as it was at the end
     """
 
     live: list[RefinedOrientation] = field(default_factory=list)
     final: list[RefinedOrientation] = field(default_factory=list)
+    whole: list[RefinedOrientation] = field(default_factory=list)
     live_points: dict[str, AdjustedPoint] = field(default_factory=dict)
     final_points: dict[str, AdjustedPoint] = field(default_factory=dict)
+    whole_points: dict[str, AdjustedPoint] = field(default_factory=dict)
     refused: list[Refusal] = field(default_factory=list)
     reports: list[WindowReport] = field(default_factory=list)
     update_s: list[float] = field(default_factory=list)
@@ -106,6 +120,7 @@ def adjust_online(
     self_calibration: SelfCalibration | None = None,
     live: bool = True,
     watch: Callable[[float, Window], None] | None = None,
+    update_s: float = UPDATE_S,
 ) -> OnlineResult:
     """Fly a simulation through the window as an on-line system would.
 
@@ -113,6 +128,7 @@ def adjust_online(
     ----------
     live : whether the live orientation is asked for on the grid
     watch : called after every update with time and window
+    update_s : platform time between updates
     """
     options = options or WindowOptions()
     slow, errors, flight = slow_errors_of(simulation.errors), simulation.observation_plan, simulation.flight
@@ -123,27 +139,27 @@ def adjust_online(
             window.add_control(str(simulation.points.id[i]), simulation.surveyed_l[i], sigma, str(role))
     events = _events(simulation, poses)
     result = OnlineResult(window=window)
-    now, waiting = UPDATE_S, {False: [], True: []}
+    now, waiting = update_s, {False: [], True: []}
     for time, _, what in events:
         while time > now:
-            _update(window, waiting, slow, now, result, live)
+            _update(window, waiting, slow, now, result, update_s if live else 0.0)
             if watch is not None:
                 watch(now, window)
-            now = round(now + UPDATE_S, 9)
+            now = round(now + update_s, 9)
         if isinstance(what, NavigationPose):
             waiting[what.smoothed].append(what)
         else:
             what(window)
-    _update(window, waiting, slow, now, result, live)
+    _update(window, waiting, slow, now, result, update_s if live else 0.0)
     _collect(window.finish(), result)
     return result
 
 
-def _events(simulation: Simulation, poses: Iterable[TimedPose]) -> list[tuple[float, int, object]]:
+def _events(simulation: Simulation, poses: Iterable[TimedPose]) -> list[tuple[float, int, Event]]:
     """Poses, strips and points with the times they become known, in order."""
     flight, images = simulation.flight, simulation.images
     looks = images.looks
-    events: list[tuple[float, int, object]] = [(p.known_s, 1, p.pose) for p in poses]
+    events: list[tuple[float, int, Event]] = [(p.known_s, 1, p.pose) for p in poses]
     delay = simulation.observation_plan.matching_delay_s
     for strip in flight.strips:
         args = strip.id, strip.first_line_time_s, strip.line_rate_hz, strip.lines
@@ -152,7 +168,8 @@ def _events(simulation: Simulation, poses: Iterable[TimedPose]) -> list[tuple[fl
         events.append((end, 3, lambda w, args=args: w.end_strip(args[0], args[3])))
     sigma = simulation.observation_plan.image_sigma_px
     ids = [line.id for line in flight.camera.lines]
-    for mine in np.split(np.arange(len(looks)), np.flatnonzero(np.diff(looks.point) | np.diff(looks.strip)) + 1):
+    groups = np.split(np.arange(len(looks)), np.flatnonzero(np.diff(looks.point) | np.diff(looks.strip)) + 1)
+    for mine in groups if len(looks) else ():
         name = str(simulation.points.id[looks.point[mine[0]]])
         of_point = [
             Look(
@@ -176,7 +193,7 @@ def _update(
     slow: SlowErrors,
     now: float,
     result: OnlineResult,
-    live: bool,
+    live_s: float,
 ) -> None:
     for smoothed, poses in waiting.items():
         if poses:
@@ -193,19 +210,18 @@ def _update(
     update = window.update(now)
     result.update_s.append(process_time() - begun)
     _collect(update, result)
-    if live:
-        for time in window.grid(now - UPDATE_S + 1e-6, now + 1e-6):
-            orientation = window.live(float(time))
-            if orientation is not None:
-                result.live.append(orientation)
+    for time in window.grid(now - live_s + 1e-6, now + 1e-6) if live_s else ():
+        orientation = window.live(float(time))
+        if orientation is not None:
+            result.live.append(orientation)
 
 
-def _collect(update: object, result: OnlineResult) -> None:
-    from .window_results import WindowUpdate
-
-    assert isinstance(update, WindowUpdate)
+def _collect(update: WindowUpdate, result: OnlineResult) -> None:
     result.final += update.final
     result.refused += update.refused
+    if update.whole is not None:
+        result.whole += update.whole.orientation
+        result.whole_points |= {p.name: p for p in update.whole.points}
     for point in update.points:
         (result.final_points if point.final else result.live_points).setdefault(point.name, point)
     if update.report is not None:
@@ -268,9 +284,6 @@ def point_errors(
 
 def direct_points(simulation: Simulation, poses: Iterable[TimedPose]) -> Errors:
     """Errors of object points by direct georeferencing: space intersection with the smoothed measured trajectory."""
-    from .space_intersection import ImageRays, intersect
-    from .trajectory import Trajectory
-
     chosen = [p.pose for p in poses if p.pose.smoothed]
     measured = Trajectory([p.time_s for p in chosen], [p.position_l for p in chosen], [p.quaternion for p in chosen])
     flight, images = simulation.flight, simulation.images

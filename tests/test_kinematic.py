@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from triline.solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from triline.solver.kinematic import KinematicFilter, KinematicOptions, N_STATES, quintic, transition
-from triline.solver.rotation import angles_from_matrix, matrix_from_angles, matrix_from_navigation, quaternion_from_matrix
+from triline.solver.kinematic import N_STATES, KinematicFilter, KinematicOptions, quintic, transition
+from triline.solver.rotation import (
+    angles_from_matrix,
+    matrix_from_angles,
+    matrix_from_navigation,
+    quaternion_from_matrix,
+)
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import simulate
 from triline.solver.window_study import measured_errors, navigate, slow_errors_of
@@ -136,6 +141,11 @@ def test_an_outage_is_coasted_and_flagged():
     assert sigma[3990].min() > 20 * sigma[1990].max()  # says that it does not know
     smoothed = {round(p.time_s, 3): p for p in poses if p.smoothed}
     assert not smoothed[15.0].valid and smoothed[25.0].valid
+    _, bridged, j = flight.error(poses, True)
+    inside = (j > 2100) & (j < 3900)
+    sigma = np.sqrt([np.diag(p.covariance)[:3] for p in poses if p.smoothed])
+    assert np.abs(bridged[inside]).max() < 0.2 * np.abs(error[(i > 2100) & (i < 3900)]).max()
+    assert (np.abs(bridged) < 4 * sigma)[inside].all()
     assert len(smoothed) == len(flight.t)
 
 
@@ -197,6 +207,20 @@ def test_an_attitude_gap_is_counted():
     assert e.counters["attitude gap"] == 1
 
 
+def test_after_a_long_silence_it_begins_again():
+    flight, e = Flight(20.0), engine()
+    keep = (flight.t < 5.0) | (flight.t > 12.0)
+    flight.t, flight.rpy, flight.measured = flight.t[keep], flight.rpy[keep], flight.measured[keep].copy()
+    flight.measured[flight.t > 12.0] += [5000.0, -300.0, 0.0]
+    poses = flight.run(e)
+    assert e.counters["gnss refused"] == 0
+    times = np.array([p.time_s for p in poses if p.smoothed])
+    assert (times < 5.0).sum() == 1000 and (times > 12.0).sum() > 1500
+    late = [p for p in poses if p.smoothed and p.time_s > 14.0]
+    want = np.interp([p.time_s for p in late], flight.t, flight.measured[:, 0])
+    assert np.abs(np.array([p.position_l[0] for p in late]) - want).max() < 2.0
+
+
 def test_transition_is_a_semigroup_and_quintic_goes_through_its_ends():
     o = KinematicOptions(wander_sigma_m=np.array([1.0, 2.0, 3.0]), wander_time_s=20.0)
     Fa, Qa = transition(0.3, o)
@@ -210,4 +234,6 @@ def test_transition_is_a_semigroup_and_quintic_goes_through_its_ends():
         assert position[0] == pytest.approx(want[:3]) and velocity[0] == pytest.approx(want[3:6])
     h = 1e-6
     ahead, back = (quintic(np.array([0.2 + d]), np.array([0.4]), x[:1], x[1:])[0][0] for d in (h, -h))
-    assert quintic(np.array([0.2]), np.array([0.4]), x[:1], x[1:])[1][0] == pytest.approx((ahead - back) / (2 * h), rel=1e-6)
+    assert quintic(np.array([0.2]), np.array([0.4]), x[:1], x[1:])[1][0] == pytest.approx(
+        (ahead - back) / (2 * h), rel=1e-6
+    )

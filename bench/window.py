@@ -1,0 +1,193 @@
+"""The sliding window, measured: latency, consistency, efficiency, a long flight.
+
+    python bench/window.py latency [--selfcal]
+    python bench/window.py consistency [--seeds 20] [--rough] [--model wander]
+    python bench/window.py efficiency [--seeds 20] [--rough] [--model wander] [--selfcal]
+    python bench/window.py long [--minutes 20]
+
+Set OPENBLAS_NUM_THREADS=1: the matrices are small, and threads cost more than they give. Times are processor times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+import numpy as np
+
+from triline.solver.selfcalibration import tls
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.window_results import WindowOptions
+from triline.solver.window_study import (
+    adjust_online,
+    direct_points,
+    measured_errors,
+    navigate,
+    orientation_errors,
+    point_errors,
+)
+
+NEVER = 1e6
+COMPONENTS = ("X", "Y", "Z", "omega", "phi", "kappa")
+
+
+def latency(args: argparse.Namespace) -> dict[str, object]:
+    """500 tie rays/s, window 40 s."""
+    simulation = simulate(FlightPlan(strip_s=80.0), 1, observation_plan=ObservationPlan(tie_points_per_s=190.0))
+    parameters = tls(simulation.flight.camera) if args.selfcal else None
+    result = adjust_online(simulation, navigate(simulation), WindowOptions(window_s=40.0), parameters, live=False)
+    rays = np.array([r.rays for r in result.reports[: len(result.update_s)]])
+    full = rays > 0.9 * rays.max()
+    ms = 1e3 * np.array(result.update_s)[full]
+    p50, p90, p99 = np.percentile(ms, [50, 90, 99])
+    unknowns = max(r.unknowns - 3 * r.points for r in result.reports)
+    return {
+        "rays in window": int(rays.max()), "unknowns without points": unknowns, "updates": int(full.sum()),
+        "p50_ms": p50, "p90_ms": p90, "p99_ms": p99, "max_ms": ms.max(),
+    }  # fmt: skip
+
+
+def _plan(rough: bool, strip_s: float) -> FlightPlan:
+    return FlightPlan(strip_s=strip_s, stabilised=not rough, turbulence=2.0 if rough else 1.0)
+
+
+def _consistency(seed: int, rough: bool, model: str) -> dict[str, object]:
+    simulation = simulate(_plan(rough, 60.0), seed)
+    poses = navigate(simulation)
+    result = adjust_online(simulation, poses, WindowOptions(model=model))
+    live, final = orientation_errors(simulation, result.live), orientation_errors(simulation, result.final)
+    points = point_errors(simulation, result.final_points)
+    return {
+        "nees": [live.nees.mean(), final.nees.mean(), points.nees.mean()],
+        "sigma0": result.reports[-1].sigma0_total,
+        "eo": final.rmse, "measured": measured_errors(simulation, poses, True).rmse,
+        "points": points.rmse, "direct": direct_points(simulation, poses).rmse,
+    }  # fmt: skip
+
+
+def _rms(rows: list[dict], key: str) -> np.ndarray:
+    return np.sqrt(np.mean([np.square(r[key]) for r in rows], axis=0))
+
+
+def consistency(args: argparse.Namespace) -> dict[str, object]:
+    """Normalised errors squared of live, final and points (1 expected), and the gain over direct georeferencing."""
+    rows = _over_seeds(partial(_consistency, rough=args.rough, model=args.model), args.seeds)
+    nees = np.array([r["nees"] for r in rows])
+    band = 1.96 * nees.std(axis=0, ddof=1) / np.sqrt(len(rows))
+    return {
+        "seeds": len(rows),
+        **{
+            f"nees {name}": f"{m:.3f} +- {b:.3f}"
+            for name, m, b in zip(("live", "final", "points"), nees.mean(0), band, strict=True)
+        },
+        "sigma0": float(np.mean([r["sigma0"] for r in rows])),
+        "orientation, times better": dict(zip(COMPONENTS, _rms(rows, "measured") / _rms(rows, "eo"), strict=True)),
+        "points, times better": dict(zip("XYZ", _rms(rows, "direct") / _rms(rows, "points"), strict=True)),
+    }
+
+
+def _efficiency(seed: int, rough: bool, model: str, selfcal: bool) -> dict[str, object]:
+    simulation = simulate(_plan(rough, 60.0), seed)
+    poses = navigate(simulation)
+    parameters = tls(simulation.flight.camera) if selfcal else None
+    finals: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+
+    def run(window_s: float, watch=None):
+        options = WindowOptions(
+            model=model, window_s=window_s, settle_s=NEVER if window_s == NEVER else 3.0, snoop=False
+        )
+        return adjust_online(simulation, poses, options, parameters, live=False, update_s=0.5, watch=watch)
+
+    online = run(0.0)
+    due = {float(o.time_s[len(o.time_s) // 2]): None for o in online.final}
+    length = online.window.length_s
+
+    def watch(now: float, window) -> None:
+        # the causal batch: nothing was ever let go, asked at the time at which the on-line answer became final
+        for time in [t for t in due if t not in finals and now - length >= t + 1.0]:
+            answer = window.live(time)
+            if answer is not None:
+                finals[time] = answer.correction[0], answer.covariance[0]
+
+    whole_batch = run(NEVER, watch)
+    errors = orientation_errors(simulation, online.final)
+    by_time = {round(t, 4): e for t, e in zip(errors.time_s.tolist(), errors.error, strict=True)}
+    corrections = {round(t, 4): c for o in online.final for t, c in zip(o.time_s.tolist(), o.correction, strict=True)}
+    causal = [by_time[round(t, 4)] + finals[t][0] - corrections[round(t, 4)] for t in finals if round(t, 4) in by_time]
+    same = [by_time[round(t, 4)] for t in finals if round(t, 4) in by_time]
+    return {
+        "same": np.sqrt(np.mean(np.square(same), axis=0)), "causal": np.sqrt(np.mean(np.square(causal), axis=0)),
+        "final": errors.rmse, "whole": orientation_errors(simulation, online.whole).rmse,
+        "batch": orientation_errors(simulation, whole_batch.final).rmse,
+        "points final": point_errors(simulation, online.final_points).rmse,
+        "points whole": point_errors(simulation, online.whole_points).rmse,
+        "points batch": point_errors(simulation, whole_batch.final_points).rmse,
+    }  # fmt: skip
+
+
+def efficiency(args: argparse.Namespace) -> dict[str, object]:
+    """RMSE over RMSE of the causal batch and of the whole batch; batches are windows that let nothing go."""
+    rows = _over_seeds(partial(_efficiency, rough=args.rough, model=args.model, selfcal=args.selfcal), args.seeds)
+    rms = {key: _rms(rows, key) for key in rows[0]}
+    return {
+        "seeds": len(rows),
+        "final / causal batch": dict(zip(COMPONENTS, rms["same"] / rms["causal"], strict=True)),
+        "after backward pass / whole batch": dict(zip(COMPONENTS, rms["whole"] / rms["batch"], strict=True)),
+        "points after backward pass / whole batch": dict(
+            zip("XYZ", rms["points whole"] / rms["points batch"], strict=True)
+        ),
+        "being on line costs: final / whole batch": dict(zip(COMPONENTS, rms["final"] / rms["batch"], strict=True)),
+        "the same for points": dict(zip("XYZ", rms["points final"] / rms["points batch"], strict=True)),
+    }
+
+
+def long(args: argparse.Namespace) -> dict[str, object]:
+    """Strips without end: memory, latency and consistency over time."""
+    strips = max(2, int(args.minutes * 60 / 140))
+    simulation = simulate(FlightPlan(strips=strips), 1, observation_plan=ObservationPlan(tie_points_per_s=8.0))
+    poses = navigate(simulation)
+    memory: list[float] = []
+
+    def watch(now: float, window) -> None:
+        if int(now) % 60 == 0:
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+    result = adjust_online(simulation, poses, live=False, watch=watch)
+    ms = 1e3 * np.array(result.update_s)
+    nees = [
+        orientation_errors(simulation, [o for o in result.final if o.strip == s.id]).nees.mean()
+        for s in simulation.flight.strips
+    ]
+    half = len(nees) // 2
+    return {
+        "minutes": simulation.flight.covered_s[-1, 1] / 60, "strips": strips,
+        "peak memory MB, first and last minute (results are kept)": [memory[0], memory[-1]],
+        "update ms, first and last quarter": [float(np.mean(ms[: len(ms) // 4])), float(np.mean(ms[-len(ms) // 4 :]))],
+        "nees, first and second half": [float(np.mean(nees[:half])), float(np.mean(nees[half:]))],
+    }  # fmt: skip
+
+
+def _over_seeds(work, seeds: int) -> list[dict]:
+    with ProcessPoolExecutor(2) as pool:
+        return list(pool.map(work, range(1, seeds + 1)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("latency", "consistency", "efficiency", "long"))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
+    parser.add_argument("--model", default="wander")
+    parser.add_argument("--selfcal", action="store_true", help="with TLS-18")
+    parser.add_argument("--minutes", type=float, default=20.0)
+    args = parser.parse_args()
+    figures = {"latency": latency, "consistency": consistency, "efficiency": efficiency, "long": long}[args.what](args)
+    print(json.dumps(figures, indent=2, default=lambda v: round(float(v), 4)))
+
+
+if __name__ == "__main__":
+    main()
