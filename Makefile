@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # tests and studies use processes, not BLAS threads
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint bench study schemas clean
+.PHONY: help demo test lint bench study schemas golden clean
 
 help:
 	@echo "make demo    live on-line triangulation of a simulated flight (headless where there is no display)"
@@ -13,6 +13,7 @@ help:
 	@echo "make bench   speed, side by side with peers"
 	@echo "make study   slow statistical studies"
 	@echo "make schemas compile the protobuf files"
+	@echo "make golden  make the golden recording and its results anew"
 
 # a virtual environment with the package; made again when the dependencies change
 $(VENV)/.run: pyproject.toml
@@ -39,7 +40,8 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright --level error
-	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/contract .
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --target build/contract .
 	cd build/contract && ../../$(BIN)/lint-imports --config ../../pyproject.toml --no-cache
 
 bench: $(VENV)/.bench
@@ -47,6 +49,9 @@ bench: $(VENV)/.bench
 
 study: $(VENV)/.bench
 	$(BIN)/triline study all
+
+golden: $(VENV)/.dev
+	$(BIN)/python recordings/golden.py
 
 schemas: $(VENV)/.dev
 	$(BIN)/python schemas/compile.py
