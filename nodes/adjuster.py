@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..solver.selfcalibration import SELF_CALIBRATIONS
+from ..solver.slow_errors import SlowErrors
 from ..solver.window import Window
 from ..solver.window_output import light
 from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
@@ -18,6 +19,9 @@ from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
+APRIORI = ("trajectory", "project")
+#: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
+NEAR_START_S = 1.0
 
 
 class Adjuster(Node):
@@ -33,6 +37,9 @@ class Adjuster(Node):
     segment_s, window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
     update_s : platform time between updates
     self_calibration : set of additional parameters, or "none"
+    apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
+        that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
+        for a pose with a known attitude.
     """
 
     name = "adjuster"
@@ -59,6 +66,7 @@ class Adjuster(Node):
         snoop: bool = True,
         update_s: float = 0.2,
         self_calibration: str = "none",
+        apriori: str = "trajectory",
     ) -> None:
         super().__init__()
         if not update_s > 0:
@@ -66,6 +74,8 @@ class Adjuster(Node):
         if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
             known = ", ".join(("none", *SELF_CALIBRATIONS))
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
+        if apriori not in APRIORI:
+            raise ValueError(f"apriori: {apriori!r} is not known, wanted one of {', '.join(APRIORI)}")
         self.options = WindowOptions(
             model=model, segment_s=segment_s, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
             settle_s=settle_s, snoop=snoop,
@@ -80,7 +90,11 @@ class Adjuster(Node):
         self._reference_ns = 0
         self._next_update_ns: int | None = None
         self._stamp_ns = 0
-        self._poses = PoseBuffer()
+        self._by_poses = apriori == "trajectory"
+        self._poses = PoseBuffer(known_only=self._by_poses)
+        self._slow = SlowErrors()  # of the newest strip
+        self._held_strips: dict[str, Any] = {}
+        self._held_ties: list[Any] = []
         self._store = OrientationStore()
         self._refusals: list[Refusal] = []
         self._rejected_total = 0
@@ -164,7 +178,10 @@ class Adjuster(Node):
         camera = convert.camera_from(self._camera)
         parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
         self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
+        self._slow = self._window.slow
         self._poses.clear()
+        self._held_strips.clear()
+        self._held_ties.clear()
         for strip in self._strips.values():
             self._begin(strip)
         for point in self._control.values():
@@ -186,9 +203,28 @@ class Adjuster(Node):
     def _begin(self, body: Any) -> None:
         assert self._window is not None
         first_s = self._seconds(body.first_line_time_ns)
-        self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines))
+        self._held_strips.pop(body.id, None)
+        slow = self._window.slow
+        if self._by_poses and body.id not in self._window.strips:
+            covariance = self._poses.covariance_after(first_s - NEAR_START_S)
+            if covariance is not None:
+                slow = slow.widened(covariance)
+            elif not body.ended:
+                self._held_strips[body.id] = body
+                return
+            self._slow = slow
+        self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow)
         if body.ended:
             self._window.end_strip(body.id, int(body.lines))
+
+    def _begin_held(self) -> None:
+        """Strips that waited for a pose begin if there is one, and get the tie points that came meanwhile."""
+        for strip in list(self._held_strips.values()):
+            self._begin(strip)
+        if not self._held_strips:
+            ties, self._held_ties = self._held_ties, []
+            for body in ties:
+                self._tie(body)
 
     def _ground_point(self, body: Any) -> None:
         if not body.point:
@@ -213,6 +249,9 @@ class Adjuster(Node):
         if self._window is None:
             self.problem("before configuration", "observation/tie came before configuration/project and camera")
             return
+        if self._held_strips and any(image.strip in self._held_strips for image in body.images):
+            self._held_ties.append(body)
+            return
         sigma = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX
         for image in body.images:
             look = Look(
@@ -232,6 +271,8 @@ class Adjuster(Node):
             raise ValueError("pose without covariance")
         time_s = self._seconds(sample.time_ns)
         self._poses.add(time_s, sample, smoothed, body.reason)
+        if self._held_strips:
+            self._begin_held()
         # without a filter (an imported trajectory) the smoothed poses lead
         if smoothed and self._poses.filtered_seen:
             return []
@@ -272,7 +313,7 @@ class Adjuster(Node):
 
     def _hand_over_poses(self) -> None:
         assert self._window is not None
-        for poses in self._poses.take(self._window.slow):
+        for poses in self._poses.take(self._slow):
             late = self._window.trajectory.add(*poses)
             if late:
                 self.problem("pose out of order", f"{late} poses came twice or too late")

@@ -19,14 +19,23 @@ Poses = tuple[list[float], Array, Array, Array, bool]
 
 #: Measured poses that were not valid are remembered this long, s; longer than any window.
 REMEMBERED_S = 300.0
+#: A pose whose attitude is more uncertain than this, rad, is none: that of a filter which is still aligning.
+KNOWN_ATTITUDE_RAD = 0.2
 #: Refined orientation is kept this long for queries, s.
 KEPT_S = 600.0
 
 
 class PoseBuffer:
-    """Measured poses since the last hand-over."""
+    """Measured poses since the last hand-over.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    known_only : leave out poses that say that they do not know the attitude
+    """
+
+    def __init__(self, known_only: bool = False) -> None:
+        self._known_only = known_only
+        self._latest: tuple[float, Array] | None = None
         self.filtered_seen = False
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
         self._invalid: dict[bool, deque[tuple[float, str]]] = {False: deque(), True: deque()}
@@ -36,16 +45,26 @@ class PoseBuffer:
         """Forget what waits."""
         for waiting in self._waiting.values():
             waiting.clear()
+        self._latest = None
 
     def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
         self.filtered_seen |= not smoothed
-        self._waiting[smoothed].append((time_s, sample))
+        assert sample.covariance is not None
+        known = float(np.diagonal(sample.covariance)[3:].max()) < KNOWN_ATTITUDE_RAD**2
+        if known or not self._known_only:
+            self._waiting[smoothed].append((time_s, sample))
+        if known and (self._latest is None or time_s >= self._latest[0]):
+            self._latest = time_s, sample.covariance
         self._newest[smoothed] = max(self._newest[smoothed], time_s)
         if not sample.valid:
             invalid = self._invalid[smoothed]
             invalid.append((time_s, reason))
             while invalid[0][0] < time_s - REMEMBERED_S:
                 invalid.popleft()
+
+    def covariance_after(self, time_s: float) -> Array | None:
+        """Covariance (6, 6) of the newest pose with a known attitude, None if there is none after a time."""
+        return self._latest[1] if self._latest is not None and self._latest[0] >= time_s else None
 
     def take(self, slow: SlowErrors) -> Iterator[Poses]:
         """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""

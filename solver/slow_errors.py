@@ -11,6 +11,11 @@ Array = NDArray[np.floating]
 Three = tuple[float, float, float]
 _NONE: Three = (0.0, 0.0, 0.0)
 
+#: A pose variance more than this many times what was said beforehand is clearly larger.
+CLEARLY = 1.5
+#: Of what a pose is more uncertain by, this share of the standard deviation may wander.
+WANDERING_SHARE = 0.5
+
 
 @dataclass(frozen=True)
 class SlowErrors:
@@ -47,6 +52,33 @@ class SlowErrors:
     def position_sigma(self) -> Array:
         """(3,) of X, Y, Z together."""
         return np.sqrt(np.square(self.offset_m) + np.square(self.wander_m))
+
+    def widened(self, covariance: Array) -> SlowErrors:
+        """With what the covariance (6, 6) of a pose at the start of a strip says more; nothing becomes smaller.
+
+        A filter's error at one time is an error for long: its excess is a constant over the strip. It may all be gone
+        when the strip ends, since the filter learns on the way, so the excess is the drift's too (the position's is in
+        offset and wander); the way it goes is not straight, so a part of it wanders.
+        """
+        variance = np.diagonal(np.asarray(covariance, dtype=float))
+        told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
+        excess = np.where(variance > CLEARLY * told, variance - told, 0.0)
+        if not excess.any():
+            return self
+
+        def more(sigma: Three, part: Array, share: float = 1.0) -> Three:
+            a, b, c = np.sqrt(np.square(sigma) + share**2 * part).tolist()
+            return (a, b, c)
+
+        m, rad = excess[:3], excess[3:]
+        return SlowErrors(
+            more(self.offset_m, m),
+            more(self.shift, rad),
+            more(self.drift, rad),
+            more(self.wander_m, m, WANDERING_SHARE),
+            more(self.wander, rad, WANDERING_SHARE),
+            self.wander_time_s,
+        )
 
     def without(self, covariance: Array) -> Array:
         """The white part of pose covariances (..., 6, 6): what is left without slow errors, 1 mm and 1 urad at least.

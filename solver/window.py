@@ -111,8 +111,10 @@ class Window:
         """Length of the window; 0 while it is not known yet."""
         return self._length_s
 
-    def begin_strip(self, id: str, first_line_time_s: float, line_rate_hz: float, lines: int = 0) -> None:
-        """A strip begins.
+    def begin_strip(
+        self, id: str, first_line_time_s: float, line_rate_hz: float, lines: int = 0, slow: SlowErrors | None = None
+    ) -> None:
+        """A strip begins; ``slow`` are its slow errors if they are not those of the window.
 
         Raises
         ------
@@ -122,7 +124,9 @@ class Window:
             raise ValueError(f"strip {id}: line rate {line_rate_hz} Hz, wanted more than 0")
         if id in self.strips:
             return
-        self.strips[id] = WindowStrip(id, first_line_time_s, line_rate_hz, lines, self.slow, self.options, self.state)
+        self.strips[id] = WindowStrip(
+            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state
+        )
 
     def end_strip(self, id: str, lines: int = 0) -> None:
         """A strip is over; ``lines`` as counted."""

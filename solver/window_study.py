@@ -9,7 +9,8 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from .kinematic import KinematicFilter, KinematicOptions
+from .kinematic import KinematicFilter
+from .kinematic_model import KinematicOptions
 from .navigation_pose import NavigationPose
 from .selfcalibration import SelfCalibration
 from .simulation.error_models import ErrorModel

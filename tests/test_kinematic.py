@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from triline.solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from triline.solver.kinematic import N_STATES, KinematicFilter, KinematicOptions, quintic, transition
+from triline.solver.kinematic import KinematicFilter
+from triline.solver.kinematic_model import N_STATES, KinematicOptions, quintic, transition
 from triline.solver.rotation import (
     angles_from_matrix,
     matrix_from_angles,
