@@ -101,6 +101,8 @@ def play(
     head, body = _split(reader, np.array(numbers, dtype=np.int64), from_ns, to_ns)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
+    if not len(body) and (loop or from_ns is not None or to_ns is not None):
+        raise UserError(f"{reader.path}: nothing but configuration in the time asked for")
     stamps = reader.index.stamp_ns[body]
     span_ns = int(stamps.max() - stamps.min()) + LOOP_PAUSE_NS if len(body) else 0
     starts = _Starts(start)

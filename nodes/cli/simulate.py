@@ -6,6 +6,7 @@ import argparse
 import json
 from collections import Counter
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from .. import convert
 from ..errors import UserError
 from ..flight_settings import GRADES, OPTIONS, Option, SimulatedFlight, shown_default, simulated_flight
+from ..formats.new_file import new_file
 from ..recording import COMPRESSIONS, RecordingWriter
 from ..simulator import Simulator
 from .progress import progress
@@ -63,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or _utc_ns(DEFAULT_EPOCH)
     simulator = Simulator(flight.simulation)
     with (
-        RecordingWriter(args.output, args.compression) as writer,
+        new_file(Path(args.output)) as part,
+        RecordingWriter(part, args.compression) as writer,
         progress("writing", quiet=args.quiet or args.json) as tell,
     ):
         for i, message in enumerate(simulator.messages(epoch_ns)):
