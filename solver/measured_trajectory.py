@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .rotation import quaternion_conjugate, quaternion_multiply, vector_from_quaternion
-from .trajectory import Poses, Trajectory, _slopes
+from .trajectory import Poses, Trajectory, slopes
 
 Array = NDArray[np.floating]
 
@@ -52,8 +52,8 @@ class GrowingTrajectory(Trajectory):
         if len(q) >= 2:
             turn = vector_from_quaternion(quaternion_multiply(quaternion_conjugate(q[:-1]), q[1:]))
             step = np.diff(b["time_s"][first : self._size])
-            velocity = _slopes(step, np.diff(b["position_l"][first : self._size], axis=0))
-            rate = _slopes(step, turn)
+            velocity = slopes(step, np.diff(b["position_l"][first : self._size], axis=0))
+            rate = slopes(step, turn)
             b["_turn"][first : self._size - 1] = turn
             keep = first + (1 if first > self._start else 0)
             b["_velocity"][keep : self._size] = velocity[keep - first :]

@@ -78,8 +78,8 @@ class Trajectory:
         self.quaternion = q / np.linalg.norm(q, axis=1, keepdims=True)
         relative = quaternion_multiply(quaternion_conjugate(self.quaternion[:-1]), self.quaternion[1:])
         self._turn = vector_from_quaternion(relative)  # rotation vector from one sample to the next, image frame
-        self._velocity = _slopes(step, np.diff(self.position_l, axis=0))
-        self._rate = _slopes(step, self._turn)
+        self._velocity = slopes(step, np.diff(self.position_l, axis=0))
+        self._rate = slopes(step, self._turn)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -124,7 +124,7 @@ class Trajectory:
         return Poses(t, p0 + position, angles, velocity, angle_rate)
 
 
-def _slopes(step: Array, change: Array) -> Array:
+def slopes(step: Array, change: Array) -> Array:
     """Derivatives (n, k) at the samples from changes (n-1, k) over steps (n-1,): parabola through three neighbours."""
     secant = change / step[:, None]
     slope = np.empty((len(step) + 1, change.shape[1]))

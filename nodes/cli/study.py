@@ -9,6 +9,7 @@ from typing import Any
 #: study -> (module beside this one, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args).
 STUDIES: dict[str, tuple[str, str]] = {
     "testfields": ("study_testfields", "the testfields of the dissertation, simulated: published accuracy beside ours"),
+    "online": ("study_online", "the demo flight with many seeds through the on-line nodes, against truth"),
     "consistency": ("study_consistency", "whether errors of adjusted blocks are as large as their sigmas say"),
 }
 
