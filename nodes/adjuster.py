@@ -208,7 +208,7 @@ class Adjuster(Node):
         if self._by_poses and body.id not in self._window.strips:
             covariance = self._poses.covariance_after(first_s - NEAR_START_S)
             if covariance is not None:
-                slow = slow.widened(covariance)
+                slow = slow.widened(covariance, self._poses.learning)
             elif not body.ended:
                 self._held_strips[body.id] = body
                 return

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections import deque
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,10 +16,16 @@ from . import convert
 Array = NDArray[np.floating]
 Poses = tuple[list[float], Array, Array, Array, bool]
 
-#: Measured poses that were not valid are remembered this long, s; longer than any window.
+#: Whether measured poses were valid is remembered this long, s; longer than any window.
 REMEMBERED_S = 300.0
+#: So many older ones may be kept, until they are forgotten together.
+MOST_OLD = 1024
+#: Times this near are the same, s.
+SAME_TIME_S = 1e-6
 #: A pose whose attitude is more uncertain than this, rad, is none: that of a filter which is still aligning.
 KNOWN_ATTITUDE_RAD = 0.2
+#: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
+LEARNT_SHARE = 0.02
 #: Refined orientation is kept this long for queries, s.
 KEPT_S = 600.0
 
@@ -35,17 +40,16 @@ class PoseBuffer:
 
     def __init__(self, known_only: bool = False) -> None:
         self._known_only = known_only
-        self._latest: tuple[float, Array] | None = None
+        self._latest: dict[bool, tuple[float, Array]] = {}
         self.filtered_seen = False
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
-        self._invalid: dict[bool, deque[tuple[float, str]]] = {False: deque(), True: deque()}
-        self._newest = {False: -np.inf, True: -np.inf}
+        self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
 
     def clear(self) -> None:
         """Forget what waits."""
         for waiting in self._waiting.values():
             waiting.clear()
-        self._latest = None
+        self._latest.clear()
 
     def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
         self.filtered_seen |= not smoothed
@@ -53,18 +57,30 @@ class PoseBuffer:
         known = float(np.diagonal(sample.covariance)[3:].max()) < KNOWN_ATTITUDE_RAD**2
         if known or not self._known_only:
             self._waiting[smoothed].append((time_s, sample))
-        if known and (self._latest is None or time_s >= self._latest[0]):
-            self._latest = time_s, sample.covariance
-        self._newest[smoothed] = max(self._newest[smoothed], time_s)
-        if not sample.valid:
-            invalid = self._invalid[smoothed]
-            invalid.append((time_s, reason))
-            while invalid[0][0] < time_s - REMEMBERED_S:
-                invalid.popleft()
+        if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):
+            self._latest[smoothed] = time_s, sample.covariance
+        times, reasons = self._seen[smoothed]
+        place = bisect_left(times, time_s)
+        times.insert(place, time_s)
+        reasons.insert(place, None if sample.valid else reason)
+        old = bisect_left(times, times[-1] - REMEMBERED_S)
+        if old > MOST_OLD:
+            del times[:old], reasons[:old]
 
     def covariance_after(self, time_s: float) -> Array | None:
         """Covariance (6, 6) of the newest pose with a known attitude, None if there is none after a time."""
-        return self._latest[1] if self._latest is not None and self._latest[0] >= time_s else None
+        if not self._latest:
+            return None
+        newest_s, covariance = max(self._latest.values(), key=lambda latest: latest[0])
+        return covariance if newest_s >= time_s else None
+
+    @property
+    def learning(self) -> bool:
+        """Whether the newest smoothed pose is clearly more certain than the newest filtered one."""
+        if len(self._latest) < 2:
+            return False
+        smoothed, filtered = (np.diagonal(self._latest[key][1]) for key in (True, False))
+        return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
 
     def take(self, slow: SlowErrors) -> Iterator[Poses]:
         """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
@@ -82,10 +98,17 @@ class PoseBuffer:
                 self._waiting[smoothed] = []
 
     def validity(self, time_s: float) -> tuple[bool, str]:
-        """Whether the measured pose at a time is valid, and why not."""
-        smoothed = time_s <= self._newest[True]
-        near = [reason for t, reason in self._invalid[smoothed] if abs(t - time_s) < 0.05]
-        return (False, near[0]) if near else (True, "")
+        """Whether the measured poses between which the one at a time was interpolated are valid, and why not.
+
+        Smoothed poses count where there are any, as in the window; a pose at the time itself stands alone.
+        """
+        smoothed_s = self._seen[True][0]
+        times, reasons = self._seen[bool(smoothed_s) and time_s <= smoothed_s[-1] + SAME_TIME_S]
+        low, high = bisect_left(times, time_s - SAME_TIME_S), bisect_right(times, time_s + SAME_TIME_S)
+        if low == high:
+            low, high = max(low - 1, 0), high + 1
+        reason = next((r for r in reasons[low:high] if r is not None), None)
+        return reason is None, reason or ""
 
 
 class OrientationStore:

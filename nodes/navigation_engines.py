@@ -13,6 +13,9 @@ from ..solver.navigation import NavigationSettings
 from ..solver.navigation_trajectory import CameraMount
 from . import convert
 
+#: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.
+LARGEST_RATE_SIGMA, LARGEST_FORCE_SIGMA = 1.0, 50.0
+
 
 def kinematic_engine(project: Any) -> KinematicFilter:
     """The engine for attitude and GNSS input."""
@@ -28,21 +31,36 @@ def kinematic_engine(project: Any) -> KinematicFilter:
     return KinematicFilter(convert.local_frame(project), options)
 
 
-def inertial_engine(project: Any, first_sample: Any, **options: float) -> InertialNavigator:
-    """The engine for raw inertial data; its noise is what the first sample says.
+def stated_noise(sample: Any) -> tuple[float, float, str]:
+    """White noise that an Imu message states, rad/sqrt(s) and m/s/sqrt(s), 0 = not given; and what is wrong with it."""
+    noise, wrong = [], []
+    for name, limit in (("rate_sigma", LARGEST_RATE_SIGMA), ("force_sigma", LARGEST_FORCE_SIGMA)):
+        value = getattr(sample, name)
+        usable = 0.0 <= value < limit  # false for NaN
+        noise.append(value * (sample.interval_ns * 1e-9) ** 0.5 if usable else 0.0)
+        if not usable:
+            wrong.append(f"{name} is {value:g}")
+    text = f"{' and '.join(wrong)}: the noise of a MEMS unit is assumed instead" if wrong else ""
+    return noise[0], noise[1], text
 
-    A project knows the antenna from the perspective centre, so the inertial sensor is taken to sit there.
+
+def inertial_engine(project: Any, first_sample: Any, **options: float) -> InertialNavigator:
+    """The engine for raw inertial data; its noise is what the first sample says, of a MEMS unit where it says nothing.
+
+    A project knows the antenna from the perspective centre, so the inertial sensor is taken to sit there. Slow errors
+    of GNSS positions, which no inertial data show, do not make a pose invalid.
     """
     slow = convert.slow_errors_of(project)
     east, north, up = slow.wander_m
     forward, right, down = (float(v) for v in convert.lever_arm_of(project))
-    root = (first_sample.interval_ns * 1e-9) ** 0.5
+    gyro_noise, accel_noise, _ = stated_noise(first_sample)
     settings = NavigationSettings(
-        grade=InertialGrade.of_noise(first_sample.rate_sigma * root, first_sample.force_sigma * root),
+        grade=InertialGrade.of_noise(gyro_noise, accel_noise),
         lever_arm_b=(forward, right, down),
         wander_sigma_ned_m=(north, east, up),
         wander_time_s=slow.wander_time_s,
     )
     mount = CameraMount(R_bc=convert.R_bc_of(project))
-    answer = OnlineOptions(offset_sigma_m=slow.offset_m, **options)  # pyright: ignore[reportArgumentType]
+    limit = float(np.hypot(OnlineOptions.valid_position_m, slow.position_sigma.max()))
+    answer = OnlineOptions(**{"offset_sigma_m": slow.offset_m, "valid_position_m": limit, **options})  # pyright: ignore
     return InertialNavigator(convert.local_frame(project), settings, mount, answer)

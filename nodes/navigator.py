@@ -15,8 +15,11 @@ from ..solver.kinematic import KinematicFilter
 from ..solver.navigation_pose import NavigationPose
 from ..solver.rotation import R_ENU_NED
 from . import convert
-from .navigation_engines import inertial_engine, kinematic_engine
+from .navigation_engines import inertial_engine, kinematic_engine, stated_noise
 from .node import Message, Node
+
+#: A measurement cannot be so much later than its message, s: one clock that runs away must not stop the filter.
+AHEAD_S = 1.0
 
 
 class Navigator(Node):
@@ -39,6 +42,7 @@ class Navigator(Node):
         self._seen: Counter[str] = Counter()
         self._stamp_ns = 0
         self._project = b""
+        self._notes: list[Message] = []
         self._frame = LocalFrame(0.0, 0.0, 0.0)
         self._covariance_key: tuple[float, ...] = ()
         self._covariance = np.zeros((3, 3))
@@ -46,6 +50,8 @@ class Navigator(Node):
     def step(self, message: Message) -> Iterable[Message]:
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         try:
+            if message.topic.startswith("sensor/"):
+                self._check_time(message)
             if message.topic == "sensor/imu":
                 poses = self._inertial(message.body)
             elif message.topic == "sensor/attitude":
@@ -85,6 +91,14 @@ class Navigator(Node):
         self._reference_ns = message.stamp_ns
         return ()
 
+    @staticmethod
+    def _check_time(message: Message) -> None:
+        body = message.body
+        time_ns = convert.time_ns(body.timestamp) if message.topic == "sensor/gnss" else body.time_ns
+        ahead = (time_ns - message.stamp_ns) * 1e-9
+        if ahead > AHEAD_S:
+            raise ValueError(f"measured {ahead:.3f} s after the stamp of its message")
+
     def _inertial(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:
             self.problem("before configuration", "sensor/imu came before configuration/project")
@@ -98,6 +112,10 @@ class Navigator(Node):
             raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
         if not isinstance(self._engine, InertialNavigator):
             self._engine, self._seen = inertial_engine(self._configuration, body), Counter()
+            wrong = stated_noise(body)[2]
+            if wrong:
+                self.problem("inertial noise", f"sensor/imu: {wrong}")
+                self._notes.append(self._log(self._stamp_ns, f"sensor/imu: {wrong}", warning=True))
         return self._engine.add_inertial(self._seconds(body.time_ns), body.interval_ns * 1e-9, force, rate)
 
     def _attitude(self, body: Any) -> list[NavigationPose]:
@@ -171,6 +189,8 @@ class Navigator(Node):
             )
             for p in poses
         ]  # fmt: skip
+        out += self._notes
+        self._notes = []
         for kind, n in self._engine.counters.items():
             self.counters[kind] += n - self._seen[kind]
             self._seen[kind] = n

@@ -20,7 +20,7 @@ from .inertial_data import GAP_FACTOR, GnssData, InertialData, concatenate
 from .navigation import Estimate, Innovation, NavigationSettings, Start
 from .navigation_chain import NavigationChain
 from .navigation_pose import NavigationEvent, NavigationPose
-from .navigation_trajectory import CameraMount, NavigationStates, camera_poses
+from .navigation_trajectory import CameraMount, NavigationStates, camera_poses, passed_over
 from .rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
 from .strapdown import State
 
@@ -106,6 +106,7 @@ class InertialNavigator:
         self._next_smooth = -np.inf
         self._restored: list[float] = []
         self._pose_due = False
+        self._ahead: tuple[NavigationStates, Array] | None = None  # what the last smoothing said of later times
         self.status = "aligning"
 
     @property
@@ -380,7 +381,12 @@ class InertialNavigator:
         poses: list[NavigationPose] = []
         if len(rows):
             states = trajectory.at_rows(rows)
-            poses = self._poses(states, trajectory.covariance(states.time_s), smoothed=True)
+            P = trajectory.covariance(states.time_s)
+            if self._ahead is not None:
+                states, P = passed_over(*self._ahead, states, P, self._published_smooth, o.smooth_every_s)
+            later = trajectory.at_rows(np.flatnonzero((ends > until + 1e-9) & (ends <= until + o.smooth_every_s + 0.1)))
+            self._ahead = later, trajectory.covariance(later.time_s)
+            poses = self._poses(states, P, smoothed=True)
             self._published_smooth = float(ends[rows[-1]])
         chain.forget(min(self._published_smooth, end - o.rewind_s) - 2.0 * o.step_s)
         return poses

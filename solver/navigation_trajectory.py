@@ -283,6 +283,44 @@ class NavigationTrajectory:
         return r_e, v_e, R_eb
 
 
+def passed_over(
+    before: NavigationStates, P_before: Array, states: NavigationStates, P: Array, start_s: float, length_s: float
+) -> tuple[NavigationStates, Array]:
+    """From one smoothed trajectory to the next, which knows more, without a step: the share of the next grows smoothly.
+
+    Parameters
+    ----------
+    before, P_before : the trajectory that held up to ``start_s``, at later times, with the covariance (k, 9, 9) of
+        ``dr, dv, psi``
+    states, P : the next, at times (m,); of the times of the passage those that ``before`` has not are left out
+    start_s, length_s : when the passage begins, and how long it takes
+
+    Returns
+    -------
+    states, P : the passage and what follows. A weighted mean is no more uncertain than the weighted mean of the
+        covariances says.
+    """
+    t = states.time_s
+    end = min(start_s + length_s, float(before.time_s[-1])) if len(before.time_s) else start_s
+    inside = t < end
+    row = np.clip(np.searchsorted(before.time_s, t - 1e-7), 0, max(len(before.time_s) - 1, 0))
+    known = np.array([], dtype=bool) if not inside.any() else np.abs(before.time_s[row[inside]] - t[inside]) < 1e-7
+    keep = ~inside
+    keep[inside] = known
+    r, v, R, P = states.r_e[keep], states.v_e[keep], states.R_eb[keep], P[keep]
+    n, old = int(known.sum()), row[inside][known]
+    s = ((t[inside][known] - start_s) / length_s)[:, None]
+    w, slope = s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s) / length_s
+    change = r[:n] - before.r_e[old]
+    r[:n] = before.r_e[old] + w * change
+    v[:n] = before.v_e[old] + w * (v[:n] - before.v_e[old]) + slope * change
+    if n:
+        turn = vector_from_quaternion(quaternion_from_matrix(R[:n] @ np.swapaxes(before.R_eb[old], -1, -2)))
+        R[:n] = matrix_from_quaternion(quaternion_from_vector(w * turn)) @ before.R_eb[old]
+        P[:n] += (1.0 - w[:, :, None]) * (P_before[old] - P[:n])
+    return NavigationStates(t[keep], r, v, R), P
+
+
 def gravitation(r_e: Array) -> Array:
     """Gravitation (m, 3) at Earth-fixed positions (m, 3)."""
     g = earth.geodetic_from_ecef(r_e)

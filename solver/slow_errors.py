@@ -14,7 +14,10 @@ _NONE: Three = (0.0, 0.0, 0.0)
 #: A pose variance more than this many times what was said beforehand is clearly larger.
 CLEARLY = 1.5
 #: Of what a pose is more uncertain by, this share of the standard deviation may wander.
-WANDERING_SHARE = 0.5
+WANDERING_SHARE = 1.0
+#: Correlation time of the errors of a trajectory whose filter still learns, s: about the lag of its smoother, which
+#: says something else with every second of data that it has more.
+LEARNING_TIME_S = 6.0
 
 
 @dataclass(frozen=True)
@@ -53,17 +56,21 @@ class SlowErrors:
         """(3,) of X, Y, Z together."""
         return np.sqrt(np.square(self.offset_m) + np.square(self.wander_m))
 
-    def widened(self, covariance: Array) -> SlowErrors:
-        """With what the covariance (6, 6) of a pose at the start of a strip says more; nothing becomes smaller.
+    def widened(self, covariance: Array, learning: bool = False) -> SlowErrors:
+        """With what the covariance (6, 6) of a pose at the start of a strip says more; no sigma becomes smaller.
 
         A filter's error at one time is an error for long: its excess is a constant over the strip. It may all be gone
         when the strip ends, since the filter learns on the way, so the excess is the drift's too (the position's is in
-        offset and wander); the way it goes is not straight, so a part of it wanders.
+        offset and wander); the way it goes is not straight, so a part of it wanders, and faster than the rest.
+
+        Parameters
+        ----------
+        learning : the filter still learns, whatever its covariance: all wander is as fast as that
         """
         variance = np.diagonal(np.asarray(covariance, dtype=float))
         told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
         excess = np.where(variance > CLEARLY * told, variance - told, 0.0)
-        if not excess.any():
+        if not (excess.any() or learning):
             return self
 
         def more(sigma: Three, part: Array, share: float = 1.0) -> Three:
@@ -77,7 +84,7 @@ class SlowErrors:
             more(self.drift, rad),
             more(self.wander_m, m, WANDERING_SHARE),
             more(self.wander, rad, WANDERING_SHARE),
-            self.wander_time_s,
+            min(self.wander_time_s, LEARNING_TIME_S),
         )
 
     def without(self, covariance: Array) -> Array:

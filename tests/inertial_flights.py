@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+
 from triline.solver import earth
 from triline.solver.inertial_data import MEMS, TACTICAL, GnssData, InertialData, InertialGrade
 from triline.solver.navigation import NavigationSettings
