@@ -33,7 +33,7 @@ from .window_results import (
     WindowReport,
     WindowUpdate,
 )
-from .window_snooping import snoop
+from .window_snooping import admit, snoop
 from .window_state import WindowState
 from .window_strip import WindowStrip, segment_length
 
@@ -152,7 +152,7 @@ class Window:
         for strip in self.strips.values():
             if not (strip.ended and strip.is_gone(self.state)):
                 strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
-        fresh = self._take_arrived()
+        fresh = self._take_arrived(result)
         self._replace_filtered()
         iterations = self._solve(fresh, result)
         for batch in fresh:
@@ -165,7 +165,7 @@ class Window:
     def finish(self) -> WindowUpdate:
         """Everything that is left becomes final."""
         result = WindowUpdate()
-        fresh = self._take_arrived()
+        fresh = self._take_arrived(result)
         iterations = self._solve(fresh, result)
         for strip in self.strips.values():
             strip.end(0)
@@ -174,7 +174,7 @@ class Window:
         result.report = self._report(iterations)
         return result
 
-    def _take_arrived(self) -> list[Batch]:
+    def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
         """Batches of the points that have new looks with a measured orientation; others wait."""
         ready: dict[int, list[str]] = {}
         step = segment_length(self.slow, self.options)
@@ -204,10 +204,15 @@ class Window:
                 continue
             for name in batch.names:
                 self._intake.place(name, batch)
+            fresh.append(batch)
+        if self.options.snoop and fresh:
+            self.state.solve()
+            for batch in fresh:
+                result.refused += admit(batch, self.state, self._points)
+        for batch in fresh:
             self._batches.append(batch)
             self.state.add(batch.columns, batch.information)
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-            fresh.append(batch)
         if not self._length_s and fresh:
             self._length_s = self.options.window_looks * self._look_time(fresh[0])
         return fresh

@@ -193,13 +193,13 @@ class Batch:
         scale = np.where(self.weight > 0, np.sqrt(np.where(self.weight > 0, self.weight, 1.0)), 1.0)
         own = self._rows / scale[:, None, None]
         if (root == 0.0).any():
-            own[root == 0.0] = self._full_rows(np.flatnonzero(root == 0.0))
+            own[root == 0.0] = self.full_rows(np.flatnonzero(root == 0.0))
         rows = own - W @ D[self.rays.point]
         through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
         observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
         return Cofactors(np.diagonal(Q).copy(), points, observed)
 
-    def _full_rows(self, which: IntArray) -> Array:
+    def full_rows(self, which: IntArray) -> Array:
         """Rows (m, 2, u) of rays at full weight."""
         layout, m = self.layout, np.arange(len(which))
         A = np.zeros((len(which), 2, len(self.columns) + 1))

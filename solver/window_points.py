@@ -50,7 +50,6 @@ class PointLooks:
     time_s : (m,)
     weight : (m,) 0 for rejected ones
     returned, reported : looks that were taken back once; looks whose rejection was reported
-    tried_again : whether the point was given a second chance after it was rejected as a whole
     batch : where the point is, None while it waits for a second look
     out : control coordinates that were rejected
     """
@@ -60,7 +59,6 @@ class PointLooks:
     weight: list[float] = field(default_factory=list)
     returned: set[int] = field(default_factory=set)
     reported: set[int] = field(default_factory=set)
-    tried_again: bool = False
     batch: Batch | None = None
     out: set[int] = field(default_factory=set)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .reliability import normalised_residuals
 from .snooping import TOGETHER, joint_limit
 from .window_batch import Batch
+from .window_entry import DECISIVE, entry_weight
 from .window_points import PointLooks
 from .window_results import Refusal
 from .window_state import WindowState
@@ -19,8 +20,10 @@ IntArray = NDArray[np.int64]
 
 #: Rounds of one update; what still fails then comes up again when the batch is due.
 MOST_ROUNDS = 8
-#: By how much the joint value of the worst ray of a point must exceed the next one's (chi-square, 0.1 %).
-DECISIVE = 10.8
+#: Probability that a good point that was left out as a whole is left out once more.
+RETURNING = 0.01
+#: Variance of a predicted ray, in units of its own, up to which a gross error in it would show.
+SHARP = 30.0
 
 
 def snoop(
@@ -30,7 +33,7 @@ def snoop(
 
     A look goes if one of its two w exceeds the critical value and the joint test fails too; of several at one point the
     one with the largest joint value. Looks left out come back once, when their prediction passes both tests; points of
-    which nothing was left are tried once more as a whole when their batch is tested again.
+    which nothing was left are judged again as at the door when their batch is tested again.
 
     Parameters
     ----------
@@ -54,11 +57,11 @@ def snoop(
     pending = batches
     for _ in range(MOST_ROUNDS):
         judged = [(batch, *_judge(batch, state)) for batch in pending]
-        worst = max((float(w[batch.weight > 0].max(initial=0.0)) for batch, w, _, _ in judged), default=0.0)
-        worst = max([worst, *(float(c.max(initial=0.0)) for _, _, _, c in judged)])
+        worst = max((float(w[batch.weight > 0].max(initial=0.0)) for batch, w, *_ in judged), default=0.0)
+        worst = max([worst, *(float(c.max(initial=0.0)) for *_, c in judged)])
         least = max(critical, TOGETHER * worst)
         changed, next_time = False, []
-        for batch, w, joint, control_w in judged:
+        for batch, w, joint, spread, control_w in judged:
             out = np.flatnonzero((batch.weight > 0) & (joint > limit) & (w > least))
             out = _worst_of_point(batch.rays.point[out], joint[out], out)
             out = _with_rivals(batch, out, joint)
@@ -66,7 +69,7 @@ def snoop(
             back = (
                 np.empty(0, dtype=np.int64)
                 if len(out) or fails.any()
-                else _agreeing(batch, points, w, joint, critical, limit)
+                else _agreeing(batch, points, w, joint, spread, critical, limit)
             )
             if (w[(batch.weight > 0) & (joint > limit)] > critical).any() or (control_w > critical).any() or len(back):
                 next_time.append(batch)
@@ -91,32 +94,45 @@ def snoop(
 _joint_limit = cache(joint_limit)
 
 
+def admit(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> list[Refusal]:
+    """Set the weights with which the rays of a batch enter that is not in the state; returns the looks left out."""
+    weight = entry_weight(batch, state)
+    out, back = np.flatnonzero((batch.weight > 0) & (weight == 0)), np.flatnonzero((batch.weight == 0) & (weight > 0))
+    if not len(out) and not len(back):
+        return []
+    batch.weight = weight
+    refused = _note(batch, points, out, back, np.zeros(len(weight)))
+    batch.eliminate()
+    return refused
+
+
 def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> bool:
-    """Give points that were rejected as a whole their weight back for one more test; whether there were any."""
+    """Let points in that were left out as a whole if the orientation as known now agrees with them."""
     lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0
-    lost &= np.array([not points[name].tried_again for name in batch.names])
     if not lost.any():
         return False
-    for i in np.flatnonzero(lost):
-        point = points[batch.names[i]]
-        point.tried_again = True
-        point.weight[:] = [1.0] * len(point.weight)
+    weight = np.where(lost[batch.rays.point], entry_weight(batch, state, RETURNING), batch.weight)
+    back = np.flatnonzero((weight > 0) & (batch.weight == 0))
+    if not len(back):
+        return False
     state.add(batch.columns, batch.information, -1)
-    batch.weight[lost[batch.rays.point]] = 1.0
+    batch.weight = weight
+    _note(batch, points, back[:0], back, weight)
     batch.eliminate()
     state.add(batch.columns, batch.information)
     return True
 
 
-def _judge(batch: Batch, state: WindowState) -> tuple[Array, Array, Array]:
-    """Larger |w| (n,), joint value (n,) of the rays, and |w| (p, 3) of control coordinates."""
+def _judge(batch: Batch, state: WindowState) -> tuple[Array, Array, Array, Array]:
+    """Larger |w| (n,), joint value (n,), largest cofactor (n,) of the rays, and |w| (p, 3) of control coordinates."""
     cofactors, statistics = batch.judge(state)
     weight = batch.control.weight
     v = -batch.control.residual(batch.points_l)
     q = 1.0 - weight * np.einsum("pii->pi", cofactors.points)
     control_w = np.where(weight > 0, np.abs(normalised_residuals(v, q)), 0.0)
     known = batch.normals.rank[batch.rays.point] == 3
-    return np.where(known, statistics.largest_w, 0.0), np.where(known, statistics.joint, 0.0), control_w
+    spread = np.einsum("naa->na", cofactors.observed).max(axis=1)
+    return np.where(known, statistics.largest_w, 0.0), np.where(known, statistics.joint, 0.0), spread, control_w
 
 
 def _worst_of_point(point: IntArray, joint: Array, rays: IntArray) -> IntArray:
@@ -142,14 +158,31 @@ def _with_rivals(batch: Batch, out: IntArray, joint: Array) -> IntArray:
 
 
 def _agreeing(
-    batch: Batch, points: dict[str, PointLooks], w: Array, joint: Array, critical: float, limit: float
+    batch: Batch, points: dict[str, PointLooks], w: Array, joint: Array, spread: Array, critical: float, limit: float
 ) -> IntArray:
-    """Rays left out that agree with the others now, one of a point, each only once."""
+    """Rays left out that agree with the others now, one of a point, each only once.
+
+    The others are those of the point. At known coordinates they may be those of the whole window, where these say
+    sharply enough what the ray should be, and that it is this one of those left out.
+    """
     out = np.flatnonzero((batch.weight == 0) & ((w <= critical) | (joint <= limit)))
-    out = out[batch.normals.rank[batch.rays.point[out]] == 3]
+    company = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points) >= 2
+    known = np.all(batch.control.weight > 0, axis=1)
+    of_point = batch.rays.point[out]
+    alone = known[of_point] & (spread[out] < SHARP) & _alone_in_agreeing(batch, joint)[out]
+    out = out[(batch.normals.rank[of_point] == 3) & (company[of_point] | alone)]
     first_time = [batch.rays.source[r] not in points[batch.names[batch.rays.point[r]]].returned for r in out]
     out = out[np.array(first_time, dtype=bool)]
     return _worst_of_point(batch.rays.point[out], -joint[out], out)
+
+
+def _alone_in_agreeing(batch: Batch, joint: Array) -> NDArray[np.bool_]:
+    """Rays left out (n,) that agree decisively better than any other left out at their point."""
+    value = np.where(batch.weight == 0, joint, np.inf)
+    best = np.minimum.reduceat(value, batch.first_ray[:-1])[batch.rays.point]
+    rest = np.where(value > best, value, np.inf)
+    second = np.minimum.reduceat(rest, batch.first_ray[:-1])[batch.rays.point]
+    return (value == best) & (second > best + DECISIVE)
 
 
 def _note(batch: Batch, points: dict[str, PointLooks], out: IntArray, back: IntArray, w: Array) -> list[Refusal]:
