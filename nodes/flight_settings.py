@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ..solver.camera import LineCamera
 from ..solver.inertial_data import MEMS, TACTICAL
-from ..solver.sensors import preset
+from ..solver.sensors import preset, with_pixels
 from ..solver.simulation.error_models import ErrorModel
 from ..solver.simulation.flight import FlightPlan
+from ..solver.simulation.imagery import ImagingPlan, LineImager, imager_of
 from ..solver.simulation.inertial_sensors import InertialPlan
 from ..solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for, real_motion
 from ..solver.simulation.scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
@@ -32,7 +34,7 @@ class Option:
     name : as in a configuration file; with dashes on the command line
     kind : int, float, str or bool (a flag)
     text : one line of help
-    group : plan, motion, observations, errors, or general
+    group : plan, motion, imagery, observations, errors, or general
     field : attribute of the plan, the error model or the observation plan it sets; empty if it is treated by itself
     count : how many values
     """
@@ -67,6 +69,10 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option("from", float, "first second of it (default 0)", "motion"),
     Option("as_sensors", bool, "give attitude and GNSS, not a degraded trajectory", "motion"),
+    Option("images", bool, "render image lines; then no tie points are simulated unless --ties says so", "imagery"),
+    Option("pixels", int, "of a CCD line, over the same field (line rate and ground sample follow)", "imagery"),
+    Option("image_noise", float, "grey values, 1 sigma", "imagery", "noise"),
+    Option("cars", float, "speed of cars on the roads, m/s, 0 for none", "imagery", "cars_m_s"),
     Option("ties", float, "new tie points a second", "observations", "tie_points_per_s"),
     Option("image_sigma", float, "noise of a line and of a sample, px", "observations", "image_sigma_px"),
     Option("outliers", float, "share of the tie rays that are blunders", "observations", "outlier_share"),
@@ -86,7 +92,12 @@ OPTIONS: tuple[Option, ...] = (
     Option("attitude_rate", float, "attitudes a second", "errors", "attitude_rate_hz"),
 )
 BY_NAME = {option.name: option for option in OPTIONS}
-_DEFAULTS = {"plan": FlightPlan(), "observations": ObservationPlan(), "errors": ErrorModel()}
+_DEFAULTS = {
+    "plan": FlightPlan(),
+    "observations": ObservationPlan(),
+    "errors": ErrorModel(),
+    "imagery": ImagingPlan(),
+}
 
 
 def default(option: Option) -> Any:
@@ -96,11 +107,12 @@ def default(option: Option) -> Any:
 
 @dataclass(frozen=True)
 class SimulatedFlight:
-    """A simulation, when it begins (None: whenever its user wants), and the real motion below it, if any."""
+    """A simulation, when it begins (None: whenever its user wants), its real motion and its imagery, if any."""
 
     simulation: Simulation
     epoch_ns: int | None = None
     motion: RealMotion | None = None
+    imager: LineImager | None = None
 
 
 def simulated_flight(settings: Mapping[str, Any]) -> SimulatedFlight:
@@ -112,7 +124,10 @@ def simulated_flight(settings: Mapping[str, Any]) -> SimulatedFlight:
     """
     values = {name: _checked(name, value) for name, value in settings.items()}
     try:
-        return _real(values) if values.get("motion") else _planned(values)
+        if values.get("images"):
+            values.setdefault("ties", 0.0)
+        flight = _real(values) if values.get("motion") else _planned(values)
+        return replace(flight, imager=_imager(flight.simulation, values)) if values.get("images") else flight
     except ValueError as error:
         raise UserError(str(error)) from None
 
@@ -147,12 +162,24 @@ def _fields(values: Mapping[str, Any], group: str) -> dict[str, Any]:
     return {o.field: values[o.name] for o in OPTIONS if o.group == group and o.field and o.name in values}
 
 
+def _camera(values: Mapping[str, Any], sensor: str) -> LineCamera:
+    camera = preset(values.get("sensor", sensor))
+    return with_pixels(camera, values["pixels"]) if "pixels" in values else camera
+
+
+def _imager(simulation: Simulation, values: Mapping[str, Any]) -> LineImager:
+    """Control and check points are signalised."""
+    points = simulation.points
+    plan = ImagingPlan(**_fields(values, "imagery"))
+    return imager_of(simulation.flight, values.get("seed", 1), points.xyz_l[points.role != "tie"], plan)
+
+
 def _planned(values: Mapping[str, Any]) -> SimulatedFlight:
     plan = _fields(values, "plan")
     for name, field in (("seconds", "strip_s"), ("relief", "relief_m")):
         if name in values:
             plan[field] = values[name]
-    camera = preset(values.get("sensor", DEFAULT_SENSOR))
+    camera = _camera(values, DEFAULT_SENSOR)
     turns, stabilised = not values.get("no_turns", False), not values.get("unstabilised", False)
     inertial = None
     if "imu" in values:
@@ -173,6 +200,8 @@ def _real(values: Mapping[str, Any]) -> SimulatedFlight:
     for name in values:
         if BY_NAME[name].group == "plan" and values[name] is not False:
             raise UserError(f"simulation: {name.replace('_', '-')} belongs to a planned flight, not to a real motion")
+    if "pixels" in values and "sensor" not in values:
+        raise UserError("simulation: pixels of a real motion's camera wants a sensor as well")
     track = read_avirisng(Path(values["motion"]))
     seconds = (track.time_ns - track.time_ns[0]) * 1e-9
     lat, lon, height = track.geodetic.T
@@ -185,7 +214,7 @@ def _real(values: Mapping[str, Any]) -> SimulatedFlight:
         values.get("seed", 1),
         replace(HIGH_ALTITUDE_ERRORS, **_fields(values, "errors")),
         ObservationPlan(**observed),
-        camera=preset(values["sensor"]) if "sensor" in values else None,
+        camera=_camera(values, DEFAULT_SENSOR) if "sensor" in values else None,
         relief_m=values.get("relief", 150.0),
         as_sensors=values.get("as_sensors", False),
     )

@@ -132,11 +132,15 @@ def active_nodes(nodes: Sequence[Node], recorded: Iterable[str]) -> list[Node]:
 def is_remade(topic: str, source: str, made: Container[str], makers: Container[str]) -> bool:
     """Whether a recorded message is left out, because nodes make it anew.
 
+    Observations of somebody else (measured targets beside matched tie points) stay.
+
     ``made`` are the outputs of the nodes that run, ``makers`` their names. Events are left out where one of these told
     them; what live nodes said of their own health is no input of anything.
     """
     if topics.find(topic).family is Family.STATUS:
         return topic.startswith("status/") or source in makers
+    if topics.find(topic).family is Family.OBSERVATION:
+        return topic in made and source in makers
     return topic in made
 
 

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas import messages as m
+from ..schemas.image_lines import LineBlock
 from ..schemas.topics import rank
 from ..solver.rotation import quaternion_from_matrix
+from ..solver.simulation.imagery import LineImager
 from ..solver.simulation.inertial_sensors import InertialMeasurements
 from ..solver.simulation.scenario import Simulation
 from ..solver.trajectory import Trajectory
@@ -50,6 +52,7 @@ class Simulator(Node):
     Parameters
     ----------
     simulation : what happened
+    imager : renders the image lines; None for a flight without
     """
 
     name = "simulator"
@@ -62,22 +65,23 @@ class Simulator(Node):
         "sensor/attitude",
         "sensor/gnss",
         "trajectory/smoothed",
+        "sensor/lines/*",
         "observation/control",
         "observation/tie",
         "truth/trajectory",
         "truth/point",
     )
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, imager: LineImager | None = None) -> None:
         super().__init__()
         self.simulation = simulation
-        # image lines (`sensor/lines/<ccd>`) and other sensors join the flight as further streams here
         self._streams = [
             *self._configuration(),
             *self._trajectory_sensors(),
             *self._ground(),
             self._ties(),
             self._true_trajectory(),
+            *([] if imager is None else self._lines(imager)),
         ]
         order = sorted(
             (int(after), rank(stream.topic), s, i)
@@ -255,6 +259,32 @@ class Simulator(Node):
 
         return _Stream("observation/tie", _ns_array(last + sim.observation_plan.matching_delay_s), tie)
 
+    def _lines(self, imager: LineImager) -> list[_Stream]:
+        """Blocks of image lines, each when its last line has been read; rendered when they are asked for."""
+        flight = self.simulation.flight
+        blocks = []
+        for number, strip in enumerate(flight.strips):
+            size = max(round(imager.plan.block_s * strip.line_rate_hz), 1)
+            blocks += [(number, first, min(size, strip.lines - first)) for first in range(0, strip.lines, size)]
+        after = [float(flight.strips[number].time_of(first + count - 1)) for number, first, count in blocks]
+
+        def stream(ccd: int, name: str) -> _Stream:
+            def block(i: int, epoch_ns: int) -> object:
+                number, first, count = blocks[i]
+                strip = flight.strips[number]
+                return LineBlock(
+                    imager.render(number, ccd, first, count),
+                    name,
+                    strip.id,
+                    first,
+                    epoch_ns + _ns(float(strip.time_of(first))),
+                    round(convert.SECOND_NS / strip.line_rate_hz),
+                )
+
+            return _Stream(f"sensor/lines/{name}", _ns_array(after), block)
+
+        return [stream(i, line.id) for i, line in enumerate(flight.camera.lines)]
+
     def _true_trajectory(self) -> _Stream:
         flight = self.simulation.flight
         return self._poses("truth/trajectory", flight.truth, flight.sample_times(TRUTH_RATE_HZ), None)
@@ -307,7 +337,8 @@ def run(options: ProgramOptions) -> int:
         rate = float(settings.pop("rate", 1.0))
     except (TypeError, ValueError):
         raise UserError(f"simulation: rate is {options.table['rate']!r}, wanted a number") from None
-    simulator = Simulator(simulated_flight(settings).simulation)
+    flight = simulated_flight(settings)
+    simulator = Simulator(flight.simulation, flight.imager)
     options.report(f"{len(simulator)} messages over {simulator.duration_s:.0f} s")
     with options.open_bus() as bus:
         bus.announce(simulator.name)

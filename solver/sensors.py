@@ -83,6 +83,7 @@ def _prism() -> LineCamera:
 #: ADS40 of Pavia: the seed gives 28.4 (F/N), 42.6 (F/B) and again 28.4 (N/B), but 42.6 - 28.4 leaves 14.2 for the last.
 _ONE_LENS: dict[str, tuple[float, int, float, dict[str, float]]] = {
     "ads40": (62.7, 12000, 0.0065, {"F": 26.0, "N": 0.0, "B": -16.0}),
+    "ads40-small": (62.7, 1200, 0.065, {"F": 26.0, "N": 0.0, "B": -16.0}),
     "ads40-pavia": (62.77, 12000, 0.0065, {"F": 28.4, "N": 0.0, "B": -14.2}),
     "si-100": (60.0, 10200, 0.007, {"F": 21.0, "N": 0.0, "B": -21.0}),
     "si-290": (93.0, 14400, 0.005, {"F": 15.0, "N": 0.0, "B": -23.0}),
@@ -111,6 +112,24 @@ def preset(name: str) -> LineCamera:
     if name in _MANY_LENSES:
         return _MANY_LENSES[name][0]
     raise ValueError(f"unknown camera preset {name!r}; known: {', '.join(PRESETS)}")
+
+
+def with_pixels(camera: LineCamera, pixels: int) -> LineCamera:
+    """The same camera with lines of so many pixels over the same field.
+
+    Raises
+    ------
+    ValueError : fewer than 16 pixels, or a camera whose lines are made of chips
+    """
+    if pixels < 16:
+        raise ValueError(f"lines of {pixels} pixels, wanted at least 16")
+    lines = []
+    for line in camera.lines:
+        if line.chips:
+            raise ValueError(f"CCD line {line.id!r} is made of chips: its pixels cannot be put together")
+        centre = (np.arange(pixels) + 0.5) * line.pixels / pixels - 0.5
+        lines.append(replace(line, xy_mm=line.image_coordinates(centre)[0]))
+    return replace(camera, name=f"{camera.name}-{pixels}", lines=tuple(lines))
 
 
 def lens_views_deg(name: str) -> dict[str, float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from triline.nodes import convert
 from triline.nodes.bus import Bus
 from triline.nodes.cli import main

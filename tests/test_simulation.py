@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from triline.solver.collinearity import project
 from triline.solver.frames import R_lc_from_navigation
 from triline.solver.inertial_data import TACTICAL

@@ -6,6 +6,7 @@ wander as value and slope at knots with its exact transition as prior - and shar
 
 import numpy as np
 import pytest
+
 from triline.solver.collinearity import image_motion, project
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate

@@ -20,13 +20,15 @@ from ..simulator import Simulator
 from .progress import progress
 
 EXAMPLE = """triline simulate -o flight.mcap --sensor ads40 --strips 6 --cross 2 --seconds 60 --seed 1
-  triline simulate -o flight.mcap --motion ang20170323t202244_eph_att --from 800 --seconds 300"""
+  triline simulate -o flight.mcap --motion ang20170323t202244_eph_att --from 800 --seconds 300
+  triline simulate -o flight.mcap --sensor ads40-small --images --seconds 60"""
 
 DEFAULT_EPOCH = "2026-05-01T10:00:00Z"
 _GROUPS = {
     "general": "flight",
     "plan": "planned flight",
     "motion": "real motion",
+    "imagery": "image lines",
     "observations": "observations",
     "errors": "errors of the trajectory, 1 sigma",
 }
@@ -63,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     given = {option.name: getattr(args, option.name) for option in OPTIONS}
     flight = simulated_flight({name: _single(value) for name, value in given.items() if value is not None})
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or _utc_ns(DEFAULT_EPOCH)
-    simulator = Simulator(flight.simulation)
+    simulator = Simulator(flight.simulation, flight.imager)
     with (
         new_file(Path(args.output)) as part,
         RecordingWriter(part, args.compression) as writer,

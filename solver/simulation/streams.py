@@ -17,6 +17,9 @@ STREAMS = (
     "image noise",
     "outliers",
     "imu",
+    "texture",
+    "illumination",
+    "sensor noise",
 )
 
 

@@ -37,8 +37,10 @@ class Terrain:
             z = z + amplitude * np.sin(k[0] * x + k[1] * y + phase)
         return z
 
-    def intersect(self, position_l: ArrayLike, direction_l: ArrayLike) -> Array:
+    def intersect(self, position_l: ArrayLike, direction_l: ArrayLike, tolerance_m: float = 1e-9) -> Array:
         """Ground points (n, 3) of rays from positions (n, 3) downward along directions (n, 3).
+
+        Heights are found to ``tolerance_m``.
 
         Raises
         ------
@@ -52,9 +54,9 @@ class Terrain:
             xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
             step = self.height(xy[:, 0], xy[:, 1]) - z
             z = z + step
-            if np.abs(step).max(initial=0.0) < 1e-9:
+            if np.abs(step).max(initial=0.0) < tolerance_m:
                 break
-        lost = ~(np.abs(step) < 1e-9)
+        lost = ~(np.abs(step) < tolerance_m)
         if lost.any() or not (d[:, 2] < 0).all():
             raise ValueError(f"{int((lost | (d[:, 2] >= 0)).sum())} rays do not come down to the ground")
         xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]

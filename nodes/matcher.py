@@ -1,0 +1,169 @@
+"""The matcher: image lines and the orientation of now in, tie points out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ..schemas import messages as m
+from ..schemas.image_lines import LineBlock
+from ..solver.matching.tie_matcher import MatchedTie, MatchingOptions, TieMatcher
+from . import convert
+from .node import Message, Node
+
+DEFAULTS = MatchingOptions()
+
+
+class Matcher(Node):
+    """Runs a `TieMatcher`.
+
+    A tie point carries the stamp of the message that completed it: the block of lines with its last look, or the pose
+    that told where that look was taken from.
+
+    Parameters
+    ----------
+    points_per_s, largest_sigma_px, least_score, least_reach_px, largest_reach_px, relief_sigma_m, least_rays,
+    budget_mb, full_scale : as in `MatchingOptions`
+    """
+
+    name = "matcher"
+    inputs = (
+        "configuration/project",
+        "configuration/camera",
+        "configuration/strip",
+        "sensor/lines/*",
+        "trajectory/filtered",
+        "trajectory/smoothed",
+        "orientation/live",
+    )
+    outputs = ("observation/tie", "event/log")
+
+    def __init__(
+        self,
+        *,
+        points_per_s: float = DEFAULTS.points_per_s,
+        largest_sigma_px: float = DEFAULTS.largest_sigma_px,
+        least_score: float = DEFAULTS.least_score,
+        least_reach_px: float = DEFAULTS.least_reach_px,
+        largest_reach_px: float = DEFAULTS.largest_reach_px,
+        relief_sigma_m: float = DEFAULTS.relief_sigma_m,
+        least_rays: int = DEFAULTS.least_rays,
+        budget_mb: float = DEFAULTS.budget_mb,
+        full_scale: int = DEFAULTS.full_scale,
+    ) -> None:
+        super().__init__()
+        self.options = MatchingOptions(
+            points_per_s=points_per_s, largest_sigma_px=largest_sigma_px, least_score=least_score,
+            least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
+            least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
+        )  # fmt: skip
+        self._matcher: TieMatcher | None = None
+        self._camera: Any = None
+        self._strips: dict[str, Any] = {}
+        self._reference_ns = 0
+        self._stamp_ns = 0
+        self._filtered_seen = False
+
+    def step(self, message: Message) -> Iterable[Message]:
+        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        try:
+            return self._take(message)
+        except ValueError as error:
+            self.problem("malformed", f"{message.topic}: {error}")
+            return ()
+
+    def state(self) -> str:
+        return "running" if self._matcher is not None else "waiting for configuration/camera"
+
+    def _take(self, message: Message) -> list[Message]:
+        topic, body = message.topic, message.body
+        if topic == "configuration/camera":
+            return self._configure(body, message.stamp_ns)
+        if topic == "configuration/strip":
+            if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
+                raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+            self._strips[body.id] = body
+        elif topic.startswith("sensor/lines/"):
+            return self._lines(topic.rpartition("/")[2], body)
+        elif topic.startswith("trajectory/"):
+            self._pose(body, topic == "trajectory/smoothed")
+        elif topic == "orientation/live":
+            self._correction(body)
+        return []
+
+    def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
+        if body == self._camera:
+            return []
+        again = self._matcher is not None
+        camera = convert.camera_from(body)
+        self._camera, self._matcher = body, None
+        self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
+        self._matcher = TieMatcher(camera, self.options)
+        return [self._log("configuration changed: matching starts again", warning=True)] if again else []
+
+    def _pose(self, body: Any, smoothed: bool) -> None:
+        self._filtered_seen |= not smoothed
+        # without a filter (an imported trajectory) the smoothed poses lead
+        if self._matcher is None or (smoothed and self._filtered_seen):
+            return
+        sample = convert.pose_sample(body)
+        if sample.covariance is None:
+            raise ValueError("pose without covariance")
+        time_s = (sample.time_ns - self._reference_ns) * 1e-9
+        if not self._matcher.orientation.add_pose(time_s, sample.position_l, sample.quaternion, sample.covariance):
+            self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
+
+    def _correction(self, body: Any) -> None:
+        if self._matcher is None or body.strip != self._matcher.strip:
+            return
+        sample = convert.pose_sample(body)
+        if sample.correction is None or sample.covariance is None:
+            return
+        if sample.correction.shape != (6,) or not np.isfinite(sample.correction).all():
+            raise ValueError(f"correction {sample.correction.tolist()}, wanted 6 finite values")
+        time_s = (sample.time_ns - self._reference_ns) * 1e-9
+        self._matcher.orientation.add_correction(time_s, sample.correction, sample.covariance)
+
+    def _lines(self, ccd: str, block: LineBlock) -> list[Message]:
+        matcher = self._matcher
+        if matcher is None:
+            self.problem("before configuration", f"lines of {ccd} came before configuration/camera")
+            return []
+        if block.ccd and block.ccd != ccd:
+            raise ValueError(f"a block of CCD line {block.ccd!r}")
+        strip = self._strips.get(block.strip)
+        if strip is None:
+            self.problem("unknown strip", f"lines of {ccd} name strip {block.strip!r}")
+            return []
+        if matcher.strip != strip.id:
+            matcher.begin_strip(strip.id, (strip.first_line_time_ns - self._reference_ns) * 1e-9, strip.line_rate_hz)
+        matcher.add_lines(ccd, int(block.first_line), block.pixels)
+        ties = matcher.match()
+        out = [self._tie(strip, tie) for tie in ties]
+        out += [self._log(f"{strip.id}: {text}", warning=True) for text in matcher.take_events()]
+        self.counters.update(matcher.counters)
+        matcher.counters.clear()
+        return out
+
+    def _tie(self, strip: Any, tie: MatchedTie) -> Message:
+        period_ns = convert.SECOND_NS / strip.line_rate_hz
+        images = [
+            {
+                "strip": strip.id,
+                "ccd": ray.ccd,
+                "line": ray.line,
+                "sample": ray.sample,
+                "sigma_line": ray.sigma_line,
+                "sigma_sample": ray.sigma_sample,
+                "time_ns": strip.first_line_time_ns + round(ray.line * period_ns),
+            }
+            for ray in tie.rays
+        ]
+        return Message("observation/tie", self._stamp_ns, convert.tie_message(f"{strip.id}-M{tie.number}", images))
+
+    def _log(self, text: str, warning: bool = False) -> Message:
+        body = m.Log(name=self.name, message=text, level=3 if warning else 2)
+        convert.set_time(body.timestamp, self._stamp_ns)
+        return Message("event/log", self._stamp_ns, body)

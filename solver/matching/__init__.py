@@ -1,0 +1,1 @@
+"""Tie points out of image lines: interest points, search, least squares matching, consistency of all views."""

@@ -1,0 +1,156 @@
+"""Do the views of a point agree with each other, and with their neighbours?
+
+Whatever the orientation has wrong shifts one view against another by an amount that varies slowly in time and across
+the image. A wrong match does not follow it. The same slow amount improves the prediction of the next matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+#: A match that is off by so many robust standard deviations is wrong; and by how many pixels at least, before it is.
+LIMIT_SIGMA, LEAST_LIMIT_PX = 3.5, 0.5
+#: Matches are judged together with those of so many seconds before, and not before there are so many.
+MEMORY_S, FEWEST = 4.0, 10
+#: Robust standard deviations are never smaller than this, px.
+LEAST_SCALE_PX = 0.05
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """What is left of the shifts of k points once each has got its height.
+
+    Attributes
+    ----------
+    time_s : (k,) when the master view saw it
+    across : (k,) place across the image, -1 to 1
+    residual : (k, views, 2) along and across, px; NaN where a view has no match
+    """
+
+    time_s: Array
+    across: Array
+    residual: Array
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def select(self, chosen: Any) -> Disagreement:
+        """Some of the points."""
+        return Disagreement(self.time_s[chosen], self.across[chosen], self.residual[chosen])
+
+
+def height_of(shift: Array, parallax: Array, weight: Array) -> tuple[Array, Array]:
+    """Height above the guess (k,) and what is left of the shifts (k, views, 2).
+
+    Parameters
+    ----------
+    shift : (k, views, 2) of each view against the master on the plane of the guessed height; NaN where not matched
+    parallax : (k, views, 2) the shift that a metre of height makes
+    weight : (k, views)
+    """
+    known = np.isfinite(shift).min(axis=2)
+    w = np.where(known, weight, 0.0)
+    d = np.where(known[:, :, None], shift, 0.0)
+    top = np.einsum("kv,kvi,kvi->k", w, parallax, d)
+    bottom = np.einsum("kv,kvi,kvi->k", w, parallax, parallax)
+    height = top / np.maximum(bottom, 1e-12)
+    return height, shift - parallax * height[:, None, None]
+
+
+@dataclass
+class SlowDisagreement:
+    """The slow part of the disagreement of the last seconds: constant, across the image, and in time.
+
+    Attributes
+    ----------
+    views : number of views besides the master
+    """
+
+    views: int
+    _past: list[Disagreement] = field(default_factory=list)
+    _fit: Array | None = None
+    _scale: Array | None = None
+    _middle_s: float = 0.0
+
+    def forget(self) -> None:
+        """A new strip begins."""
+        self._past, self._fit, self._scale = [], None, None
+
+    @property
+    def known(self) -> bool:
+        return self._fit is not None
+
+    def expected(self, time_s: Array, across: Array) -> Array:
+        """(k, views, 2) shifts to be expected, px; zero as long as nothing is known."""
+        if self._fit is None:
+            return np.zeros((len(time_s), self.views, 2))
+        # a trend is not carried on beyond what it was found from
+        t = np.clip(np.asarray(time_s) - self._middle_s, -MEMORY_S / 2, MEMORY_S / 2)
+        return np.einsum("kp,pvi->kvi", _design(t, np.asarray(across)), self._fit)
+
+    @property
+    def scale_px(self) -> Array:
+        """(views, 2) robust standard deviation about the slow part; infinite as long as nothing is known."""
+        return np.full((self.views, 2), np.inf) if self._scale is None else self._scale
+
+    def judge(self, new: Disagreement) -> NDArray[np.bool_] | None:
+        """Which views (k, views) of new points agree with the rest; None as long as there are too few to tell."""
+        together = _joined([*self._past, new])
+        if len(together) < FEWEST:
+            return None
+        middle = float(np.median(together.time_s))
+        design = _design(together.time_s - middle, together.across)
+        fit, scale = np.zeros((3, self.views, 2)), np.full((self.views, 2), np.inf)
+        for v in range(self.views):
+            for i in range(2):
+                fit[:, v, i], scale[v, i] = _robust_fit(design, together.residual[:, v, i])
+        left = new.residual - np.einsum("kp,pvi->kvi", _design(new.time_s - middle, new.across), fit)
+        limit = np.maximum(LIMIT_SIGMA * scale, LEAST_LIMIT_PX)
+        good = (np.abs(left) <= limit).all(axis=2)
+        self._fit, self._scale, self._middle_s = fit, scale, middle
+        return good
+
+    def remember(self, accepted: Disagreement) -> None:
+        """Keep points for those to come."""
+        if not len(accepted):
+            return
+        newest = max(float(accepted.time_s.max()), *(float(d.time_s.max()) for d in self._past), -np.inf)
+        kept = _joined([*self._past, accepted])
+        self._past = [kept.select(np.flatnonzero(np.greater(kept.time_s, newest - MEMORY_S)))]
+
+
+def _joined(parts: Sequence[Disagreement]) -> Disagreement:
+    return Disagreement(
+        np.concatenate([d.time_s for d in parts]),
+        np.concatenate([d.across for d in parts]),
+        np.concatenate([d.residual for d in parts]),
+    )
+
+
+def _design(t: Array, across: Array) -> Array:
+    return np.stack([np.ones_like(t), across, t], axis=1)
+
+
+def _robust_fit(design: Array, values: Array) -> tuple[Array, float]:
+    """Coefficients and robust standard deviation; zero and infinite with too few values."""
+    known = np.isfinite(values)
+    if known.sum() < FEWEST // 2:
+        return np.zeros(design.shape[1]), np.inf
+    A, b = design[known], values[known]
+    # a little regularisation: slopes stay small where the points do not decide them
+    damping = np.diag([0.0, 0.05, 0.05]) * len(b)
+    fit = np.array([np.median(b), 0.0, 0.0])
+    scale = LEAST_SCALE_PX
+    for _ in range(8):
+        left = b - A @ fit
+        scale = max(1.4826 * float(np.median(np.abs(left))), LEAST_SCALE_PX)
+        w = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2
+        fit = np.linalg.solve(A.T @ (A * w[:, None]) + damping + 1e-9 * np.eye(3), A.T @ (w * b))
+    return fit, scale

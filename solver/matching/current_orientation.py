@@ -1,0 +1,78 @@
+"""The best orientation known now, at any line time: measured poses at their high rate, plus slow corrections."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..measured_trajectory import GrowingTrajectory
+from ..rotation import matrix_from_angles
+
+Array = NDArray[np.floating]
+
+#: Corrections are averaged over so long: a live orientation moves a little at each update, and patches must not bend.
+KNOT_S = 1.0
+#: Poses and corrections older than this are forgotten, s.
+KEPT_S = 120.0
+
+
+class CurrentOrientation:
+    """Measured poses and the corrections that an adjustment has found so far."""
+
+    def __init__(self) -> None:
+        self._poses = GrowingTrajectory()
+        self._knots: dict[int, list[Array | int]] = {}
+        self._covariance: dict[int, Array] = {}
+
+    @property
+    def end_s(self) -> float:
+        """Times before this one will not change with the next pose; minus infinity with fewer than four poses."""
+        return float(self._poses.time_s[-2]) if len(self._poses) >= 4 else -np.inf
+
+    @property
+    def start_s(self) -> float:
+        return self._poses.start_s if len(self._poses) >= 2 else np.inf
+
+    def add_pose(self, time_s: float, position_l: Array, quaternion: Array, covariance: Array) -> bool:
+        """Add a measured pose; False for one that does not come after the last."""
+        if len(self._poses) and time_s <= self._poses.end_s:
+            return False
+        self._poses.append(np.array([time_s]), position_l[None], quaternion[None], covariance[None])
+        if len(self._poses) > 4096 and self._poses.start_s < time_s - 2 * KEPT_S:
+            self._poses.forget(time_s - KEPT_S)
+        return True
+
+    def add_correction(self, time_s: float, correction: Array, covariance: Array) -> None:
+        """Add what an adjustment adds to the measured pose at a time (6,), and the covariance (6, 6) of the sum."""
+        knot = int(time_s // KNOT_S)
+        total, n = self._knots.get(knot, (np.zeros(6), 0))
+        self._knots[knot] = [total + correction, n + 1]
+        self._covariance[knot] = covariance
+        for old in [k for k in self._knots if k < knot - KEPT_S / KNOT_S]:
+            del self._knots[old], self._covariance[old]
+
+    def forget_corrections(self) -> None:
+        """A new strip begins: corrections of the last one say little about it."""
+        self._knots.clear()
+        self._covariance.clear()
+
+    def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Perspective centres (n, 3) and rotations ``R_lc`` (n, 3, 3) at times (n,) inside the poses."""
+        t = np.asarray(time_s, dtype=float)
+        poses = self._poses.at(t)
+        position, angles = poses.position_l, poses.angles
+        if self._knots:
+            numbers = sorted(self._knots)
+            middle = (np.array(numbers) + 0.5) * KNOT_S
+            values = np.array([self._knots[k][0] / self._knots[k][1] for k in numbers])
+            correction = np.stack([np.interp(t, middle, column) for column in values.T], axis=1)
+            position, angles = position + correction[:, :3], angles + correction[:, 3:]
+        return position, matrix_from_angles(*angles.T)
+
+    def covariance(self, time_s: float) -> Array:
+        """(6, 6) of the pose at a time; that of the nearest pose or corrected pose."""
+        if self._knots:
+            nearest = min(self._covariance, key=lambda k: abs((k + 0.5) * KNOT_S - time_s))
+            return self._covariance[nearest]
+        i = int(np.clip(np.searchsorted(self._poses.time_s, time_s), 0, len(self._poses) - 1))
+        return self._poses.covariance[i]

@@ -1,0 +1,53 @@
+"""How high the ground is, from the points found so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+#: Heights that are kept, and how many neighbours a guess takes.
+KEPT, NEIGHBOURS = 600, 6
+#: The ground rises so much over a distance, 1 sigma.
+SLOPE = 0.06
+
+
+@dataclass
+class HeightGuess:
+    """A guess from neighbours, or the prior where there are none.
+
+    Attributes
+    ----------
+    prior_m, prior_sigma_m : of heights of which nothing is known
+    """
+
+    prior_m: float
+    prior_sigma_m: float
+    _points: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    def forget(self) -> None:
+        """A new strip begins."""
+        self._points = np.empty((0, 3))
+
+    def add(self, xyz_l: Array) -> None:
+        """Points (n, 3) that were found."""
+        self._points = np.concatenate([self._points, xyz_l])[-KEPT:]
+
+    def at(self, xy: Array) -> tuple[Array, Array]:
+        """Heights (n,) and their sigma (n,) at places (n, 2)."""
+        if len(self._points) < 3:
+            return np.full(len(xy), self.prior_m), np.full(len(xy), self.prior_sigma_m)
+        distance = np.hypot(*(xy[:, None, :] - self._points[None, :, :2]).transpose(2, 0, 1))
+        n = min(NEIGHBOURS, len(self._points))
+        near = np.argpartition(distance, n - 1, axis=1)[:, :n]
+        d = np.take_along_axis(distance, near, axis=1)
+        z = self._points[near, 2]
+        w = 1.0 / (d + 1e-3 * d.max() + 1e-6) ** 2
+        w /= w.sum(axis=1, keepdims=True)
+        height = np.sum(w * z, axis=1)
+        spread = np.sum(w * (z - height[:, None]) ** 2, axis=1)
+        sigma = np.sqrt(spread + (SLOPE * d.min(axis=1)) ** 2)
+        return height, np.minimum(sigma, self.prior_sigma_m)

@@ -1,0 +1,39 @@
+"""Image lines that are not fit for matching, and why."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: A line is dark if nine tenths of it lie below this share of full scale, saturated if a third lies above.
+DARK, SATURATED = 0.02, 0.995
+GOOD, IS_DARK, IS_SATURATED, IS_FROZEN = 0, 1, 2, 3
+REASONS = ("good", "dark", "saturated", "frozen")
+#: So many samples of a line are looked at.
+SAMPLES = 512
+
+
+def judge_lines(
+    pixels: NDArray[np.unsignedinteger], before: NDArray[np.unsignedinteger] | None, full_scale: int
+) -> NDArray[np.int8]:
+    """Place in `REASONS` of each line (n,).
+
+    A line that repeats the one before it grey value by grey value comes from a frozen CCD: noise never repeats.
+
+    Parameters
+    ----------
+    pixels : (n, samples)
+    before : (samples,) the line before the first one, if there is one
+    full_scale : largest grey value
+    """
+    step = max(pixels.shape[1] // SAMPLES, 1)
+    some = pixels[:, ::step]
+    previous = some[:1] if before is None else before[None, ::step]
+    same = (some == np.concatenate([previous, some[:-1]])).all(axis=1)
+    if before is None and len(same):
+        same[0] = False
+    out = np.full(len(some), GOOD, dtype=np.int8)
+    out[same] = IS_FROZEN
+    out[(some >= SATURATED * full_scale).mean(axis=1) > 1 / 3] = IS_SATURATED
+    out[(some < DARK * full_scale).mean(axis=1) > 0.9] = IS_DARK
+    return out

@@ -1,0 +1,267 @@
+"""Image lines of a simulated flight, and the tie points that matching makes of them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from triline.nodes.cli import main
+from triline.nodes.flight_settings import simulated_flight
+from triline.nodes.recording import RecordingReader
+from triline.solver.line_store import LineRing, LineStore
+from triline.solver.matching.least_squares import match_patches
+from triline.solver.matching.line_quality import IS_DARK, IS_FROZEN, IS_SATURATED, judge_lines
+from triline.solver.matching.line_scan import LineScan, view_of
+from triline.solver.matching.tie_matcher import MatchingOptions, TieMatcher
+from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
+from triline.solver.simulation.imagery import ImagingPlan, LineImager
+from triline.solver.simulation.observations import find_looks
+
+PIXELS, SECONDS, BLOCK = 800, 50.0, 4
+
+
+@pytest.fixture(scope="module")
+def flown():
+    settings = {
+        "sensor": "ads40-small",
+        "pixels": PIXELS,
+        "images": True,
+        "seconds": SECONDS,
+        "lead_in": 2.0,
+        "seed": 3,
+    }
+    return simulated_flight(settings)
+
+
+@pytest.fixture(scope="module")
+def images(flown):
+    lines = flown.simulation.flight.strips[0].lines
+    return [flown.imager.render(0, ccd, 0, lines) for ccd in range(3)]
+
+
+def matched(flight, images, seed=1, wrong_px=0.0, options=None):
+    """Ties and matcher for images of the first strip, with slow attitude errors (0.02 deg) and perhaps large ones."""
+    strip, camera = flight.strips[0], flight.camera
+    matcher = TieMatcher(camera, options or MatchingOptions())
+    matcher.begin_strip(strip.id, strip.first_line_time_s, strip.line_rate_hz)
+    time_s = np.arange(0.0, flight.truth.end_s, 0.005)
+    truth = flight.truth.at(time_s)
+    rng = np.random.default_rng(seed)
+    angles = truth.angles + np.radians(0.02) * rng.standard_normal(3)
+    angles += np.radians(0.01) * np.sin(time_s[:, None] / 5.0 + rng.uniform(0, 6, 3))
+    pixel = 0.0065 * 12000 / PIXELS / 62.7
+    angles[:, 0] += wrong_px * pixel * np.sin(2 * np.pi * time_s / 40.0)
+    quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
+    covariance = np.diag([1.0] * 3 + [np.radians(0.03) + wrong_px * pixel] * 3) ** 2
+    ties, told, poses = [], [], 0
+    for first in range(0, strip.lines, BLOCK):
+        end_s = float(strip.time_of(first + BLOCK - 1))
+        while poses < len(time_s) and time_s[poses] <= end_s:
+            matcher.orientation.add_pose(time_s[poses], truth.position_l[poses], quaternion[poses], covariance)
+            poses += 1
+        for image, line in zip(images, camera.lines, strict=True):
+            block = image[first : first + BLOCK] if not isinstance(image, dict) else image.get(first, np.empty((0, 0)))
+            if len(block):
+                matcher.add_lines(line.id, first, block)
+        ties += matcher.match()
+        told += matcher.take_events()
+    return ties, matcher, told
+
+
+def errors(flight, ties):
+    """(rays, 2) line and sample against the truth of the place in the master view, and their sigma (rays, 2)."""
+    camera, strip = flight.camera, flight.strips[0]
+    index = camera.line_index
+    ccd = np.array([index[tie.rays[0].ccd] for tie in ties])
+    line, sample = np.array([[tie.rays[0].line, tie.rays[0].sample] for tie in ties]).T
+    poses = flight.truth.at(strip.time_of(line))
+    xy = camera.image_coordinates(ccd, sample)[0]
+    ray = np.einsum("nij,nj->ni", poses.R_lc, np.column_stack([xy, -camera.focal_length_mm[ccd]]))
+    looks = find_looks(flight.terrain.intersect(poses.position_l, ray), flight.strips, camera)
+    true = {(p, c): uv for p, c, *uv in zip(looks.point, looks.ccd, looks.line, looks.sample, strict=True)}
+    rows = [
+        (r.line - true[i, index[r.ccd]][0], r.sample - true[i, index[r.ccd]][1],
+         np.hypot(r.sigma_line, tie.rays[0].sigma_line), np.hypot(r.sigma_sample, tie.rays[0].sigma_sample))
+        for i, tie in enumerate(ties) for r in tie.rays[1:]
+    ]  # fmt: skip
+    rows = np.array(rows)
+    return rows[:, :2], rows[:, 2:]
+
+
+# ---- imagery
+
+
+def test_a_target_is_rendered_where_collinearity_puts_it():
+    # a calm flight: vibration pulls the grey values of a target about, their centre would not be its centre
+    settings = {"sensor": "ads40-small", "pixels": PIXELS, "images": True, "seconds": 30.0, "turbulence": 0.0}
+    flown = simulated_flight(settings)
+    flight = flown.simulation.flight
+    points = flown.simulation.points
+    targets = points.xyz_l[points.role != "tie"]
+    # even light and a ground without detail: the centre of the grey values is the centre of the target
+    flat = replace(
+        flown.imager.texture, reflectance=np.full(1024, 0.4, np.float32), contrast=np.zeros(1024, np.float32),
+        unsteady=np.zeros(1024, np.float32), roads=(), parcel_m=(1e7, 1e7),
+        target_radius_m=3.0 * flown.imager.texture.detail_m,
+    )  # fmt: skip
+    imager = LineImager(flight, flat, 1, ImagingPlan(falloff=0.0, flicker=0.0))
+    background = LineImager(flight, replace(flat, targets_l=np.empty((0, 2))), 1, imager.plan)
+    looks = find_looks(targets, flight.strips, flight.camera)
+    half, off = 11, []
+    for ccd, line, sample in zip(looks.ccd, looks.line, looks.sample, strict=True):
+        u, v = round(line), round(sample)
+        near = (looks.ccd == ccd) & (np.abs(looks.line - line) < 25) & (np.abs(looks.sample - sample) < 25)
+        if near.sum() > 1 or not (half <= v < PIXELS - half and half <= u < flight.strips[0].lines - half):
+            continue
+        patch, empty = (
+            image.signal(0, int(ccd), u - half, 2 * half + 1)[:, v - half : v + half + 1].astype(float)
+            for image in (imager, background)
+        )
+        bright = (patch - empty) ** 2  # disc and ring
+        r = np.arange(-half, half + 1)
+        off.append((bright.sum(1) @ r / bright.sum() - (line - u), bright.sum(0) @ r / bright.sum() - (sample - v)))
+    off = np.array(off)
+    assert len(off) > 40
+    assert np.abs(np.median(off, axis=0)).max() < 0.01
+    assert 1.4826 * np.median(np.abs(off)) < 0.02
+
+
+def test_pixels_see_the_ground_that_collinearity_gives_them(flown):
+    flight, points = flown.simulation.flight, flown.simulation.points
+    looks = find_looks(points.xyz_l, flight.strips, flight.camera)
+    assert len(looks) > 50
+    for point, ccd, line, sample in zip(looks.point, looks.ccd, looks.line, looks.sample, strict=True):
+        v = min(int(sample), PIXELS - 2)
+        ground = flown.imager.ground(int(ccd), np.atleast_1d(flight.strips[0].time_of(line)))[:, 0]
+        there = ground[:, v] + (sample - v) * (ground[:, v + 1] - ground[:, v])
+        off = np.hypot(*(there - points.xyz_l[point])[:2])
+        assert off < 0.02 * flown.imager.texture.detail_m
+
+
+def test_lines_are_the_same_in_whatever_blocks_they_are_rendered(flown, images):
+    parts = [flown.imager.render(0, 1, first, n) for first, n in ((100, 3), (103, 7))]
+    np.testing.assert_array_equal(np.concatenate(parts), images[1][100:110])
+    assert images[1].max() <= 4095 and images[1].dtype == np.uint16
+    with pytest.raises(ValueError, match="strip of"):
+        flown.imager.render(0, 1, flown.simulation.flight.strips[0].lines - 1, 2)
+
+
+# ---- parts
+
+
+def test_a_ring_keeps_the_newest_lines_and_knows_the_missing_ones():
+    ring = LineRing(4, 10)
+    lines = np.arange(40, dtype=np.uint16).reshape(10, 4)
+    assert ring.add(5, lines[:6]) == (0, 0)
+    assert ring.add(14, lines[:3]) == (3, 0)
+    assert ring.add(15, lines[:4]) == (0, 2)
+    got = ring.read(0, 100)
+    assert (got.first_line, len(got.pixels)) == (9, 10)
+    np.testing.assert_array_equal(got.usable, [1, 1, 0, 0, 0, 1, 1, 1, 1, 1])
+    np.testing.assert_array_equal(got.pixels[-1], lines[3])
+    store = LineStore({"F": 100, "N": 100}, {"F": 300, "N": 100}, 40_000)
+    assert store.nbytes <= 40_000 and store.rings["F"].capacity == pytest.approx(3 * store.rings["N"].capacity, abs=3)
+    with pytest.raises(ValueError, match="too small"):
+        LineStore({"F": 1000}, {"F": 100}, 1000)
+
+
+def test_bad_lines_are_told_apart():
+    rng = np.random.default_rng(1)
+    lines = rng.integers(500, 3000, (5, 600)).astype(np.uint16)
+    lines[1], lines[2], lines[4] = rng.integers(0, 50, 600), 4095, lines[3]
+    np.testing.assert_array_equal(judge_lines(lines, None, 4095), [0, IS_DARK, IS_SATURATED, 0, IS_FROZEN])
+
+
+def test_least_squares_matching_finds_shifts():
+    rng = np.random.default_rng(2)
+    n, k = 27, 150
+    f = np.hypot(np.fft.fftfreq(64)[:, None], np.fft.fftfreq(64)[None, :])
+    spectrum = np.fft.fft2(rng.standard_normal((k, 64, 64))) * np.exp(-0.5 * (f / 0.2) ** 2)
+    shift = rng.uniform(-0.8, 0.8, (k, 2))
+    phase = np.exp(-2j * np.pi * (np.fft.fftfreq(64)[:, None] * shift[:, 0, None, None]
+                                  + np.fft.fftfreq(64)[None, :] * shift[:, 1, None, None]))  # fmt: skip
+    first, second = (np.fft.ifft2(s).real[:, :n, :n] * 800 for s in (spectrum, spectrum * phase))
+    first, second = (a + 15 * rng.standard_normal(a.shape) for a in (first, 0.8 * second + 100))
+    found = match_patches(first[:, 4:-4, 4:-4].astype(np.float32), second.astype(np.float32), np.zeros((k, 2)))
+    error = found.shift - shift
+    assert found.converged.all() and np.abs(error.mean(axis=0)).max() < 0.01
+    assert np.sqrt((error**2).mean()) < 0.08
+    assert (found.score > 0.9).mean() > 0.9
+
+
+def test_ground_points_are_found_back_on_their_lines(flown):
+    flight = flown.simulation.flight
+    view, strip = view_of(flight.camera, 0), flight.strips[0]
+    poses = flight.truth.at(strip.time_of(np.arange(100, 400)))
+    scan = LineScan(view, 100, poses.position_l, poses.R_lc)
+    rng = np.random.default_rng(3)
+    line, sample = rng.integers(120, 380, 200).astype(float), rng.uniform(5, PIXELS - 6, 200)
+    point, _ = scan.to_plane(line, sample, rng.uniform(-40, 40, 200))
+    u, v, inside = scan.locate(point, line + rng.uniform(-30, 30, 200), rounds=5)
+    assert inside.all()
+    assert np.abs(u - line).max() < 1e-3 and np.abs(v - sample).max() < 1e-3
+
+
+# ---- all of it
+
+
+def test_ties_lie_where_the_truth_says_with_the_covariance_they_claim(flown, images):
+    ties, _, _ = matched(flown.simulation.flight, images)
+    error, sigma = errors(flown.simulation.flight, ties)
+    length = np.hypot(*error.T)
+    assert len(ties) > 80
+    assert (length < 0.3).mean() > 0.95 and (length > 2.0).mean() < 0.01
+    assert 1.4826 * np.median(np.abs(error)) < 0.1
+    assert 0.5 < np.median((error / sigma) ** 2) / 0.455 < 1.6
+    assert 0.6 < ((error / sigma)[length < 2] ** 2).mean() < 1.8
+
+
+def test_a_wrong_orientation_does_not_hinder(flown, images):
+    ties, _, _ = matched(flown.simulation.flight, images, wrong_px=30.0)
+    error, _ = errors(flown.simulation.flight, ties)
+    length = np.hypot(*error.T)
+    assert len(ties) > 60
+    assert (length < 0.3).mean() > 0.93 and (length > 2.0).mean() < 0.01
+
+
+def test_bad_imagery_is_told_and_survived(flown, images):
+    bad = [image.copy() for image in images]
+    bad[0][300:340] = 0
+    bad[2][1100:1160] = bad[2][1100]
+    bad[1][900:906] = 4095
+    dropped = {first: bad[1][first : first + BLOCK] for first in range(0, len(bad[1]), BLOCK) if first != 640}
+    ties, matcher, told = matched(flown.simulation.flight, [bad[0], dropped, bad[2]])
+    error, _ = errors(flown.simulation.flight, ties)
+    length = np.hypot(*error.T)
+    assert len(ties) > 40 and (length < 0.3).mean() > 0.95 and (length > 2.0).mean() < 0.01
+    assert matcher.counters["lines dark"] == 40 and matcher.counters["lines frozen"] == 59
+    assert matcher.counters["lines saturated"] == 6 and matcher.counters["lines missing"] == BLOCK
+    for words in ("F: lines are dark", "F: lines are good again", "B: lines are frozen", "N: 4 lines are missing"):
+        assert any(words in text for text in told), words
+
+
+def test_featureless_ground_gives_no_ties_and_is_told(flown, images):
+    rng = np.random.default_rng(1)
+    water = [rng.normal(300, 5, image[:900].shape).astype(np.uint16) for image in images]
+    short = [np.concatenate([w, image[900:1000]]) for w, image in zip(water, images, strict=True)]
+    ties, matcher, told = matched(flown.simulation.flight, [image[:900] for image in short])
+    assert not ties and matcher.counters["ties"] == 0
+    assert any("poor in texture" in text for text in told)
+
+
+def test_from_image_lines_to_refined_orientation(tmp_path, capsys):
+    flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    arguments = ["--sensor", "ads40-small", "--pixels", "600", "--images", "--seconds", "30", "--lead-in", "2"]
+    assert main(["simulate", "-q", "-o", str(flight), *arguments, "--seed", "5"]) == 0
+    assert main(["process", "-q", "--json", str(flight), "-o", str(out), "--nodes", "navigator,matcher,adjuster"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["nodes"] == ["navigator", "matcher", "adjuster"] and not result["counters"]["matcher"].get("failed")
+    bodies = [message.body for message in RecordingReader(out).messages(["observation/tie"])]
+    tie = [body for body in bodies if "-M" in body.point]
+    assert len(tie) > 40 and all(0 < image.sigma_line < 0.2 for body in tie for image in body.images)
+    assert any(not body.point.startswith("S1-M") for body in bodies)  # targets measured by others stay
+    assert result["outputs"]["orientation/final"] > 100
+    again = tmp_path / "again.mcap"
+    assert main(["process", "-q", str(flight), "-o", str(again), "--nodes", "navigator,matcher,adjuster"]) == 0
+    assert again.read_bytes() == out.read_bytes()
