@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from .program import PARENT_VARIABLE
+
 #: Large image blocks are allocated and freed all the time; glibc would return each to the system and fetch it again.
 ALLOCATOR = {
     "MALLOC_MMAP_THRESHOLD_": "1073741824",
@@ -70,7 +72,7 @@ class NodeGroup:
         command = [sys.executable, "-m", "triline.nodes.cli", "node", name, *self.arguments, *arguments]
         process = subprocess.Popen(
             command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-            env={**os.environ, **ALLOCATOR}, start_new_session=own_session,
+            env={**os.environ, **ALLOCATOR, PARENT_VARIABLE: str(os.getpid())}, start_new_session=own_session,
         )  # fmt: skip
         self.processes[name] = NodeProcess(name, process, path)
         return self.processes[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -47,6 +48,24 @@ class ProgramOptions:
     def open_bus(self) -> Bus:
         """The bus, with the node's name as source."""
         return Bus(self.platform, source=self.name, port=self.port, file=self.bus_file)
+
+
+#: Names the process that a node must not outlive.
+PARENT_VARIABLE = "TRILINE_PARENT"
+
+
+def stop_with_parent(stop: threading.Event) -> None:
+    """End cleanly when the program that started this one has died, however it died; only where it asked for that."""
+    parent = os.environ.get(PARENT_VARIABLE, "")
+    if not parent.isdigit():
+        return
+
+    def watch() -> None:
+        while os.getppid() == int(parent) and not stop.wait(0.5):
+            pass
+        stop.set()
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def stop_on_signals(stop: threading.Event) -> None:

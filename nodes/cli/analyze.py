@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..report.accuracy_table import accuracy_lines
 
 EXAMPLE = "triline analyze flight.mcap -o report.html"
 
@@ -50,5 +51,8 @@ def run(args: argparse.Namespace) -> int:
         if args.verbose:
             for line in result["missing"]:
                 print(f"not in this recording: {line}")
+            for name, n in result["poses_left_out"].items():
+                print(f"{name}: {n} poses that are not valid, left out of the statistics")
+        print("\n".join(accuracy_lines(result)))
         print(f"{args.output}: {args.output.stat().st_size / 1e6:.1f} MB")
     return 0

@@ -25,12 +25,6 @@ PLATFORM = "demo"
 #: Everything that must run before the flight begins, in the order in which it is stopped at the end.
 ESTIMATORS = ("navigator", "adjuster")
 READY_S = 20.0
-ORIENTATION_ROWS = {
-    "measured": "measured (GNSS, INS)",
-    "filtered": "filtered",
-    "live": "on-line, at once",
-    "final": "on-line, final",
-}
 #: Once the flight has landed: longest wait until every node has worked off what it has.
 DRAIN_S = 15.0
 
@@ -73,13 +67,14 @@ class Demo:
         self._clear()
         port = self.args.port or _free_port()
         with NodeGroup(self.folder / "log", PLATFORM, port) as group, _interruptible(self.stop):
-            self._say(f"bus on 127.0.0.1:{port}; logs in {group.log_folder}; Ctrl-C lands early")
+            self._say(f"bus on 127.0.0.1:{port}; logs in {group.log_folder}; Ctrl-C ends the flight early")
             group.start("recorder", "-o", str(self.recording))
             for name in ESTIMATORS:
                 group.start(name)
             group.start("viewer", "--set", f"mode={json.dumps(self.viewer_mode)}")
             with self._monitor(port) as (overview, alive):
                 self._wait_ready(group, alive)
+                self._tell_web_address(group)
                 simulator = group.start(
                     "simulator", "--set", f"seed={self.args.seed}", "--set", f"seconds={self.args.seconds}"
                 )
@@ -124,6 +119,12 @@ class Demo:
                 raise UserError(f"{missing} did not come up within {READY_S:.0f} s (see {group.log_folder})")
             if self.stop.wait(0.1):
                 break
+
+    def _tell_web_address(self, group: NodeGroup) -> None:
+        if self.viewer_mode == "web" and "viewer" in group.processes:
+            log = group.processes["viewer"].log_path.read_text(errors="replace")
+            address = next((word for word in log.split() if word.startswith("http://")), None)
+            self._say(f"scene at {address}" if address else f"no address of the scene; see {group.log_folder}")
 
     # ---- in flight
 
@@ -206,29 +207,9 @@ class Demo:
 
     def summary(self, result: dict[str, Any]) -> str:
         """What a person wants to know at the end."""
-        lines = ["", "RMSE against truth            X       Y       Z          omega     phi   kappa"]
-        orientation, points = result["orientation"], result["points"]
+        from ..report.accuracy_table import accuracy_lines
 
-        def row(title: str, metres: list[float], degrees: list[float] | None = None) -> str:
-            text = f"  {title:<22}" + "".join(f"{v:8.3f}" for v in metres) + " m"
-            return text + ("   " + "".join(f"{1e3 * v:8.2f}" for v in degrees) + " mdeg" if degrees else "")
-
-        lines.append("exterior orientation")
-        for name, title in ORIENTATION_ROWS.items():
-            if name in orientation:
-                lines.append(row(title, orientation[name]["rmse_m"], orientation[name]["rmse_deg"]))
-        lines.append("object points")
-        for name, title in (("direct_georeferencing", "direct georeferencing"), ("final", "on-line, final")):
-            if name in points:
-                lines.append(row(title, points[name]["rmse_m"]))
-        gain = result.get("improvement", {}).get("points")
-        if gain:
-            lines.append("  improvement           " + "".join(f"{v:7.1f}x" if v else "       -" for v in gain))
-        if "sigma0" in result:
-            lines.append(
-                f"sigma0 {result['sigma0']:.3f}, redundancy {result['redundancy']}, {result['updates']} updates, "
-                f"{result['rejected']} observations rejected"
-            )
+        lines = ["", *accuracy_lines(result)]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
         if self.restarts:
             lines.append(f"{self.restarts} nodes were started again")
@@ -246,8 +227,9 @@ class Demo:
 
 @contextmanager
 def _interruptible(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM land the flight instead of breaking off."""
-    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Ctrl-C, SIGTERM and a terminal that is closed land the flight instead of breaking off."""
+    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
     try:
         yield
     finally:

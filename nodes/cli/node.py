@@ -12,7 +12,7 @@ from ..config import Tables, build, load
 from ..errors import UserError
 from ..live import BusRunner
 from ..node import Node
-from ..program import ProgramOptions, stop_on_signals
+from ..program import ProgramOptions, stop_on_signals, stop_with_parent
 from .bus_options import add_bus_arguments, reporter
 
 EXAMPLE = "triline node adjuster --config adjuster.toml --platform aircraft1"
@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     tables = _tables(args)
     options = ProgramOptions(args.name, args.platform, args.port, args.bus, tables, report=reporter(args.quiet))
     stop_on_signals(options.stop)
+    stop_with_parent(options.stop)
     if args.name in registry.PROGRAMS:
         return registry.program(args.name)(options)
     node = build(registry.node_class(args.name), tables, args.name)
@@ -43,6 +44,9 @@ def run_on_bus(node: Node, options: ProgramOptions) -> int:
     with options.open_bus() as bus:
         runner = BusRunner(node, bus, options.report, stop=options.stop)
         options.report(f"{node.name} on platform {options.platform}")
+        url = getattr(node, "url", None)
+        if url:
+            options.report(f"{node.name} at {url}")
         runner.run()
     counted = ", ".join(f"{n} {kind}" for kind, n in sorted(node.counters.items()))
     options.report(f"{node.name} stopped" + (f"; {counted}; {node.last_problem}" if counted else ""))
@@ -50,7 +54,7 @@ def run_on_bus(node: Node, options: ProgramOptions) -> int:
 
 
 def _tables(args: argparse.Namespace) -> Tables:
-    tables = load(args.config)
+    tables = load(args.config, registry.names())
     settings = list(args.set)
     table: dict[str, Any] = dict(tables.get(args.name, {}))
     for setting in settings:

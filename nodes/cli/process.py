@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    tables = load(args.config)
+    tables = load(args.config, registry.names())
     reader = RecordingReader(args.recording)
     _check(reader, args)
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
@@ -126,9 +126,10 @@ def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
     lines += [f"  {topic:<24} {n:>9} out" for topic, n in sorted(summary.outputs.items())]
     if summary.dropped:
         counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
-        lines.append(f"  left out: {counted}; the last: {summary.last_problem}")
+        lines.append(f"  left out: {counted}" + (f"; the last: {summary.last_problem}" if summary.last_problem else ""))
     for name, counters in summary.counters.items():
         if counters:
             counted = ", ".join(f"{n} {kind}" for kind, n in counters.items())
-            lines.append(f"  {name}: {counted}; the last: {summary.problems.get(name, '')}")
+            last = summary.problems.get(name)
+            lines.append(f"  {name}: {counted}" + (f"; the last: {last}" if last else ""))
     return lines
