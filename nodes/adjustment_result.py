@@ -97,6 +97,10 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
             for r in result.rejected
             if r.ray < 0
         ],
+        "doubtful_points": [
+            {"point": result.network.point_ids[d.point], "rays_left_out": d.lost, "rays": d.rays, "reason": d.reason}
+            for d in result.doubtful
+        ],
         "variance_components": {
             c.group: {
                 "observations": c.n,
@@ -231,10 +235,23 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     notes += _test_notes(adjustment)
     notes += _control_notes(network)
     notes += _weakness_notes(result)
+    if result.doubtful:
+        notes.append(_doubt_note(result))
     lost = int(((solution.points.rank < 3) & (network.rays_per_point > 0)).sum())
     if lost:
         notes.append(f"{lost} object points are not determined by their rays and have no coordinates in points.csv")
     return notes
+
+
+def _doubt_note(result: BatchResult) -> str:
+    """Which points are doubtful, and which of them are missing in the statistics of the check points."""
+    network, doubtful = result.network, result.doubtful
+    shown = ", ".join(f"{network.point_ids[d.point]} ({d.lost} of {d.rays} rays out)" for d in doubtful[:MOST_LISTED])
+    more = f" and {len(doubtful) - MOST_LISTED} more" if len(doubtful) > MOST_LISTED else ""
+    check = set(network.check.point.tolist())
+    out = sum(d.point in check for d in doubtful)
+    left = f"; {out} of them check points, left out of the statistics" if out else ""
+    return f"{len(doubtful)} object points are doubtful, their remaining rays do not confirm them: {shown}{more}{left}"
 
 
 def _sigma0_note(result: BatchResult) -> str:

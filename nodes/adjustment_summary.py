@@ -97,6 +97,8 @@ def _rejected(c: Content, verbose: bool) -> Iterator[str]:
     rejected, control = c["rejected"], c["rejected_control"]
     if not rejected and not control:
         return
+    if c["doubtful_points"]:
+        yield f"doubtful: {len(c['doubtful_points'])} object points that lost too many rays, see the note"
     yield f"rejected: {len(rejected)} image points, {len(control)} control coordinates"
     for r in control:
         yield f"  control point {r['point']}, {r['coordinate']}: w {r['w']:.1f}"

@@ -54,7 +54,8 @@ def points_table(adjustment: Adjustment) -> pd.DataFrame:
     columns: dict[str, object] = {"point": [network.point_ids[i] for i in order]}
     columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
     columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
-    return pd.DataFrame(columns | {"rays": in_use[order], "role": network.role()[order]})
+    doubtful = np.isin(order, [d.point for d in result.doubtful]).astype(int)
+    return pd.DataFrame(columns | {"rays": in_use[order], "role": network.role()[order], "doubtful": doubtful})
 
 
 def residuals_table(adjustment: Adjustment) -> pd.DataFrame:

@@ -18,11 +18,12 @@ from .network_weakness import Combination, undetermined
 from .normal_equations import reduce_normals
 from .normal_matrix import DenseMatrix
 from .parameter_elimination import eliminate, own_information
+from .point_consensus import Doubt, doubts
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
 from .robust import WeightFunction, huber
 from .selfcalibration import SelfCalibration
-from .snooping import Rejected, Round, Snooping, image_scale, snoop
+from .snooping import Rejected, Round, Snooping, image_scale, joint_limit, snoop
 from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
 from .variance_components import LEAST_REDUNDANCY, Component, Scales, estimate_components, group_sums, scaled
 
@@ -114,6 +115,7 @@ class BatchResult:
     georeferenced : object points without adjustment
     groups : number, ``v^T P v`` and redundancy of image, control, position and attitude
     iterations : steps of all adjustments
+    doubtful : object points that the rays they kept do not confirm; comparisons leave them out
     """
 
     stages: tuple[Solution, ...]
@@ -130,6 +132,7 @@ class BatchResult:
     georeferenced: Georeferenced
     groups: dict[str, tuple[int, float, float]]
     iterations: int
+    doubtful: tuple[Doubt, ...] = ()
 
     @property
     def solution(self) -> Solution:
@@ -170,8 +173,9 @@ class BatchResult:
         return np.sqrt(np.maximum(np.einsum("pii->pi", self.point_covariance), 0.0))
 
     def compare(self, with_: Control, points_l: Array, sigma_m: Array) -> PointAccuracy:
-        """Accuracy of points (p, 3) with sigmas (p, 3) against given coordinates."""
-        given = np.isfinite(with_.sigma_m)
+        """Accuracy of points (p, 3) with sigmas (p, 3) against given coordinates, without points that are doubtful."""
+        sure = ~np.isin(with_.point, [d.point for d in self.doubtful])
+        given = np.isfinite(with_.sigma_m) & sure[:, None]
         difference = np.where(given, points_l[with_.point] - with_.xyz_l, np.nan)
         return point_accuracy(difference, np.where(given, sigma_m[with_.point], np.nan))
 
@@ -201,13 +205,15 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
     solution = outcome.solution
     tell(Phase("statistics"))
     found = outcome.snooping
+    rejected = found.rejected if found else _robust_rejected(solution)
+    lost = np.array([r.ray for r in rejected if r.ray >= 0 and r.reason != "lone"], dtype=np.int64)
     Q = cofactors(solution)
     return BatchResult(
         tuple(stages),
         Q,
         ray_statistics(solution, Q),
         global_test(solution.cost, max(solution.redundancy, 0)),
-        found.rejected if found else _robust_rejected(solution),
+        rejected,
         found.given_up if found else 0.0,
         outcome.removed,
         outcome.kept,
@@ -217,6 +223,7 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
         georeference(stages[0].network, job.model, _taking_part(solution)),
         group_sums(solution, Q),
         outcome.steps,
+        doubts(solution, lost, joint_limit(job.critical)),
     )
 
 

@@ -3,6 +3,7 @@
 Several observations go in one round only where they cannot have caused each other's failure: at most one of an object
 point, and none that is much smaller than the largest of all. What was left out is tested against the adjustment without
 it and returns if it agrees: an outlier that was masked, or that made good neighbours look bad, is undone that way.
+Where a point has lost half of its rays, the largest set of its rays that agree takes the place of those that were kept.
 
 The test takes model and a-priori sigmas for right. Where most image points fail they are not, and nothing is left out.
 Control is what the block stands on: a coordinate goes only if it fails clearly while the image points fit.
@@ -20,6 +21,7 @@ from scipy import stats
 from .adjustment import AdjustmentOptions, Solution, solve
 from .covariance import Cofactors, cofactors
 from .normal_equations import weigh_control
+from .point_consensus import consensus_of_points
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W, normalised_residuals
 
@@ -129,7 +131,7 @@ def snoop(
     beginning = search.result(0)
     for number in range(1, MOST_ROUNDS + 1):
         largest, out = search.leave_out()
-        back = 0 if out else search.bring_back()
+        back = 0 if out else search.bring_back() or search.exchange()
         if progress:
             progress(Round(number, largest, out, back))
         if search.share > MOST_LEFT_OUT:
@@ -160,6 +162,7 @@ class _Search:
         self.out: dict[int, float] = {}
         self.control_out: dict[tuple[int, int], float] = {}
         self.returned: set[int | tuple[int, int]] = set()
+        self.exchanged: set[int] = set()
         for r in before.rejected if before else ():
             if r.reason == "snooping" and r.ray >= 0:
                 self.out[r.ray] = r.w
@@ -248,6 +251,30 @@ class _Search:
             self.returned.add(int(i))
         self.weight[first] = 1.0
         return len(first)
+
+    def exchange(self) -> int:
+        """Where half of a point's rays are out and more of them agree than were kept, these take their place."""
+        n = self.solution.network.n_points
+        lost = np.bincount(self.point[list(self.out)], minlength=n) if self.out else np.zeros(n, dtype=np.int64)
+        mostly = (lost > 0) & (2 * lost >= np.bincount(self.point, minlength=n))
+        mostly[self.solution.network.control.point] = False
+        points = np.array([p for p in np.flatnonzero(mostly) if int(p) not in self.exchanged], dtype=np.int64)
+        self.exchanged.update(points.tolist())
+        back = 0
+        for p, (chosen, rival) in consensus_of_points(self.solution, points, self.joint_limit).items():
+            own = np.flatnonzero(self.point == p)
+            kept = own[self.weight[own] > 0]
+            if rival or len(chosen) < 3 or len(chosen) <= len(kept):
+                continue
+            for i in own:
+                inside = bool(np.isin(i, chosen))
+                back += inside and int(i) in self.out
+                if inside:
+                    self.out.pop(int(i), None)
+                else:
+                    self.out.setdefault(int(i), 0.0)
+                self.weight[i] = float(inside)
+        return back
 
     @property
     def share(self) -> float:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+
 from triline.solver.block import Apriori, Block, GroundPoints, ImagePoints
 from triline.solver.collinearity import project
 from triline.solver.frames import LocalFrame

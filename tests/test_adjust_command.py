@@ -1,6 +1,7 @@
 """``triline adjust``: block folders and recordings in, result files and one-line refusals out."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -163,7 +164,9 @@ def test_result_files_have_what_the_interface_says(folder, tmp_path):
     assert (result["check"]["n"], result["control"]["n"]) == (15, 5)
     assert result["redundancy"] == result["n_observations"] - result["n_unknowns"]
     points = pd.read_csv(tmp_path / "points.csv")
-    assert list(points.columns) == ["point", "X_m", "Y_m", "Z_m", "sigma_X_m", "sigma_Y_m", "sigma_Z_m", "rays", "role"]
+    columns = "point X_m Y_m Z_m sigma_X_m sigma_Y_m sigma_Z_m rays role doubtful"
+    assert list(points.columns) == columns.split() and set(points.doubtful) <= {0, 1}
+    assert result["doubtful_points"] == [] and points.doubtful.sum() == 0
     assert points.role.value_counts().to_dict() == {"check": 15, "control": 5, "tie": len(points) - 20}
     residuals = pd.read_csv(tmp_path / "residuals.csv")
     image = pd.read_csv(folder / "image_points.csv")
@@ -338,6 +341,46 @@ def test_refusals_are_one_line(folder, tmp_path, capsys):
     occupied = tmp_path / "file"
     occupied.write_text("")
     assert "is a file" in refusal(capsys, folder, "-q", "-o", occupied)
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "sealed/below"])
+def test_a_folder_that_cannot_be_is_refused_before_the_work(folder, tmp_path, capsys, place, monkeypatch):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "sealed").mkdir()
+    monkeypatch.setattr(os, "access", lambda where, mode: Path(where).name != "sealed")  # root may write anywhere
+    monkeypatch.setattr("triline.nodes.cli.adjust.run_job", None)
+    monkeypatch.setattr("triline.nodes.cli.navigate.read_sensor_folder", None)
+    assert str(tmp_path / place) in refusal(capsys, folder, "-q", "-o", tmp_path / place)
+    assert main(["navigate", str(folder), "-o", str(tmp_path / place)]) == 1
+    assert str(tmp_path / place) in capsys.readouterr().err
+    assert not list((tmp_path / "sealed").iterdir())
+
+
+@pytest.mark.parametrize("words", [("ppm", "--segments"), ("lim", "--fixes")])
+def test_more_segments_than_the_rays_carry_are_refused_at_once(folder, capsys, words, monkeypatch):
+    monkeypatch.setattr("triline.nodes.cli.adjust.run_job", None)
+    said = refusal(capsys, folder, "--model", words[0], words[1], "100000")
+    assert f"{words[1]} 100000: more than the image points carry, wanted at most" in said
+
+
+def test_a_point_that_lost_most_rays_is_named_in_all_results(folder, tmp_path, capsys):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(folder, spoiled)
+    image = pd.read_csv(spoiled / "image_points.csv")
+    ground = pd.read_csv(spoiled / "ground_points.csv")
+    seen = image[image.point.isin(ground.point[ground.role == "check"])].groupby("point").size()
+    name = seen.idxmax()
+    rng = np.random.default_rng(3)
+    bad = rng.choice(image.index[image.point == name], seen.max() // 2 + 1, replace=False)
+    image.loc[bad, "line"] += rng.uniform(8, 40, len(bad))
+    image.loc[bad, "sample"] += rng.choice([-1, 1], len(bad)) * rng.uniform(8, 40, len(bad))
+    image.to_csv(spoiled / "image_points.csv", index=False)
+    code, out, _ = adjust(spoiled, "--snoop", "-o", tmp_path / "out", capsys=capsys)
+    assert code == 0 and "doubtful: 1 object points" in out and f"{name} ({len(bad)} of {seen.max()} rays out)" in out
+    result = result_in(tmp_path / "out")
+    assert [d["point"] for d in result["doubtful_points"]] == [name] and result["check"]["n"] == 14
+    points = pd.read_csv(tmp_path / "out" / "points.csv", index_col="point")
+    assert list(points.index[points.doubtful == 1]) == [name]
 
 
 def test_block_without_any_usable_ray_is_refused(folder, tmp_path, capsys):

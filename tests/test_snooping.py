@@ -11,6 +11,7 @@ from triline.solver.batch import Job, run
 from triline.solver.covariance import cofactors
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.network import Control, Measurements, build_network
+from triline.solver.point_consensus import consensus
 from triline.solver.ray_statistics import ray_statistics
 from triline.solver.reliability import CRITICAL_W
 from triline.solver.robust import danish, huber, igg3
@@ -102,6 +103,64 @@ def test_a_fifth_of_outliers_is_found_too():
     assert (out & bad).sum() / bad.sum() >= 0.98
     assert (out & ~bad).sum() / (~bad).sum() < 0.01
     assert 0.9 < outcome.solution.sigma0 < 1.1
+
+
+def mostly_spoiled(seed, points):
+    """A block where more than half of the rays of some check points are moved by 6..40 pixels; which rays they are."""
+    network, rng = block(seed).network, np.random.default_rng(seed + 50)
+    line, sample = network.rays.line.copy(), network.rays.sample.copy()
+    many = [p for p in network.check.point if network.rays_per_point[p] >= 7]
+    bad = []
+    for p in many[:points]:
+        own = np.flatnonzero(network.rays.point == p)
+        chosen = rng.choice(own, len(own) - 4, replace=False)
+        angle, size = rng.uniform(0, 2 * np.pi, len(chosen)), rng.uniform(6, 40, len(chosen))
+        line[chosen] += size * np.cos(angle)
+        sample[chosen] += size * np.sin(angle)
+        bad.extend(chosen)
+    spoiled = rebuilt(network, line, sample)
+    return spoiled, np.isin(spoiled.rays.source, bad)
+
+
+def test_points_with_most_rays_wrong_keep_the_right_ones_and_are_named():
+    missed = wronged = 0
+    for seed in range(5):
+        network, bad = mostly_spoiled(seed, 4)
+        result = run(network, Job(MODEL, snoop=True))
+        out = rejected_rays(network, result.rejected)
+        missed, wronged = missed + (bad & ~out).sum(), wronged + (out & ~bad).sum()
+        spoiled = {int(p) for p in network.rays.point[bad]}
+        assert spoiled <= {d.point for d in result.doubtful}
+        assert len(result.doubtful) <= len(spoiled) + 2
+        compared = result.compare(network.check, result.adjusted_points(), result.point_sigma_m)
+        assert compared.n == len(network.check) - sum(d.point in network.check.point for d in result.doubtful)
+    assert missed <= 1 and wronged <= 6
+
+
+def test_largest_set_that_agrees_takes_the_place_of_rays_that_were_kept_wrongly():
+    """Here testing one ray after the other keeps six wrong rays and loses twelve good ones."""
+    missed = wronged = 0
+    for seed in (1, 4, 7):
+        network, bad = with_outliers(block(seed).network, 0.25, seed + 5)
+        out = rejected_rays(network, snoop(adjust(network, MODEL)).rejected)
+        missed, wronged = missed + (bad & ~out).sum(), wronged + (out & ~bad).sum()
+    assert missed <= 2 and wronged <= 3
+
+
+def test_points_of_a_clean_block_are_not_doubtful():
+    assert sum(len(run(block(seed).network, Job(MODEL, snoop=True)).doubtful) for seed in range(4)) <= 1
+
+
+def test_three_rays_of_one_strip_of_which_one_slid_along_it_do_not_tell_which():
+    """Each two of three rays in a plane meet: leaving out any of them cures the misfit."""
+    design = np.zeros((2, 3, 3))
+    tilt = np.array([-0.5, 0.0, 0.5])
+    design[0, 0], design[0, 2], design[1, 1] = 1.0, tilt, 1.0
+    slid = np.array([[20.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    found = consensus(slid, design, joint_limit(CRITICAL_W))
+    assert found is not None and len(found.rays) == 2 and found.rival
+    across = consensus(slid[::-1], design, joint_limit(CRITICAL_W))
+    assert across is not None and across.rays.tolist() == [1, 2] and not across.rival
 
 
 def test_clean_block_loses_no_more_than_the_error_probability():

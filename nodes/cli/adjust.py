@@ -28,6 +28,7 @@ from ..adjustment_tables import write_tables
 from ..errors import UserError
 from ..formats.block_folder import read_block
 from ..formats.block_recording import TOPICS, block_from_messages
+from ..formats.new_file import refuse_unless_folder
 from ..recording import RecordingReader
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
@@ -35,6 +36,9 @@ EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
 
 #: Beyond this sigma0 an adjustment that has not converged is no result.
 HOPELESS = 100.0
+
+#: So many segments or fixes are never too many for a block.
+FEW = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
     if args.iterations < 1:
         raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
+    if args.output:
+        refuse_unless_folder(Path(args.output))
     block = read_input(Path(args.input))
     adjustment = adjust_block(block, job_of(args, block), _Teller(args))
     content = result_of(adjustment)
@@ -112,6 +118,7 @@ def job_of(args: argparse.Namespace, block: Block) -> Job:
     for option, model in (("segments", "ppm"), ("fixes", "lim")):
         if getattr(args, option) is not None and model not in models:
             raise UserError(f"--{option} is for the model {model}; asked for is {args.model}")
+    _refuse_more_than_rays_carry(settings, models, block)
     limits = Limits(keep_significant=args.keep == "significant")
     robust = WEIGHT_FUNCTIONS[args.robust]() if args.robust else None
     return Job(
@@ -127,6 +134,19 @@ def job_of(args: argparse.Namespace, block: Block) -> Job:
         args.variance_components,
         max_iterations=args.iterations,
     )
+
+
+def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str], block: Block) -> None:
+    """A segment has 18 unknowns and a ray two equations; fixes that too few rays carry are merged, up to a limit."""
+    rays = np.bincount(block.image.strip[block.image.strip >= 0], minlength=1)
+    most, strip = int(rays.max()), block.strips[int(rays.argmax())].id
+    for option, model, share in (("segments", "ppm", 9), ("fixes", "lim", 2)):
+        number, limit = settings.get(option), max(most // share, FEW)
+        if model in models and isinstance(number, int) and number > limit:
+            raise UserError(
+                f"--{option} {number}: more than the image points carry, wanted at most {limit} "
+                f"(strip {strip} has the most image points, {most})"
+            )
 
 
 def _model(name: str, settings: Mapping[str, object]) -> ModelOptions:
@@ -172,8 +192,7 @@ def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
 
 def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False) -> None:
     """Write ``result.json`` and the tables, and the pictures on request."""
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is a file, wanted a folder for the result")
+    refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
