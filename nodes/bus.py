@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -262,4 +263,13 @@ def _parameters(text: str) -> list[tuple[str, str]]:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]
+    """What Zenoh says, without the place in its own source and the picture of the line."""
+    text = str(error)
+    found = re.search(r"JSON error: Message \{ msg: \"(.*?)\", location: Some\(Location \{ line: (\d+)", text)
+    if found:
+        return f"line {found[2]}: {found[1]}"[:300]
+    text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", text)
+    picture = re.search(r"--> (\d+):(\d+)\n.*\n\s*=\s*(.*)", text, re.DOTALL)
+    if picture:
+        text = f"line {picture[1]}, column {picture[2]}: {picture[3]}"
+    return " ".join(text.split())[:300]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,17 @@ from .errors import UserError
 Tables = dict[str, dict[str, Any]]
 
 
-def load(path: str | Path | None) -> Tables:
+def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     """The tables of a configuration file, none without a file.
+
+    Parameters
+    ----------
+    path : of the file
+    known : names that tables may have; None = any
 
     Raises
     ------
-    UserError : not TOML, or something outside a table
+    UserError : not TOML, something outside a table, or a table of another name
     """
     if path is None:
         return {}
@@ -35,6 +41,8 @@ def load(path: str | Path | None) -> Tables:
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise UserError(f"{path}: {name} stands outside a table, wanted [node] tables")
+        if known is not None and name not in known:
+            raise UserError(f"{path}: table [{name}] is not known, wanted one of {', '.join(known)}")
     return tables
 
 

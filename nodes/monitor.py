@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..schemas import messages as m
 from . import convert
+from .config import build
 from .node import Message, Node
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ def run(options: ProgramOptions) -> int:
     """Watch a platform until told to stop."""
     from .live import BusRunner, in_thread
 
-    monitor = Monitor()
+    monitor = build(Monitor, options.tables)
     title = f"platform {options.platform}"
     with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title) as show:
         while not options.stop.wait(0.25):

@@ -1,6 +1,8 @@
 """Recordings: MCAP files of messages with their envelopes. The only file that knows the MCAP library.
 
-One channel stands for one run of one publisher on one topic. Publish time is the platform stamp, log time the time of
+One channel stands for one run of one publisher on one topic. What all else depends on, the configuration, stands in a
+chunk of its own at the head, and once more at the end, on channels marked as copies; readers take a copy only where the
+first one is lost. Publish time is the platform stamp, log time the time of
 reception, and the channel's metadata name the source; so a recording explains itself and keeps both times apart.
 """
 
@@ -61,9 +63,11 @@ class RecordingWriter:
         self._writer = Writer(self._stream, chunk_size=chunk_size, compression=kind, enable_data_crcs=True)
         self._platform = platform
         self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str, int, str], int] = {}
+        self._channels: dict[tuple[str, str, int, str, bool], int] = {}
         self._last: dict[tuple[str, str], tuple[int, int]] = {}
         self.counts: Counter[str] = Counter()
+        self._head = True
+        self._configuration: list[tuple[RawMessage, str | None]] = []
         self._writer.start("", LIBRARY)
         self._stream.flush()
 
@@ -94,7 +98,18 @@ class RecordingWriter:
     def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
         """Add a message that is encoded already."""
         envelope = raw.envelope
-        key = (raw.topic, envelope.source, envelope.start, platform or self._platform)
+        if topics.find(raw.topic).family is topics.Family.CONFIGURATION:
+            kept = RawMessage(raw.topic, envelope, bytes(raw.data), raw.receive_ns)
+            self._configuration.append((kept, platform))
+        elif self._head:
+            self._head = False
+            self.flush()
+        self._add(raw, platform)
+        self.counts[raw.topic] += 1
+
+    def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> None:
+        envelope = raw.envelope
+        key = (raw.topic, envelope.source, envelope.start, platform or self._platform, copy)
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._register(*key)
@@ -105,9 +120,8 @@ class RecordingWriter:
             publish_time=envelope.stamp_ns,
             sequence=envelope.sequence & _SEQUENCE_MASK,
         )
-        self.counts[raw.topic] += 1
 
-    def _register(self, topic: str, source: str, start: int, platform: str) -> int:
+    def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)
         schema = self._schemas.get(row.type_name)
         if schema is None:
@@ -116,6 +130,8 @@ class RecordingWriter:
         metadata = {"source": source, "platform": platform}
         if start:
             metadata["start"] = str(start)
+        if copy:
+            metadata["copy"] = "yes"
         channel = self._writer.register_channel(topic, "protobuf", schema, metadata)
         # A channel stands in the first chunk that uses it; written once more outside chunks it survives that chunk.
         self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})
@@ -131,7 +147,11 @@ class RecordingWriter:
         return self._stream.tell()
 
     def close(self) -> None:
-        """Write the index and close the file."""
+        """Write the configuration once more and the index, and close the file."""
+        if not self._head:
+            self.flush()
+            for raw, platform in self._configuration:
+                self._add(raw, platform, copy=True)
         self._writer.finish()
         self._stream.flush()
         if self._owned:
@@ -180,6 +200,7 @@ class RecordingReader:
         self._schemas: dict[int, tuple[int, str]] = {}
         self._data_end: scan.Record | None = None
         self._trust: dict[int, int] = {}
+        self._copies: set[int] = set()
         self._chunks: list[scan.Chunk] = []
         self._content = lru_cache(maxsize=64)(self._decompress)
         self.index = self._scan()
@@ -206,7 +227,31 @@ class RecordingReader:
                 self.damage.append(scan.Damage(offset, 0, str(error)))
         for channel in set(columns.columns[2]) - set(self.channels):
             self.problems["without a channel"] += columns.columns[2].count(channel)
-        return columns.index()
+        return self._without_copies(columns.index())
+
+    def _without_copies(self, index: Index) -> Index:
+        """Without the copies of messages that are there; those of messages that are lost stand at the head."""
+
+        def whose(c: Channel) -> tuple[str, str, int, str]:
+            return c.topic, c.source, c.start, c.platform
+
+        first = {whose(c): c.id for c in self.channels.values() if c.id not in self._copies}
+        order = np.arange(len(index))
+        channel = index.channel.copy()
+        for copy in sorted(self._copies):
+            rows = np.flatnonzero(index.channel == copy)
+            original = first.get(whose(self.channels[copy]))
+            if original is None:
+                continue
+            del self.channels[copy]
+            lost = ~np.isin(index.sequence[rows], index.sequence[index.channel == original])
+            channel[rows] = original
+            order[rows] = np.where(lost, rows - len(index), len(index))
+        if not self._copies:
+            return index
+        chosen = np.argsort(order, kind="stable")[: int((order < len(index)).sum())]
+        columns = (index.chunk, index.place, channel, index.sequence, index.receive_ns, index.stamp_ns)
+        return Index(*(column[chosen] for column in columns))
 
     def _note(self, record: scan.Record | scan.WholeChunk, columns: IndexColumns) -> None:
         if isinstance(record, scan.WholeChunk):
@@ -278,6 +323,8 @@ class RecordingReader:
         except KeyError:
             wanted = None
         type_name = wanted if type_name is None else type_name
+        if metadata.get("copy"):
+            self._copies.add(number)
         start = metadata.get("start", "0")
         self.channels[number] = Channel(
             number, topic, type_name or "", metadata.get("source", ""), metadata.get("platform", ""),

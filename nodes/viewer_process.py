@@ -38,7 +38,10 @@ class ViewerProcess:
     def __init__(self, web: bool, grpc_port: int = 0, web_port: int = 0) -> None:
         binary = viewer_binary()
         if not web and sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-            raise UserError("no display for the native viewer; use --web or --rrd FILE")
+            raise UserError(
+                "no display for the native viewer; triline view: use --web or --rrd FILE, "
+                "triline node viewer: --set mode=web or --set mode=rrd:FILE"
+            )
         self.grpc_port = grpc_port or _free_port(_FIRST_PORTS["grpc"])
         self.web_port = (web_port or _free_port(_FIRST_PORTS["web"])) if web else 0
         self._home = _private_folder()

@@ -23,21 +23,31 @@ class Finding:
         ``gnss.position``
     text : one line: the cause, and the figure that shows it
     fatal : navigating on would give nonsense
+    place : row of the data as they were given and place among the columns of the subject, where it is one value
     """
 
     code: str
     subject: str
     text: str
     fatal: bool
+    place: tuple[int, int] | None = None
 
 
-def clean_inertial(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array, Array, Array, list[Finding]]:
-    """Times that increase and values that are finite: takes out what is neither, and a first interval that is garbage.
+#: A value beyond these (rad/s, m/s^2) and so many times what nearly all others stay below is no measurement.
+_RATE_LIMIT, _FORCE_LIMIT, _TIMES = 35.0, 500.0, 20.0
+
+
+def clean_inertial(
+    time_s: ArrayLike, a: ArrayLike, b: ArrayLike, *, increments: bool = False
+) -> tuple[Array, Array, Array, list[Finding]]:
+    """Times that increase and values that are finite and possible: takes out what is not, and a first interval that is
+    garbage.
 
     Parameters
     ----------
     time_s : (n,)
     a, b : (n, 3) rates and forces, or increments
+    increments : which of both
 
     Returns
     -------
@@ -53,6 +63,9 @@ def clean_inertial(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array
         )
         t, a, b = t[good], a[good], b[good]
     if len(t) > 8:
+        possible, more = _possible(t, a, b, np.flatnonzero(good), increments)
+        findings += more
+        t, a, b = t[possible], a[possible], b[possible]
         step = np.diff(t)
         nominal = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
         early = np.flatnonzero((step[:4] <= 0) | (step[:4] > max(20.0 * nominal, nominal + 0.2)))
@@ -71,6 +84,29 @@ def clean_inertial(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array
     return t, a, b, findings
 
 
+def _possible(
+    t: Array, a: Array, b: Array, rows: NDArray[np.int64], increments: bool
+) -> tuple[NDArray[np.bool_], list[Finding]]:
+    """Which samples (n,) have no value that is impossible, and a finding for each kind of sensor that has some."""
+    findings = []
+    possible = np.ones(len(t), dtype=bool)
+    scale = abs(float(np.median(np.diff(t)))) if increments else 1.0
+    unit = ("rad", "m/s") if increments else ("rad/s", "m/s^2")
+    kinds = (("imu.rate", a, _RATE_LIMIT, unit[0]), ("imu.force", b, _FORCE_LIMIT, unit[1]))
+    for subject, values, most, name in kinds:
+        limit = np.maximum(most * scale, _TIMES * np.quantile(np.abs(values), 0.99, axis=0))
+        bad = np.abs(values) > limit
+        wrong = np.flatnonzero(bad.any(axis=1))
+        if not len(wrong):
+            continue
+        i, k = wrong[0], int(np.argmax(bad[wrong[0]]))
+        more = f" (and {len(wrong) - 1} more like it)" if len(wrong) > 1 else ""
+        text = f"{values[i, k]:g} {name} cannot be, wanted less than {limit[k]:.3g}: sample dropped{more}"
+        findings.append(Finding("impossible", subject, text, False, (int(rows[i]), k)))
+        possible[wrong] = False
+    return possible, findings
+
+
 def _increasing(t: Array, a: Array, b: Array) -> tuple[Array, Array, Array, int]:
     newest = np.maximum.accumulate(t)
     keep = np.concatenate([[True], t[1:] > newest[:-1]])
@@ -80,16 +116,27 @@ def _increasing(t: Array, a: Array, b: Array) -> tuple[Array, Array, Array, int]
 def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
     """Fixes with positions on Earth, times that increase and sigmas above zero.
 
-    A sigma that is zero or not a number is replaced by the median of the good ones of its component.
+    A position that is not on Earth is left out, and is fatal where most are so. A sigma that is zero or not a number is
+    replaced by the median of the good ones of its component.
     """
     findings = []
+    rows = np.arange(len(gnss))
     position = np.column_stack([gnss.lat, gnss.lon, gnss.height_m])
     good = np.isfinite(gnss.time_s) & np.isfinite(position).all(axis=1)
     if not good.all():
         findings.append(
             Finding("no position", "gnss.position", f"{int((~good).sum())} fixes without a position: dropped", False)
         )
-    gnss = gnss[good]
+    gnss, rows = gnss[good], rows[good]
+    off = np.column_stack([np.abs(gnss.lat) > np.pi / 2, np.abs(gnss.lon) > 2 * np.pi])
+    wrong = np.flatnonzero(off.any(axis=1))
+    if len(wrong) and 2 * len(wrong) < len(gnss):
+        i, k = wrong[0], int(np.argmax(off[wrong[0]]))
+        more = f" (and {len(wrong) - 1} more like it)" if len(wrong) > 1 else ""
+        value = float(np.degrees((gnss.lat, gnss.lon)[k][i]))
+        text = f"{value:g}, wanted {'-90 to 90' if k == 0 else '-360 to 360'} deg: fix dropped{more}"
+        findings.append(Finding("not geodetic", "gnss.position", text, False, (int(rows[i]), k)))
+        gnss = gnss[np.flatnonzero(~off.any(axis=1))]
     if len(gnss):
         newest = np.maximum.accumulate(gnss.time_s)
         keep = np.concatenate([[True], gnss.time_s[1:] > newest[:-1]])

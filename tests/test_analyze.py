@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,7 +15,8 @@ from triline.nodes import convert
 from triline.nodes.cli import main
 from triline.nodes.recording import RecordingWriter
 from triline.nodes.report.analysis import analyse
-from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses
+from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses, orientation_errors
+from triline.nodes.report.figures import errors
 from triline.nodes.report.flight import collect, updates_with_new_rays
 from triline.nodes.report.page import page
 from triline.nodes.report.strip_time import StripTime
@@ -130,6 +132,35 @@ def test_partial_recordings_are_evaluated_as_far_as_they_go(messages, absent):
         assert any(line.startswith("truth/trajectory") for line in result["missing"])
     for line in result["missing"]:
         assert line.split(":")[0] in text
+
+
+def test_poses_that_are_not_valid_are_left_out_and_counted(messages):
+    whole = evaluate_flight(collect(messages))
+    copies = []
+    for message in messages:
+        if message.topic == "trajectory/filtered":
+            body = type(message.body).FromString(message.body.SerializeToString())
+            if 10.0 < (message.stamp_ns - messages[0].stamp_ns) / 1e9 < 14.0:
+                body.valid = False
+                body.pose.position.x += 500.0
+            message = replace(message, body=body)
+        copies.append(message)
+    flight = collect(copies)
+    result = evaluate_flight(flight)
+    left_out = result["poses_left_out"]
+    assert set(left_out) == {"filtered"} and left_out["filtered"] > 100 and whole["poses_left_out"] == {}
+    n = result["orientation"]["filtered"]["n"]
+    assert n + left_out["filtered"] == whole["orientation"]["filtered"]["n"]
+    assert result["orientation"]["filtered"]["rmse_m"][0] < 2 * whole["orientation"]["filtered"]["rmse_m"][0]
+    assert f"are left out: {left_out['filtered']} filtered." in page(flight, analyse(flight, "flight.mcap"))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_recording_with_nothing_but_measurements_and_truth_draws_no_warning(messages):
+    kept = [m for m in messages if not m.topic.startswith(("orientation/", "point/", "adjustment/", "trajectory/"))]
+    flight = collect(kept)
+    assert set(orientation_errors(flight)) == {"measured"}
+    assert errors(flight) is None
 
 
 def test_unusable_messages_are_counted(messages):

@@ -515,10 +515,11 @@ def _chunk_spans(path: Path) -> list[tuple[int, int]]:
 
 
 def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, capsys):
-    """Configuration stands in the first chunk: without it there is nothing to compute, and the exit code tells."""
+    """Configuration stands in the first chunk and in the last: without both there is nothing to compute."""
     data = bytearray(simulated_flight(12).read_bytes())
-    first = _chunk_spans(simulated_flight(12))[0]
+    first, *_, last = _chunk_spans(simulated_flight(12))
     data[sum(first) // 2] ^= 1
+    data[sum(last) // 2] ^= 1
     flipped, cut, out = tmp_path / "flipped.mcap", tmp_path / "cut.mcap", tmp_path / "out.mcap"
     flipped.write_bytes(data)
     cut.write_bytes(data[: first[1] - 10])

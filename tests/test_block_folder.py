@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from small_block import FILES, REAL, simulated_block, write_files
+
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_writer import write_block

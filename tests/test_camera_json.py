@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from small_block import CAMERA, REAL
+
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.camera_json import read_camera, write_camera

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from triline.solver.camera import CcdLine, Lens, LineCamera, straight_line, three_line_camera
 from triline.solver.collinearity import image_motion, project
 from triline.solver.rotation import matrix_from_angles

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from triline.nodes import registry
-from triline.nodes.bus import DEFAULT_PORT, default_port
+from triline.nodes.bus import DEFAULT_PORT, configuration, default_port
+from triline.nodes.cli import main
 from triline.nodes.config import build, load
 from triline.nodes.errors import UserError
 from triline.nodes.node import Node
@@ -47,6 +48,30 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, text, what):
     with pytest.raises(UserError, match=what) as caught:
         build(Gauge, load(write(tmp_path / "a.toml", text)))
     assert "\n" not in str(caught.value)
+
+
+def test_tables_and_keys_that_nobody_reads_are_refused(tmp_path, capsys):
+    file = write(tmp_path / "a.toml", "[adjustor]\nmodel = 'ppm'\n")
+    assert main(["node", "monitor", "--config", str(file)]) == 1
+    assert "a.toml: table [adjustor] is not known, wanted one of simulator, " in capsys.readouterr().err
+    assert main(["node", "monitor", "--set", "foo=1"]) == 1
+    assert "configuration [monitor]: foo is not known" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("not json {", "line 1, column 1: expected array"),
+        ('{\nmode:"foo"}', "line 2: unknown variant `foo`"),
+        ("", "Empty config file"),
+    ],
+)
+def test_a_bad_bus_file_is_told_without_what_zenoh_is_made_of(tmp_path, text, what):
+    with pytest.raises(UserError) as caught:
+        configuration(file=write(tmp_path / "bus.json5", text))
+    said = str(caught.value)
+    assert f"bus.json5: not a Zenoh configuration: {what}" in said
+    assert "\n" not in said and ".rs" not in said and "cargo" not in said
 
 
 def test_every_step_node_can_be_loaded_and_keeps_to_the_topic_table():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_block import FILES, REAL, write_files
 from test_imports import write_ros_file, write_sbet_file
+
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.detect import kind_of_path, read_any

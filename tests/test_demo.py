@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from triline.nodes.recording import RecordingReader
 
 DEMO = [sys.executable, "-m", "triline.nodes.cli", "demo", "--headless", "--json"]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from small_block import simulated_block
+
 from triline.nodes.cli import main
 from triline.nodes.convert import gnss_message, ground_point_message, pose_message
 from triline.nodes.formats.block_messages import block_messages

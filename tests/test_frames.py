@@ -3,6 +3,7 @@
 import numpy as np
 import pyproj
 import pytest
+
 from triline.solver import earth
 from triline.solver.frames import (
     CrsError,

@@ -12,6 +12,7 @@ import pytest
 from mcap.writer import Writer
 from small_block import REAL, simulated_block, write_files
 from tracks import ns, straight_track
+
 from triline.nodes.cli import main
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError

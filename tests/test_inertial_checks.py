@@ -130,6 +130,17 @@ def test_garbage_first_interval_and_disorder_are_taken_out():
     assert {f.code for f in findings} == {"time order", "not finite"}
 
 
+@pytest.mark.parametrize("increments", [False, True])
+def test_impossible_samples_are_taken_out_and_hard_turns_are_not(increments):
+    t, factor = 100.0 + 0.01 * np.arange(2000), 0.01 if increments else 1.0
+    rate, force = np.full((2000, 3), 1e-5), np.full((2000, 3), 0.1)
+    rate[500:510, 0], force[500:510, 2] = 4.0, 90.0  # a short manoeuvre after standing still
+    force[700, 1], rate[800, 2] = -3000.0, 1e4
+    time, a, b, findings = clean_inertial(t, factor * rate, factor * force, increments=increments)
+    assert len(time) == 1998 and a.max() == 4.0 * factor and b.max() == 90.0 * factor
+    assert {(f.subject, f.place) for f in findings} == {("imu.rate", (800, 2)), ("imu.force", (700, 1))}
+
+
 def test_gnss_sigmas_of_zero_or_nan():
     _, g, _ = data()
     sigma = g.sigma_ned_m.copy()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_block import REAL
 from tracks import ns, straight_track
+
 from triline.nodes.cli import main
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_rig import free_port
+
 from triline.nodes.processes import NodeGroup
 from triline.nodes.recording import RecordingReader
 from triline.nodes.report.evaluation import evaluate

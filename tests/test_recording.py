@@ -153,7 +153,25 @@ def test_a_flipped_bit_is_found_wherever_it_is(long_recording, tmp_path):
         reader = RecordingReader(path)
         assert findings(reader, decode=False), place
         hit = {i for i, (a, b) in enumerate(spans) if a <= place < b}
-        assert keys(reader) == [k for k, c in zip(messages, chunks, strict=True) if c not in hit], place
+        spared = [k[0].startswith("configuration/") or c not in hit for k, c in zip(messages, chunks, strict=True)]
+        assert keys(reader) == [k for k, kept in zip(messages, spared, strict=True) if kept], place
+
+
+def test_configuration_stands_twice_and_is_read_once(tmp_path):
+    path = write(tmp_path / "a.mcap", sample.flight(lines=True))
+    reader = RecordingReader(path)
+    topics = [b.topic for b in reader.messages()]
+    head = [t for t in topics if t.startswith("configuration/")]
+    assert head and topics[: len(head)] == head and findings(reader) == []
+    assert set(reader.index.chunk[: len(head)]) == {0} and 0 not in reader.index.chunk[len(head) :]
+    first, end = chunk_span(path.read_bytes(), reader._chunks[0].offset)
+    broken = bytearray(path.read_bytes())
+    broken[(first + end) // 2] ^= 4
+    (tmp_path / "b.mcap").write_bytes(broken)
+    again = RecordingReader(tmp_path / "b.mcap")
+    assert keys(again) == keys(reader)
+    assert len(findings(again)) == 1 and again.damage
+    assert sorted(c.id for c in again.channels.values()) == sorted(c.id for c in reader.channels.values())
 
 
 def test_overwritten_stretches_cost_only_the_chunks_they_touch(long_recording, tmp_path):

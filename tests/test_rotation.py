@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
 from triline.solver import rotation as rot
 
 RNG = np.random.default_rng(7)

@@ -184,6 +184,23 @@ def test_sigmas_of_zero_or_nan_are_named(tmp_path, capsys):
     assert "sigma" in capsys.readouterr().err
 
 
+def test_single_impossible_values_are_named_with_line_and_column_and_dropped(tmp_path, capsys):
+    folder = write(tmp_path / "in")
+    lines = (folder / "imu.csv").read_text().splitlines()
+    cells = lines[4001].split(",")
+    lines[4001] = ",".join([cells[0], "1e9", *cells[2:]])
+    (folder / "imu.csv").write_text("\n".join(lines) + "\n")
+    fixes = (folder / "gnss.csv").read_text().splitlines()
+    cells = fixes[20].split(",")
+    fixes[20] = ",".join([cells[0], "148.0", *cells[2:]])
+    (folder / "gnss.csv").write_text("\n".join(fixes) + "\n")
+    assert main(["navigate", str(folder), "-o", str(tmp_path / "out"), "--no-page"]) == 0
+    said = capsys.readouterr().err
+    assert "imu.csv:4002: fx_m_s2: 1e+09 m/s^2 cannot be" in said
+    assert "gnss.csv:21: lat_deg: 148, wanted -90 to 90 deg: fix dropped" in said
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["n_inertial"] == len(lines) - 2
+
+
 def test_defaults_unknown_columns_and_missing_files(tmp_path, capsys):
     folder = write(tmp_path / "flight", platform="")
     edit(folder / "gnss.csv", 1, "sigma_d_m", "sigma_d_m,satellites")

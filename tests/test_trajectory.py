@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.trajectory import Trajectory
 

@@ -251,6 +251,8 @@ def test_native_viewer_without_a_display_is_refused(monkeypatch, recording, caps
         open_canvas("native")
     assert main(["view", str(recording)]) == 1
     assert "--web or --rrd" in capsys.readouterr().err
+    assert main(["node", "viewer"]) == 1
+    assert "triline node viewer: --set mode=web" in capsys.readouterr().err
 
 
 def test_view_command_writes_a_file(recording, messages, tmp_path, capsys):

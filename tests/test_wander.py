@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
+
 from triline.solver.simulation.error_models import draw_wander
 from triline.solver.wander import autocorrelation, damping_rate, second_order_gauss_markov
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 import numpy as np
+
 from triline.nodes.formats.track import NavigationTrack
 
 

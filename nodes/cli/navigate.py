@@ -24,6 +24,7 @@ from ...solver.post_processing import (
     zero_velocities,
 )
 from ..errors import UserError
+from ..formats.new_file import refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
 from ..formats.sensor_folder import SensorFolder, read_sensor_folder
 
@@ -59,6 +60,9 @@ def run(args: argparse.Namespace) -> int:
     platform = None if args.platform is None else Path(args.platform)
     if platform is not None and not platform.is_file():
         raise UserError(f"{platform}: no such file")
+    default = source / "navigation" if source.is_dir() else source.with_name(source.name + ".navigation")
+    out = Path(args.output) if args.output else default
+    refuse_unless_folder(out)
     if source.is_dir():
         folder = read_sensor_folder(source, platform)
     else:
@@ -87,8 +91,6 @@ def run(args: argparse.Namespace) -> int:
     notes = [*folder.notes, *(folder.named(f) for f in findings)]
     for note in notes:
         _say(quiet, f"note: {note}")
-    default = source / "navigation" if source.is_dir() else source.with_name(source.name + ".navigation")
-    out = Path(args.output) if args.output else default
     out.mkdir(parents=True, exist_ok=True)
     rows = write_trajectory(out / "trajectory.csv", stretches, inertial, folder, args.rate)
     result = _result(folder, stretches, inertial, gnss, notes, held_out)

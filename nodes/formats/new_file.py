@@ -18,6 +18,18 @@ def refuse_unless_file(target: Path) -> None:
         raise UserError(f"{target}: is a device, wanted a file")
 
 
+def refuse_unless_folder(target: Path) -> None:
+    """Raise UserError where no folder of results can be, before the work that they cost; makes nothing."""
+    place = target
+    while not (place.exists() or place.is_symlink()) and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        what = "is a file, wanted a folder for the result" if place == target else f"{place} is not a folder"
+        raise UserError(f"{target}: {what}")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise UserError(f"{target}: cannot be written: no permission in {place}")
+
+
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
     """A path to write to that takes the place of ``target`` at the end, and goes away if something fails before.

@@ -126,7 +126,9 @@ class SensorFolder:
             raise UserError(f"{self.path}: imu.csv is missing, wanted inertial data ({','.join((*FORCE, *RATE))})")
         if self.gnss is None:
             raise UserError(f"{self.path}: gnss.csv is missing, wanted GNSS positions")
-        time, rotation, force, findings = clean_inertial(self.time_s, self.rotation, self.force)
+        time, rotation, force, findings = clean_inertial(
+            self.time_s, self.rotation, self.force, increments=self.increments
+        )
         if len(time) < 10:
             why = "".join(f"; {finding.text}" for finding in findings)
             raise UserError(f"{self.path / 'imu.csv'}: only {len(time)} usable samples, wanted at least 10{why}")
@@ -141,7 +143,7 @@ class SensorFolder:
         return make(time, rotation, force), gnss, findings
 
     def named(self, finding: Finding) -> str:
-        """A finding in one line, with file and columns."""
+        """A finding in one line, with file and columns, or line and column where it is one value."""
         force, rate = (DV, DTHETA) if self.increments else (FORCE, RATE)
         where = {
             "imu.time": ("imu.csv", ("time_s",)),
@@ -154,7 +156,13 @@ class SensorFolder:
             "gnss.position": ("gnss.csv", POSITION),
             "gnss.velocity": ("gnss.csv", VELOCITY),
         }.get(finding.subject)
-        return finding.text if where is None else f"{where[0]}: {','.join(where[1])}: {finding.text}"
+        if where is None:
+            return finding.text
+        file, columns = where
+        if finding.place is not None and (self.path / file).is_file():
+            row, column = finding.place
+            return f"{file}:{Table(self.path / file, {}).line_of(row)}: {columns[column]}: {finding.text}"
+        return f"{file}: {','.join(columns)}: {finding.text}"
 
 
 def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> SensorFolder:

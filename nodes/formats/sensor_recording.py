@@ -67,7 +67,9 @@ def _told(folder: SensorFolder, findings: list[Finding], notes: list[str]) -> No
 def _imu(folder: SensorFolder, notes: list[str], source: str) -> Iterator[Message]:
     if folder.time_s is None or folder.rotation is None or folder.force is None:
         return
-    time, rotation, force, findings = clean_inertial(folder.time_s, folder.rotation, folder.force)
+    time, rotation, force, findings = clean_inertial(
+        folder.time_s, folder.rotation, folder.force, increments=folder.increments
+    )
     _told(folder, findings, notes)
     if len(time) < 2:
         raise UserError(f"{folder.path / 'imu.csv'}: {len(time)} usable samples, wanted at least 2")

@@ -55,6 +55,7 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
     - ``improvement``: RMSE of direct georeferencing (filtered) / final: ``points`` (3), ``orientation`` (6);
     - ``sigma0`` over the flight, ``redundancy``, ``updates``, ``rejected``;
+    - ``poses_left_out``: how many poses of each orientation are not valid and so not compared;
     - ``missing``: what the recording does not hold, one line each.
 
     ``sigma`` is the theoretical value (root mean of the stated variances); keys without data are absent.
@@ -63,6 +64,7 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     errors = orientation_errors(flight)
     for name, (_, error, covariance) in errors.items():
         result["orientation"][name] = _orientation_row(error, covariance)
+    result["poses_left_out"] = poses_left_out(flight)
     intersections = intersect_points(flight)
     truth, check = flight.truth_points, _given(flight, "check")
     for target, known in (("points", truth), ("check", check), ("control", _given(flight, "control"))):
@@ -147,11 +149,8 @@ def _diagonal3(values: Any) -> Array:
     return np.array(values).reshape(3, 3).diagonal() if len(values) == 9 else np.full(3, np.nan)
 
 
-def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Array, Array]]:
-    """Time (n,), error estimate minus truth (n, 6) in m and rad, and stated covariance (n, 6, 6), by name.
-
-    Valid samples on strips, in the time the final orientation covers, so that rows compare like with like.
-    """
+def _compared(flight: Flight) -> dict[str, Poses]:
+    """Samples on strips, in the time that the final orientation and the truth cover, by name; valid or not."""
     truth = flight.poses.get("truth")
     if truth is None or len(truth) < 2:
         return {}
@@ -162,16 +161,34 @@ def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Arr
     span = all_poses.get("final", truth).time_ns
     true_path = truth.trajectory(flight.start_ns)
     result = {}
-    for name in ORIENTATIONS:
-        poses = all_poses.get(name)
-        if poses is None:
+    for name in (n for n in ORIENTATIONS if n in all_poses):
+        t = all_poses[name].time_ns
+        use = flight.during_strips(t) & (t >= span[0]) & (t <= span[-1]) & true_path.covers(flight.seconds(t))
+        if use.any():
+            result[name] = all_poses[name].take(use)
+    return result
+
+
+def poses_left_out(flight: Flight) -> dict[str, int]:
+    """How many poses say of themselves that they are not valid, and so are not compared with truth; by name."""
+    counts = {name: int((~poses.valid).sum()) for name, poses in _compared(flight).items()}
+    return {name: n for name, n in counts.items() if n}
+
+
+def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Array, Array]]:
+    """Time (n,), error estimate minus truth (n, 6) in m and rad, and stated covariance (n, 6, 6), by name.
+
+    Valid samples on strips, in the time the final orientation covers, so that rows compare like with like.
+    """
+    result = {}
+    compared = _compared(flight)
+    if not compared:
+        return result
+    true_path = flight.poses["truth"].trajectory(flight.start_ns)
+    for name, poses in compared.items():
+        if not poses.valid.any():
             continue
-        t = poses.time_ns
-        use = poses.valid & flight.during_strips(t) & (t >= span[0]) & (t <= span[-1])
-        use &= true_path.covers(flight.seconds(t))
-        if not use.any():
-            continue
-        poses = poses.take(use)
+        poses = poses.take(poses.valid)
         true = true_path.at(flight.seconds(poses.time_ns))
         error = np.hstack([poses.position_l - true.position_l, angle_difference(poses.angles, true.angles)])
         result[name] = poses.time_ns, error, poses.covariance

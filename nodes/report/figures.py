@@ -276,7 +276,7 @@ def correction_functions(flight: Flight) -> Figure | None:
 
 def errors(flight: Flight) -> Figure | None:
     """Errors of the orientation against truth, with the band that the final orientation states."""
-    found = orientation_errors(flight)
+    found = {n: e for n, e in orientation_errors(flight).items() if n in (flight.measured, "live", "final")}
     if not found:
         return None
     fig = figure(5.9)
@@ -302,7 +302,8 @@ def errors(flight: Flight) -> Figure | None:
                 ax.plot(x, y, color=color, lw=width, label=name)
                 span = max(span, SCALE[i] * float(np.percentile(np.abs(error[:, i]), 90)))
         ax.axhline(0, color="#777777", lw=0.6)
-        ax.set_ylim(-1.15 * span, 1.15 * span)
+        if span > 0.0:
+            ax.set_ylim(-1.15 * span, 1.15 * span)
         ax.set_title(f"{SYMBOLS[i]} error [{'m' if i < 3 else 'mdeg'}]")
     axis.dress(axes.ravel(), axes[-1])
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)

@@ -198,8 +198,16 @@ def _accuracy(result: dict[str, Any]) -> Iterable[str]:
             '<p class="note">σ stated: root mean of the variances the estimates came with. NEES: mean normalised error '
             "squared per component, 1 if the stated covariance is right; sensors state their noise only. Direct "
             "georeferencing: intersection with the trajectory before triangulation. Orientations are compared on the "
-            "strips, over the time the final orientation covers; all intersections use the same rays.</p>"
+            "strips, over the time the final orientation covers; all intersections use the same rays."
+            f"{_left_out(result['poses_left_out'])}</p>"
         )
+
+
+def _left_out(poses: dict[str, int]) -> str:
+    if not poses:
+        return ""
+    counts = ", ".join(f"{n} {escape(name)}" for name, n in poses.items())
+    return f" Poses that are not valid by their own account are left out: {counts}."
 
 
 def _times(values: Sequence[float] | None) -> list[float] | None:
