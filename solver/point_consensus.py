@@ -184,7 +184,9 @@ def doubts(solution: Solution, lost: Places, limit: float) -> tuple[Doubt, ...]:
     candidate[network.control.point] = False
     out = []
     places = np.flatnonzero(candidate)
-    rivals = consensus_of_points(solution, places[2 * n_lost[places] < n_rays[places]], limit)
+    # two places have at most two rays in common, so a rival as large as what was kept needs almost as many lost ones
+    twice = 2 * n_lost[places]
+    rivals = consensus_of_points(solution, places[(twice >= n_rays[places] - 2) & (twice < n_rays[places])], limit)
     for p in places.tolist():
         d = Doubt(p, int(n_lost[p]), int(n_rays[p]), "half of the rays or more are left out")
         if 2 * d.lost >= d.rays:
