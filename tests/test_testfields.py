@@ -66,14 +66,17 @@ def test_study_refuses_no_seeds():
         study((), 0)
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
 @pytest.mark.parametrize("name", MODELS)
-def test_blocks_with_errors_as_assumed_are_consistent(name):
-    c = consistency(MODELS[name], True, 10)
-    assert ((c.points > 0.85) & (c.points < 1.15)).all()
+def test_blocks_with_errors_as_assumed_are_consistent(name, calibrated):
+    c = consistency(MODELS[name], calibrated, 50)
+    assert ((c.points > 0.95) & (c.points < 1.05)).all()
+    assert (c.points_sigma > 0.005).all() and (c.points_sigma < 0.05).all()
     low, high = c.band
-    assert low - 0.03 < c.orientation < high + 0.03
-    assert 0.75 < c.parameters < 1.25
-    assert c.sigma0 == pytest.approx(1.0, abs=0.035)
+    assert low - 0.01 < c.orientation < high + 0.01
+    assert np.isnan(c.parameters) if not calibrated else 0.9 < c.parameters < 1.1
+    assert c.sigma0 == pytest.approx(1.0, abs=0.01)
+    assert c.passed_band[0] <= c.passed <= c.passed_band[1]
 
 
 def test_command_prints_the_table(capsys):

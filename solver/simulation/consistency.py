@@ -43,19 +43,23 @@ class Consistency:
     Attributes
     ----------
     points : (3,) RMSE of object points over their theoretical sigma, X, Y, Z
+    points_sigma : (3,) standard deviation of that ratio, from how it scatters from block to block
     orientation, parameters : mean normalised error squared of the model's unknowns and of the additional parameters,
         per unknown; NaN without such parameters
     sigma0 : mean of sigma0 of the image points, root of their squares over their redundancy
     passed : share of chi-square tests of it that passed
     band : (low, high) in which the mean normalised error squared of the model's unknowns lies with 95 %
+    passed_band : (low, high) in which ``passed`` lies with 95 %
     """
 
     points: Array
+    points_sigma: Array
     orientation: float
     parameters: float
     sigma0: float
     passed: float
     band: tuple[float, float]
+    passed_band: tuple[float, float]
 
 
 def consistency(
@@ -65,15 +69,17 @@ def consistency(
 
     Errors of trajectory and camera are drawn from the a-priori knowledge, jointly where continuity binds them. So the
     a-priori equations have as many squares as unknowns, not as equations, and sigma0 is judged on the image points.
+    Every model has draws of its own, so that one unlucky block does not show in several rows.
     """
     if seeds < 1:
         raise ValueError(f"seeds: wanted 1 at least, got {seeds}")
     camera = preset("ads40")
     parameters = replace(tls(camera), sigma=CAMERA_SHARE * tls(camera).sigma) if self_calibration else None
-    squares, stated = np.zeros(3), np.zeros(3)
+    squares, stated = np.empty((seeds, 3)), np.empty((seeds, 3))
+    series = 2 * list(MODELS.values()).index(model) + self_calibration if model in MODELS.values() else 0
     orientation, camera_error, sigma0, passed, unknowns = [], [], [], [], 0
     for seed in range(seeds):
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng((series, seed))
         drawn_camera = np.empty(0)
         if parameters:
             drawn_camera = parameters.apriori_sigma * rng.standard_normal(parameters.n_unknowns)
@@ -86,8 +92,8 @@ def consistency(
         layout = solution.layout
         Q = cofactors(solution)
         known = solution.points.rank == 3
-        squares += np.mean((solution.state.points_l - simulated.points_l)[known] ** 2, axis=0)
-        stated += np.mean(np.einsum("pii->pi", Q.points)[known], axis=0)
+        squares[seed] = np.mean((solution.state.points_l - simulated.points_l)[known] ** 2, axis=0)
+        stated[seed] = np.mean(np.einsum("pii->pi", Q.points)[known], axis=0)
         drawn = [simulated.corrections[simulated.network.strips[s.strip].id] for s in layout.sets]
         error = solution.state.theta[: layout.n_model] - np.concatenate(drawn)
         unknowns = layout.n_model
@@ -102,13 +108,19 @@ def consistency(
         if progress:
             progress((seed + 1) / seeds)
     low, high = stats.chi2.ppf([0.025, 0.975], seeds * unknowns) / (seeds * unknowns)
+    ratio = np.sqrt(squares.mean(axis=0) / stated.mean(axis=0))
+    # of a ratio of means, by the scatter of its blocks; half of that for the root
+    scatter = np.std(squares - ratio**2 * stated, axis=0, ddof=min(1, seeds - 1)) / np.sqrt(seeds)
+    least, most = stats.binom.ppf([0.025, 0.975], seeds, 0.95) / seeds
     return Consistency(
-        np.sqrt(squares / stated),
+        ratio,
+        scatter / (2.0 * ratio * stated.mean(axis=0)),
         float(np.mean(orientation)),
         float(np.mean(camera_error)) if camera_error else float("nan"),
         float(np.mean(sigma0)),
         float(np.mean(passed)),
         (float(low), float(high)),
+        (float(least), float(most)),
     )
 
 
