@@ -56,9 +56,10 @@ class ImagePoints:
     strip : (n,) index into the block's strips, -1 for one that does not exist
     ccd : (n,) index into the camera's CCD lines, -1 for one that does not exist
     line, sample : (n,) pixels, 0-based, integer at pixel and line centre
-    sigma_px : (n,) of a line and of a sample
+    sigma_px : (n,) of a line, and of a sample where it has no own
     time_s : (n,) time of the line; NaN where the strip does not exist
     unknown : names (strip, ccd) as written, of the rows where one of the two does not exist
+    sigma_sample_px : (n,) of a sample; None where it is that of a line
     """
 
     point: IntArray
@@ -69,6 +70,7 @@ class ImagePoints:
     sigma_px: Array
     time_s: Array
     unknown: Mapping[int, tuple[str, str]] = field(default_factory=dict)
+    sigma_sample_px: Array | None = None
 
     def __len__(self) -> int:
         return len(self.point)
@@ -139,11 +141,12 @@ def network_from_block(block: Block) -> Network:
     check = np.array([role == "check" for role in block.ground.role], dtype=bool)
     sigma = block.ground.sigma_m
     image = block.image
+    of_sample = image.sigma_px if image.sigma_sample_px is None else image.sigma_sample_px
     return build_network(
         block.camera,
         block.strips,
         block.point_ids,
-        Measurements(image.point, image.strip, image.ccd, image.line, image.sample, image.sigma_px, image.sigma_px),
+        Measurements(image.point, image.strip, image.ccd, image.line, image.sample, image.sigma_px, of_sample),
         Control(index[~check], block.ground.xyz_l[~check], sigma[~check]),
         Control(index[check], block.ground.xyz_l[check], sigma[check]),
     )

@@ -72,11 +72,27 @@ def residual_covariance(rays: Rays, d_orientation: Array, attitude_rate: bool = 
     rays : n rays
     d_orientation : (2, 6, n) derivative of the projection to the orientation
     attitude_rate : False leaves the attitude rate out, which holds for a stabilised mount only
+
+    The white noise of the orientation, where it is known, goes the same way: `orientation_noise`.
     """
     rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T if attitude_rate else np.zeros((3, len(rays)))])
     u = np.einsum("ckn,kn->cn", d_orientation, rates) * (rays.line_period_s * rays.sigma_line_px)
     v = rays.pitch_mm.T * rays.sigma_sample_px
-    return np.stack([u[0] * u[0] + v[0] * v[0], u[0] * u[1] + v[0] * v[1], u[1] * u[1] + v[1] * v[1]])
+    return _outer(u) + _outer(v) + orientation_noise(rays, d_orientation)
+
+
+def _outer(a: Array) -> Array:
+    """Elements xx, xy, yy of ``a a^T`` for (2, n)."""
+    return np.stack([a[0] * a[0], a[0] * a[1], a[1] * a[1]])
+
+
+def orientation_noise(rays: Rays, d_orientation: Array) -> Array | float:
+    """What the white noise of the measured orientation adds to the covariance (3, n) of the residuals."""
+    if rays.orientation_noise is None:
+        return 0.0
+    through = np.einsum("akn,nkl->anl", d_orientation, rays.orientation_noise)
+    xx, xy, yy = (np.einsum("nk,kn->n", through[a], d_orientation[b]) for a, b in ((0, 0), (0, 1), (1, 1)))
+    return np.stack([xx, xy, yy])
 
 
 def pitch_covariance(rays: Rays) -> Array:
@@ -178,7 +194,7 @@ def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tup
     rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
     u = np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)
     v = whitening.apply(rays.pitch_mm.T * rays.sigma_sample_px)
-    turn = whiten(np.stack([u[0] * u[0] + v[0] * v[0], u[0] * u[1] + v[0] * v[1], u[1] * u[1] + v[1] * v[1]]))
+    turn = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation))
     a, b, c = turn.g
     g = whitening.g
     fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .rotation import quaternion_conjugate, quaternion_multiply, vector_from_quaternion
-from .trajectory import Poses, Trajectory, slopes
+from .trajectory import Poses, Trajectory, noise_between, slopes
 
 Array = NDArray[np.floating]
 
@@ -158,9 +158,6 @@ class MeasuredTrajectory:
     def at(self, time_s: ArrayLike) -> MeasuredPoses:
         """Orientation at times (n,) that are covered.
 
-        The white noise of the attitude shrinks between samples, since the interpolation averages; that of the position
-        does not, it is correlated over many samples.
-
         Raises
         ------
         ValueError : a time outside
@@ -176,12 +173,7 @@ class MeasuredTrajectory:
                 raise ValueError("no orientation yet")
             p = source.at(t[mine])
             values[:, mine] = p.position_l, p.angles, p.velocity_l, p.angle_rate
-            i = np.clip(np.searchsorted(source.time_s, t[mine], side="right") - 1, 0, len(source) - 2)
-            s = (t[mine] - source.time_s[i]) / (source.time_s[i + 1] - source.time_s[i])
-            nearest = source.covariance[np.where(s < 0.5, i, i + 1)]
-            factor = np.ones((len(s), 6))
-            factor[:, 3:] = np.sqrt(hermite_noise(s))[:, None]
-            covariance[mine] = nearest * factor[:, :, None] * factor[:, None, :]
+            covariance[mine] = noise_between(source.time_s, source.covariance, t[mine])
         return MeasuredPoses(Poses(t, *values), covariance, by_smoothed)
 
     def forget(self, before_s: float) -> None:
@@ -189,11 +181,3 @@ class MeasuredTrajectory:
         for trajectory in (self._filtered, self._smoothed):
             if len(trajectory):
                 trajectory.forget(before_s)
-
-
-def hermite_noise(s: Array) -> Array:
-    """Sum of squared weights of the four samples about share ``s`` of a step: what is left of white noise variance."""
-    s2, s3 = s * s, s * s * s
-    h0, h1 = s3 - 2 * s2 + s, s3 - s2  # of the slopes, each half the difference of its sample's neighbours
-    w0, w1 = 1 - 3 * s2 + 2 * s3, 3 * s2 - 2 * s3
-    return (0.5 * h0) ** 2 + (w0 - 0.5 * h1) ** 2 + (w1 + 0.5 * h0) ** 2 + (0.5 * h1) ** 2

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from .camera import LineCamera
 from .intersection import intersect_rays
 from .rotation import matrix_from_angles
-from .trajectory import Trajectory
+from .trajectory import Trajectory, noise_between
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -33,6 +33,7 @@ class Strip:
     lines : number of image lines; 0 when it is not known
     line_time_s : (lines,) times of the lines where a camera does not keep a constant rate; replaces the two above
     lens : lens of the camera this strip was taken through, where strips are given lens by lens
+    noise : (k, 6, 6) covariance of the white noise of the trajectory's k samples, m and rad; None where it is not known
     """
 
     id: str
@@ -42,6 +43,7 @@ class Strip:
     lines: int = 0
     line_time_s: Array | None = field(default=None, repr=False)
     lens: str | None = None
+    noise: Array | None = field(default=None, repr=False)
 
     def time_of(self, line: ArrayLike) -> Array:
         """Times of (fractional) image lines, seconds."""
@@ -88,6 +90,7 @@ class Rays:
     xy_mm : (n, 2) calibrated image coordinates, reduced to the principal point
     pitch_mm : (n, 2) their change per pixel along the CCD line
     focal_length_mm : (n,)
+    orientation_noise : (n, 6, 6) covariance of the white noise of the measured orientation, or None
     """
 
     point: IntArray
@@ -107,13 +110,15 @@ class Rays:
     xy_mm: Array
     pitch_mm: Array
     focal_length_mm: Array
+    orientation_noise: Array | None = None
 
     def __len__(self) -> int:
         return len(self.point)
 
-    def part(self, which: slice) -> Rays:
-        """A range of the rays, as views."""
-        return Rays(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+    def part(self, which: slice | IntArray) -> Rays:
+        """Some of the rays; a range of them as views."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return Rays(**{name: value[which] for name, value in given.items()})
 
 
 @dataclass(frozen=True)
@@ -261,7 +266,7 @@ def build_network(
     place = np.full(len(point_ids), -1)
     place[order] = np.arange(len(order))
     by_point = np.lexsort((rays.time_s, rays.strip, place[rays.point]))
-    rays = Rays(**{name: getattr(rays, name)[by_point] for name in rays.__dataclass_fields__})
+    rays = rays.part(by_point)
     rays = replace(rays, point=place[rays.point])
     first_ray = np.searchsorted(rays.point, np.arange(len(order) + 1))
     seen = used[check.point]
@@ -307,12 +312,16 @@ def _rays(camera: LineCamera, strips: Sequence[Strip], m: Measurements, good: ND
     n = len(good)
     time, period = np.empty(n), np.empty(n)
     pose = np.empty((4, n, 3))
+    noise = np.zeros((n, 6, 6)) if any(s.noise is not None for s in strips) else None
     for i in np.unique(strip):
         mine = strip == i
         time[mine] = strips[i].time_of(line[mine])
         period[mine] = strips[i].line_period(line[mine])
         p = strips[i].trajectory.at(time[mine])
         pose[:, mine] = p.position_l, p.angles, p.velocity_l, p.angle_rate
+        of_samples = strips[i].noise
+        if noise is not None and of_samples is not None:
+            noise[mine] = noise_between(strips[i].trajectory.time_s, of_samples, time[mine])
     xy, pitch = camera.image_coordinates(ccd, sample)
     return Rays(
         np.asarray(m.point)[good].astype(np.int64),
@@ -332,6 +341,7 @@ def _rays(camera: LineCamera, strips: Sequence[Strip], m: Measurements, good: ND
         xy,
         pitch,
         camera.focal_length_mm[ccd],
+        noise,
     )
 
 

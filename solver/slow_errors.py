@@ -19,6 +19,9 @@ WANDERING_SHARE = 1.0
 #: says something else with every second of data that it has more.
 LEARNING_TIME_S = 6.0
 
+#: No pose has less white noise than this, m and rad.
+LEAST_NOISE = (1e-3, 1e-6)
+
 
 @dataclass(frozen=True)
 class SlowErrors:
@@ -87,13 +90,13 @@ class SlowErrors:
             min(self.wander_time_s, LEARNING_TIME_S),
         )
 
-    def without(self, covariance: Array) -> Array:
-        """The white part of pose covariances (..., 6, 6): what is left without slow errors, 1 mm and 1 urad at least.
+    def without(self, covariance: Array, least: tuple[float, float] = LEAST_NOISE) -> Array:
+        """The white part of pose covariances (..., 6, 6): what is left without slow errors, `least` (m, rad) at least.
 
         Correlations are kept between components whose variance stays.
         """
         slow = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
-        floor = np.array([1e-3] * 3 + [1e-6] * 3) ** 2
+        floor = np.repeat(np.square(least), 3)
         rest = np.array(covariance, dtype=float)
         variance = np.einsum("...ii->...i", rest)
         left = np.maximum(variance - slow, floor)

@@ -144,3 +144,24 @@ def _hermite(s: Array, h: Array, change: Array, slope0: Array, slope1: Array) ->
     value = (3 * s2 - 2 * s3) * change + h * ((s3 - 2 * s2 + s) * slope0 + (s3 - s2) * slope1)
     rate = (6 * (s - s2) / h) * change + (3 * s2 - 4 * s + 1) * slope0 + (3 * s2 - 2 * s) * slope1
     return value, rate
+
+
+def noise_between(time_s: Array, covariance: Array, at_s: Array) -> Array:
+    """Covariance (m, 6, 6) of the noise of an interpolated pose, from that of the samples (n, 6, 6) at times (n,).
+
+    The white noise of the attitude shrinks between samples, since the interpolation averages; that of the position does
+    not, it is correlated over many samples.
+    """
+    i = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
+    s = (at_s - time_s[i]) / (time_s[i + 1] - time_s[i])
+    factor = np.ones((len(s), 6))
+    factor[:, 3:] = np.sqrt(hermite_noise(s))[:, None]
+    return covariance[np.where(s < 0.5, i, i + 1)] * factor[:, :, None] * factor[:, None, :]
+
+
+def hermite_noise(s: Array) -> Array:
+    """Sum of squared weights of the four samples about share ``s`` of a step: what is left of white noise variance."""
+    s2, s3 = s * s, s * s * s
+    h0, h1 = s3 - 2 * s2 + s, s3 - s2  # of the slopes, each half the difference of its sample's neighbours
+    w0, w1 = 1 - 3 * s2 + 2 * s3, 3 * s2 - 2 * s3
+    return (0.5 * h0) ** 2 + (w0 - 0.5 * h1) ** 2 + (w1 + 0.5 * h0) ** 2 + (0.5 * h1) ** 2

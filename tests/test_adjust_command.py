@@ -220,6 +220,21 @@ def test_recording_gives_what_the_folder_gives(folder, tmp_path):
     np.testing.assert_allclose(other["check"]["rmse_m"], one["check"]["rmse_m"], atol=1e-5)
 
 
+def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
+    """Wander and the white noise of the poses are the project's: image points do not get the blame for either."""
+    flight, smoothed = tmp_path / "flight.mcap", tmp_path / "smoothed.mcap"
+    assert main(["simulate", "-o", str(flight), "--seconds", "30", "-q"]) == 0
+    assert main(["process", str(flight), "-o", str(smoothed), "--nodes", "navigator", "-q"]) == 0
+    assert adjust(smoothed, "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    assert result["model"] == "wander"
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.07)
+    (strip,) = read_input(smoothed).strips
+    assert strip.noise is not None and strip.noise.shape == (len(strip.trajectory), 6, 6)
+    assert adjust(smoothed, "-q", "--model", "dgr", "-o", tmp_path / "dgr") == 0
+    assert result_in(tmp_path / "dgr")["model"] == "dgr"
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
 def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
     """The block moved to 9 deg 30' east, 48 deg north: same adjustment, coordinates and angles in the other system."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from adjustment_networks import CAMERA, dense_design, simulate
+from scipy import stats
 from scipy.optimize import least_squares
 
 from triline.solver.adjustment import AdjustmentOptions, State, adjust, pose_problem, solve
@@ -256,6 +257,26 @@ def test_weights_through_the_image_motion_pay_on_an_unstabilised_mount():
     assert 0.97 < motion < 1.03
     assert 1.2 < pitch < 1.6
     assert np.sqrt(pitch_error / motion_error) > 1.2
+
+
+def test_white_noise_of_the_orientation_belongs_to_the_weights():
+    """Where it is known, sigma0 is 1; where it is kept back, the image points get the blame."""
+    sigma = np.array([0.03, 0.03, 0.03, 3e-5, 3e-5, 6e-5])
+    model, squares = MODELS["dgr"], {"known": 0.0, "kept back": 0.0}
+    redundancy = 0
+    for seed in range(4):
+        simulated, _ = block(model, False, seed=seed)
+        rays, rng = simulated.network.rays, np.random.default_rng(seed)
+        error = sigma * rng.standard_normal((len(rays), 6))
+        network = simulated.network.with_orientation(rays.position_l + error[:, :3], rays.angles + error[:, 3:])
+        noise = np.broadcast_to(np.diag(sigma**2), (len(rays), 6, 6))
+        told = replace(network, rays=replace(network.rays, orientation_noise=noise))
+        for name, each in (("known", told), ("kept back", network)):
+            squares[name] += adjust(each, model).cost
+        redundancy += adjust(network, model).redundancy
+    low, high = np.sqrt(stats.chi2.ppf([0.005, 0.995], redundancy) / redundancy)
+    assert low < np.sqrt(squares["known"] / redundancy) < high
+    assert np.sqrt(squares["kept back"] / redundancy) > 1.2
 
 
 def test_bad_starting_points_are_reached_by_damping():

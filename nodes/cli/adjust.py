@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", metavar="INPUT", help="block folder, or recording (MCAP)")
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
     group = parser.add_argument_group("model")
-    group.add_argument("--model", choices=sorted(MODELS), default="dgr", help="trajectory model (dgr)")
+    group.add_argument(
+        "--model", choices=sorted(MODELS), help="trajectory model (dgr; wander if the project states one)"
+    )
     group.add_argument("--then", choices=sorted(MODELS), help="a second model on the orientation the first one refined")
     group.add_argument("--segments", type=int, metavar="N", help="segments a strip, for ppm")
     group.add_argument("--fixes", type=int, metavar="N", help="orientation fixes a strip, for lim")
@@ -114,15 +116,16 @@ def job_of(args: argparse.Namespace, block: Block) -> Job:
     """The job that the options ask for."""
     settings: dict[str, object] = dict(block.apriori.trajectory)
     settings |= {key: value for key in ("segments", "fixes") if (value := getattr(args, key)) is not None}
-    models = {args.model, args.then}
-    for option, model in (("segments", "ppm"), ("fixes", "lim")):
-        if getattr(args, option) is not None and model not in models:
-            raise UserError(f"--{option} is for the model {model}; asked for is {args.model}")
+    model = args.model or ("wander" if _wanders(settings) else "dgr")
+    models = {model, args.then}
+    for option, owner in (("segments", "ppm"), ("fixes", "lim")):
+        if getattr(args, option) is not None and owner not in models:
+            raise UserError(f"--{option} is for the model {owner}; asked for is {model}")
     _refuse_more_than_rays_carry(settings, models, block)
     limits = Limits(keep_significant=args.keep == "significant")
     robust = WEIGHT_FUNCTIONS[args.robust]() if args.robust else None
     return Job(
-        _model(args.model, settings),
+        _model(model, settings),
         _model(args.then, settings) if args.then else None,
         _self_calibration(args, block),
         args.keep != "all",
@@ -134,6 +137,11 @@ def job_of(args: argparse.Namespace, block: Block) -> Job:
         args.variance_components,
         max_iterations=args.iterations,
     )
+
+
+def _wanders(settings: Mapping[str, object]) -> bool:
+    """Whether the project says that the errors of the trajectory wander."""
+    return any(np.any(np.asarray(settings.get(key, 0.0), float)) for key in ("wander_sigma_m", "wander_sigma_deg"))
 
 
 def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str], block: Block) -> None:

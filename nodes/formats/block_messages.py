@@ -197,6 +197,7 @@ def _tie_messages(block: Block, times: _Times, source: str) -> Iterator[Message]
     image = block.image
     if not len(image):
         return
+    of_sample = image.sigma_px if image.sigma_sample_px is None else image.sigma_sample_px
     time_ns = times.of_looks(block)
     order = np.lexsort((time_ns, image.strip, image.point))
     key = np.stack([image.point[order], image.strip[order]])
@@ -215,7 +216,7 @@ def _tie_messages(block: Block, times: _Times, source: str) -> Iterator[Message]
                     line=image.line[row],
                     sample=image.sample[row],
                     sigma_line=image.sigma_px[row],
-                    sigma_sample=image.sigma_px[row],
+                    sigma_sample=of_sample[row],
                     time_ns=int(time_ns[row]),
                 )
             )

@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...solver.block import Apriori, Block, GroundPoints, ImagePoints
 from ...solver.network import Strip
+from ...solver.slow_errors import SlowErrors
 from ...solver.trajectory import Trajectory
-from ..convert import SECOND_NS, camera_from, local_frame, role_of
+from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
@@ -22,6 +24,9 @@ TOPICS = (
     *("configuration/project", "configuration/camera", "configuration/strip"),
     *("observation/control", "observation/tie", "trajectory/filtered", "trajectory/smoothed"),
 )
+
+#: Share of a variance that is rounding.
+ROUNDING = 1e-9
 
 
 @dataclass
@@ -49,7 +54,7 @@ class _Collected:
             self.ties.extend((body.point, image) for image in body.images)
         elif message.topic in ("trajectory/filtered", "trajectory/smoothed"):
             stamp = body.timestamp.seconds * SECOND_NS + body.timestamp.nanos
-            self.poses.setdefault(message.topic, []).append((stamp, body.strip, body.pose))
+            self.poses.setdefault(message.topic, []).append((stamp, body.strip, body))
 
 
 def block_from_messages(messages: Iterable[Message], name: str) -> Block:
@@ -88,7 +93,9 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
     poses.sort(key=lambda pose: pose[0])
     # times near the start of the epoch are those of a project; others lose digits unless they count from their start
     reference = 0 if poses[-1][0] < 10**8 * SECOND_NS else poses[0][0] // SECOND_NS * SECOND_NS
-    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses})
+    stated = any(getattr(project, key) for key in SIGMAS)
+    slow = slow_errors_of(project) if stated else None
+    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow)
     if not strips:
         raise UserError(f"{name}: no strip with a trajectory; {notes[0] if notes else ''}")
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
@@ -104,7 +111,12 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
 
 
 def _strips_of(
-    found: _Collected, poses: list[tuple[int, str, Any]], reference: int, notes: list[str], lenses: set[str]
+    found: _Collected,
+    poses: list[tuple[int, str, Any]],
+    reference: int,
+    notes: list[str],
+    lenses: set[str],
+    slow: SlowErrors | None,
 ) -> tuple[Strip, ...]:
     time_ns = np.array([pose[0] for pose in poses], dtype=np.int64)
     label = np.array([pose[1] for pose in poses], dtype=object)
@@ -126,15 +138,30 @@ def _strips_of(
         if len(rows) < 2 or not rate > 0:
             notes.append(f"strip {id} has no trajectory or no line rate and was left out")
             continue
-        p = [poses[row][2] for row in rows]
+        bodies = [poses[row][2] for row in rows]
+        p = [body.pose for body in bodies]
         trajectory = Trajectory(
             (time_ns[rows] - reference) * 1e-9,
             [(q.position.x, q.position.y, q.position.z) for q in p],
             [(q.orientation.x, q.orientation.y, q.orientation.z, q.orientation.w) for q in p],
         )
+        noise = _noise_of(bodies, slow)
         lens = id.rpartition("/")[2] if "/" in id else None
-        strips.append(Strip(id, trajectory, first, rate, lines, lens=lens if lens in lenses else None))
+        strips.append(Strip(id, trajectory, first, rate, lines, lens=lens if lens in lenses else None, noise=noise))
     return tuple(strips)
+
+
+def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.float64] | None:
+    """(n, 6, 6) white noise of poses: their covariance without the slow errors that the project states.
+
+    None where it states none, since then nobody knows what part of the covariance is white, or where nothing is left.
+    """
+    if slow is None or not all(len(pose.covariance) == 36 for pose in poses):
+        return None
+    stated = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
+    noise = slow.without(stated, least=(0.0, 0.0))
+    variances = np.einsum("nii->ni", noise), np.einsum("nii->ni", stated)
+    return noise if np.isfinite(noise).all() and (variances[0] > ROUNDING * variances[1]).any() else None
 
 
 def _ground_of(found: _Collected, notes: list[str]) -> GroundPoints:
@@ -157,16 +184,18 @@ def _image_of(
     place = {strip.id: i for i, strip in enumerate(strips)}
     n = len(found.ties)
     index = np.empty((3, n), dtype=np.int64)
-    value = np.empty((3, n))
+    value = np.empty((4, n))
     unknown: dict[int, tuple[str, str]] = {}
+    usual = apriori.image_sigma_px
     for i, (point, image) in enumerate(found.ties):
         index[:, i] = ids.setdefault(point, len(ids)), place.get(image.strip, -1), camera.line_index.get(image.ccd, -1)
-        value[:, i] = image.line, image.sample, max(image.sigma_line, image.sigma_sample) or apriori.image_sigma_px
+        value[:2, i] = image.line, image.sample
+        value[2:, i] = image.sigma_line or usual, image.sigma_sample or usual
         if index[1:, i].min() < 0:
             unknown[i] = (image.strip, image.ccd)
     time = np.full(n, np.nan)
     for i, strip in enumerate(strips):
         mine = index[1] == i
         time[mine] = strip.time_of(value[0, mine])
-    line, sample, sigma = value
-    return tuple(ids), ImagePoints(index[0], index[1], index[2], line, sample, sigma, time, unknown)
+    line, sample, sigma, of_sample = value
+    return tuple(ids), ImagePoints(index[0], index[1], index[2], line, sample, sigma, time, unknown, of_sample)

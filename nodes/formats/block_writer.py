@@ -127,12 +127,13 @@ def _write_image_points(folder: Path, block: Block) -> None:
     strip, ccd = strips[image.strip], ccds[image.ccd]
     for row, (strip_name, ccd_name) in image.unknown.items():
         strip[row], ccd[row] = strip_name, ccd_name
+    of_sample = image.sigma_sample_px  # the format has one sigma for both
     columns = {
         "point": points[image.point],
         "strip": strip,
         "ccd": ccd,
         "line": image.line,
         "sample": image.sample,
-        "sigma_px": image.sigma_px,
+        "sigma_px": image.sigma_px if of_sample is None else np.maximum(image.sigma_px, of_sample),
     }
     write_table(folder / "image_points.csv", columns, {"line": ".6f", "sample": ".6f", "sigma_px": ".6g"})
