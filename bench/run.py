@@ -10,6 +10,7 @@ FOLDER = Path(__file__).parent
 #: What is measured, and the program that measures it with its arguments.
 BENCHMARKS = {
     "bus and recorder under the load of three full image lines": ["bus_load.py"],
+    "timing of a replay": ["replay_timing.py"],
     "batch adjustment against Ceres": ["ceres/compare.py"],
     "batch adjustment: time and memory against size": ["adjustment_scaling.py", "-o", "out/bench"],
     "batch job: snooping, elimination, covariances": ["adjustment_job.py"],

@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -62,21 +63,22 @@ def test_node_shows_what_it_is_given(messages):
 
 
 class _Stuck(Notebook):
+    def __init__(self):
+        super().__init__()
+        self.released = threading.Event()
+
     def points(self, *args, **kwargs):
-        time.sleep(0.3)
+        self.released.wait()
 
 
-def test_a_slow_viewer_drops_and_counts_and_holds_nobody_up(messages):
-    viewer = Viewer(canvas=_Stuck(), queue_size=300)
-    wanted = [m for m in messages if m.topic in Viewer.inputs]
-    longest, begun = 0.0, time.perf_counter()
-    for message in wanted:
-        start = time.perf_counter()
-        viewer.step(message)
-        longest = max(longest, time.perf_counter() - start)
-    total = time.perf_counter() - begun
-    assert total < 1.0 and longest < 0.2
+def test_a_stuck_viewer_drops_and_counts_and_holds_nobody_up(messages):
+    canvas = _Stuck()
+    viewer = Viewer(canvas=canvas, queue_size=300)
+    for message in messages:  # would hang here if a step waited for the picture
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
     assert viewer.counters["view dropped"] > 500
+    canvas.released.set()
     viewer.finish()
 
 
