@@ -320,7 +320,7 @@ class Adjuster(Node):
 
     def _results(self, update: WindowUpdate) -> list[Message]:
         for refusal in update.refused:
-            self.counters["rejected" if refusal.reason == "snooping" else refusal.reason] += 1
+            self.counters["observations rejected" if refusal.reason == "snooping" else refusal.reason] += 1
         refusals, self._refusals = self._refusals + update.refused, []
         self._rejected_total += len(refusals)
         outputs: list[Message] = []
