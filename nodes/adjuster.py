@@ -34,7 +34,8 @@ class Adjuster(Node):
     Parameters
     ----------
     model : trajectory model: wander, dgr, ppm, lim
-    segment_s, window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
+    segment_s : longest segment of the model, s; without it a fifteenth of the correlation time of the wander
+    window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
     update_s : platform time between updates
     self_calibration : set of additional parameters, or "none"
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
@@ -58,7 +59,7 @@ class Adjuster(Node):
         self,
         *,
         model: str = WindowOptions.model,
-        segment_s: float = WindowOptions.segment_s,
+        segment_s: float | None = None,
         window_s: float = WindowOptions.window_s,
         window_looks: float = WindowOptions.window_looks,
         grid_hz: float = WindowOptions.grid_hz,
@@ -71,13 +72,15 @@ class Adjuster(Node):
         super().__init__()
         if not update_s > 0:
             raise ValueError(f"update_s: wanted more than 0, got {update_s}")
+        if segment_s is not None and not segment_s > 0:
+            raise ValueError(f"segment_s is {segment_s:g}, wanted more than 0 s (leave it out for the default)")
         if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
             known = ", ".join(("none", *SELF_CALIBRATIONS))
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
         if apriori not in APRIORI:
             raise ValueError(f"apriori: {apriori!r} is not known, wanted one of {', '.join(APRIORI)}")
         self.options = WindowOptions(
-            model=model, segment_s=segment_s, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
+            model=model, segment_s=segment_s or 0.0, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
             settle_s=settle_s, snoop=snoop,
         )  # fmt: skip
         self._update_ns = round(update_s * convert.SECOND_NS)
@@ -276,11 +279,11 @@ class Adjuster(Node):
         # without a filter (an imported trajectory) the smoothed poses lead
         if smoothed and self._poses.filtered_seen:
             return []
-        return self._live(time_s, sample.valid, body.reason)
+        return self._live(time_s)
 
     # -- output --------------------------------------------------------------------------------------------------------
 
-    def _live(self, time_s: float, valid: bool, reason: str) -> list[Message]:
+    def _live(self, time_s: float) -> list[Message]:
         assert self._window is not None
         hz = self.options.grid_hz
         if time_s < self._next_live:
@@ -294,8 +297,9 @@ class Adjuster(Node):
         for t in due:
             orientation = self._window.live(float(t))
             if orientation is not None:
-                outputs += out.orientations("orientation/live", orientation, self._reference_ns, self._stamp_ns,
-                                            lambda _: (valid, reason))  # fmt: skip
+                outputs += out.orientations(
+                    "orientation/live", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
+                )
         self._store.add_live([message.body for message in outputs])
         return outputs
 

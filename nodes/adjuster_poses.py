@@ -16,7 +16,7 @@ from . import convert
 Array = NDArray[np.floating]
 Poses = tuple[list[float], Array, Array, Array, bool]
 
-#: Whether measured poses were valid is remembered this long, s; longer than any window.
+#: Of so long, s, each measured pose's validity is remembered, longer than any window; of earlier ones the stretches.
 REMEMBERED_S = 300.0
 #: So many older ones may be kept, until they are forgotten together.
 MOST_OLD = 1024
@@ -44,6 +44,7 @@ class PoseBuffer:
         self.filtered_seen = False
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
         self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
+        self._invalid: dict[bool, list[tuple[float, float, str]]] = {False: [], True: []}
 
     def clear(self) -> None:
         """Forget what waits."""
@@ -65,6 +66,7 @@ class PoseBuffer:
         reasons.insert(place, None if sample.valid else reason)
         old = bisect_left(times, times[-1] - REMEMBERED_S)
         if old > MOST_OLD:
+            self._invalid[smoothed] += _stretches(times[: old + 1], reasons[: old + 1])
             del times[:old], reasons[:old]
 
     def covariance_after(self, time_s: float) -> Array | None:
@@ -103,12 +105,29 @@ class PoseBuffer:
         Smoothed poses count where there are any, as in the window; a pose at the time itself stands alone.
         """
         smoothed_s = self._seen[True][0]
-        times, reasons = self._seen[bool(smoothed_s) and time_s <= smoothed_s[-1] + SAME_TIME_S]
+        by_smoothed = bool(smoothed_s) and time_s <= smoothed_s[-1] + SAME_TIME_S
+        times, reasons = self._seen[by_smoothed]
+        if times and time_s < times[0] - SAME_TIME_S:
+            found = (r for a, b, r in self._invalid[by_smoothed] if a - SAME_TIME_S < time_s < b + SAME_TIME_S)
+            return (False, old) if (old := next(found, None)) is not None else (True, "")
         low, high = bisect_left(times, time_s - SAME_TIME_S), bisect_right(times, time_s + SAME_TIME_S)
         if low == high:
             low, high = max(low - 1, 0), high + 1
         reason = next((r for r in reasons[low:high] if r is not None), None)
         return reason is None, reason or ""
+
+
+def _stretches(times: list[float], reasons: list[str | None]) -> list[tuple[float, float, str]]:
+    """Begin, end and reason of what is not valid, each with the pose before and after it."""
+    out = []
+    for i, reason in enumerate(reasons):
+        if reason is None:
+            continue
+        if i and reasons[i - 1] is not None and out:
+            out[-1] = out[-1][0], times[min(i + 1, len(times) - 1)], out[-1][2]
+        else:
+            out.append((times[max(i - 1, 0)], times[min(i + 1, len(times) - 1)], reason))
+    return out
 
 
 class OrientationStore:

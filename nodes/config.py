@@ -75,7 +75,7 @@ def _wanted(default: Any, value: Any) -> str:
     """What a value should be to take the place of a default; empty if it can."""
     if isinstance(default, bool):
         return "" if isinstance(value, bool) else "true or false"
-    if isinstance(default, int | float):
+    if default is None or isinstance(default, int | float):
         return "" if isinstance(value, int | float) and not isinstance(value, bool) else "a number"
     if isinstance(default, str):
         return "" if isinstance(value, str) else "a text"

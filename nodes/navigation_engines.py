@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..solver.inertial_data import InertialGrade
-from ..solver.inertial_navigator import InertialNavigator, OnlineOptions
+from ..solver.inertial_navigator import InertialNavigator
 from ..solver.kinematic import KinematicFilter, KinematicOptions
 from ..solver.navigation import NavigationSettings
 from ..solver.navigation_trajectory import CameraMount
+from ..solver.online_poses import OnlineOptions
 from . import convert
 
 #: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.

@@ -8,56 +8,23 @@ gives the same poses as the live run.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .alignment import AlignmentError, AttitudePrior, align
+from .alignment import AttitudePrior
 from .frames import LocalFrame
-from .gnss_fix import local_fix, stacked
-from .inertial_data import GAP_FACTOR, GnssData, InertialData, concatenate
-from .navigation import Estimate, Innovation, NavigationSettings, Start
+from .gnss_fix import local_fix
+from .inertial_data import GAP_FACTOR, GnssData, InertialData
+from .navigation import Innovation, NavigationSettings, Start
 from .navigation_chain import NavigationChain
 from .navigation_pose import NavigationEvent, NavigationPose
-from .navigation_trajectory import CameraMount, NavigationStates, camera_poses, passed_over
-from .rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
+from .navigation_trajectory import CameraMount, NavigationStates, passed_over
+from .online_alignment import Aligned, AlignmentBuffer, GnssWatch
+from .online_poses import OnlineOptions, PoseMaker
 from .strapdown import State
 
 Array = NDArray[np.floating]
-
-
-@dataclass(frozen=True)
-class OnlineOptions:
-    """How an on-line navigator answers.
-
-    Attributes
-    ----------
-    pose_step_s : distance of poses
-    lag_s : smoothed poses come so much later
-    smooth_every_s : how often they come
-    rewind_s : how late a fix may be
-    step_s : longest distance of nodes
-    valid_position_m, valid_attitude_rad : a pose with larger standard deviations is not valid
-    patience_s : so long the alignment waits for turns before it takes a given attitude or the course
-    longest_alignment_s : of this much past data the alignment makes use
-    offset_sigma_m : constant error of GNSS positions, local X, Y, Z, that no data show; it is added to the covariance
-    """
-
-    pose_step_s: float = 0.02
-    lag_s: float = 5.0
-    smooth_every_s: float = 1.0
-    rewind_s: float = 2.0
-    step_s: float = 0.25
-    valid_position_m: float = 3.0
-    valid_attitude_rad: float = float(np.radians(2.0))
-    patience_s: float = 25.0
-    longest_alignment_s: float = 130.0
-    offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if not self.lag_s >= self.rewind_s:
-            raise ValueError(f"lag_s {self.lag_s} is shorter than rewind_s {self.rewind_s}: late fixes would be lost")
 
 
 class InertialNavigator:
@@ -80,11 +47,10 @@ class InertialNavigator:
         options: OnlineOptions | None = None,
         prior: AttitudePrior | None = None,
     ):
-        self.frame, self.settings = frame, settings
-        self.mount, self.options = mount or CameraMount(), options or OnlineOptions()
+        self.frame, self.settings, self.options = frame, settings, options or OnlineOptions()
+        self._maker = PoseMaker(frame, mount or CameraMount(), self.options)
         self.counters: Counter[str] = Counter()
-        self.status = "aligning"
-        self._prior = prior
+        self._watch_gnss = GnssWatch()
         self._events: list[NavigationEvent] = []
         self._last_s = -np.inf  # stamp of the last inertial sample
         self._interval = 0.0
@@ -92,22 +58,23 @@ class InertialNavigator:
         self._published = -np.inf
         self._published_smooth = -np.inf
         self._replaying = False
-        self._forget()
+        self._forget(prior)
 
-    def _forget(self) -> None:
+    def _forget(self, prior: AttitudePrior | None = None) -> None:
         """Back to the alignment."""
         self._chain: NavigationChain | None = None
-        self._raw: list[InertialData] = []  # kept while aligning
-        self._fixes: list[tuple[float, GnssData]] = []
+        self._alignment = AlignmentBuffer(self.settings, self.options, prior)
         self._waiting: list[tuple[float, GnssData]] = []
         self._open: list[tuple[float, float, Array, Array, float, float]] = []
         self._next_pose = -np.inf
-        self._next_try = -np.inf
         self._next_smooth = -np.inf
         self._restored: list[float] = []
         self._pose_due = False
         self._ahead: tuple[NavigationStates, Array] | None = None  # what the last smoothing said of later times
-        self.status = "aligning"
+
+    @property
+    def status(self) -> str:
+        return self._alignment.status if self._chain is None else "navigating"
 
     @property
     def aligned(self) -> bool:
@@ -147,12 +114,16 @@ class InertialNavigator:
             self.counters["inertial gap"] += 1
             if gap > self.settings.longest_gap_s:
                 self._event(time_s, f"inertial data missing for {gap:.1f} s: aligning anew")
+                self.counters["aligned anew"] += 1
                 self._forget()
                 self._previous = None
             else:
                 poses += self._bridge(time_s, interval_s, v, th)
         elif np.isfinite(self._last_s):
             interval_s = step  # stamps are better than the nominal interval
+        if said := self._watch_gnss.inertial(time_s):
+            self.counters["gnss outage"] += 1
+            self._event(time_s, said if self.aligned else f"{said}: the alignment waits for it")
         poses += self._sample(time_s, interval_s, th, v, 0.0, 0.0)
         return poses
 
@@ -211,7 +182,7 @@ class InertialNavigator:
         raw = InertialData(t, dt, th, v, pg, pa)
         self._open = []
         if self._chain is None:
-            self._raw.append(raw)
+            self._alignment.append(raw)
             self._previous = th[-1], v[-1], float(dt[-1])
             return []
         pieces = raw.corrected(self._previous)
@@ -246,9 +217,12 @@ class InertialNavigator:
         if time_s < self._last_s - self.options.rewind_s:
             self.counters["gnss too late"] += 1
             return []
+        if said := self._watch_gnss.fix(time_s):
+            self._event(time_s, said)
         if self._chain is None:
-            self._fixes.append((time_s, fix))
-            self._fixes.sort(key=lambda f: f[0])
+            if not self._alignment.add_fix(time_s, fix):
+                self.counters["gnss duplicate"] += 1
+                return []
             return self._align(time_s)
         if any(abs(time_s - w) < 1e-6 for w, _ in self._waiting):
             self.counters["gnss duplicate"] += 1
@@ -287,48 +261,29 @@ class InertialNavigator:
         if len(self._restored) >= 4:
             self._event(now, "filter and GNSS keep disagreeing: aligning anew")
             self.counters["aligned anew"] += 1
-            self._prior = None
             self._forget()
 
     # ----------------------------------------------------------------------------------------------------- alignment
 
     def _align(self, time_s: float) -> list[NavigationPose]:
-        o = self.options
         if self._open:
             self._close_chunk()
-        if not self._raw:
+        found, remarks = self._alignment.attempt(self._last_s)
+        for text in [*remarks, *(found.remarks if found else [])]:
+            self.counters["data suspicious"] += 1
+            self._event(time_s, text)
+        if found is None:
             return self._unaligned(time_s)
-        while len(self._raw) > 1 and self._last_s - self._raw[0].time_s[0] > o.longest_alignment_s:
-            self._raw.pop(0)
-            self._prior = None  # it was for the first sample
-        start = float(self._raw[0].time_s[0] - self._raw[0].dt_s[0])
-        self._fixes = [f for f in self._fixes if f[0] >= start]
-        if len(self._fixes) < 4 or self._last_s - self._fixes[0][0] < 4.0 or self._last_s < self._next_try:
-            return self._unaligned(time_s)
-        self._next_try = self._last_s + max(1.0, 0.25 * (self._last_s - self._fixes[0][0]))
-        raw = concatenate(self._raw)
-        covered = [f for f in self._fixes if f[0] <= self._last_s]
-        gnss = stacked([f for _, f in covered])
-        seen = float(gnss.time_s[-1] - start)
-        try:
-            patience = o.patience_s if seen >= o.patience_s else np.inf
-            found = align(raw, gnss, self.settings, start_s=start, prior=self._prior, patience_s=patience)
-        except AlignmentError as error:
-            self.status = f"aligning: {error}"
-            return self._unaligned(time_s)
-        waiting = [f for f in self._fixes if f[0] > self._last_s]
-        self._begin(found.estimate, found.P, raw, covered)
-        self._waiting = waiting
-        text = f"aligned {found.how} after {seen:.0f} s"
-        self._event(time_s, "; ".join([text, *found.notes]))
-        self.status = "navigating"
+        text = f"aligned {found.start.how} after {found.seen_s:.0f} s"
+        self._begin(found)
+        self._event(time_s, "; ".join([text, *found.start.notes]))
         return self._filtered()
 
-    def _begin(self, estimate: Estimate, P: Array, raw: InertialData, fixes: list[tuple[float, GnssData]]) -> None:
+    def _begin(self, found: Aligned) -> None:
         """Start the filter at the beginning of the kept data and take it to the present."""
-        self._chain = NavigationChain(self.settings, Start(estimate, P), self.options.step_s)
-        self._raw, self._fixes = [], []
-        self._previous, self._waiting, self._replaying = None, list(fixes), True
+        start, raw = found.start, found.raw
+        self._chain = NavigationChain(self.settings, Start(start.estimate, start.P), self.options.step_s)
+        self._previous, self._waiting, self._replaying = None, list(found.fixes), True
         self._next_pose = -np.inf
         end = self._last_s
         for i in range(len(raw)):
@@ -338,22 +293,18 @@ class InertialNavigator:
             )  # fmt: skip
         self._close_chunk()
         self._last_s, self._replaying = end, False
+        self._waiting = list(found.ahead)
         self._next_smooth = end + self.options.smooth_every_s
-        self._published_smooth = max(self._published_smooth, estimate.time_s)
+        self._published_smooth = max(self._published_smooth, start.estimate.time_s)
+        self._alignment = AlignmentBuffer(self.settings, self.options, None)  # lets the kept data go
 
     def _unaligned(self, time_s: float) -> list[NavigationPose]:
-        """A pose that is not valid: the place of the antenna, nothing known of the attitude."""
-        if time_s <= self._published or not self._fixes:
+        """A pose that is not valid, at the newest fix."""
+        if time_s <= self._published or not self._alignment.fixes:
             return []
         self._published = time_s
-        fix = self._fixes[-1][1]
-        position = self.frame.from_geodetic(np.degrees(fix.lat[0]), np.degrees(fix.lon[0]), fix.height_m[0])
-        size = float(np.linalg.norm(self.settings.lever_arm_b)) + float(np.linalg.norm(self.mount.lever_arm_b))
-        angles = np.zeros(3)
-        covariance = np.diag([*(fix.sigma_ned_m[0] ** 2 + size**2), *(3 * [np.pi**2 / 3.0])])
-        covariance[:3, :3] = R_ENU_NED @ covariance[:3, :3] @ R_ENU_NED.T
-        q = quaternion_from_matrix(matrix_from_angles(*angles))
-        return [NavigationPose(time_s, position, angles, q, np.zeros(3), covariance, False, self.status, False)]
+        arm = float(np.linalg.norm(self.settings.lever_arm_b))
+        return [self._maker.unaligned(time_s, self._alignment.fixes[-1][1], arm, self.status)]
 
     # --------------------------------------------------------------------------------------------------------- poses
 
@@ -364,7 +315,7 @@ class InertialNavigator:
         if time_s <= self._published:
             return []
         self._published = time_s
-        return self._poses(_states([time_s], [state]), P[None, :9, :9], smoothed=False)
+        return self._maker.poses(_states([time_s], [state]), P[None, :9, :9], smoothed=False)
 
     def _smoothed(self, lag_s: float) -> list[NavigationPose]:
         """Poses that have become old enough."""
@@ -386,37 +337,10 @@ class InertialNavigator:
                 states, P = passed_over(*self._ahead, states, P, self._published_smooth, o.smooth_every_s)
             later = trajectory.at_rows(np.flatnonzero((ends > until + 1e-9) & (ends <= until + o.smooth_every_s + 0.1)))
             self._ahead = later, trajectory.covariance(later.time_s)
-            poses = self._poses(states, P, smoothed=True)
+            poses = self._maker.poses(states, P, smoothed=True)
             self._published_smooth = float(ends[rows[-1]])
         chain.forget(min(self._published_smooth, end - o.rewind_s) - 2.0 * o.step_s)
         return poses
-
-    def _poses(self, states: NavigationStates, P: Array, smoothed: bool) -> list[NavigationPose]:
-        o, frame = self.options, self.frame
-        poses = camera_poses(states, P, frame, self.mount)
-        covariance = poses.covariance + np.diag([*np.square(o.offset_sigma_m), 0.0, 0.0, 0.0])
-        velocity = states.v_e @ frame.R_el
-        q = quaternion_from_matrix(matrix_from_angles(*poses.angles.T))
-        limit = np.array([*(3 * [o.valid_position_m]), *(3 * [o.valid_attitude_rad])]) ** 2
-        large = np.einsum("mii->mi", covariance) > limit
-        out = []
-        for i in range(len(states.time_s)):
-            valid = not large[i].any()
-            reason = "" if valid else ("position uncertain" if large[i, :3].any() else "attitude uncertain")
-            out.append(
-                NavigationPose(
-                    float(states.time_s[i]),
-                    poses.position_l[i],
-                    poses.angles[i],
-                    q[i],
-                    velocity[i],
-                    covariance[i],
-                    valid,
-                    reason,
-                    smoothed,
-                )
-            )
-        return out
 
     def finish(self) -> list[NavigationPose]:
         """The stream has ended: what the smoother still holds."""

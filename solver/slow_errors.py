@@ -93,15 +93,17 @@ class SlowErrors:
     def without(self, covariance: Array, least: tuple[float, float] = LEAST_NOISE) -> Array:
         """The white part of pose covariances (..., 6, 6): what is left without slow errors, `least` (m, rad) at least.
 
-        Correlations are kept between components whose variance stays.
+        Correlation coefficients are kept between components of which something is left.
         """
         slow = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
         floor = np.repeat(np.square(least), 3)
         rest = np.array(covariance, dtype=float)
-        variance = np.einsum("...ii->...i", rest)
+        variance = np.einsum("...ii->...i", rest).copy()
         left = np.maximum(variance - slow, floor)
+        share = np.sqrt(left / np.maximum(variance, floor))  # rows and columns alike, so that it stays a covariance
+        rest *= share[..., :, None] * share[..., None, :]
+        np.einsum("...ii->...i", rest)[...] = left
         too_small = left <= floor
-        variance[...] = left
         off = too_small[..., :, None] | too_small[..., None, :]
         rest[off & ~np.eye(6, dtype=bool)] = 0.0
         return rest

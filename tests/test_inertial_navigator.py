@@ -9,8 +9,9 @@ import pytest
 
 from triline.solver.alignment import AttitudePrior
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_navigator import InertialNavigator, OnlineOptions
+from triline.solver.inertial_navigator import InertialNavigator
 from triline.solver.navigation_trajectory import CameraMount
+from triline.solver.online_poses import OnlineOptions
 from triline.solver.post_processing import navigate
 from triline.solver.rotation import R_BC_NOMINAL, angles_from_matrix
 
@@ -201,7 +202,7 @@ def test_rates_and_increments_are_the_same():
         dt = float(d.dt_s[i])
         a.add_increments(float(d.time_s[i]), dt, d.dv[i], d.dtheta[i])
         b.add_inertial(float(d.time_s[i]), dt, d.dv[i] / dt, d.dtheta[i] / dt)
-    assert np.allclose(a._raw[0].dv, b._raw[0].dv, rtol=1e-12)
+    assert np.allclose(a._alignment._raw[0].dv, b._alignment._raw[0].dv, rtol=1e-12)
 
 
 def test_bad_calls_are_refused_in_words():
