@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.slow_errors import SlowErrors
 from ..solver.window import Window
@@ -14,7 +15,7 @@ from ..solver.window_output import light
 from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
-from .adjuster_poses import OrientationStore, PoseBuffer
+from .adjuster_poses import OrientationStore, PoseBuffer, SlowHistory
 from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
@@ -95,7 +96,9 @@ class Adjuster(Node):
         self._stamp_ns = 0
         self._by_poses = apriori == "trajectory"
         self._poses = PoseBuffer(known_only=self._by_poses)
-        self._slow = SlowErrors()  # of the newest strip
+        self._slow = SlowHistory()
+        self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
+        self._handed_s = -np.inf
         self._held_strips: dict[str, Any] = {}
         self._held_ties: list[Any] = []
         self._store = OrientationStore()
@@ -181,7 +184,10 @@ class Adjuster(Node):
         camera = convert.camera_from(self._camera)
         parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
         self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
-        self._slow = self._window.slow
+        self._slow = SlowHistory()
+        self._slow.add(-np.inf, self._window.slow)
+        self._stated.clear()
+        self._handed_s = -np.inf
         self._poses.clear()
         self._held_strips.clear()
         self._held_ties.clear()
@@ -215,10 +221,12 @@ class Adjuster(Node):
             elif not body.ended:
                 self._held_strips[body.id] = body
                 return
-            self._slow = slow
+            self._slow.add(first_s, slow)
+            self._stated[body.id] = slow, slow
         self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow)
         if body.ended:
             self._window.end_strip(body.id, int(body.lines))
+            self._stated.pop(body.id, None)
 
     def _begin_held(self) -> None:
         """Strips that waited for a pose begin if there is one, and get the tie points that came meanwhile."""
@@ -317,10 +325,30 @@ class Adjuster(Node):
 
     def _hand_over_poses(self) -> None:
         assert self._window is not None
+        if self._stated and self._poses.leading is not None:
+            self._follow_covariance(*self._poses.leading)
         for poses in self._poses.take(self._slow):
             late = self._window.trajectory.add(*poses)
             if late:
                 self.problem("pose out of order", f"{late} poses came twice or too late")
+
+    def _follow_covariance(self, time_s: float, covariance: Any) -> None:
+        """Where the trajectory becomes clearly less certain in the middle of a strip, or certain again, the wander does
+        too: while GNSS is out, after the navigator has started again."""
+        assert self._window is not None
+        another = self._poses.started_anew()
+        for id, (first, now) in self._stated.items():
+            model = self._window.strips[id].model
+            slow = (self._window.slow if another else first).grown(covariance)
+            if not isinstance(model, Wander) or not (another or now.differs(slow)):
+                continue
+            used_s = max(self._handed_s, model.borders[0])
+            border_s = model.restate(used_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
+            first = self._window.slow if another else first
+            self._stated[id] = first, slow
+            self._slow.add(border_s, slow)
+            self.counters["wander restated"] += 1
+        self._handed_s = max(self._handed_s, time_s)
 
     def _results(self, update: WindowUpdate) -> list[Message]:
         for refusal in update.refused:

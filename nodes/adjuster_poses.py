@@ -26,8 +26,38 @@ SAME_TIME_S = 1e-6
 KNOWN_ATTITUDE_RAD = 0.2
 #: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
 LEARNT_SHARE = 0.02
+#: So many statements about slow errors are remembered.
+MOST_STATED = 200
 #: Refined orientation is kept this long for queries, s.
 KEPT_S = 600.0
+
+
+class SlowHistory:
+    """Which slow errors hold from when on."""
+
+    def __init__(self) -> None:
+        self._from_s: list[float] = []
+        self._slow: list[SlowErrors] = []
+
+    @property
+    def newest(self) -> SlowErrors:
+        return self._slow[-1] if self._slow else SlowErrors()
+
+    def add(self, from_s: float, slow: SlowErrors) -> None:
+        """From a time on, not before the last one that was given."""
+        self._from_s.append(max([from_s, *self._from_s[-1:]]))
+        self._slow.append(slow)
+        del self._from_s[:-MOST_STATED], self._slow[:-MOST_STATED]
+
+    def without(self, time_s: list[float], covariance: Array) -> Array:
+        """White part of pose covariances (n, 6, 6) at times (n,)."""
+        which = np.maximum(np.searchsorted(self._from_s, time_s, side="right") - 1, 0)
+        if not self._slow:
+            return covariance
+        out = np.empty_like(covariance)
+        for i in np.unique(which):
+            out[which == i] = self._slow[i].without(covariance[which == i])
+        return out
 
 
 class PoseBuffer:
@@ -41,6 +71,7 @@ class PoseBuffer:
     def __init__(self, known_only: bool = False) -> None:
         self._known_only = known_only
         self._latest: dict[bool, tuple[float, Array]] = {}
+        self._attitude_lost = False
         self.filtered_seen = False
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
         self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
@@ -56,6 +87,8 @@ class PoseBuffer:
         self.filtered_seen |= not smoothed
         assert sample.covariance is not None
         known = float(np.diagonal(sample.covariance)[3:].max()) < KNOWN_ATTITUDE_RAD**2
+        if not smoothed and self._latest:
+            self._attitude_lost |= not known
         if known or not self._known_only:
             self._waiting[smoothed].append((time_s, sample))
         if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):
@@ -84,7 +117,20 @@ class PoseBuffer:
         smoothed, filtered = (np.diagonal(self._latest[key][1]) for key in (True, False))
         return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
 
-    def take(self, slow: SlowErrors) -> Iterator[Poses]:
+    @property
+    def leading(self) -> tuple[float, Array] | None:
+        """Time and covariance (6, 6) of the newest pose with a known attitude: filtered ones where there are any."""
+        return self._latest.get(not self.filtered_seen)
+
+    def started_anew(self) -> bool:
+        """Whether attitude is known again after it was not: the filter has started anew. True once."""
+        newest = self._latest.get(False)
+        if not self._attitude_lost or newest is None or newest[0] < self._seen[False][0][-1]:
+            return False
+        self._attitude_lost = False
+        return True
+
+    def take(self, slow: SlowHistory) -> Iterator[Poses]:
         """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
         for smoothed in (False, True):
             waiting = self._waiting[smoothed]
@@ -94,7 +140,7 @@ class PoseBuffer:
                     [time for time, _ in waiting],
                     np.array([s.position_l for s in samples]),
                     np.array([s.quaternion for s in samples]),
-                    slow.without(np.array([s.covariance for s in samples])),
+                    slow.without([time for time, _ in waiting], np.array([s.covariance for s in samples])),
                     smoothed,
                 )
                 self._waiting[smoothed] = []

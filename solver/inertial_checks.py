@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .alignment_window import SUSPICIOUS_CHI2
 from .inertial_cleaning import Finding
 from .inertial_data import GnssData, InertialData
-from .inertial_windows import DataWindow, best_fit, data_windows, misfit, misfit_without_outliers, window_lengths
+from .inertial_windows import DataWindow, best_fit, data_windows, misfit, misfit_without_outliers, tells, window_lengths
 from .navigation import NavigationSettings
 
 Array = NDArray[np.floating]
@@ -56,7 +56,7 @@ def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, 
         if not windows:
             continue
         given = misfit(windows, settings)
-        if given < _BAD:
+        if given < _BAD or not all(tells(w) for w in windows):
             continue
         if misfit_without_outliers(windows, settings) < _BAD:  # then a cause must explain all
             given = min(given, _BETTER * _GOOD)
@@ -151,14 +151,20 @@ def _other_time(
 ) -> _Cause | None:
     shifts = [s for k in (*range(1, 21), 37) for s in (k, -k)]
     fits = [(misfit([w.shifted(gnss, float(s)) for w in windows], settings), s) for s in shifts]
-    best, shift = min(fits)
+    best = min(fits)[0]
     if not _cures(given, best):
         return None
-    known = {18: " (GPS time against UTC)", 37: " (TAI against UTC)", 19: " (GPS time against TAI)"}.get(abs(shift), "")
-    text = f"GNSS times are {abs(shift)} s {'late' if shift > 0 else 'early'} against the inertial ones{known}: "
-    return _Cause(
-        best, Finding("time scale", "gnss.time", text + f"the motion fits only so ({_times(given, best)})", True)
-    )
+    alike = [s for f, s in sorted(fits) if f < _CLEARLY * best]
+    shift = next((s for s in alike if abs(s) in (18, 37)), alike[0])  # of shifts alike, one that has a reason
+    name = {18: " (GPS time against UTC)", 37: " (TAI against UTC)", 19: " (GPS time against TAI)"}.get(abs(shift), "")
+    others = [_late(s) for s in alike if s != shift][:3]
+    text = f"GNSS times are {_late(shift)} against the inertial ones{name}: the motion fits only so"
+    text += f" ({_times(given, best)}{'; nearly as well ' + ', '.join(others) if others else ''})"
+    return _Cause(best, Finding("time scale", "gnss.time", text, True))
+
+
+def _late(shift: int) -> str:
+    return f"{abs(shift)} s {'late' if shift > 0 else 'early'}"
 
 
 def _other_axes(windows: Sequence[DataWindow], settings: NavigationSettings) -> list[_Cause]:

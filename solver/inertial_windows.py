@@ -20,7 +20,9 @@ SHORT_S, LONG_S = 20.0, 100.0
 #: GNSS with a larger standard deviation, m, is looked at over long stretches as well.
 COARSE_M = 0.2
 #: So many fixes of a stretch are enough, and that much of a second between inertial samples.
-_FIXES, _STEP_S = 24, 0.02
+_FIXES, _STEP_S = {SHORT_S: 24, LONG_S: 60}, 0.02
+#: Where the velocity changes by less, m/s, a stretch shows nothing of units, axes and clocks.
+_LEAST_CHANGE_M_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,12 @@ class DataWindow:
         """With the fixes that fall into it if GNSS clocks are late by ``shift_s``."""
         t = gnss.time_s - shift_s
         k = np.flatnonzero((t > self.start_s) & (t <= self.inertial.time_s[-1]))
-        k = k[:: max(1, len(k) // _FIXES)]
+        k = k[:: max(1, len(k) // _most_fixes(float(self.inertial.time_s[-1]) - self.start_s))]
         return replace(self, gnss=replace(gnss[k], time_s=t[k]))
+
+
+def _most_fixes(length_s: float) -> int:
+    return _FIXES[SHORT_S] if length_s <= 1.5 * SHORT_S else _FIXES[LONG_S]
 
 
 def window_lengths(inertial: InertialData, gnss: GnssData) -> list[float]:
@@ -76,11 +82,23 @@ def data_windows(inertial: InertialData, gnss: GnssData, length_s: float, most: 
         if len(part) < 50 or part.gaps() or len(fixes) < 6:
             continue
         taken.append(s)
-        step = max(1, len(fixes) // _FIXES)
+        step = max(1, len(fixes) // _most_fixes(length_s))
         out.append(DataWindow(float(part.time_s[0] - part.dt_s[0]), _coarse(part), fixes[::step]))
         if len(out) == most:
             break
     return out
+
+
+def tells(window: DataWindow) -> bool:
+    """Whether the velocity changes enough in a stretch for units, axes and clocks to show."""
+    g = window.gnss
+    usual = float(np.median(np.diff(g.time_s)))
+    far = max(1, round(3.0 * float(np.median(g.sigma_ned_m[:, :2])) / usual))
+    t, r = g.time_s[::far], g.position_e[::far]
+    if len(t) < 3:
+        return False
+    v = np.diff(r, axis=0) / np.diff(t)[:, None]
+    return float(np.linalg.norm(v - np.median(v, axis=0), axis=1).max()) > _LEAST_CHANGE_M_S
 
 
 def _turning(gnss: GnssData, starts: Array, length_s: float) -> Array:

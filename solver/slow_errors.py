@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ _NONE: Three = (0.0, 0.0, 0.0)
 
 #: A pose variance more than this many times what was said beforehand is clearly larger.
 CLEARLY = 1.5
+#: A variance that has become so many times smaller is that of another error.
+MUCH_LESS = 4.0
 #: Of what a pose is more uncertain by, this share of the standard deviation may wander.
 WANDERING_SHARE = 1.0
 #: Correlation time of the errors of a trajectory whose filter still learns, s: about the lag of its smoother, which
@@ -89,6 +91,29 @@ class SlowErrors:
             more(self.wander, rad, WANDERING_SHARE),
             min(self.wander_time_s, LEARNING_TIME_S),
         )
+
+    def grown(self, covariance: Array) -> SlowErrors:
+        """With what the covariance (6, 6) of a pose in the middle of a strip says more: of the wander alone.
+
+        Offset, shift and drift are those of the whole strip; what comes later is none of them.
+        """
+        variance = np.diagonal(np.asarray(covariance, dtype=float))
+        told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
+        excess = np.where(variance > CLEARLY * told, variance - told, 0.0)
+        if not excess.any():
+            return self
+        wander = np.sqrt(np.square([*self.wander_m, *self.wander]) + excess).tolist()
+        return replace(
+            self,
+            wander_m=(wander[0], wander[1], wander[2]),
+            wander=(wander[3], wander[4], wander[5]),
+            wander_time_s=min(self.wander_time_s, LEARNING_TIME_S),
+        )
+
+    def differs(self, other: SlowErrors) -> bool:
+        """Whether another wander is clearly larger, or so much smaller that a new one has begun."""
+        ratio = np.array([*other.wander_m, *other.wander]) / np.maximum([*self.wander_m, *self.wander], 1e-9)
+        return bool((ratio**2 > CLEARLY).any() or (ratio**2 < 1.0 / MUCH_LESS).any())
 
     def without(self, covariance: Array, least: tuple[float, float] = LEAST_NOISE) -> Array:
         """The white part of pose covariances (..., 6, 6): what is left without slow errors, `least` (m, rad) at least.

@@ -1,5 +1,6 @@
 """Users' traps: found in the data, named, and never in good data."""
 
+import re
 from dataclasses import replace
 
 import inertial_flights as sim
@@ -25,7 +26,7 @@ def turned(d: InertialData, gyro: np.ndarray, accel: np.ndarray) -> InertialData
 
 
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
-@pytest.mark.parametrize("sigma", [(0.02, 0.02, 0.04), (1.0, 1.0, 2.0)])
+@pytest.mark.parametrize("sigma", [(0.02, 0.02, 0.04), (2.0, 2.0, 4.0)])
 def test_good_data_raise_no_alarm(grade, sigma):
     for seed in (21, 22):
         f = sim.flight(grade, duration_s=300.0, seed=seed, sigma=sigma)
@@ -81,8 +82,6 @@ def test_wrong_units_and_axes_are_named(case):
     d, g, s = data()
     (finding,) = check(change(d, d.dt_s[:, None]), g, s, increments=increments)
     assert finding.fatal and finding.subject == subject
-    import re
-
     assert re.search(words, finding.text), finding.text
     assert "\n" not in finding.text
 
@@ -93,6 +92,37 @@ def test_time_scales_that_differ_by_whole_seconds_are_named(shift):
     (finding,) = check(d, replace(g, time_s=g.time_s + shift), s, increments=False)
     assert finding.subject == "gnss.time"
     assert f"{abs(shift):.0f} s {'late' if shift > 0 else 'early'}" in finding.text
+
+
+METRES = [
+    "degrees", "angle increments in columns of rates", "forward-left-up", "x and y swapped", "gyro axes swapped",
+    "accelerometers forward-left-up",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", METRES)
+def test_metre_level_gnss_shows_units_and_axes(case):
+    change, increments, subject, words = CASES[case]
+    d, g, s = data(sigma=(2.0, 2.0, 4.0))
+    (finding,) = check(change(d, d.dt_s[:, None]), g, s, increments=increments)
+    assert finding.fatal and finding.subject == subject and re.search(words, finding.text), finding.text
+
+
+@pytest.mark.parametrize("shift", [1.0, -1.0, 2.0, 18.0, -18.0])
+def test_metre_level_gnss_shows_whole_seconds(shift):
+    d, g, s = data(sigma=(2.0, 2.0, 4.0), grade="mems")
+    (finding,) = check(d, replace(g, time_s=g.time_s + shift), s, increments=False)
+    assert finding.subject == "gnss.time"
+    assert f"{abs(shift):.0f} s {'late' if shift > 0 else 'early'}" in finding.text
+
+
+def test_a_few_seconds_at_rest_raise_no_alarm():
+    """There a fit from a wrong heading is as bad as any other trap's."""
+    f = sim.flight("tactical", duration_s=60.0, seed=24, static_s=50.0)
+    for start, length in ((5.0, 9.0), (12.0, 16.0), (30.0, 9.0)):
+        d = f.inertial[(f.inertial.time_s > start) & (f.inertial.time_s < start + length)]
+        g = f.gnss[(f.gnss.time_s > start) & (f.gnss.time_s < start + length)]
+        assert check(d, g, f.settings, increments=False) == []
 
 
 def test_times_that_do_not_overlap():

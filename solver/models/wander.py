@@ -5,6 +5,10 @@ is the conditional mean of a second-order Gauss-Markov process (for a correlatio
 through both values and slopes, so that C0 and C1 hold exactly), and from border to border its transition is observed
 with its own noise. What a segment cannot follow is known too: `left_out_variance`.
 
+The errors of a filter do not stay as large as they were: they grow while GNSS is out and are others after a restart.
+From a border on the process can therefore be stated anew (`Wander.restate`): what grows is the old error made larger;
+what becomes smaller is another error, since observations have taken the place of the old one.
+
 Source: the process in `wander`; interpolation as in T. D. Barfoot, State Estimation for Robotics, 2017, section 3.4.
 """
 
@@ -18,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..slow_errors import SlowErrors
-from ..wander import second_order_gauss_markov
+from ..wander import damping_rate, second_order_gauss_markov
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -104,8 +108,11 @@ class Wander(CorrectionModel):
         ]
         self.unknown_names = tuple(names)
         self.notes = ("drift is the change over the strip: s = (t - start) / (end - start)",)
-        self._sigma = np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING)
+        self._sigma = np.tile(np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING), (segments + 1, 1))
+        self._time_s = np.full(segments + 1, slow.wander_time_s)
+        self._another = np.zeros(segments + 1, dtype=bool)
         self._F, self._Q, self._P0 = second_order_gauss_markov(1.0, slow.wander_time_s, self.step_s)
+        self._observations = self._stated()
 
     def design(self, time_s: ArrayLike) -> Design:
         t = np.asarray(time_s, dtype=float)
@@ -120,44 +127,109 @@ class Wander(CorrectionModel):
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
-        return self._inside(t)[2][:, None] * self._sigma**2
+        k, _, variance = self._inside(t)
+        before, after = self._sigma[k], self._sigma[k + 1]
+        part = (t - self.borders[k]) / self.step_s
+        size = np.where(self._another[k + 1][:, None], before**2 + after**2, (after - before) ** 2)
+        jump = np.clip(part * (1.0 - part), 0.0, 0.25)[:, None] * size  # it can be anywhere between
+        return variance[:, None] * np.maximum(before, after) ** 2 + jump
+
+    def restate(self, from_s: float, sigma: ArrayLike, time_s: float, another: bool = False) -> float:
+        """Another wander from a border on, the second one after a time, so that the segment there and its borders stay.
+
+        The arrays that `pseudo_observations` gave change for the segments concerned; who has used them already for
+        times up to ``from_s`` sees no difference.
+
+        Parameters
+        ----------
+        from_s : up to here the model has been in use
+        sigma : (6,) standard deviations, metres and radians
+        time_s : correlation time
+        another : it is another error altogether, however large
+
+        Returns
+        -------
+        border_s : from here on it holds; infinite if the strip ends before
+        """
+        first = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1)) + 2
+        first = max(first, 0)
+        if first >= len(self.borders):
+            return np.inf
+        self._sigma[first:] = np.maximum(np.asarray(sigma, dtype=float), NOTHING)
+        self._time_s[first:] = time_s
+        self._another[first] = another
+        changed = self._stated()
+        self._observations.coefficients[...] = changed.coefficients
+        self._observations.sigma[...] = changed.sigma
+        return float(self.borders[first])
 
     def _inside(self, t: Array) -> tuple[NDArray[np.int_], Array, Array]:
         """Segment (n,), coefficients (n, 4) of value and slope at both its borders, variance (n,) for sigma 1."""
         k = np.clip(np.floor((t - self.borders[0]) / self.step_s).astype(int), 0, len(self.borders) - 2)
         after = np.clip(t - self.borders[k], 0.0, self.step_s)
-        time = self.options.slow.wander_time_s
-        F0, Q0, _ = second_order_gauss_markov(1.0, time, after)
-        F1, _, _ = second_order_gauss_markov(1.0, time, self.step_s - after)
+        _, part = self._between(after, self.options.slow.wander_time_s, self._F, self._Q)
+        variance = np.empty(len(t))
+        for time_s in np.unique(self._time_s[k + 1]):
+            mine = self._time_s[k + 1] == time_s
+            F, Q, _ = second_order_gauss_markov(1.0, float(time_s), self.step_s)
+            variance[mine] = self._between(after[mine], float(time_s), F, Q)[0]
+        return k, part, variance
+
+    def _between(self, after: Array, time_s: float, F: Array, Q: Array) -> tuple[Array, Array]:
+        """Variance (n,) of what is left out for sigma 1, and coefficients (n, 4), at times after a border."""
+        F0, Q0, _ = second_order_gauss_markov(1.0, time_s, after)
+        F1, _, _ = second_order_gauss_markov(1.0, time_s, self.step_s - after)
         back = Q0 @ np.swapaxes(F1, 1, 2)
-        right = back @ np.linalg.inv(self._Q)
-        left = F0 - right @ self._F
+        right = back @ np.linalg.inv(Q)
+        left = F0 - right @ F
         variance = Q0[:, 0, 0] - np.einsum("nk,nk->n", right[:, 0], back[:, 0])
-        return k, np.concatenate([left[:, 0], right[:, 0]], axis=1), np.maximum(variance, 0.0)
+        return np.maximum(variance, 0.0), np.concatenate([left[:, 0], right[:, 0]], axis=1)
 
     def pseudo_observations(self) -> PseudoObservations:
+        return self._observations
+
+    def _stated(self) -> PseudoObservations:
         slow = self.options.slow
         sigma = np.concatenate([slow.offset_m, slow.shift, slow.drift])
         start = GLOBALS + np.arange(12)
-        slope_sigma = self._sigma * np.sqrt(self._P0[1, 1])
+        slope_sigma = self._sigma[0] * damping_rate(float(self._time_s[0]))
         direct = direct_observations(
-            np.concatenate([np.maximum(sigma, NOTHING), self._sigma, slope_sigma]), self.unknown_names[: GLOBALS + 12]
+            np.concatenate([np.maximum(sigma, NOTHING), self._sigma[0], slope_sigma]),
+            self.unknown_names[: GLOBALS + 12],
         )
         assert (direct.columns[GLOBALS:, 0] == start).all()
         return join_observations([direct, self._transitions()])
 
     def _transitions(self) -> PseudoObservations:
-        """Two whitened observations ``G (z_k+1 - F z_k) = 0`` of every component and segment, ``G Q G^T = I``."""
-        G = np.linalg.inv(np.linalg.cholesky(self._Q))
-        rows = np.concatenate([-G @ self._F, G], axis=1)  # (2, 4) on value, slope, next value, next slope
-        segment, component, row = (a.ravel() for a in np.indices((len(self.borders) - 1, 6, 2)))
+        """Two whitened observations ``G (z_k+1 - F D z_k) = 0`` of every component and segment, ``G Q G^T = I``.
+
+        ``D`` makes an error that grows larger. Where sigma falls, the value at the next border is a new one.
+        """
+        n = len(self.borders) - 1
+        coefficients = np.zeros((n, 6, 2, 4))
+        for time_s in np.unique(self._time_s[1:]):
+            mine = self._time_s[1:] == time_s
+            F, Q, P0 = second_order_gauss_markov(1.0, float(time_s), self.step_s)
+            G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
+            ratio = self._sigma[1:][mine] / self._sigma[:-1][mine]  # (m, 6)
+            rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[:-1][mine]])
+            D = np.zeros((*ratio.shape, 2, 2))
+            D[..., 0, 0], D[..., 1, 1] = ratio, ratio * rate[:, None]
+            falls = ((ratio < 1.0 - 1e-9) | self._another[1:][mine][:, None])[..., None, None]
+            coefficients[mine, :, :, :2] = np.where(falls, 0.0, -G @ F @ D)
+            coefficients[mine, :, :, 2:] = np.where(falls, new, G)
+        segment, component, row = (a.ravel() for a in np.indices((n, 6, 2)))
         columns = GLOBALS + 12 * segment[:, None] + component[:, None] + np.array([0, 6, 12, 18])
         labels = tuple(
             f"wander of {COMPONENTS[c]} over segment {k + 1} of {self.extent.name}"
             for k, c in zip(segment, component, strict=True)
         )
         return PseudoObservations(
-            columns.astype(np.int32), rows[row], np.zeros(len(row)), self._sigma[component], labels
+            columns.astype(np.int32),
+            coefficients[segment, component, row],
+            np.zeros(len(row)),
+            self._sigma[segment + 1, component],
+            labels,
         )
 
     def describe(self, theta: ArrayLike, sigma: ArrayLike) -> dict[str, object]:
