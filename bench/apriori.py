@@ -75,7 +75,7 @@ def normalised_squares(out: list[Message], simulation: Simulation, topic: str, e
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=16)
-    parser.add_argument("--cases", nargs="+", default=["flight", "outage", "restart"])
+    parser.add_argument("--cases", nargs="+", default=["flight", "outage"])
     parser.add_argument("--grades", nargs="+", default=list(GRADES))
     parser.add_argument("--quick", action="store_true", help="three seeds")
     args = parser.parse_args()

@@ -15,6 +15,8 @@ BENCHMARKS = {
     "batch adjustment: time and memory against size": ["adjustment_scaling.py", "-o", "out/bench"],
     "batch job: snooping, elimination, covariances": ["adjustment_job.py"],
     "inertial navigation": ["navigation.py"],
+    "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
+    "a-priori weights from the trajectory": ["apriori.py"],
     "sliding window": ["window.py"],
 }
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.slow_errors import SlowErrors
-from ..solver.window import Window
+from ..solver.window import AHEAD_S, Window
 from ..solver.window_output import light
 from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
@@ -98,7 +98,7 @@ class Adjuster(Node):
         self._poses = PoseBuffer(known_only=self._by_poses)
         self._slow = SlowHistory()
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
-        self._handed_s = -np.inf
+        self._handed_s = self._used_to_s = -np.inf
         self._held_strips: dict[str, Any] = {}
         self._held_ties: list[Any] = []
         self._store = OrientationStore()
@@ -187,7 +187,7 @@ class Adjuster(Node):
         self._slow = SlowHistory()
         self._slow.add(-np.inf, self._window.slow)
         self._stated.clear()
-        self._handed_s = -np.inf
+        self._handed_s = self._used_to_s = -np.inf
         self._poses.clear()
         self._held_strips.clear()
         self._held_ties.clear()
@@ -321,6 +321,7 @@ class Adjuster(Node):
         now_ns = stamp_ns // self._update_ns * self._update_ns
         self._next_update_ns = now_ns + self._update_ns
         self._hand_over_poses()
+        self._used_to_s = self._seconds(now_ns) + AHEAD_S
         return self._results(self._window.update(self._seconds(now_ns)))
 
     def _hand_over_poses(self) -> None:
@@ -342,11 +343,14 @@ class Adjuster(Node):
             slow = (self._window.slow if another else first).grown(covariance)
             if not isinstance(model, Wander) or not (another or now.differs(slow)):
                 continue
-            used_s = max(self._handed_s, model.borders[0])
+            used_s = max(self._handed_s, self._used_to_s, model.borders[0])
             border_s = model.restate(used_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
-            first = self._window.slow if another else first
+            if another:  # of the new filter, what the model still takes for the old one's error is no use
+                self._poses.leave_out(self._handed_s, min(border_s, model.extent.end_s))
+                first = self._window.slow
             self._stated[id] = first, slow
-            self._slow.add(border_s, slow)
+            if np.isfinite(border_s):
+                self._slow.add(border_s, slow)
             self.counters["wander restated"] += 1
         self._handed_s = max(self._handed_s, time_s)
 

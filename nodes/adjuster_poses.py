@@ -72,6 +72,7 @@ class PoseBuffer:
         self._known_only = known_only
         self._latest: dict[bool, tuple[float, Array]] = {}
         self._attitude_lost = False
+        self._left_out = (0.0, 0.0)
         self.filtered_seen = False
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
         self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
@@ -130,10 +131,16 @@ class PoseBuffer:
         self._attitude_lost = False
         return True
 
+    def leave_out(self, begin_s: float, end_s: float) -> None:
+        """Poses between two times are not to be handed over."""
+        self._left_out = begin_s, end_s
+
     def take(self, slow: SlowHistory) -> Iterator[Poses]:
         """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
+        begin_s, end_s = self._left_out
         for smoothed in (False, True):
-            waiting = self._waiting[smoothed]
+            waiting = [w for w in self._waiting[smoothed] if not begin_s < w[0] < end_s]
+            self._waiting[smoothed] = []
             if waiting:
                 samples = [sample for _, sample in waiting]
                 yield (
@@ -143,7 +150,6 @@ class PoseBuffer:
                     slow.without([time for time, _ in waiting], np.array([s.covariance for s in samples])),
                     smoothed,
                 )
-                self._waiting[smoothed] = []
 
     def validity(self, time_s: float) -> tuple[bool, str]:
         """Whether the measured poses between which the one at a time was interpolated are valid, and why not.

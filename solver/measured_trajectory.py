@@ -151,9 +151,13 @@ class MeasuredTrajectory:
         return good
 
     def _is_smoothed(self, t: Array) -> NDArray[np.bool_]:
+        """Which times (n,) lie between smoothed samples; those in a gap of them do not (a smoother that was killed)."""
         if len(self._smoothed) < 2:
             return np.zeros(len(t), dtype=bool)
-        return (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
+        times = self._smoothed.time_s
+        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        near = (times[i + 1] - times[i] <= self.gap_s) | (t == times[i])
+        return near & (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
 
     def at(self, time_s: ArrayLike) -> MeasuredPoses:
         """Orientation at times (n,) that are covered.

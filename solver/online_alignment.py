@@ -15,8 +15,8 @@ from .online_poses import OnlineOptions
 
 Fixes = list[tuple[float, GnssData]]
 
-#: Data without an alignment, or that have just been aligned, are looked through for a cause if they are so long, s.
-_ENOUGH_S = 8.0
+#: Data that cannot be aligned are looked through for a cause when they are so long, s, and again at twice that.
+_CHECK_S = 60.0
 #: Without a fix for so long, s, or so many times the usual interval, GNSS is out.
 _OUTAGE_S, _OUTAGE_INTERVALS = 3.0, 5.0
 #: The usual interval, s, as long as there is one fix only.
@@ -66,7 +66,7 @@ class AlignmentBuffer:
         self._prior = prior
         self._raw: list[InertialData] = []
         self._next_try = -np.inf
-        self._next_check_s = 60.0
+        self._next_check_s = _CHECK_S
         self._said: set[str] = set()
 
     def append(self, raw: InertialData) -> None:
@@ -108,8 +108,7 @@ class AlignmentBuffer:
             self._next_check_s = 2.0 * seen
             return None, self._remarks(raw, gnss)
         ahead = [f for f in self.fixes if f[0] > now_s]
-        remarks = self._remarks(raw, gnss) if seen >= _ENOUGH_S else []
-        return Aligned(found, raw, covered, ahead, seen, remarks), []
+        return Aligned(found, raw, covered, ahead, seen, self._remarks(raw, gnss)), []
 
     def _remarks(self, raw: InertialData, gnss: GnssData) -> list[str]:
         """What is wrong with the data, said once."""

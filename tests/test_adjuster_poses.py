@@ -7,6 +7,7 @@ import pytest
 
 from triline.nodes.adjuster_poses import PoseBuffer
 from triline.nodes.convert import PoseSample
+from triline.solver.measured_trajectory import MeasuredTrajectory
 
 
 def sample(valid):
@@ -50,3 +51,32 @@ def test_late_and_old_poses(buffer):
         buffer.add(20.2 + 0.2 * i, sample(True), False, "")
     assert len(buffer._seen[False][0]) < 3000
     assert buffer.validity(1000.0) == (True, "")
+
+
+def test_what_was_invalid_long_ago_is_still_known(buffer):
+    for i in range(5000):
+        buffer.add(20.2 + 0.2 * i, sample(True), False, "")
+    assert buffer.validity(11.1) == (False, "aligning") and buffer.validity(12.1) == (False, "aligning")
+    assert buffer.validity(15.0) == (True, "")
+
+
+def test_known_again_is_a_new_filter_once():
+    buffer = PoseBuffer(known_only=True)
+    unknown = PoseSample(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), False, "", None)
+    buffer.add(9.0, unknown, False, "aligning")
+    buffer.add(10.0, sample(True), False, "")
+    assert not buffer.started_anew()  # the first one is none
+    buffer.add(11.0, unknown, False, "aligning")
+    assert not buffer.started_anew()
+    buffer.add(12.0, sample(True), False, "")
+    assert buffer.started_anew() and not buffer.started_anew()
+
+
+def test_between_the_smoothings_of_two_filters_the_filtered_poses_count():
+    measured = MeasuredTrajectory()
+    q, P = np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)
+    for smoothed, times in ((False, np.arange(0.0, 30.0, 0.1)), (True, np.r_[0.0:10.0:0.1, 20.0:25.0:0.1])):
+        position = np.column_stack([70.0 * times, np.full_like(times, 5.0 * smoothed), 0.0 * times])
+        measured.add(times, position, np.tile(q, (len(times), 1)), np.tile(P, (len(times), 1, 1)), smoothed)
+    at = measured.at([5.05, 15.05, 22.05])
+    assert at.smoothed.tolist() == [True, False, True] and at.poses.position_l[1, 1] == pytest.approx(0.0, abs=1e-9)

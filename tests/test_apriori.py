@@ -7,6 +7,8 @@ import pytest
 
 from triline.nodes import convert
 from triline.nodes.adjuster import Adjuster
+from triline.nodes.config import build
+from triline.nodes.errors import UserError
 from triline.nodes.navigator import Navigator
 from triline.nodes.simulator import Simulator
 from triline.solver.accuracy import angle_difference
@@ -49,10 +51,41 @@ def test_a_filter_that_still_learns_has_faster_errors():
     assert slow.wander_time_s < TOLD.wander_time_s and slow.shift == TOLD.shift and slow.offset_m == TOLD.offset_m
 
 
-def run(adjuster: Adjuster, simulation) -> list:
+def test_what_is_left_of_a_covariance_is_one():
+    """A heading that is being learnt is correlated with the other angles; what is left must stay positive definite."""
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        A = rng.standard_normal((6, 6)) * np.concatenate([TOLD.position_sigma, 3.0 * TOLD.attitude_sigma])
+        P = A.T @ A
+        rest = TOLD.without(P[None])[0]
+        assert np.linalg.eigvalsh(rest / np.sqrt(np.outer(np.diag(rest), np.diag(rest)))).min() > 0.0
+        kept = np.diagonal(rest) > 2e-6
+        assert np.diagonal(rest)[kept] == pytest.approx(
+            (np.diagonal(P) - np.square([*TOLD.position_sigma, *TOLD.attitude_sigma]))[kept]
+        )
+
+
+def test_in_the_middle_of_a_strip_only_the_wander_grows_and_shrinks_again():
+    slow = TOLD.grown(covariance(4.0, 1.0))
+    assert slow.offset_m == TOLD.offset_m and slow.wander == TOLD.wander and slow.wander_time_s < TOLD.wander_time_s
+    assert slow.position_sigma == pytest.approx(4.0 * TOLD.position_sigma)
+    assert TOLD.differs(slow) and slow.differs(TOLD) and not TOLD.differs(TOLD)
+    assert TOLD.grown(covariance(1.1, 1.1)) is TOLD
+
+
+def run(adjuster: Adjuster, simulation, hole_s=(0.0, 0.0), killed_s: float = np.inf) -> list:
+    """Final and live orientation; GNSS is out in a hole, the navigator is killed and started again at a time."""
     navigator = Navigator()
-    out = []
+    out, project = [], None
     for message in Simulator(simulation).messages(EPOCH):
+        time_s = (message.stamp_ns - EPOCH) * 1e-9
+        if message.topic == "configuration/project":
+            project = message
+        if message.topic == "sensor/gnss" and hole_s[0] < time_s < hole_s[1]:
+            continue
+        if time_s > killed_s and project is not None:
+            navigator, killed_s = Navigator(), np.inf
+            navigator.step(project)
         made = list(navigator.step(message)) if message.topic in navigator.inputs else []
         for each in (message, *made):
             if each.topic in adjuster.inputs:
@@ -91,6 +124,27 @@ def test_a_heading_found_in_motion_is_weighted_by_its_covariance():
     assert np.mean(by_project) > 3.0
 
 
+def test_an_outage_in_the_middle_of_a_strip_is_weighted_by_what_it_leaves():
+    """The refined orientation knows the larger error (two-sided, many seeds in bench)."""
+    plan = FlightPlan(strips=1, strip_s=38.0, lead_in_s=18.0)
+    simulation = simulate(plan, 1, ErrorModel(gnss_rate_hz=2.0), inertial=InertialPlan(MEMS, 50.0))
+    adjuster = Adjuster(apriori="trajectory")
+    out = run(adjuster, simulation, hole_s=(26.0, 45.0))
+    assert adjuster.counters["wander restated"] >= 2  # larger, and small again
+    assert 0.15 < nees(out, simulation) < 2.5
+
+
+def test_a_new_filter_in_the_middle_of_a_strip_has_another_error():
+    """What it says of the time that the model takes for the old filter's is not used: no orientation there."""
+    plan = FlightPlan(strips=1, strip_s=34.0, lead_in_s=18.0)
+    simulation = simulate(plan, 1, ErrorModel(gnss_rate_hz=2.0), inertial=InertialPlan(MEMS, 50.0))
+    adjuster = Adjuster(apriori="trajectory")
+    out = run(adjuster, simulation, killed_s=20.0)
+    assert adjuster.counters["wander restated"] >= 1
+    final = np.array([(convert.time_ns(o.body.timestamp) - EPOCH) * 1e-9 for o in out if "final" in o.topic])
+    assert (final < 20.0).any() and not ((final > 21.0) & (final < 35.0)).any() and (final > 48.0).any()
+
+
 def test_with_measured_attitude_both_give_the_same_bytes():
     flight = simulate(FlightPlan(strip_s=12.0, lead_in_s=3.0), 1, ErrorModel(attitude_rate_hz=100.0))
     first, second = (
@@ -98,6 +152,16 @@ def test_with_measured_attitude_both_give_the_same_bytes():
         for a in ("trajectory", "project")
     )
     assert first == second and len(first) > 200
+
+
+def test_a_segment_without_length_is_refused():
+    for value in (0, 0.0, -1.0):
+        with pytest.raises(UserError, match=r"\[adjuster\]: segment_s is -?[01], wanted more than 0 s"):
+            build(Adjuster, {"adjuster": {"segment_s": value}})
+    with pytest.raises(UserError, match="segment_s is 'long', wanted a number"):
+        build(Adjuster, {"adjuster": {"segment_s": "long"}})
+    assert build(Adjuster, {"adjuster": {"segment_s": 2}}).options.segment_s == 2
+    assert build(Adjuster, {}).options.segment_s == 0.0
 
 
 def test_an_unknown_choice_is_refused():

@@ -1,0 +1,78 @@
+"""The wander model stated anew in the middle of a strip has the covariance it is stated with."""
+
+import numpy as np
+import pytest
+
+from triline.solver.models.base import Extent
+from triline.solver.models.wander import WanderOptions
+from triline.solver.slow_errors import SlowErrors
+from triline.solver.wander import autocorrelation
+
+START, END = 100.0, 160.0
+SLOW = SlowErrors(wander_m=(1.0, 1.0, 1.5), wander=(1e-4, 1e-4, 2e-4), wander_time_s=30.0)
+SIGMA = np.array([1.0, 1.0, 1.5, 1e-4, 1e-4, 2e-4])
+
+
+def model():
+    return WanderOptions(SLOW).build(Extent("strip S1", START, END))
+
+
+def covariance(wander, times, component):
+    """Of the corrections of one component at times, from the a-priori observations alone."""
+    p = wander.pseudo_observations()
+    A = np.zeros((len(p), wander.n_unknowns + 1))
+    np.put_along_axis(A, np.where(p.columns >= 0, p.columns, wander.n_unknowns), p.coefficients, axis=1)
+    A = A[:, :-1] / p.sigma[:, None]
+    scale = 1.0 / np.linalg.norm(A, axis=0)
+    N = (A * scale).T @ (A * scale)
+    design = wander.design(times)
+    D = np.zeros((len(times), wander.n_unknowns))
+    for i in range(len(times)):
+        np.add.at(D[i], design.columns[i, :, component][2:], design.coefficients[i][2:])
+    D = D * scale
+    return D @ np.linalg.solve(N, D.T)
+
+
+def test_without_it_the_process_is_stationary():
+    times = np.array([100.0, 113.0, 140.0, 159.0])
+    C = covariance(model(), times, 2)
+    assert np.diagonal(C) == pytest.approx(1.5**2, rel=0.02)
+
+
+def test_what_grows_is_the_same_error_made_larger_and_what_shrinks_is_another():
+    wander = model()
+    grown = SIGMA * [5.0, 1.0, 1.0, 1.0, 1.0, 30.0]
+    up = wander.restate(112.3, grown, 6.0)
+    down = wander.restate(129.0, SIGMA, 30.0)
+    assert 112.3 < up <= 112.3 + 2.1 * wander.step_s and 129.0 < down <= 129.0 + 2.1 * wander.step_s
+    times = np.array([up - wander.step_s, up, 0.5 * (up + down), down, down + 4.0])
+    for component, factor in ((0, 5.0), (1, 1.0), (5, 30.0)):
+        C = covariance(wander, times, component)
+        before, large = SIGMA[component] ** 2, (factor * SIGMA[component]) ** 2
+        assert np.diagonal(C) == pytest.approx([before, large, large, before, before], rel=0.02)
+        correlation = C / np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
+        assert correlation[0, 1] == pytest.approx(autocorrelation(6.0, wander.step_s), abs=0.01)  # the old error
+        assert correlation[3, 4] > 0.9
+        if factor > 1.0:
+            assert abs(correlation[1, 3]) < 1e-6  # another one
+
+
+def test_a_new_error_of_the_same_size_has_nothing_to_do_with_the_old_one():
+    wander = model()
+    border = wander.restate(120.0, SIGMA, 30.0, another=True)
+    C = covariance(wander, np.array([border - wander.step_s, border]), 4)
+    assert np.diagonal(C) == pytest.approx(SIGMA[4] ** 2, rel=0.02) and abs(C[0, 1]) < 1e-3 * SIGMA[4] ** 2
+    between = wander.left_out_variance([border - 0.5 * wander.step_s])[0, 4]
+    assert between > 0.4 * SIGMA[4] ** 2  # where between two borders it begins is not known
+
+
+def test_what_has_been_used_does_not_change():
+    wander = model()
+    p = wander.pseudo_observations()
+    coefficients, sigma = p.coefficients.copy(), p.sigma.copy()
+    used_s = 120.7
+    border = wander.restate(used_s, 4.0 * SIGMA, 6.0)
+    changed = np.flatnonzero((p.coefficients != coefficients).any(axis=1) | (p.sigma != sigma))
+    columns = wander.design([used_s]).columns
+    assert changed.size and p.columns[changed].max(axis=1).min() > columns.max()
+    assert wander.restate(END, SIGMA, 30.0) == np.inf and border > used_s
