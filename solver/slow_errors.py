@@ -18,7 +18,7 @@ MUCH_LESS = 4.0
 #: Of what a pose is more uncertain by, this share of the standard deviation may wander.
 WANDERING_SHARE = 1.0
 #: Correlation time of the errors of a trajectory whose filter still learns, s: about the lag of its smoother, which
-#: says something else with every second of data that it has more.
+#: says something else with every second of data that it has more. Judged over seeds by bench/apriori.py.
 LEARNING_TIME_S = 6.0
 
 #: No pose has less white noise than this, m and rad.

@@ -175,7 +175,9 @@ class Wander(CorrectionModel):
             variance[mine] = self._between(after[mine], float(time_s), F, Q)[0]
         return k, part, variance
 
-    def _between(self, after: Array, time_s: float, F: Array, Q: Array) -> tuple[Array, Array]:
+    def _between(
+        self, after: Array, time_s: float, F: NDArray[np.floating], Q: NDArray[np.floating]
+    ) -> tuple[Array, Array]:
         """Variance (n,) of what is left out for sigma 1, and coefficients (n, 4), at times after a border."""
         F0, Q0, _ = second_order_gauss_markov(1.0, time_s, after)
         F1, _, _ = second_order_gauss_markov(1.0, time_s, self.step_s - after)
