@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "a valid recording from a broken one"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
     "import": ("import_", "block folder, sensor folder, SBET and others to a recording"),
+    "rectify": ("rectify", "image lines to an orthoimage, a cloud-optimised GeoTIFF"),
     "study": ("study", "Monte Carlo and sensitivity studies"),
     "view": ("view", "open a recording in Rerun"),
 }

@@ -1,0 +1,88 @@
+"""Where each line was taken from: measured poses at their high rate, and what an adjustment adds to them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from ..trajectory import Trajectory
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+#: Measured poses farther apart than this have a gap between them; refined ones reach so far beyond the last, s.
+GAP_S, REACH_S = 0.3, 1.0
+
+
+class LineOrientation:
+    """Measured orientation, refined where there is refined orientation.
+
+    Refined poses come less often than lines. They are not interpolated themselves, which would smooth the motion of the
+    platform away: what they add to the measured pose of the same time is, since errors of a trajectory change slowly.
+
+    Parameters
+    ----------
+    time_s, position_l, quaternion : (n,), (n, 3), (n, 4) measured poses, ascending
+    gap_s : measured poses farther apart than this have a gap between them
+
+    Raises
+    ------
+    ValueError : fewer than two poses, times that do not increase
+    """
+
+    def __init__(self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike, gap_s: float = GAP_S) -> None:
+        self.measured = Trajectory(time_s, position_l, quaternion)
+        self._gap_s = gap_s
+        self._knots: tuple[Array, Array] | None = None
+
+    def refine(self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike) -> None:
+        """Refined poses (n,); those at times without measured pose are left out.
+
+        Raises
+        ------
+        ValueError : none is left
+        """
+        t, position, q = (np.asarray(a, dtype=float) for a in (time_s, position_l, quaternion))
+        t, first = np.unique(t, return_index=True)
+        inside = self._measured_at(t)
+        if not inside.any():
+            raise ValueError("no refined pose lies inside the measured trajectory")
+        t, first = t[inside], first[inside]
+        measured = self.measured.at(t)
+        turn = angles_from_matrix(matrix_from_quaternion(q[first])) - measured.angles
+        turn = (turn + np.pi) % (2 * np.pi) - np.pi
+        self._knots = t, np.concatenate([position[first] - measured.position_l, turn], axis=1)
+
+    def covers(self, time_s: ArrayLike) -> Mask:
+        """Which times (n,) have an orientation; where there is refined orientation at all, a refined one."""
+        t = np.asarray(time_s, dtype=float)
+        good = self._measured_at(t)
+        if self._knots is not None:
+            knots = self._knots[0]
+            i = np.searchsorted(knots, t)
+            before = t - knots[np.maximum(i - 1, 0)]
+            after = knots[np.minimum(i, len(knots) - 1)] - t
+            good &= np.minimum(np.abs(before), np.abs(after)) <= REACH_S
+        return good
+
+    def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Perspective centres (n, 3) and rotations ``R_lc`` (n, 3, 3).
+
+        Raises
+        ------
+        ValueError : a time outside the measured poses
+        """
+        t = np.asarray(time_s, dtype=float)
+        poses = self.measured.at(t)
+        position, angles = poses.position_l, poses.angles
+        if self._knots is not None:
+            knots, added = self._knots
+            correction = np.stack([np.interp(t, knots, column) for column in added.T], axis=1)
+            position, angles = position + correction[:, :3], angles + correction[:, 3:]
+        return position, matrix_from_angles(*angles.T)
+
+    def _measured_at(self, t: Array) -> Mask:
+        times = self.measured.time_s
+        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        return self.measured.covers(t) & (times[i + 1] - times[i] <= self._gap_s)

@@ -1,0 +1,374 @@
+"""The lines of a strip become patches of the orthoimage.
+
+Direct and indirect rectification share the work. Rays of every line, through pixels some way apart, go to the ground
+(direct): this carries the jitter of each line, and the relief. Their ground points are turned into the other direction,
+line and sample as functions of the place, by one-dimensional interpolation along the flight and then across it: the
+best scan line of every place, without search. Cells then take their grey value from there (indirect), so that none is
+left out and none is asked twice.
+
+Places are counted in the strip's own straight axes: ``p`` along the flight, about one a line, ``q`` across, about one a
+pixel. Both are linear in column and row. Bands of whole ``p`` share the cells among them without gap or overlap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import LineCamera
+from .ground_grid import GroundGrid
+from .resampling import TAPS, resample
+from .surface import Surface
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+#: Pixels from one ray to the next, and rays beyond either end of the CCD line.
+NODE_STEP, BEYOND = 16, 2
+#: Lines (p) that are rectified at once, at most, and cells that are worked on at once.
+BAND, CELLS = 256, 32_768
+#: More than so many lines may not wait for others: a strip that turns round sees no new ground.
+MOST_WAITING = 20_000
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Cells of an orthoimage, run by run; n runs of neighbouring cells in a row.
+
+    Attributes
+    ----------
+    row, column : (n,) where each run begins
+    length : (n,) cells in it
+    values : (sum of length,) grey values, rounded; 0 = nothing known
+    steepness : (sum of length,) 1 for a ray at the end of the CCD line to 255 for its middle, 0 = nothing known
+    """
+
+    row: IntArray
+    column: IntArray
+    length: IntArray
+    values: NDArray[np.unsignedinteger]
+    steepness: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return int(self.length.sum())
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays of some pixels of a CCD line, beyond its ends too.
+
+    Attributes
+    ----------
+    sample : (k,) px, ascending
+    ray_c : (k, 3) directions, image frame
+    pixels : of the CCD line
+    """
+
+    sample: Array
+    ray_c: Array
+    pixels: int
+
+
+def rays_of(camera: LineCamera, line: int, step: int = NODE_STEP, factor: int = 1) -> Rays:
+    """Rays of every ``step``-th pixel of CCD line ``line`` of a camera.
+
+    Parameters
+    ----------
+    factor : pixels that were put together to one; samples are those of the reduced image
+
+    Raises
+    ------
+    ValueError : a CCD line too short for it
+    """
+    pixels = camera.lines[line].pixels // factor
+    if pixels < 2:
+        raise ValueError(f"CCD line {camera.lines[line].id!r} has {camera.lines[line].pixels} pixels, too few")
+    inner = np.unique(np.append(np.arange(0, pixels - 1, step), pixels - 1)).astype(float)
+    # two pixels beyond the end are enough for what leans on the end, the next one keeps far places out
+    outer = np.array([4.0, 4.0 + step])[:BEYOND]
+    sample = np.concatenate([-outer[::-1], inner, pixels - 1 + outer])
+    full = factor * sample + 0.5 * (factor - 1)
+    xy = camera.image_coordinates(np.full(len(full), line), full)[0]
+    return Rays(sample, np.column_stack([xy, np.full(len(xy), -camera.focal_length_mm[line])]), pixels)
+
+
+class StripRectifier:
+    """Rectifies the lines of one strip as they come.
+
+    Parameters
+    ----------
+    rays : of the CCD line, `rays_of`
+    surface : the ground
+    grid : cells
+    resampling : of `resampling.TAPS`
+    band : lines that are rectified at once
+
+    Attributes
+    ----------
+    missed : rays that did not meet the ground
+
+    Raises
+    ------
+    ValueError : an unknown resampling
+    """
+
+    def __init__(
+        self, rays: Rays, surface: Surface, grid: GroundGrid, resampling: str = "bilinear", band: int = BAND
+    ) -> None:
+        if resampling not in TAPS:
+            raise ValueError(f"resampling {resampling!r}, wanted one of {', '.join(TAPS)}")
+        self.rays, self.surface, self.grid, self.resampling, self.band = rays, surface, grid, resampling, band
+        self.missed = 0
+        self._axes: _Axes | None = None
+        self._first = 0  # number of the first line at hand
+        self._pixels = np.empty((0, rays.pixels), dtype=np.uint16)
+        self._usable = np.empty(0, dtype=bool)
+        self._cells = np.empty((0, len(rays.sample), 2))
+        self._place = np.empty((0, len(rays.sample), 2))
+        self._done = 0  # places p below are rectified
+
+    def add(
+        self, first_line: int, pixels: NDArray[np.unsignedinteger], usable: Mask | None, position_l: Array, R_lc: Array
+    ) -> list[Patch]:
+        """Add lines; returns what can be rectified now.
+
+        Parameters
+        ----------
+        first_line : number of the first one; lines that were left out are missing from the orthoimage
+        pixels : (n, samples)
+        usable : (n,) which of them are fit for use, None for all
+        position_l, R_lc : (n, 3), (n, 3, 3) orientation of each line
+
+        Raises
+        ------
+        ValueError : lines of another length, or that come before those at hand
+        """
+        n = len(pixels)
+        if pixels.shape[1] != self.rays.pixels:
+            raise ValueError(f"lines of {pixels.shape[1]} pixels, wanted {self.rays.pixels}")
+        usable = np.ones(n, dtype=bool) if usable is None else usable
+        out: list[Patch] = []
+        if not n:
+            return out
+        if len(self._usable) and first_line != self._first + len(self._usable):
+            if first_line < self._first + len(self._usable):
+                raise ValueError(f"line {first_line} comes after line {self._first + len(self._usable) - 1}")
+            out = self.finish()  # what is missing has no place: begin anew behind it
+        if not len(self._usable):
+            self._first = first_line
+            self._pixels = self._pixels.astype(pixels.dtype)
+        cells = self._to_ground(position_l, R_lc)
+        if not len(self._usable) and self._axes is not None and np.isfinite(cells).any():
+            self._done = int(np.floor(np.nanmin(self._axes.place(cells)[..., 0])))
+        self._pixels = np.concatenate([self._pixels, pixels])
+        self._usable = np.concatenate([self._usable, usable])
+        self._cells = np.concatenate([self._cells, cells])
+        if self._axes is None:
+            return out + (self._begin() if len(self._usable) >= min(self.band, 32) else [])
+        self._place = np.concatenate([self._place, self._axes.place(cells)])
+        return out + self._rectify(self.band)
+
+    def finish(self) -> list[Patch]:
+        """What is left; lines that are added then begin anew, on the same axes."""
+        out = self._begin(least=2) if self._axes is None else []
+        out += self._rectify(1)
+        self._forget(len(self._usable))
+        return out
+
+    def _to_ground(self, position_l: Array, R_lc: Array) -> Array:
+        """Cells (n, k, 2) that the rays of lines meet."""
+        direction = self.rays.ray_c @ np.swapaxes(R_lc, 1, 2)
+        point, met = self.surface.meet(np.asarray(position_l)[:, None, :], direction)
+        self.missed += int((~met).sum())
+        if not met.any():
+            return np.full((*met.shape, 2), np.nan)
+        return self.grid.cells_of_many(point)
+
+    def _begin(self, least: int = 8) -> list[Patch]:
+        """Lay the axes through the lines at hand."""
+        known = np.flatnonzero(np.isfinite(self._cells).all(axis=(1, 2)))
+        if len(known) < least:
+            return []
+        self._axes = _Axes.through(self._cells[known], known, self.rays.sample)
+        self._place = self._axes.place(self._cells)
+        self._done = int(np.floor(np.nanmin(self._place[..., 0])))
+        return self._rectify(self.band)
+
+    def _rectify(self, least: int) -> list[Patch]:
+        """Rectify all places that the lines at hand have passed, if they are enough."""
+        out: list[Patch] = []
+        if self._axes is None or len(self._usable) < 2 or not np.isfinite(self._place).any():
+            return out
+        columns = np.isfinite(self._place[..., 0]).any(axis=0)
+        ahead = int(np.floor(np.nanmax(self._place[:, columns, 0], axis=0).min())) - 2
+        if least == 1:  # the last lines: places that only some of the pixels have passed, too
+            ahead = int(np.ceil(np.nanmax(self._place[..., 0]))) + 1
+        if len(self._usable) > MOST_WAITING:
+            self._forget(len(self._usable) - MOST_WAITING)
+        while ahead - self._done >= least:
+            end = min(self._done + max(self.band, least), ahead)
+            patch = self._band(self._done, end)
+            if patch is not None:
+                out.append(patch)
+            self._done = end
+        with np.errstate(invalid="ignore"):
+            needed = (self._place[..., 0] >= self._done - 3).any(axis=1) | np.isnan(self._place[..., 0]).all(axis=1)
+        taps = TAPS[self.resampling][1]
+        self._forget(max(int(np.argmax(needed)) - taps, 0))
+        return out
+
+    def _forget(self, lines: int) -> None:
+        self._first += lines
+        self._pixels, self._usable = self._pixels[lines:], self._usable[lines:]
+        self._cells, self._place = self._cells[lines:], self._place[lines:]
+
+    def _band(self, begin: int, end: int) -> Patch | None:
+        """Cells with p from ``begin`` to below ``end``."""
+        assert self._axes is not None
+        table = self._inverse(begin, end)
+        if table is None:
+            return None
+        q0, source = table
+        q1 = q0 + NODE_STEP * (source.shape[1] - 1)
+        row, column, length = self._axes.cells_between(begin, end, q0, q1)
+        if not len(row):
+            return None
+        # places of the cells, relative to the table
+        starts = np.concatenate([[0], np.cumsum(length)])
+        p_start, q_start = self._axes.place_of(column, row)
+        p_start, q_start = (p_start - (begin - 1)).astype(np.float32), ((q_start - q0) / NODE_STEP).astype(np.float32)
+        dp = np.float32(self._axes.to_place[0, 0])
+        dq = np.float32(self._axes.to_place[1, 0] / NODE_STEP)
+        dtype = self._pixels.dtype
+        values = np.zeros(starts[-1], dtype=dtype)
+        steepness = np.zeros(starts[-1], dtype=np.uint8)
+        largest = np.float32(np.iinfo(dtype).max)
+        middle = np.float32(0.5 * (self.rays.pixels - 1))
+        usable = None if self._usable.all() else self._usable
+        run = 0
+        while run < len(row):
+            stop = max(int(np.searchsorted(starts, starts[run] + CELLS, side="right")) - 1, run + 1)
+            part = slice(starts[run], starts[stop])
+            n = length[run:stop]
+            along = (np.arange(starts[run], starts[stop]) - np.repeat(starts[run:stop], n)).astype(np.float32)
+            p = np.repeat(p_start[run:stop], n) + dp * along
+            q = np.repeat(q_start[run:stop], n) + dq * along
+            place = _bilinear(source, p, q)
+            line, sample = place.real, place.imag
+            with np.errstate(invalid="ignore"):
+                grey, known = resample(self._pixels, usable, line, sample, self.resampling)
+                np.rint(grey, out=grey)
+                grey = np.clip(grey, 1, largest, out=grey)  # 0 is for nothing known
+                steep = 255.0 - np.float32(254.0) / middle * np.abs(sample - middle)
+            values[part] = np.where(known, grey, 0)
+            steepness[part] = np.where(known, steep, 0)
+            run = stop
+        return Patch(row, column, length, values, steepness)
+
+    def _inverse(self, begin: int, end: int) -> tuple[int, NDArray[np.complexfloating]] | None:
+        """Line (of those at hand) and sample, as real and imaginary part, at p = begin - 1 .. end and q every so often.
+
+        Returns the first q, and the table.
+        """
+        p_wanted = np.arange(begin - 1, end + 1, dtype=float)
+        lines = np.arange(len(self._usable), dtype=float)
+        k = len(self.rays.sample)
+        line, q = np.full((len(p_wanted), k), np.nan), np.full((len(p_wanted), k), np.nan)
+        for j in range(k):
+            met = np.isfinite(self._place[:, j, 0])
+            if np.count_nonzero(met) < 2:
+                continue
+            p = np.maximum.accumulate(self._place[met, j, 0])  # where a jolt shows ground twice, the first look counts
+            line[:, j] = np.interp(p_wanted, p, lines[met], left=np.nan, right=np.nan)
+            q[:, j] = np.interp(p_wanted, p, self._place[met, j, 1])
+        if not np.isfinite(q).any():
+            return None
+        q0 = int(np.floor(np.nanmin(q)))
+        count = int(np.ceil((np.nanmax(q) - q0) / NODE_STEP)) + 1
+        q_wanted = q0 + NODE_STEP * np.arange(count, dtype=float)
+        table = np.full((len(p_wanted), count), np.nan + 0j, dtype=np.complex64)
+        sample = self.rays.sample
+        for i in range(len(p_wanted)):
+            met = np.isfinite(line[i])
+            if np.count_nonzero(met) < 2:
+                continue
+            across = np.maximum.accumulate(q[i, met])
+            table[i].real = np.interp(q_wanted, across, line[i, met], left=np.nan, right=np.nan)
+            table[i].imag = np.interp(q_wanted, across, sample[met])
+        return q0, table
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """``(p, q) = to_place @ (column, row) + shift``."""
+
+    to_place: Array
+    shift: Array
+
+    @classmethod
+    def through(cls, cells: Array, line: NDArray[np.int_], sample: Array) -> _Axes:
+        """Axes along and across lines (n, k, 2): p grows with the lines, q with the samples; rectangular."""
+        middle = cells[:, len(sample) // 2]
+        way = middle[-1] - middle[0]
+        across = (cells[:, -1] - cells[:, 0]).mean(axis=0)
+        travel = float(np.linalg.norm(way)) / max(int(line[-1] - line[0]), 1)
+        width = float(np.linalg.norm(across)) / float(sample[-1] - sample[0])
+        if travel < 1e-3 * width or width == 0:  # hardly moved: across is known at least
+            travel, way = width, np.array([across[1], -across[0]])
+        along = way / np.linalg.norm(way)
+        side = np.array([-along[1], along[0]])
+        side *= np.sign(side @ across) or 1.0
+        to_place = np.stack([along / travel, side / width])
+        shift = np.array([line[0], sample[len(sample) // 2]]) - to_place @ middle[0]
+        return cls(to_place, shift)
+
+    def place(self, cells: Array) -> Array:
+        return cells @ self.to_place.T + self.shift
+
+    def place_of(self, column: IntArray, row: IntArray) -> tuple[Array, Array]:
+        (pc, pr), (qc, qr) = self.to_place
+        return pc * column + pr * row + self.shift[0], qc * column + qr * row + self.shift[1]
+
+    def cells_between(self, p0: int, p1: int, q0: int, q1: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Row, first column and length of the runs of cells with p0 <= p < p1 and q0 <= q < q1."""
+        corners = np.array([(p0, q0), (p0, q1), (p1, q0), (p1, q1)]) - self.shift
+        column, row = np.linalg.solve(self.to_place, corners.T)
+        rows = np.arange(int(np.floor(row.min())) - 1, int(np.ceil(row.max())) + 2)
+        left = np.full(len(rows), int(np.floor(column.min())) - 1)
+        right = np.full(len(rows), int(np.ceil(column.max())) + 2)
+        for low, high, (by_column, by_row), shift in zip((p0, q0), (p1, q1), self.to_place, self.shift, strict=True):
+            at = by_row * rows + shift
+            if abs(by_column) < 1e-9:
+                right = np.where((at >= low) & (at < high), right, left)
+            elif by_column > 0:
+                left = np.maximum(left, np.ceil((low - at) / by_column).astype(np.int64))
+                right = np.minimum(right, np.ceil((high - at) / by_column).astype(np.int64))
+            else:
+                left = np.maximum(left, np.floor((high - at) / by_column).astype(np.int64) + 1)
+                right = np.minimum(right, np.floor((low - at) / by_column).astype(np.int64) + 1)
+        some = right > left
+        return rows[some], left[some], (right - left)[some]
+
+
+def _bilinear(table: NDArray[np.complexfloating], p: Array, q: Array) -> NDArray[np.complexfloating]:
+    """Between the nodes of a table (rows, columns); p and q lie inside."""
+    rows, columns = table.shape
+    i, j = p.astype(np.intp), q.astype(np.intp)
+    np.clip(i, 0, rows - 2, out=i)
+    np.clip(j, 0, columns - 2, out=j)
+    a, b = p - i.astype(np.float32), q - j.astype(np.float32)
+    i *= columns
+    i += j
+    flat = table.ravel()
+    low = flat.take(i)
+    low += b * (flat.take(i + 1) - low)
+    i += columns
+    high = flat.take(i)
+    high += b * (flat.take(i + 1) - high)
+    high -= low
+    high *= a
+    low += high
+    return low

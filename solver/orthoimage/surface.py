@@ -1,0 +1,192 @@
+"""Where rays meet the ground: a plane, the ellipsoid, or heights on a grid [D]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import earth
+from ..frames import LocalFrame
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+#: The relief correction ends when heights move less than this, m, or after so many rounds.
+TOLERANCE_M, ROUNDS = 1e-3, 12
+#: Steps a cell of the search along a ray that the relief correction could not follow, and the most of them.
+STEPS_A_CELL, MOST_STEPS = 2.0, 4096
+
+
+class Surface(Protocol):
+    """The ground."""
+
+    def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
+        """Where rays first meet it.
+
+        Parameters
+        ----------
+        position_l, direction_l : (..., 3) local frame; directions of any length
+
+        Returns
+        -------
+        point_l : (..., 3), NaN where there is none
+        met : (...) whether there is one
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A level plane of the local frame.
+
+    Attributes
+    ----------
+    height_m : its Z
+    """
+
+    height_m: float
+
+    def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
+        """See `Surface.meet`."""
+        met = (direction_l[..., 2] < 0) & (position_l[..., 2] > self.height_m)
+        down = np.where(met, direction_l[..., 2], np.nan)
+        point = position_l + direction_l * ((self.height_m - position_l[..., 2]) / down)[..., None]
+        return point, met
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """The WGS 84 ellipsoid, its half axes made longer by a height.
+
+    Attributes
+    ----------
+    frame : the local frame
+    height_m : above the ellipsoid; exact at the equator and the poles, within 1e-5 of the height elsewhere
+    """
+
+    frame: LocalFrame
+    height_m: float = 0.0
+
+    def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
+        """See `Surface.meet`; the nearer root of the quadratic equation in closed form."""
+        a = earth.SEMI_MAJOR_M + self.height_m
+        b = earth.SEMI_MAJOR_M * (1.0 - earth.FLATTENING) + self.height_m
+        scale = np.array([1.0, 1.0, a / b])  # the ellipsoid becomes a sphere of radius a
+        origin = (position_l @ self.frame.R_el.T + self.frame.origin_e) * scale
+        ray = (direction_l @ self.frame.R_el.T) * scale
+        A = np.einsum("...i,...i->...", ray, ray)
+        B = np.einsum("...i,...i->...", origin, ray)
+        # |origin|^2 - a^2 as a product: the squares are 1e13 m^2 and would cancel
+        length = np.linalg.norm(origin, axis=-1)
+        C = (length - a) * (length + a)
+        discriminant = B * B - A * C
+        met = (discriminant >= 0) & (B < 0) & (C > 0)
+        root = np.sqrt(np.where(met, discriminant, np.nan))
+        share = C / (root - B)  # the nearer root, in the form that does not cancel
+        return position_l + direction_l * share[..., None], met
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """Heights at the nodes of a grid along X and Y of the local frame, bilinear between them.
+
+    Attributes
+    ----------
+    x_m, y_m : first node
+    step_m : between nodes
+    z_m : (rows along Y, columns along X) Z of the nodes, NaN where not known
+
+    Raises
+    ------
+    ValueError : fewer than 2 x 2 nodes, no height at all, a step that is not positive
+    """
+
+    x_m: float
+    y_m: float
+    step_m: float
+    z_m: Array = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.z_m.ndim != 2 or min(self.z_m.shape) < 2:
+            raise ValueError(f"heights of shape {self.z_m.shape}, wanted at least 2 x 2 nodes")
+        if not self.step_m > 0:
+            raise ValueError(f"heights every {self.step_m} m, wanted more than 0")
+        if not np.isfinite(self.z_m).any():
+            raise ValueError("no height is known")
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Z below X, Y (...); NaN outside and next to nodes without height."""
+        rows, columns = self.z_m.shape
+        u, v = (y - self.y_m) / self.step_m, (x - self.x_m) / self.step_m
+        inside = (u >= 0) & (u <= rows - 1) & (v >= 0) & (v <= columns - 1)
+        u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+        i, j = np.minimum(u.astype(np.int64), rows - 2), np.minimum(v.astype(np.int64), columns - 2)
+        a, b = u - i, v - j
+        z, at = self.z_m.ravel(), i * columns + j
+        low = z[at] + b * (z[at + 1] - z[at])
+        high = z[at + columns] + b * (z[at + columns + 1] - z[at + columns])
+        return np.where(inside, low + a * (high - low), np.nan)
+
+    def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
+        """See `Surface.meet`.
+
+        The relief correction goes from height to height along the ray, by the secant through the last two. Rays that
+        it does not bring to rest (relief about as steep as the ray) are searched from above, step by step.
+        """
+        shape = np.broadcast_shapes(position_l.shape, direction_l.shape)
+        origin = np.broadcast_to(position_l, shape).reshape(-1, 3)
+        d = np.broadcast_to(direction_l, shape).reshape(-1, 3)
+        down = d[:, 2] < 0
+        slope = d[:, :2] / np.where(down, d[:, 2], np.nan)[:, None]
+        z = self._correct(origin, slope)
+        lost = np.flatnonzero(~np.isfinite(z) & down)
+        if len(lost):
+            z[lost] = self._search(origin[lost], slope[lost])
+        xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
+        point = np.column_stack([xy, z])
+        return point.reshape(shape), np.isfinite(z).reshape(shape[:-1])
+
+    def _above(self, origin: Array, slope: Array, z: Array) -> Array:
+        """How far the ground lies above height z on each ray, m."""
+        xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
+        return self.height(xy[:, 0], xy[:, 1]) - z
+
+    def _correct(self, origin: Array, slope: Array) -> Array:
+        """Heights (n,) by relief correction, NaN where it does not converge."""
+        z0 = np.full(len(origin), float(np.nanmedian(self.z_m)))
+        f0 = self._above(origin, slope, z0)
+        z1 = z0 + f0
+        for _ in range(ROUNDS):
+            f1 = self._above(origin, slope, z1)
+            if not (np.abs(f1) > TOLERANCE_M).any():
+                break
+            fall = f1 - f0
+            # without relief the fall is minus the step; a secant that bends off by more is no guide
+            step = z1 - z0
+            guide = np.abs(fall + step) < 0.9 * np.abs(step)
+            change = np.where(guide, -f1 * step / np.where(guide, fall, 1.0), f1)
+            z0, f0, z1 = z1, f1, z1 + change
+        return np.where(np.abs(self._above(origin, slope, z1)) <= TOLERANCE_M, z1, np.nan)
+
+    def _search(self, origin: Array, slope: Array) -> Array:
+        """Heights (n,) of the first crossing of each ray from above, NaN where there is none."""
+        top, bottom = float(np.nanmax(self.z_m)) + 1e-6, float(np.nanmin(self.z_m)) - 1e-6
+        way = float(np.nanmax(np.linalg.norm(slope, axis=1), initial=0.0)) * (top - bottom)
+        steps = int(np.clip(np.ceil(STEPS_A_CELL * way / self.step_m), 8, MOST_STEPS))
+        high = np.full(len(origin), top)
+        low = np.full(len(origin), np.nan)
+        before = high
+        for z in np.linspace(top, bottom, steps + 1):
+            here = np.full(len(origin), z)
+            crossed = np.isnan(low) & (self._above(origin, slope, here) >= 0)
+            low[crossed], high[crossed] = z, before[crossed]
+            before = here
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            under = self._above(origin, slope, middle) >= 0
+            low, high = np.where(under, middle, low), np.where(under, high, middle)
+        z = 0.5 * (low + high)
+        return np.where(np.abs(self._above(origin, slope, z)) < 10 * TOLERANCE_M, z, np.nan)
