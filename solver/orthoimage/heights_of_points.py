@@ -12,7 +12,7 @@ from .surface import HeightField
 Array = NDArray[np.floating]
 
 #: Nodes of the field along its longer side; it reaches beyond the points by this share of their extent.
-NODES, BEYOND = 200, 0.5
+NODES, BEYOND = 200, 0.25
 #: A point this many times farther from its neighbours' median height than they are among themselves is left out.
 OUTLIER, NEIGHBOURS = 5.0, 9
 
@@ -46,7 +46,7 @@ def heights_of_points(point_l: Array, spacing_m: float = 0.0) -> HeightField:
         raise ValueError("all points with a height lie on a line") from None
     outside = ~np.isfinite(z)
     z[outside] = NearestNDInterpolator(point_l[:, :2], point_l[:, 2])(x[outside], y[outside])
-    return HeightField(float(low[0]), float(low[1]), step, z)
+    return HeightField(float(low[0]), float(low[1]), step, z, endless=True)
 
 
 def _trusted(point_l: Array) -> NDArray[np.bool_]:

@@ -98,6 +98,7 @@ class HeightField:
     x_m, y_m : first node
     step_m : between nodes
     z_m : (rows along Y, columns along X) Z of the nodes, NaN where not known
+    endless : whether the heights of its border go on beyond it
 
     Raises
     ------
@@ -108,6 +109,7 @@ class HeightField:
     y_m: float
     step_m: float
     z_m: Array = field(repr=False)
+    endless: bool = False
 
     def __post_init__(self) -> None:
         if self.z_m.ndim != 2 or min(self.z_m.shape) < 2:
@@ -118,9 +120,11 @@ class HeightField:
             raise ValueError("no height is known")
 
     def height(self, x: Array, y: Array) -> Array:
-        """Z below X, Y (...); NaN outside and next to nodes without height."""
+        """Z below X, Y (...); NaN outside (unless endless) and next to nodes without height."""
         rows, columns = self.z_m.shape
         u, v = (y - self.y_m) / self.step_m, (x - self.x_m) / self.step_m
+        if self.endless:
+            u, v = np.clip(u, 0, rows - 1), np.clip(v, 0, columns - 1)
         inside = (u >= 0) & (u <= rows - 1) & (v >= 0) & (v <= columns - 1)
         u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
         i, j = np.minimum(u.astype(np.int64), rows - 2), np.minimum(v.astype(np.int64), columns - 2)
