@@ -36,6 +36,7 @@ class Layout:
     image_size : width (samples) and height of an image-space view
     units : units of the parameters, one plot each
     truth : whether errors against truth are shown
+    mosaic : whether there is an orthoimage
     geographic_centre : latitude and longitude for the map, deg; None without a map
     """
 
@@ -47,6 +48,7 @@ class Layout:
     image_size: tuple[float, float]
     units: tuple[str, ...] = ()
     truth: bool = False
+    mosaic: bool = False
     geographic_centre: tuple[float, float] | None = None
 
 
@@ -73,6 +75,10 @@ class Canvas(Protocol):
     ) -> None: ...  # fmt: skip
 
     def ellipsoids(self, entity: str, centres: Array, half_axes: Array, quaternions: Array, color: Color) -> None: ...
+
+    def picture(self, entity: str, corners: Array, grey: NDArray[np.uint8]) -> None:
+        """A grey image (rows, columns) between four corners (4, 3): of its first row, then back along its last."""
+        ...
 
     def geographic_line(self, entity: str, lat_lon: Array, color: Color) -> None: ...
 
@@ -107,6 +113,9 @@ class NullCanvas:
         pass
 
     def ellipsoids(self, entity, centres, half_axes, quaternions, color) -> None:
+        pass
+
+    def picture(self, entity, corners, grey) -> None:
         pass
 
     def geographic_line(self, entity, lat_lon, color) -> None:

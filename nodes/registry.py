@@ -12,6 +12,7 @@ STEP_NODES: dict[str, tuple[str, str]] = {
     "navigator": ("navigator", "Navigator"),
     "matcher": ("matcher", "Matcher"),
     "adjuster": ("adjuster", "Adjuster"),
+    "rectifier": ("rectifier", "Rectifier"),
 }
 #: name -> (module, function): programs on the bus with a life of their own, run as ``function(options)``.
 PROGRAMS: dict[str, tuple[str, str]] = {

@@ -72,6 +72,14 @@ class RerunCanvas:
         )  # fmt: skip
         self.stream.log(entity, shape)
 
+    def picture(self, entity: str, corners: Array, grey: NDArray[np.uint8]) -> None:
+        mesh = rr.Mesh3D(
+            vertex_positions=corners, triangle_indices=[[0, 1, 2], [0, 2, 3]],
+            vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
+            albedo_texture=np.repeat(grey[:, :, None], 3, axis=2),
+        )  # fmt: skip
+        self.stream.log(entity, mesh)
+
     def geographic_line(self, entity: str, lat_lon: Array, color: Color) -> None:
         self.stream.log(entity, rr.GeoLineStrings(lat_lon=[lat_lon], colors=[color], radii=rr.Radius.ui_points(2.0)))
 
@@ -127,7 +135,7 @@ def open_canvas(mode: str) -> Canvas:
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
-    tabs = [_overview(layout), _corrections(), _adjustment(layout)]
+    tabs = [_overview(layout), *([_mosaic(layout)] if layout.mosaic else []), _corrections(), _adjustment(layout)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -157,6 +165,31 @@ def _overview(layout: Layout) -> rrb.Container:
     left = rrb.Vertical(_flight(layout), _legend(layout), side, row_shares=[10, 1.3, 3])
     right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
     return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
+
+
+def _mosaic(layout: Layout) -> rrb.Container:
+    """Both orthoimages from above, the one over the other for a long strip that runs east."""
+    low, high = layout.corners.min(axis=0), layout.corners.max(axis=0)
+    middle, extent = (low + high) / 2, high - low
+    wide = extent[0] >= extent[1]
+    reach = max(extent[0] / (2 * _ASPECT if wide else _ASPECT), extent[1])
+    views = [
+        rrb.Spatial3DView(
+            origin="/",
+            contents=[f"+ /mosaic/{version}/**"],
+            name=title,
+            background=_BACKGROUND,
+            line_grid=rrb.LineGrid3D(visible=False),
+            eye_controls=rrb.EyeControls3D(
+                kind=rrb.Eye3DKind.Orbital,
+                position=[middle[0], middle[1] - 1e-3 * reach, low[2] + reach / (2 * np.tan(_FIELD_OF_VIEW / 2))],
+                look_target=[middle[0], middle[1], low[2]],
+                eye_up=[0.0, 1.0, 0.0],
+            ),
+        )
+        for version, title in (("live", "Orthoimage, live orientation"), ("final", "Orthoimage, final orientation"))
+    ]
+    return (rrb.Vertical if wide else rrb.Horizontal)(*views, name="Orthoimage")
 
 
 def _corrections() -> rrb.Container:
@@ -206,7 +239,7 @@ def _flight(layout: Layout) -> rrb.View:
     eye, target = viewpoint(layout)
     return rrb.Spatial3DView(
         origin="/",
-        contents=["+ /flight/**", "+ /points/**"],
+        contents=["+ /flight/**", "+ /points/**", "+ /mosaic/**"],
         name=layout.title,
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=True, spacing=layout.grid_m, color=[70, 75, 90, 120], stroke_width=0.6),

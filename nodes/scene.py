@@ -20,6 +20,7 @@ from .node import Message
 from .scene_flight import FlightPart
 from .scene_image import ImagePart
 from .scene_map import MapPart
+from .scene_mosaic import MosaicPart
 from .scene_parts import FILTERED, LEGEND
 from .scene_plots import PlotsPart
 from .scene_points import PointsPart
@@ -40,6 +41,8 @@ TOPICS: tuple[str, ...] = (
     "orientation/final",
     "point/object",
     "adjustment/report",
+    "orthoimage/live",
+    "orthoimage/final",
     "event/log",
 )
 TRUTH_TOPICS: tuple[str, ...] = ("truth/trajectory",)
@@ -60,6 +63,7 @@ class Scene:
             ImagePart(self.state),
             PlotsPart(self.state),
             MapPart(self.state),
+            MosaicPart(self.state),
         )
         self._laid_out: Any = None
         self._held: list[tuple[str, PoseSample]] = []
@@ -154,7 +158,7 @@ class Scene:
     def _lay_out(self) -> None:
         """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
         s = self.state
-        key = (tuple(s.extent), s.camera is not None, s.has_truth, tuple(s.units), s.frame is not None)
+        key = (tuple(s.extent), s.camera is not None, s.has_truth, s.has_mosaic, tuple(s.units), s.frame is not None)
         if key == self._laid_out or not s.extent:
             return
         self._laid_out = key
@@ -175,6 +179,7 @@ class Scene:
             image_size=s.image_size,
             units=tuple(s.units),
             truth=s.has_truth,
+            mosaic=s.has_mosaic,
             geographic_centre=middle,
         )
         self.canvas.layout(layout)

@@ -88,6 +88,7 @@ class SceneState:
         self.extent: dict[str, Array] = {}
         self.units: list[str] = []
         self.has_truth = False
+        self.has_mosaic = False
         self.newest: PoseSample | None = None
         self.speed_m_s = 70.0
         self._control: list[Array] = []

@@ -88,6 +88,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
+    Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
+    Topic("orthoimage/final", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
     Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
     Topic("event/log", m.Log, Family.STATUS, 0),

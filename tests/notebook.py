@@ -36,6 +36,10 @@ class Notebook(NullCanvas):
     def ellipsoids(self, entity, centres, half_axes, quaternions, color):
         self._note(entity, centres, half_axes, quaternions)
 
+    def picture(self, entity, corners, grey):
+        assert corners.shape == (4, 3) and grey.ndim == 2 and grey.dtype == np.uint8
+        self._note(entity, np.array(corners), np.array(grey))
+
     def geographic_line(self, entity, lat_lon, color):
         self._note(entity, np.array(lat_lon))
 

@@ -58,6 +58,8 @@ def body(topic: str, i: int = 0) -> Any:
         "orientation/final": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
         "point/object": point,
         "adjustment/report": report,
+        "orthoimage/live": m.GroundTile(size=2, gsd_m=0.5, encoding="mono8", data=b"\0\1\2\3", ccd="N"),
+        "orthoimage/final": m.GroundTile(size=2, gsd_m=0.5, row=-3, encoding="mono8", data=b"\0\1\2\3", ccd="N"),
         "truth/trajectory": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
         "truth/point": ground,
         "event/log": log,
