@@ -18,6 +18,7 @@ BENCHMARKS = {
     "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
     "a-priori weights from the trajectory": ["apriori.py"],
     "sliding window": ["window.py"],
+    "orthoimage": ["orthoimage.py"],
 }
 
 

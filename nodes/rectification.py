@@ -207,6 +207,8 @@ class Rectification:
             pixels = np.concatenate([np.zeros((gap, pixels.shape[1]), dtype=pixels.dtype), pixels])
             usable = np.concatenate([np.zeros(gap, dtype=bool), usable])
             first -= gap
+        elif gap > 0:
+            self._rest = None
         self._next_line = first + len(pixels)
         self._reduced(pixels, usable, time_s, first)
 
@@ -217,8 +219,9 @@ class Rectification:
             self._place(pixels, usable, time_s, first)
             return
         if self._rest is not None:
-            pixels, usable, time_s = (np.concatenate(p) for p in zip(self._rest, (pixels, usable, time_s), strict=True))
-            first -= len(self._rest[1])
+            rest, rest_usable, rest_s = self._rest
+            pixels, time_s = np.concatenate([rest, pixels]), np.concatenate([rest_s, time_s])
+            usable, first = np.concatenate([rest_usable, usable]), first - len(rest)
         skip = min(-first % f, len(pixels))
         pixels, usable, time_s, first = pixels[skip:], usable[skip:], time_s[skip:], first + skip
         n, width = len(pixels) // f, pixels.shape[1] // f
@@ -227,7 +230,7 @@ class Rectification:
         if n:
             grey = pixels[:used, : width * f].reshape(n, f, width, f).mean(axis=(1, 3), dtype=np.float32)
             small = np.rint(grey).astype(pixels.dtype)
-            together = usable[:used].reshape(n, f).all(axis=1)
+            together = np.logical_and.reduce(usable[:used].reshape(n, f), axis=1)
             self._place(small, together, time_s[:used].reshape(n, f).mean(axis=1), first // f)
 
     def _place(self, pixels: NDArray[Any], usable: NDArray[np.bool_], time_s: Array, first: int) -> None:

@@ -58,7 +58,13 @@ class Rectifier(Node):
     outputs = ("orthoimage/live", "orthoimage/final", "event/log")
 
     def __init__(
-        self, *, ccd: str = "", samples: int = 600, publish_s: float = 2.0, budget_mb: float = 256.0, full_scale: int = 0
+        self,
+        *,
+        ccd: str = "",
+        samples: int = 600,
+        publish_s: float = 2.0,
+        budget_mb: float = 256.0,
+        full_scale: int = 0,
     ) -> None:
         super().__init__()
         if not samples >= 16:
@@ -187,7 +193,8 @@ class Rectifier(Node):
             raise ValueError(f"lines of {block.pixels.shape[1]} pixels, wanted {line.pixels}")
         first = int(block.first_line)
         late = min(max(self._next_line.get(block.strip, first) - first, 0), len(block.pixels))
-        self.counters["lines twice or late"] += late
+        if late:
+            self.counters["lines twice or late"] += late
         if late < len(block.pixels):
             time_s = (block.times_ns()[late:] - self._reference_ns) * 1e-9
             self._next_line[block.strip] = first + len(block.pixels)

@@ -17,6 +17,8 @@ Array = NDArray[np.floating]
 #: The tiles lie so far below the ground, shares of the flying height, that points and residuals stand above them.
 BELOW = {"live": 0.062, "final": 0.060}
 LARGEST_TILE = 4096
+#: Ground is dark to a sensor that clouds must not blind: what a grey value is shown as.
+SHOWN = np.rint(255.0 * (np.arange(256) / 255.0) ** 0.6).astype(np.uint8)
 
 
 class MosaicPart(Part):
@@ -57,5 +59,5 @@ class MosaicPart(Part):
             x0, x1 = tile.x + c0 * tile.gsd_m, tile.x + c1 * tile.gsd_m
             y0, y1 = tile.y - r0 * tile.gsd_m, tile.y - r1 * tile.gsd_m
             corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)])
-            canvas.picture(f"mosaic/{version}/{row}_{column}", self.state.display(corners), grey[r0:r1, c0:c1])
+            canvas.picture(f"mosaic/{version}/{row}_{column}", self.state.display(corners), SHOWN[grey[r0:r1, c0:c1]])
         self._changed.clear()

@@ -75,7 +75,9 @@ def run(args: argparse.Namespace) -> int:
     surface, ground_m, ground = _ground(args, recording, frame)
     above = float(np.median(orientation.measured.position_l[:, 2])) - ground_m
     if above <= 0:
-        raise UserError(f"{args.input}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem")
+        raise UserError(
+            f"{args.input}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem"
+        )
     pixel = pixel_on_ground(camera, ccd, above)
     grid = GroundGrid(target, args.gsd or float(f"{pixel:.2g}"))
     factor = max(int(grid.gsd / pixel + 0.1), 1)
@@ -180,10 +182,12 @@ def _ground(args: argparse.Namespace, recording: Recording, frame: LocalFrame) -
 
 
 def _check_size(recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid) -> None:
-    lines = int(recording.strips()["lines"].max() or 0)
+    lines = max((int(message.body.lines) for message in recording.messages("configuration/strip")), default=0)
     cells = lines * camera.lines[ccd].pixels * (pixel / grid.gsd) ** 2
     if cells > MOST_CELLS:
-        raise UserError(f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one")
+        raise UserError(
+            f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one"
+        )
 
 
 def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> None:

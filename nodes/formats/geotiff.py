@@ -53,12 +53,13 @@ def read_heights(path: Path) -> Heights:
     UserError : not there, not a raster, without CRS, turned, too large, or without a single height
     """
     import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     if not path.exists():
         raise UserError(f"{path}: no such file")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as source:
                 if source.crs is None:
                     raise UserError(f"{path}: has no coordinate reference system")
@@ -70,7 +71,7 @@ def read_heights(path: Path) -> Heights:
                     raise UserError(f"{path}: {size} heights are too many, wanted at most {MOST_HEIGHTS:.0e}")
                 band = source.read(1, masked=True)
                 crs = source.crs.to_wkt()
-    except rasterio.errors.RasterioError as error:
+    except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
     z = np.ma.filled(band.astype(float), np.nan)
     if not np.isfinite(z).any():
@@ -109,6 +110,8 @@ def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[st
     """
     import rasterio
     import rasterio.shutil
+    from rasterio.crs import CRS
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.windows import Window
 
     try:
@@ -116,14 +119,14 @@ def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[st
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
     x, y = grid.corner(column0, row0)
-    crs = None if grid.frame.crs == "local" else rasterio.crs.CRS.from_user_input(grid.frame.crs)
+    crs = None if grid.frame.crs == "local" else CRS.from_user_input(grid.frame.crs)
     shape = row1 - row0, column1 - column0
     profile = {
         "width": shape[1], "height": shape[0], "count": 1, "dtype": mosaic.dtype.name, "crs": crs,
         "transform": rasterio.Affine(grid.gsd, 0.0, x, 0.0, -grid.gsd, y), "nodata": 0,
     }  # fmt: skip
     with new_file(path) as part, warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
         draft = part.with_suffix(".draft")
         try:
             # a cloud-optimised file is made from a whole one: overviews stand before the pixels
@@ -142,7 +145,7 @@ def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[st
                 draft, part, driver="COG", compress="deflate", predictor="yes", blocksize=BLOCK,
                 overview_resampling="average", bigtiff="if_safer",
             )  # fmt: skip
-        except rasterio.errors.RasterioError as error:
+        except RasterioError as error:
             raise UserError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
         finally:
             draft.unlink(missing_ok=True)

@@ -120,9 +120,7 @@ def heights_in_frame(
     middle = float(np.nanmedian(z))
     corners = other.from_crs(np.column_stack([border, np.full(len(border), middle)]))
     if not step_m:
-        here = other.from_crs(
-            np.array([x0, y0, middle]) + np.array([[0, 0, 0], [dx, 0, 0], [0, dy, 0]]) + [dx, dy, 0]
-        )
+        here = other.from_crs(np.array([x0, y0, middle]) + np.array([[0, 0, 0], [dx, 0, 0], [0, dy, 0]]) + [dx, dy, 0])
         step_m = float(min(np.linalg.norm(here[1] - here[0]), np.linalg.norm(here[2] - here[0])))
     (left, bottom), (right, top) = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
     nx, ny = int((right - left) / step_m) + 2, int((top - bottom) / step_m) + 2
@@ -136,6 +134,7 @@ def heights_in_frame(
         for _ in range(3):  # the place in the CRS hardly depends on the height
             place = other.to_crs(point)
             h = given.height((place[:, 0] - x0) / dx, (place[:, 1] - y0) / dy)
-            point[:, 2] += np.where(np.isfinite(h), h, place[:, 2]) - place[:, 2]
-        field[i] = np.where(np.isfinite(h), point[:, 2], np.nan)
+            known = np.isfinite(h)
+            point[:, 2] += np.where(known, h - place[:, 2], 0.0)
+            field[i] = np.where(known, point[:, 2], np.nan)
     return HeightField(float(left), float(bottom), step_m, field)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.spatial import QhullError, cKDTree
+from scipy.spatial import KDTree, QhullError
 
 from .surface import HeightField
 
@@ -53,7 +53,7 @@ def _trusted(point_l: Array) -> NDArray[np.bool_]:
     """Points whose height is like that of the points around; all of them where there are few."""
     if len(point_l) <= NEIGHBOURS:
         return np.ones(len(point_l), dtype=bool)
-    _, around = cKDTree(point_l[:, :2]).query(point_l[:, :2], k=NEIGHBOURS)
+    around = np.asarray(KDTree(point_l[:, :2]).query(point_l[:, :2], k=NEIGHBOURS)[1])
     away = point_l[:, 2] - np.median(point_l[around[:, 1:], 2], axis=1)
     scale = 1.4826 * float(np.median(np.abs(away)))
     return np.abs(away) <= OUTLIER * max(scale, 1e-6)

@@ -6,8 +6,9 @@ line and sample as functions of the place, by one-dimensional interpolation alon
 best scan line of every place, without search. Cells then take their grey value from there (indirect), so that none is
 left out and none is asked twice.
 
-Places are counted in the strip's own straight axes: ``p`` along the flight, about one a line, ``q`` across, about one a
-pixel. Both are linear in column and row. Bands of whole ``p`` share the cells among them without gap or overlap.
+Places are counted in the strip's own straight, perhaps oblique axes: ``p`` along the flight, about one a line, ``q``
+across, about one a pixel. Both are linear in column and row. Bands of whole ``p`` share the cells among them without
+gap or overlap.
 """
 
 from __future__ import annotations
@@ -28,10 +29,16 @@ Mask = NDArray[np.bool_]
 
 #: Pixels from one ray to the next, and rays beyond either end of the CCD line.
 NODE_STEP, BEYOND = 16, 2
+#: Rows of the inverse table a line: where a jolt slows the scan down, line as a function of place bends sharply.
+ROWS = 3
+#: The first and last lines go on straight for so many, so that the orthoimage ends where the lines do.
+STRAIGHT_ON = 40
 #: Lines (p) that are rectified at once, at most, and cells that are worked on at once.
 BAND, CELLS = 256, 32_768
 #: More than so many lines may not wait for others: a strip that turns round sees no new ground.
 MOST_WAITING = 20_000
+#: Lines across the flight: nearer to its direction, by the sine between them, they say little of it.
+LEAST_SINE = 0.2
 
 
 @dataclass(frozen=True)
@@ -239,8 +246,11 @@ class StripRectifier:
         # places of the cells, relative to the table
         starts = np.concatenate([[0], np.cumsum(length)])
         p_start, q_start = self._axes.place_of(column, row)
-        p_start, q_start = (p_start - (begin - 1)).astype(np.float32), ((q_start - q0) / NODE_STEP).astype(np.float32)
-        dp = np.float32(self._axes.to_place[0, 0])
+        p_start, q_start = (
+            (ROWS * (p_start - begin)).astype(np.float32),
+            ((q_start - q0) / NODE_STEP).astype(np.float32),
+        )
+        dp = np.float32(ROWS * self._axes.to_place[0, 0])
         dq = np.float32(self._axes.to_place[1, 0] / NODE_STEP)
         dtype = self._pixels.dtype
         values = np.zeros(starts[-1], dtype=dtype)
@@ -269,12 +279,13 @@ class StripRectifier:
         return Patch(row, column, length, values, steepness)
 
     def _inverse(self, begin: int, end: int) -> tuple[int, NDArray[np.complexfloating]] | None:
-        """Line (of those at hand) and sample, as real and imaginary part, at p = begin - 1 .. end and q every so often.
+        """Line (of those at hand) and sample, as real and imaginary part, at p = begin .. end and q every so often.
 
         Returns the first q, and the table.
         """
-        p_wanted = np.arange(begin - 1, end + 1, dtype=float)
+        p_wanted = begin + np.arange(ROWS * (end - begin) + 1) / ROWS
         lines = np.arange(len(self._usable), dtype=float)
+        on = np.concatenate([[-STRAIGHT_ON], lines, [lines[-1] + STRAIGHT_ON]])
         k = len(self.rays.sample)
         line, q = np.full((len(p_wanted), k), np.nan), np.full((len(p_wanted), k), np.nan)
         for j in range(k):
@@ -282,7 +293,12 @@ class StripRectifier:
             if np.count_nonzero(met) < 2:
                 continue
             p = np.maximum.accumulate(self._place[met, j, 0])  # where a jolt shows ground twice, the first look counts
-            line[:, j] = np.interp(p_wanted, p, lines[met], left=np.nan, right=np.nan)
+            if met.all():
+                near = min(10, len(lines) - 1)
+                steps = np.maximum([p[near] - p[0], p[-1] - p[-1 - near]], 0.2 * near) * (STRAIGHT_ON / near)
+                line[:, j] = np.interp(p_wanted, np.concatenate([[p[0] - steps[0]], p, [p[-1] + steps[1]]]), on)
+            else:
+                line[:, j] = np.interp(p_wanted, p, lines[met], left=np.nan, right=np.nan)
             q[:, j] = np.interp(p_wanted, p, self._place[met, j, 1])
         if not np.isfinite(q).any():
             return None
@@ -310,7 +326,10 @@ class _Axes:
 
     @classmethod
     def through(cls, cells: Array, line: NDArray[np.int_], sample: Array) -> _Axes:
-        """Axes along and across lines (n, k, 2): p grows with the lines, q with the samples; rectangular."""
+        """Axes along and across lines (n, k, 2): p grows with the lines, q with the samples.
+
+        They are as oblique as the lines: a platform that crabs, or a line that looks forward over a slope.
+        """
         middle = cells[:, len(sample) // 2]
         way = middle[-1] - middle[0]
         across = (cells[:, -1] - cells[:, 0]).mean(axis=0)
@@ -318,10 +337,10 @@ class _Axes:
         width = float(np.linalg.norm(across)) / float(sample[-1] - sample[0])
         if travel < 1e-3 * width or width == 0:  # hardly moved: across is known at least
             travel, way = width, np.array([across[1], -across[0]])
-        along = way / np.linalg.norm(way)
-        side = np.array([-along[1], along[0]])
-        side *= np.sign(side @ across) or 1.0
-        to_place = np.stack([along / travel, side / width])
+        along, side = way / np.linalg.norm(way), across / np.linalg.norm(across)
+        if abs(along[0] * side[1] - along[1] * side[0]) < LEAST_SINE:
+            along = np.array([side[1], -side[0]])
+        to_place = np.linalg.inv(np.stack([along * travel, side * width], axis=1))
         shift = np.array([line[0], sample[len(sample) // 2]]) - to_place @ middle[0]
         return cls(to_place, shift)
 

@@ -20,8 +20,8 @@ Array = NDArray[np.floating]
 STEP, SURROUNDINGS = 0.25, 4.0
 #: Rows along the road that are put together to one profile, and from one profile to the next, cells.
 TOGETHER, APART = 5, 10.0
-#: A place counts if it is this near, cells, to the median of so many neighbours each way: tracks along parcels look much
-#: like roads, but they are found here and there. Nearer to another road than this many widths no road is looked for.
+#: A place counts if it is this near, cells, to the median of so many neighbours each way: tracks along parcels look
+#: much like roads, but here and there only. Nearer to another road than this many widths no road is looked for.
 AGREES, NEIGHBOURS, CROSSING = 1.5, 4, 4.0
 #: A road stands out by this share of its brightness against both sides, and the model explains so much of a profile.
 CONTRAST, EXPLAINED = 0.12, 0.9
@@ -53,7 +53,8 @@ class RoadPlaces:
             mine = self.road == road
             if mine.sum() > 3:
                 left.append(
-                    self.offset[mine] - np.polyval(np.polyfit(self.along_m[mine], self.offset[mine], 1), self.along_m[mine])
+                    self.offset[mine]
+                    - np.polyval(np.polyfit(self.along_m[mine], self.offset[mine], 1), self.along_m[mine])
                 )
         return float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else float("nan")
 
@@ -88,7 +89,9 @@ def find_roads(mosaic: Mosaic, grid: GroundGrid, texture: GroundTexture, terrain
             for other in texture.roads:
                 if other is not roads:
                     slant = abs(np.sin(other.azimuth_rad - roads.azimuth_rad))
-                    good &= np.abs(other.place(xy[:, 0], xy[:, 1])[0]) > slant * reach * grid.gsd + CROSSING * roads.width_m
+                    good &= (
+                        np.abs(other.place(xy[:, 0], xy[:, 1])[0]) > slant * reach * grid.gsd + CROSSING * roads.width_m
+                    )
             found = np.flatnonzero(good)
             good[found] = _agreeing(offset[found], t[found], grid.gsd)
             parts.append((np.full(int(good.sum()), name), t[good], offset[good]))
