@@ -288,5 +288,5 @@ class Rectifier(Node):
         return m.GroundTile(
             column=column, row=row, size=size, gsd_m=gsd, x=column * size * gsd, y=-row * size * gsd, z=self._mean_m,
             encoding="mono8", data=image.mosaic.tiles[key].tobytes(), ccd=self._camera.lines[self._line].id,
-            strip=image.strip, newest_line_ns=self._reference_ns + round(image.newest_s * convert.SECOND_NS),
+            strip=image.strip, newest_time_ns=self._reference_ns + round(image.newest_s * convert.SECOND_NS),
         )  # fmt: skip

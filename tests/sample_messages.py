@@ -43,6 +43,13 @@ def body(topic: str, i: int = 0) -> Any:
     convert.set_time(log.timestamp, time_ns)
     tie = {"strip": "S1", "ccd": "F", "line": 10.5 + i, "sample": 3.25, "time_ns": time_ns}
     ground = convert.ground_point_message(f"G{i}", (1.0, 2.0, 3.0), IDENTITY3, "control")
+    tile: dict[str, Any] = {
+        "size": 2,
+        "gsd_m": 0.5,
+        "encoding": "mono8",
+        "data": b"\0\1\2\3",
+        "newest_time_ns": time_ns,
+    }
     return {
         "configuration/project": m.Project(name="test", crs="local", origin_latitude=48.9, lever_arm_m=[0.1, 0.2, 0.3]),
         "configuration/camera": camera,
@@ -58,8 +65,8 @@ def body(topic: str, i: int = 0) -> Any:
         "orientation/final": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
         "point/object": point,
         "adjustment/report": report,
-        "orthoimage/live": m.GroundTile(size=2, gsd_m=0.5, encoding="mono8", data=b"\0\1\2\3", ccd="N"),
-        "orthoimage/final": m.GroundTile(size=2, gsd_m=0.5, row=-3, encoding="mono8", data=b"\0\1\2\3", ccd="N"),
+        "orthoimage/live": m.GroundTile(**tile),
+        "orthoimage/final": m.GroundTile(row=-3, **tile),
         "truth/trajectory": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
         "truth/point": ground,
         "event/log": log,
