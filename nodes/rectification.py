@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from ..schemas.image_lines import LineBlock
 from ..solver.camera import LineCamera
 from ..solver.frames import LocalFrame
-from ..solver.orthoimage.ground_grid import GroundGrid
+from ..solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ..solver.orthoimage.heights_of_points import heights_of_points
 from ..solver.orthoimage.mosaic import Mosaic
 from ..solver.orthoimage.orientation import LineOrientation
 from ..solver.orthoimage.strip import StripRectifier, rays_of
 from ..solver.orthoimage.surface import HeightField, Surface
+from ..solver.simulation.flight import Flight
 from . import convert
 from .access import Poses, Recording
 from .errors import UserError
+from .formats.geotiff import Heights
 
 Array = NDArray[np.floating]
 
@@ -295,6 +297,25 @@ def frame_for(frame: LocalFrame, crs: str) -> LocalFrame:
     if geographic:
         raise UserError(f"--crs {crs}: is geographic, wanted a projected CRS such as EPSG:32632")
     return other
+
+
+def true_relief(flight: Flight, step_m: float = 10.0) -> Heights:
+    """The ground of a simulated flight, as far as its cameras look, on a grid of its UTM zone."""
+    low, high = flight.truth.position_l.min(axis=0), flight.truth.position_l.max(axis=0)
+    above = high[2] - flight.terrain.height_m
+    c = float(flight.camera.focal_length_mm.min())
+    reach = 1.3 * above * max(float(np.abs(line.xy_mm).max()) for line in flight.camera.lines) / c
+    utm = replace(flight.frame, crs=utm_of(flight.frame))
+    corners = [(x, y, 0.0) for x in (low[0] - reach, high[0] + reach) for y in (low[1] - reach, high[1] + reach)]
+    border = utm.to_crs(np.array(corners))
+    (x0, y0), (x1, y1) = border[:, :2].min(axis=0), border[:, :2].max(axis=0)
+    x, y = np.meshgrid(np.arange(x0, x1, step_m), np.arange(y1, y0, -step_m))
+    place = np.stack([x.ravel(), y.ravel(), np.full(x.size, flight.frame.height_m + flight.terrain.height_m)], axis=1)
+    for _ in range(3):  # the plumb lines of the local frame and of the map differ a little
+        local = utm.from_crs(place)
+        local[:, 2] = flight.terrain.height(local[:, 0], local[:, 1])
+        place[:, 2] = utm.to_crs(local)[:, 2]
+    return Heights(utm.crs, place[:, 2].reshape(x.shape), float(x[0, 0]), float(y[0, 0]), step_m, -step_m)
 
 
 def project_frame(recording: Recording) -> LocalFrame:

@@ -22,7 +22,7 @@ from triline.nodes.recording import RecordingReader, RecordingWriter
 from triline.nodes.rectifier import Rectifier
 from triline.nodes.scene import Scene
 from triline.schemas import messages as m
-from triline.solver.orthoimage.ground_grid import GroundGrid, utm_of
+from triline.solver.orthoimage.ground_grid import GroundGrid
 from triline.solver.orthoimage.surface import HeightField
 from triline.solver.simulation.imagery import ground_sample
 from triline.solver.simulation.road_check import find_roads
@@ -52,27 +52,16 @@ def flown(folder):
     for name, value in SETTINGS.items():
         values = value if isinstance(value, tuple) else (value,)
         options += ["--" + name.replace("_", "-"), *(() if value is True else map(str, values))]
-    assert main(["simulate", "-o", str(folder / "raw.mcap"), "-q", *options]) == 0
+    assert main(["simulate", "-o", str(folder / "raw.mcap"), "--dem", str(folder / "dem.tif"), "-q", *options]) == 0
     out = folder / "flown.mcap"
     assert main(["process", str(folder / "raw.mcap"), "-o", str(out), "--nodes", "navigator,adjuster,rectifier"]) == 0
     return out
 
 
 @pytest.fixture(scope="module")
-def dem(simulated, folder):
-    """The true relief as a GeoTIFF in UTM."""
-    flight = simulated.simulation.flight
-    utm = replace(flight.frame, crs=utm_of(flight.frame))
-    middle = utm.to_crs(np.zeros((1, 3)))[0]
-    x, y = np.meshgrid(middle[0] + 10.0 * np.arange(-330, 331), middle[1] - 10.0 * np.arange(-180, 181))
-    place = np.stack([x, y, np.full(x.shape, flight.frame.height_m)], axis=-1).reshape(-1, 3)
-    for _ in range(3):
-        local = utm.from_crs(place)
-        local[:, 2] = flight.terrain.height(local[:, 0], local[:, 1])
-        place[:, 2] = utm.to_crs(local)[:, 2]
-    path = folder / "dem.tif"
-    write_heights(path, Heights(utm.crs, place[:, 2].reshape(x.shape), x[0, 0], y[0, 0], 10.0, -10.0))
-    return path
+def dem(flown, folder):
+    """The true relief, as `triline simulate` wrote it beside the recording."""
+    return folder / "dem.tif"
 
 
 def _rectify(capsys, flown, target, *options):

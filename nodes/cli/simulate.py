@@ -14,8 +14,10 @@ import numpy as np
 from .. import convert
 from ..errors import UserError
 from ..flight_settings import GRADES, OPTIONS, Option, SimulatedFlight, shown_default, simulated_flight
+from ..formats.geotiff import write_heights
 from ..formats.new_file import new_file
 from ..recording import COMPRESSIONS, RecordingWriter
+from ..rectification import true_relief
 from ..simulator import Simulator
 from .progress import progress
 
@@ -38,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="recording to write")
     parser.add_argument("--epoch", metavar="UTC", help=f"when it begins (default {DEFAULT_EPOCH}, or as --motion says)")
     parser.add_argument("--compression", choices=sorted(COMPRESSIONS), default="none", help="of the recording")
+    parser.add_argument("--dem", metavar="FILE", help="also write the true relief, a GeoTIFF in UTM, for `rectify`")
     groups = {name: parser.add_argument_group(title) for name, title in _GROUPS.items()}
     for option in OPTIONS:
         _add(groups[option.group], option)
@@ -76,6 +79,8 @@ def run(args: argparse.Namespace) -> int:
             if tell is not None and i % 1000 == 0:
                 tell(i / len(simulator))
         counts = dict(sorted(writer.counts.items()))
+    if args.dem is not None:
+        write_heights(Path(args.dem), true_relief(flight.simulation.flight))
     result = _summary(flight, simulator.duration_s, args.output, 1 if given["seed"] is None else given["seed"], counts)
     if args.json:
         print(json.dumps(result, indent=2))
