@@ -73,6 +73,7 @@ OPTIONS: tuple[Option, ...] = (
     Option("pixels", int, "of a CCD line, over the same field (line rate and ground sample follow)", "imagery"),
     Option("image_noise", float, "grey values, 1 sigma", "imagery", "noise"),
     Option("cars", float, "speed of cars on the roads, m/s, 0 for none", "imagery", "cars_m_s"),
+    Option("clouds", float, "share of the view that clouds cover, 0 for a clear sky", "imagery", "clouds"),
     Option("ties", float, "new tie points a second", "observations", "tie_points_per_s"),
     Option("image_sigma", float, "noise of a line and of a sample, px", "observations", "image_sigma_px"),
     Option("outliers", float, "share of the tie rays that are blunders", "observations", "outlier_share"),

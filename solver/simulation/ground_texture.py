@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
+from scipy.special import erf, ndtri
 
 Array = NDArray[np.floating]
 Float32 = NDArray[np.floating]
@@ -36,6 +36,8 @@ KINDS: dict[str, tuple[float, float, float, float, float]] = {
 }
 _KEYS = 1024
 TRACK_REFLECTANCE, ROAD_REFLECTANCE, CAR_REFLECTANCE = 0.5, 0.62, 0.9
+#: Clouds: reflectance, texel of the larger of their two tiles in pixels, and width of their rim (standard deviations).
+CLOUD_REFLECTANCE, CLOUD_TEXEL, CLOUD_RIM = 0.95, 48.0, 0.5
 #: A signalised target: white disc in a black ring, reflectances.
 TARGET_WHITE, TARGET_BLACK, TARGET_RING = 0.9, 0.05, 2.2
 
@@ -157,9 +159,18 @@ class SeenTexture:
         self._draw_targets(value, x, y)
         return np.clip(value, 0.0, 1.0).reshape(shape)
 
-    def _noise(self, level: int, x: Array, y: Array) -> Float32:
-        """Bilinear in a periodic tile."""
-        texel = _texel(self.texture.detail_m, level)
+    def clouds(self, x: Array, y: Array, share: float) -> Float32:
+        """How much of the light from below clouds keep (0 .. 1), at places (...) in their layer; they cover a share."""
+        shape = x.shape
+        x, y = np.ravel(x), np.ravel(y)
+        grown = CLOUD_TEXEL / (FINEST_TEXEL * TILE_STEP**3)
+        value = self._noise(3, x, y, grown) / TILE_SIGMA[3] + 0.25 * self._noise(2, x, y, grown) / TILE_SIGMA[2]
+        rim = float(ndtri(1.0 - share)) * np.hypot(1.0, 0.25)
+        return np.clip((value - np.float32(rim)) / np.float32(CLOUD_RIM), 0.0, 1.0).reshape(shape)
+
+    def _noise(self, level: int, x: Array, y: Array, grown: float = 1.0) -> Float32:
+        """Bilinear in a periodic tile, ``grown`` times as large as usual."""
+        texel = grown * _texel(self.texture.detail_m, level)
         c, s = np.cos(self.texture.turn[level]) / texel, np.sin(self.texture.turn[level]) / texel
         u, v = c * x + s * y, c * y - s * x
         i, j = np.floor(u), np.floor(v)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .flight import Flight, pixel_angle, view_tangents
-from .ground_texture import GroundTexture, ground_texture
+from .ground_texture import CLOUD_REFLECTANCE, GroundTexture, ground_texture
 from .streams import STREAMS, stream
 
 Array = NDArray[np.floating]
@@ -21,8 +21,6 @@ Array = NDArray[np.floating]
 FULL_SCALE = 4095
 #: Heights are computed this far apart on the ground, at most; the shortest relief has more than ten times that length.
 NODE_M = 12.0
-#: Rays meet the ground to this height, m.
-HEIGHT_TOLERANCE_M = 1e-4
 #: Lines rendered at once are limited to so many pixels, so that the arrays stay small.
 CHUNK_PIXELS = 200_000
 
@@ -40,6 +38,8 @@ class ImagingPlan:
     noise : grey values, 1 sigma, without light; photon noise comes on top
     photon_noise : grey values, 1 sigma, at full scale
     cars_m_s : speed of cars on the roads, 0 for none
+    clouds : share of the view that clouds cover, 0 for a clear sky
+    cloud_height : of their layer, as a share of the flying height
     block_s : a block of lines is sent at least this often
 
     Raises
@@ -57,12 +57,16 @@ class ImagingPlan:
     noise: float = 4.0
     photon_noise: float = 12.0
     cars_m_s: float = 14.0
+    clouds: float = 0.0
+    cloud_height: float = 0.5
     block_s: float = 0.1
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0 <= value < np.inf:
                 raise ValueError(f"imaging plan: {name} must not be negative, got {value}")
+        if not (self.clouds < 1 and self.cloud_height < 1):
+            raise ValueError("imaging plan: wanted clouds and cloud_height below 1")
         if not (self.dark < self.bright and self.flicker_s > 0 and self.block_s > 0):
             raise ValueError("imaging plan: wanted dark below bright, flicker_s and block_s above 0")
 
@@ -130,10 +134,12 @@ class LineImager:
     def signal(self, strip: int, ccd: int, first_line: int, count: int) -> NDArray[np.floating]:
         """The same without noise, rounding and limits."""
         time_s = self.flight.strips[strip].time_of(first_line + np.arange(count))
+        plan, seen = self.plan, self._seen[ccd]
         ground = self.ground(ccd, time_s)
-        look = strip * len(self._seen) + ccd
-        value = self._seen[ccd].reflectance(ground[0], ground[1], time_s[:, None], look)
-        plan = self.plan
+        value = seen.reflectance(ground[0], ground[1], time_s[:, None], strip * len(self._seen) + ccd)
+        if plan.clouds:
+            there = self._in_cloud_layer(ground, time_s)
+            value += seen.clouds(there[0], there[1], plan.clouds) * (np.float32(CLOUD_REFLECTANCE) - value)
         light = self._gain[ccd] * (1 + plan.flicker * np.sin(2 * np.pi * time_s / plan.flicker_s + self._phase[ccd]))
         value = value * (plan.bright - plan.dark) + np.float32(plan.dark)
         return value * (light.astype(np.float32)[:, None] * self._light[ccd]) + np.float32(self._offset[ccd])
@@ -146,10 +152,16 @@ class LineImager:
         n, k = len(time_s), len(nodes)
         origin = np.repeat(poses.position_l, k, axis=0)
         at_nodes = direction[:, :, nodes].reshape(3, -1).T
-        height = self.flight.terrain.intersect(origin, at_nodes, HEIGHT_TOLERANCE_M)[:, 2].reshape(n, k)
+        height = self.flight.terrain.met(origin, at_nodes).reshape(n, k)
         z = (self._between[ccd] @ height.T).T
         position = poses.position_l.T[:, :, None]
         return position + direction * ((z - position[2]) / direction[2])
+
+    def _in_cloud_layer(self, ground: Array, time_s: Array) -> Array:
+        """(2, n, pixels) places where the rays to the ground (3, n, pixels) pass through the clouds."""
+        position = self.flight.truth.at(time_s).position_l.T[:, :, None]
+        share = self.plan.cloud_height
+        return ground[:2] + share * (position[:2] - ground[:2])
 
 
 def imager_of(flight: Flight, seed: int, targets_l: Array | None = None, plan: ImagingPlan | None = None) -> LineImager:
