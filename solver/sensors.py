@@ -84,7 +84,7 @@ def _prism() -> LineCamera:
 _ONE_LENS: dict[str, tuple[float, int, float, dict[str, float]]] = {
     "ads40": (62.7, 12000, 0.0065, {"F": 26.0, "N": 0.0, "B": -16.0}),
     "ads40-small": (62.7, 1200, 0.065, {"F": 26.0, "N": 0.0, "B": -16.0}),
-    # the inner half of the field in pixels four times as large: 200 lines a second from 840 m at 70 m/s
+    # the inner half of the field in pixels four times as large: 200 lines a second from 1690 m at 140 m/s
     "ads40-inner": (62.7, 1500, 0.026, {"F": 26.0, "N": 0.0, "B": -16.0}),
     "ads40-pavia": (62.77, 12000, 0.0065, {"F": 28.4, "N": 0.0, "B": -14.2}),
     "si-100": (60.0, 10200, 0.007, {"F": 21.0, "N": 0.0, "B": -21.0}),

@@ -157,6 +157,7 @@ class TieMatcher:
         self._events: list[str] = []
         self._heights = HeightGuess(0.0, self.options.relief_sigma_m)
         self._slow = SlowDisagreement(len(self._others))
+        self._widest_px = 0.0  # search of late
         self._store: LineStore | None = None
         self._strip = ""
         self._first_s = self._rate = 0.0
@@ -325,7 +326,7 @@ class TieMatcher:
 
     def _reach_guess(self) -> float:
         if self._slow.known:
-            return 10.0
+            return float((CORRELATION_HALF + COARSE_REACH + 2) * coarsest_factor(self._widest_px))
         height, travel = self._height_and_travel()
         reach = max(self._orientation_reach(view, travel) for view in self.views)
         base = max(abs(view.forward) for view in self.views) * 3 * self.options.relief_sigma_m / travel
@@ -411,6 +412,7 @@ class TieMatcher:
         axes = np.stack([ground.along, ground.across]) / ground.spacing_m
         parallax = (slope - other_slope) @ axes.T
         reach = self._reach(index, ground, sigma_height, parallax)
+        self._widest_px = max(reach, 0.9 * self._widest_px)
         half = (CORRELATION_HALF + 2) * coarsest_factor(reach) + PAD
         master = self._image(self._master, master_scan, line, half, travel)
         image = self._image(index, wide, other_line, half + reach, travel)

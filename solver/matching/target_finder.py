@@ -1,0 +1,344 @@
+"""Signalised targets as the lines come in: where each should appear, whether it does, and where exactly.
+
+Coordinates of the target and the orientation of now, with its covariance, say where on the CCD lines a target appears
+and how far from there it may lie. The pattern is looked for within that, and the best place is centred by least squares
+in the original pixels. What lies further off than the covariance allows, looks like two targets, or is measured poorly
+is held for a person to decide.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from ..camera import LineCamera
+from ..line_store import LineRing
+from ..rotation import angles_from_matrix, matrix_from_angles
+from .current_orientation import CurrentOrientation
+from .line_scan import LineScan, View, view_of
+from .target_image import RING, Centre, candidates, fit
+
+Array = NDArray[np.floating]
+
+#: Lines kept beyond the widest search: looks wait so long for the pose at their time, s, and lines of vibration.
+WAIT_S, PAD = 2.0, 16
+#: A look whose orientation has not come is given up after so long, s.
+PATIENCE_S = 1.5
+#: Targets are looked for so far along the flight about where the platform is, s: times of looks are guessed to that.
+HORIZON_S = 0.5
+#: Steps of the pose by which derivatives of a prediction are made, m and rad.
+STEPS = (1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4)
+
+
+@dataclass(frozen=True)
+class TargetOptions:
+    """How targets are measured, and what is believed.
+
+    Attributes
+    ----------
+    least_score : correlation coefficient of grey values and model of a target
+    rival_score : another place in the search window that looks so much like a target makes the best one doubtful
+    least_radius_px : smaller targets are not measured
+    least_reach_px, largest_reach_px : of the search
+    largest_sigma_px : of a measurement that is believed
+    line_sigma_px, sample_sigma_px : what is added for what residuals of grey values do not show; along the flight
+        vibration that the poses do not tell moves single lines
+    critical : chi-square (2) of what is measured against what is expected, beyond which a look is doubtful (0.1 %)
+
+    Raises
+    ------
+    ValueError : a value that makes no sense
+    """
+
+    least_score: float = 0.97
+    rival_score: float = 0.93
+    least_radius_px: float = 1.2
+    least_reach_px: float = 6.0
+    largest_reach_px: float = 80.0
+    largest_sigma_px: float = 0.15
+    line_sigma_px: float = 0.04
+    sample_sigma_px: float = 0.02
+    critical: float = 13.8
+
+    def __post_init__(self) -> None:
+        if not (0 < self.least_score < 1 and 0 < self.rival_score < 1):
+            raise ValueError(f"scores {self.least_score}, {self.rival_score}: wanted 0 to 1")
+        if not 0 < self.least_reach_px <= self.largest_reach_px:
+            raise ValueError(f"largest_reach_px: wanted at least {self.least_reach_px:g}, got {self.largest_reach_px}")
+        if not min(self.line_sigma_px, self.sample_sigma_px, self.largest_sigma_px, self.critical) > 0:
+            raise ValueError("line_sigma_px, sample_sigma_px, largest_sigma_px and critical: wanted more than 0")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A ground point that is signalised: local coordinates (3,), their covariance (3, 3), radius of the disc, m."""
+
+    name: str
+    xyz_l: Array
+    covariance: Array
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class TargetLook:
+    """A target in one view.
+
+    Attributes
+    ----------
+    target, ccd : names
+    line, sample, sigma_line, sigma_sample : measured, px
+    expected_line, expected_sample : by the orientation of now, px
+    reach_px : how far from there it was looked for
+    score : correlation coefficient of grey values and model; 0 where nothing was found
+    off : (2,) measured minus expected, on the ground, X and Y, m
+    chi2 : of this, by the covariance of the orientation and of the coordinates
+    reason : why it is doubtful; empty for a good one
+    found : whether there is a measurement at all
+    """
+
+    target: str
+    ccd: str
+    line: float
+    sample: float
+    sigma_line: float
+    sigma_sample: float
+    expected_line: float
+    expected_sample: float
+    reach_px: float
+    score: float
+    off: tuple[float, float]
+    chi2: float
+    reason: str
+    found: bool
+
+
+class TargetFinder:
+    """Measures the targets that the lines of one strip after another see.
+
+    Parameters
+    ----------
+    camera : line camera with one lens
+    orientation : best orientation known now; kept up to date by whoever owns it
+    options : see `TargetOptions`
+
+    Attributes
+    ----------
+    counters : looks by what became of them
+    """
+
+    def __init__(self, camera: LineCamera, orientation: CurrentOrientation, options: TargetOptions | None = None):
+        self.options = options or TargetOptions()
+        self.orientation = orientation
+        self.views = {line.id: view_of(camera, i) for i, line in enumerate(camera.lines)}
+        self.counters: Counter[str] = Counter()
+        self._targets: dict[str, Target] = {}
+        self._rings: dict[str, LineRing] = {}
+        self._open: set[tuple[str, str]] = set()
+        self._first_s = self._rate = 0.0
+
+    def set_target(self, target: Target) -> None:
+        """Add a target, or change its coordinates.
+
+        Raises
+        ------
+        ValueError : a radius that is not positive
+        """
+        if not target.radius_m > 0:
+            raise ValueError(f"target {target.name!r} of radius {target.radius_m} m, wanted more than 0")
+        known = target.name in self._targets
+        self._targets[target.name] = target
+        if not known and self._rate:
+            self._open |= {(target.name, ccd) for ccd in self.views}
+
+    def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
+        """Lines that follow belong to a new strip; all targets may appear in it."""
+        self._first_s, self._rate = first_line_time_s, line_rate_hz
+        lines = int(WAIT_S * line_rate_hz + 2 * self.options.largest_reach_px) + 8 * PAD
+        self._rings = {}
+        self._capacity = lines
+        self._open = {(name, ccd) for name in self._targets for ccd in self.views}
+
+    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
+        """Lines of one CCD line of the strip; nothing is kept while there is no target."""
+        view = self.views.get(ccd)
+        if view is None or not self._targets or not self._rate or pixels.ndim != 2 or pixels.shape[1] != view.pixels:
+            return
+        if ccd not in self._rings:
+            self._rings[ccd] = LineRing(view.pixels, self._capacity, pixels.dtype)
+        self._rings[ccd].add(first_line, pixels)
+
+    def measure(self, ccd: str) -> list[TargetLook]:
+        """Targets whose look by a CCD line has become known, in the order of their names."""
+        ring, o = self._rings.get(ccd), self.orientation
+        if ring is None or not np.isfinite(o.end_s) or ring.end <= ring.start:
+            return []
+        names = sorted(name for name, view in self._open if view == ccd)
+        if not names:
+            return []
+        low = max(ring.start, int(np.ceil((o.start_s - self._first_s) * self._rate)) + 1)
+        high = min(ring.end - 1, int(np.floor((o.end_s - self._first_s) * self._rate)) - 1)
+        if high - low < 4 * PAD:
+            return []
+        near = self._near(ccd, names, high)
+        if not near:
+            return []
+        position, R = o.at(self._first_s + np.arange(low, high + 1) / self._rate)
+        scan = LineScan(self.views[ccd], low, position, R)
+        looks = []
+        for name in near:
+            look = self._look(self._targets[name], scan, ring)
+            if look is not None:
+                self._open.discard((name, ccd))
+                self.counters["target " + (look.reason if look.reason else "measured")] += 1
+                looks.append(look)
+        return looks
+
+    # -- where -------------------------------------------------------------------------------------------------------
+
+    def _near(self, ccd: str, names: list[str], newest: int) -> list[str]:
+        """The targets that the newest lines have passed a moment ago, roughly."""
+        o, view = self.orientation, self.views[ccd]
+        t = self._first_s + newest / self._rate
+        position, R = o.at([t - 0.1, t])
+        velocity = (position[1] - position[0]) / 0.1
+        middle = R[1] @ view.rays_c(np.array([0.5 * (view.pixels - 1)]))[0]
+        points = np.array([self._targets[name].xyz_l for name in names])
+        ground = position[1] + middle * ((points[:, 2:] - position[1, 2]) / middle[2])
+        speed = max(float(np.hypot(*velocity[:2])), 1e-6)
+        behind_s = (ground[:, :2] - points[:, :2]) @ velocity[:2] / speed**2
+        aside = np.abs((ground[:, :2] - points[:, :2]) @ np.array([-velocity[1], velocity[0]]) / speed)
+        above = position[1, 2] - points[:, 2]
+        swath = above * float(np.ptp(view.y_mm)) / view.focal_length_mm
+        return [n for n, b, a, s in zip(names, behind_s, aside, swath, strict=True) if -HORIZON_S < b < WAIT_S and a < s]
+
+    def _look(self, target: Target, scan: LineScan, ring: LineRing) -> TargetLook | None:
+        """The look at a target, or None while it is not complete or not on these lines."""
+        place = target.xyz_l[None]
+        middle = np.array([scan.first_line + 0.5 * len(scan.position_l)])
+        line, sample, inside = scan.locate(place, middle, rounds=8)
+        if not inside[0]:
+            return None
+        i = int(np.clip(line[0] - scan.first_line, 0, len(scan.position_l) - 2))
+        above = scan.position_l[i, 2] - target.xyz_l[2]
+        pixel = above * scan.view.pitch_mm / scan.view.focal_length_mm
+        travel = float(np.linalg.norm(scan.position_l[-1] - scan.position_l[0])) / (len(scan.position_l) - 1)
+        covariance = self._expected(target, scan, line[0], sample[0])
+        o = self.options
+        sigma_px = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) / min(pixel, travel)
+        reach = float(np.clip(3.0 * sigma_px + 1.0, o.least_reach_px, o.largest_reach_px))
+        half = int(np.ceil(reach + RING * target.radius_m / pixel)) + 2
+        away = (half + PAD) * max(pixel / travel, 1.0)
+        last = scan.first_line + len(scan.position_l) - 1
+        if line[0] + away > last:
+            return None  # lines, or poses, are still to come
+        if line[0] - away < scan.first_line:
+            return None
+        nothing = TargetLook(
+            target.name, scan.view.ccd, float(line[0]), float(sample[0]), 0.0, 0.0, float(line[0]), float(sample[0]),
+            reach, 0.0, (0.0, 0.0), 0.0, "not found", False,
+        )  # fmt: skip
+        if target.radius_m < o.least_radius_px * pixel:
+            return replace(nothing, reason="too small")
+        found = self._search(target, scan, ring, line[0], pixel, travel, half)
+        if isinstance(found, str):
+            return replace(nothing, reason=found)
+        return self._judge(nothing, target, scan, found, covariance, pixel, travel)
+
+    def _expected(self, target: Target, scan: LineScan, line: float, sample: float) -> Array:
+        """Covariance (2, 2) of where the target appears, as X and Y on the ground, m^2: pose and coordinates."""
+        i = int(np.clip(round(line) - scan.first_line, 0, len(scan.position_l) - 1))
+        position, angles = scan.position_l[i], angles_from_matrix(scan.R_lc[i])
+        poses = np.concatenate([position, angles]) + np.vstack([np.zeros(6), np.diag(STEPS)])
+        moved = LineScan(scan.view, 0, poses[:, :3], matrix_from_angles(*poses[:, 3:].T))
+        xyz, slope = moved.to_plane(np.arange(7), np.full(7, sample), np.full(7, target.xyz_l[2]))
+        by_pose = ((xyz[1:, :2] - xyz[0, :2]) / np.array(STEPS)[:, None]).T
+        by_point = np.column_stack([-np.eye(2), slope[0]])
+        time_s = self._first_s + line / self._rate
+        pose = self.orientation.covariance(time_s)
+        return by_pose @ pose @ by_pose.T + by_point @ target.covariance @ by_point.T
+
+    # -- what --------------------------------------------------------------------------------------------------------
+
+    def _search(
+        self, target: Target, scan: LineScan, ring: LineRing, line: float, pixel: float, travel: float, half: int
+    ) -> tuple[Centre, str] | str:
+        """The target among the pixels about where it should be, with a doubt; or why there is none."""
+        away = int((half + PAD) * max(pixel / travel, 1.0))
+        stretch = ring.read(int(line) - away, int(line) + away + 1)
+        if len(stretch.pixels) < 2 * away or not stretch.usable.all():
+            return "no lines"
+        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
+        along = way / np.linalg.norm(way)
+        turned = scan.view.sample[0] > scan.view.sample[-1]
+        across = np.array([along[1], -along[0]]) if turned else np.array([-along[1], along[0]])
+        r = pixel * np.arange(-half, half + 1)
+        grid = np.empty((len(r), len(r), 3))
+        grid[..., :2] = target.xyz_l[:2] + r[:, None, None] * along + r[None, :, None] * across
+        grid[..., 2] = target.xyz_l[2]
+        guess = np.broadcast_to((line + r / travel)[:, None], grid.shape[:2])
+        u, v, inside = scan.locate(grid.reshape(-1, 3), guess.ravel(), rounds=4)
+        # beyond the ends of the line there are no pixels: their nearest ones stand in, which look like no target
+        values = map_coordinates(
+            stretch.pixels.astype(np.float32), [u - stretch.first_line, v], order=1, mode="nearest"
+        ).reshape(len(r), len(r))
+        if inside.mean() < 0.3:
+            return "at the end of the line"
+        places, _ = candidates(values, target.radius_m / pixel, 4)
+        fits = [
+            self._centre(target, scan, stretch, u.reshape(values.shape)[a, b], v.reshape(values.shape)[a, b], pixel)
+            for a, b in places
+        ]
+        good = sorted((c for c in fits if c is not None and c.converged and c.white > c.black), key=lambda c: -c.score)
+        if not good or good[0].score < 0.7:
+            return "not found"
+        rivals = [c for c in good[1:] if np.hypot(*(c.xy - good[0].xy)) > 1.5 * pixel]
+        doubt = "two alike" if rivals and rivals[0].score > self.options.rival_score else ""
+        return good[0], doubt
+
+    def _centre(self, target: Target, scan: LineScan, stretch, u: float, v: float, pixel: float) -> Centre | None:
+        """The centre of a target near a pixel, in ground coordinates."""
+        size = int(np.ceil(RING * target.radius_m / pixel)) + 3
+        first, left = round(float(u)) - 2 * size, round(float(v)) - size
+        lines = np.arange(max(first, stretch.first_line), min(first + 4 * size + 1, stretch.first_line + len(stretch.pixels)))
+        samples = np.arange(max(left, 0), min(left + 2 * size + 1, scan.view.pixels))
+        if len(samples) < size + 1 or len(lines) < size + 1:
+            return None
+        line, sample = (a.ravel() for a in np.meshgrid(lines, samples, indexing="ij"))
+        xyz, _ = scan.to_plane(line, sample.astype(float), np.full(len(line), target.xyz_l[2]))
+        grey = stretch.pixels[line - stretch.first_line, sample].astype(float)
+        nearest = int(np.argmin(np.hypot(line - u, sample - v)))
+        return fit(xyz[:, :2], grey, xyz[nearest, :2], target.radius_m, pixel)
+
+    def _judge(
+        self, nothing: TargetLook, target: Target, scan: LineScan, found: tuple[Centre, str], expected: Array,
+        pixel: float, travel: float,
+    ) -> TargetLook:  # fmt: skip
+        """The look, and whether it is to be believed."""
+        o, (centre, doubt) = self.options, found
+        xyz = np.append(centre.xy, target.xyz_l[2])
+        line, sample, inside = scan.locate(xyz[None], np.array([nothing.line]), rounds=6)
+        if not inside[0]:
+            return nothing
+        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
+        along = way / np.linalg.norm(way)
+        across = np.array([-along[1], along[0]])
+        sigma_line = float(np.sqrt(along @ centre.covariance @ along / travel**2 + o.line_sigma_px**2))
+        sigma_sample = float(np.sqrt(across @ centre.covariance @ across / pixel**2 + o.sample_sigma_px**2))
+        off = centre.xy - target.xyz_l[:2]
+        noise = centre.covariance + (o.line_sigma_px * max(pixel, travel)) ** 2 * np.eye(2)
+        chi2 = float(off @ np.linalg.solve(expected + noise, off))
+        reason = doubt
+        if chi2 > o.critical:
+            reason = "far from where it should be"
+        if max(sigma_line, sigma_sample) > o.largest_sigma_px:
+            reason = "imprecise"
+        if centre.score < o.least_score:
+            reason = "poor likeness"
+        return replace(
+            nothing, line=float(line[0]), sample=float(sample[0]), sigma_line=sigma_line, sigma_sample=sigma_sample,
+            score=centre.score, off=(float(off[0]), float(off[1])), chi2=chi2, reason=reason, found=True,
+        )  # fmt: skip
