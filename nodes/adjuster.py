@@ -52,6 +52,7 @@ class Adjuster(Node):
         "trajectory/filtered",
         "trajectory/smoothed",
         "observation/control",
+        "observation/verdict",
         "observation/tie",
     )
     outputs = ("orientation/live", "orientation/final", "point/object", "adjustment/report", "event/log")
@@ -91,6 +92,7 @@ class Adjuster(Node):
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
         self._control: dict[str, Any] = {}
+        self._refused: set[str] = set()  # ground points whose coordinates do not count
         self._reference_ns = 0
         self._next_update_ns: int | None = None
         self._stamp_ns = 0
@@ -160,6 +162,8 @@ class Adjuster(Node):
             self._tie(body)
         elif topic == "observation/control":
             self._ground_point(body)
+        elif topic == "observation/verdict":
+            return self._verdict(body)
         elif topic == "configuration/strip":
             return self._strip(body)
         else:
@@ -253,8 +257,19 @@ class Adjuster(Node):
                 raise ValueError(f"ground point {body.point!r}: variance {variance[axis]}, wanted more than 0")
             sigma[axis] = np.sqrt(variance[axis])
         self._control[body.point] = body
+        if body.point in self._refused:
+            sigma, role = np.full(3, np.inf), "check"
         if self._window is not None:
             self._window.add_control(body.point, xyz, sigma, role)
+
+    def _verdict(self, body: Any) -> list[Message]:
+        """A surveyor says whether the coordinates of a point count."""
+        if body.point not in self._control:
+            raise ValueError(f"verdict on {body.point!r}, which is no ground point")
+        (self._refused.discard if body.accepted else self._refused.add)(body.point)
+        self._ground_point(self._control[body.point])
+        verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
+        return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
 
     def _tie(self, body: Any) -> None:
         if self._window is None:

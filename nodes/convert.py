@@ -246,11 +246,16 @@ def attitude_message(time_ns: int, rpy: ArrayLike, sigma: ArrayLike) -> Any:
     return m.Attitude(time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=covariance)
 
 
-def ground_point_message(point: str, position_l: ArrayLike, covariance: ArrayLike, role: str) -> Any:
-    """A GroundPoint; ``role`` is control, planimetric, height or check."""
+def ground_point_message(
+    point: str, position_l: ArrayLike, covariance: ArrayLike, role: str, target_radius_m: float = 0.0
+) -> Any:
+    """A GroundPoint; ``role`` is control, planimetric, height or check; a radius of 0 = not signalised."""
     x, y, z = (float(v) for v in np.asarray(position_l))
     cov = np.asarray(covariance, dtype=float).ravel().tolist()
-    return m.GroundPoint(point=point, x=x, y=y, z=z, covariance=cov, role=m.GroundPoint.Role.Value(role.upper()))
+    return m.GroundPoint(
+        point=point, x=x, y=y, z=z, covariance=cov, role=m.GroundPoint.Role.Value(role.upper()),
+        target_radius=target_radius_m,
+    )  # fmt: skip
 
 
 def role_of(ground_point: Any) -> str:

@@ -12,20 +12,25 @@ from ..schemas.image_lines import LineBlock
 from ..solver.matching.tie_matcher import MatchedTie, MatchingOptions, TieMatcher
 from . import convert
 from .node import Message, Node
+from .target_desk import TargetDesk
 
 DEFAULTS = MatchingOptions()
+#: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
+DELAY_S = 1.0
 
 
 class Matcher(Node):
     """Runs a `TieMatcher`.
 
-    A tie point carries the stamp of the message that completed it: the block of lines with its last look, or the pose
-    that told where that look was taken from.
+    A tie point is completed by a message: the block of lines with its last look, or the pose that told where that look
+    was taken from. Signalised control and check points are measured as well, see `TargetDesk`.
 
     Parameters
     ----------
     points_per_s, largest_sigma_px, least_score, least_reach_px, largest_reach_px, relief_sigma_m, least_rays,
     budget_mb, full_scale : as in `MatchingOptions`
+    delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
+        that time, so they may be so long on their way: live and from a recording it sees them at the same place.
     """
 
     name = "matcher"
@@ -37,8 +42,10 @@ class Matcher(Node):
         "trajectory/filtered",
         "trajectory/smoothed",
         "orientation/live",
+        "observation/control",
+        "observation/verdict",
     )
-    outputs = ("observation/tie", "event/log")
+    outputs = ("observation/tie", "observation/target", "event/log")
 
     def __init__(
         self,
@@ -52,13 +59,18 @@ class Matcher(Node):
         least_rays: int = DEFAULTS.least_rays,
         budget_mb: float = DEFAULTS.budget_mb,
         full_scale: int = DEFAULTS.full_scale,
+        delay_s: float = DELAY_S,
     ) -> None:
         super().__init__()
+        if not 0 <= delay_s <= 10:
+            raise ValueError(f"delay_s: wanted 0 to 10, got {delay_s}")
         self.options = MatchingOptions(
             points_per_s=points_per_s, largest_sigma_px=largest_sigma_px, least_score=least_score,
             least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
             least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
         )  # fmt: skip
+        self._targets = TargetDesk()
+        self._delay_ns = round(delay_s * convert.SECOND_NS)
         self._matcher: TieMatcher | None = None
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
@@ -91,6 +103,10 @@ class Matcher(Node):
             self._pose(body, topic == "trajectory/smoothed")
         elif topic == "orientation/live":
             self._correction(body)
+        elif topic == "observation/control":
+            self._targets.ground_point(body)
+        elif topic == "observation/verdict":
+            return self._targets.verdict(body, self._observed_ns)
         return []
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -101,6 +117,7 @@ class Matcher(Node):
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         self._matcher = TieMatcher(camera, self.options)
+        self._targets.configure(camera, self._matcher.orientation)
         return [self._log("configuration changed: matching starts again", warning=True)] if again else []
 
     def _pose(self, body: Any, smoothed: bool) -> None:
@@ -138,11 +155,16 @@ class Matcher(Node):
             self.problem("unknown strip", f"lines of {ccd} name strip {block.strip!r}")
             return []
         if matcher.strip != strip.id:
-            matcher.begin_strip(strip.id, (strip.first_line_time_ns - self._reference_ns) * 1e-9, strip.line_rate_hz)
+            first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
+            matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
+            self._targets.begin_strip(strip, first_s)
         matcher.add_lines(ccd, int(block.first_line), block.pixels)
         ties = matcher.match()
         out = [self._tie(strip, tie) for tie in ties]
-        out += [self._log(f"{strip.id}: {text}", warning=True) for text in matcher.take_events()]
+        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns)
+        out += targets
+        out += [self._log(f"{strip.id}: {text}", warning=True) for text in (*matcher.take_events(), *words)]
+        self.counters.update(self._targets.take_counters())
         self.counters.update(matcher.counters)
         matcher.counters.clear()
         return out
@@ -161,7 +183,12 @@ class Matcher(Node):
             }
             for ray in tie.rays
         ]
-        return Message("observation/tie", self._stamp_ns, convert.tie_message(f"{strip.id}-M{tie.number}", images))
+        return Message("observation/tie", self._observed_ns, convert.tie_message(f"{strip.id}-M{tie.number}", images))
+
+    @property
+    def _observed_ns(self) -> int:
+        """Stamp of observations that follow from the newest message."""
+        return self._stamp_ns + self._delay_ns
 
     def _log(self, text: str, warning: bool = False) -> Message:
         body = m.Log(name=self.name, message=text, level=3 if warning else 2)

@@ -78,8 +78,8 @@ class Simulator(Node):
         self._streams = [
             *self._configuration(),
             *self._trajectory_sensors(),
-            *self._ground(),
-            self._ties(),
+            *self._ground(0.0 if imager is None else imager.texture.target_radius_m),
+            *([self._ties()] if imager is None or simulation.observation_plan.tie_points_per_s else []),
             self._true_trajectory(),
             *([] if imager is None else self._lines(imager)),
         ]
@@ -211,7 +211,7 @@ class Simulator(Node):
         variances = [np.sum(np.square(parts), axis=0) for parts in (position, np.radians(attitude))]
         return np.diag(np.concatenate(variances))
 
-    def _ground(self) -> list[_Stream]:
+    def _ground(self, target_radius_m: float) -> list[_Stream]:
         sim = self.simulation
         start = np.full(len(sim.points), BEFORE_NS)
         control = [
@@ -220,6 +220,7 @@ class Simulator(Node):
                 sim.surveyed_l[i],
                 np.diag(np.square(sim.observation_plan.control_sigma_m)) if role == "control" else np.zeros((3, 3)),
                 str(role),
+                target_radius_m,
             )
             for i, role in enumerate(sim.points.role)
             if role != "tie"

@@ -19,6 +19,7 @@ _SIZES: dict[str, dict[str, int]] = {
     "triline.Attitude": {"covariance": 9},
     "triline.GroundPoint": {"covariance": 9},
     "triline.ObjectPoint": {"covariance": 9},
+    "triline.TargetLook": {"off": 2},
     "triline.Project": dict.fromkeys(
         ("lever_arm_m", "boresight_deg", "offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m",
          "wander_sigma_deg"), 3,
