@@ -23,6 +23,8 @@ from .runner import StepDriver
 LOSSLESS_DEPTH = 20_000
 #: Waiting messages of each newest-first topic.
 NEWEST_DEPTH = 16
+#: ... and more of them while they take fewer bytes than this.
+NEWEST_BYTES = 32 << 20
 #: The same for nodes that only look on: they take all topics newest-first.
 ONLOOKER_DEPTH = 2_000
 #: After so long without any message everything that waits is worked off. A node that lives on the results of others
@@ -39,13 +41,16 @@ LAST_WORDS_S = 0.2
 class Inbox:
     """The bounded queue between the bus and a worker: lossless topics block, newest-first topics lose their oldest."""
 
-    def __init__(self, lossless_depth: int = LOSSLESS_DEPTH, newest_depth: int = NEWEST_DEPTH) -> None:
+    def __init__(
+        self, lossless_depth: int = LOSSLESS_DEPTH, newest_depth: int = NEWEST_DEPTH, newest_bytes: int = 0
+    ) -> None:
         self._condition = threading.Condition()
         self._entries: deque[list[RawMessage | None]] = deque()
         self._newest: dict[str, deque[list[RawMessage | None]]] = {}
         self._lossless = 0
         self._lossless_depth = lossless_depth
         self._newest_depth = newest_depth
+        self._newest_bytes = newest_bytes
         self._closed = False
         self.dropped: Counter[str] = Counter()
 
@@ -59,7 +64,7 @@ class Inbox:
                 self._lossless += 1
             else:
                 waiting = self._newest.setdefault(raw.topic, deque())
-                if len(waiting) >= self._newest_depth:
+                if len(waiting) >= self._newest_depth and len(waiting) * len(raw.data) >= self._newest_bytes:
                     waiting.popleft()[0] = None
                     self.dropped[raw.topic] += 1
                 waiting.append(entry)
@@ -132,7 +137,9 @@ class BusRunner:
         self._driver = StepDriver(node, time.perf_counter)
         self._check: StreamCheck[RawMessage] = StreamCheck(node.problem)
         self._sequencer: Sequencer[Message] = Sequencer(node.inputs)
-        self._inbox = Inbox(newest_depth=NEWEST_DEPTH if node.outputs else ONLOOKER_DEPTH)
+        self._inbox = (
+            Inbox(newest_bytes=NEWEST_BYTES) if node.outputs else Inbox(newest_depth=ONLOOKER_DEPTH)
+        )
         self._lock = threading.Lock()
         self._malformed: Counter[str] = Counter()
         self._stop = stop or threading.Event()

@@ -176,7 +176,9 @@ class Sequencer(Generic[T]):
     A message leaves when no other stream can still bring one that belongs before it: the stream has passed it, or has
     been silent while platform time went on by more than the allowed lateness of its topic. A steady stream (one with a
     high rate) must also have been silent for ``grace_s`` of waiting time, so that a machine that hesitates does not
-    change the order. What arrives after its place has passed leaves at once, and is called late.
+    change the order. What arrives after its place has passed leaves at once, and is called late. Observations may be
+    stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or
+    a steady stream has died.
 
     Parameters
     ----------
@@ -191,6 +193,7 @@ class Sequencer(Generic[T]):
         self._grace_s = grace_s
         self._arrivals = 0
         self._newest_ns: int | None = None
+        self._time_ns: int | None = None  # the same without observations
         self._released: Key | None = None
         self._streams: dict[tuple[str, str], _Watermark] = {}
         self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
@@ -201,8 +204,8 @@ class Sequencer(Generic[T]):
 
     @property
     def newest_ns(self) -> int | None:
-        """Newest stamp that has arrived."""
-        return self._newest_ns
+        """Newest stamp that has arrived; observations count only where nothing else has."""
+        return self._newest_ns if self._time_ns is None else self._time_ns
 
     def push(self, topic: str, envelope: Envelope, item: T, now_s: float) -> T | None:
         """Take a message that arrived at waiting time ``now_s`` (any steady clock); returns it if it came late."""
@@ -211,6 +214,8 @@ class Sequencer(Generic[T]):
             self._started_s = now_s
         if self._newest_ns is None or stamp > self._newest_ns:
             self._newest_ns = stamp
+        if topics.find(topic).family is not Family.OBSERVATION and (self._time_ns is None or stamp > self._time_ns):
+            self._time_ns = stamp
         stream = self._streams.get((topic, envelope.source))
         if stream is None:
             row = topics.find(topic)
@@ -248,20 +253,21 @@ class Sequencer(Generic[T]):
 
     def _may_leave(self, key: Key, now_s: float) -> bool:
         stamp, rank, topic, source = key[:4]
-        assert self._newest_ns is not None and self._started_s is not None
+        newest_ns, time_ns = self._newest_ns, self.newest_ns
+        assert newest_ns is not None and time_ns is not None and self._started_s is not None
         for stream in self._streams.values():
             if stream.place == (rank, topic, source):
                 continue
             bound = stream.latest_ns
             if not (stream.steady and now_s - stream.heard_s < self._grace_s):
-                bound = max(bound, self._newest_ns - stream.lateness_ns)
+                bound = max(bound, (newest_ns if stream.steady else time_ns) - stream.lateness_ns)
             if bound < stamp or (bound == stamp and stream.place < (rank, topic, source)):
                 return False
         for row in self._unheard.values():
             lateness, steady = _patience(row)
             if steady and now_s - self._started_s < self._grace_s:
                 return False
-            if self._newest_ns - lateness <= stamp:
+            if (newest_ns if steady else time_ns) - lateness <= stamp:
                 return False
         return True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from ..schemas import topics
 from .bus import Bus
@@ -36,6 +36,10 @@ class Pacer:
     def mean_late_s(self) -> float:
         return self._late_sum_s / max(self._n, 1)
 
+    def postpone(self, seconds: float) -> None:
+        """Let everything that is still to come happen later."""
+        self._begun += seconds
+
     def wait(self, due_s: float) -> bool:
         """Wait until it is time; False where the waiting was ended."""
         if self._rate:
@@ -56,12 +60,13 @@ class Pacer:
 
 
 def publish_paced(
-    bus: Bus, messages: Iterable[Message], rate: float, stop: threading.Event, *, settle_s: float = SETTLE_S
-) -> Pacer:
+    bus: Bus, messages: Iterable[Message], rate: float, stop: threading.Event, *, settle_s: float = SETTLE_S,
+    hold: Callable[[], float] | None = None,
+) -> Pacer:  # fmt: skip
     """Publish `Message` objects at the pace of their stamps; used by programs that make messages, such as a simulator.
 
     Latched messages at the beginning go out at once; the others follow ``settle_s`` later, so that all who listen know
-    the configuration by then.
+    the configuration by then. ``hold`` is called before each message; it may wait, and returns for how long, s.
     """
     bus.prepare(row.name for row in topics.TOPICS if row.latched)
     pacer: Pacer | None = None
@@ -73,6 +78,8 @@ def publish_paced(
                 continue
             stop.wait(settle_s)
             pacer, first_ns = Pacer(rate, stop), message.stamp_ns
+        if hold is not None:
+            pacer.postpone(hold())
         if not pacer.wait((message.stamp_ns - first_ns) / SECOND_NS):
             break
         bus.publish(message)

@@ -23,6 +23,7 @@ from .errors import UserError
 from .node import Message, Node
 
 if TYPE_CHECKING:
+    from .brake import Brake
     from .live import StatusPublisher
     from .program import ProgramOptions
 
@@ -325,10 +326,12 @@ def _at_least(values: tuple[float, ...], least: float) -> list[float]:
 
 
 def run(options: ProgramOptions) -> int:
-    """Fly on the bus in real time: [simulator] takes the settings of ``triline simulate``, and rate.
+    """Fly on the bus in real time: [simulator] takes the settings of ``triline simulate``, rate, and wait_for.
 
-    The stamps are wall-clock time (at rate 1); the flight begins when it has been computed.
+    The stamps are wall-clock time (at rate 1); the flight begins when it has been computed. It waits for nodes of
+    ``wait_for`` (names with commas) that are too far behind.
     """
+    from .brake import Brake
     from .flight_settings import simulated_flight
     from .live import StatusPublisher
     from .pacing import publish_paced
@@ -338,6 +341,7 @@ def run(options: ProgramOptions) -> int:
         rate = float(settings.pop("rate", 1.0))
     except (TypeError, ValueError):
         raise UserError(f"simulation: rate is {options.table['rate']!r}, wanted a number") from None
+    waited_for = str(settings.pop("wait_for", ""))
     flight = simulated_flight(settings)
     simulator = Simulator(flight.simulation, flight.imager)
     options.report(f"{len(simulator)} messages over {simulator.duration_s:.0f} s")
@@ -345,16 +349,19 @@ def run(options: ProgramOptions) -> int:
         bus.announce(simulator.name)
         epoch_ns = time.time_ns() - BEFORE_NS
         status = StatusPublisher(bus, simulator.name)
-        publish_paced(bus, _telling(simulator, epoch_ns, status), rate, options.stop)
+        brake = Brake(bus, tuple(name.strip() for name in waited_for.split(",") if name.strip()), options.stop)
+        publish_paced(bus, _telling(simulator, epoch_ns, status, brake), rate, options.stop, hold=brake.wait)
         options.stop.wait(0.5)  # what is still on its way
     return 0
 
 
-def _telling(simulator: Simulator, epoch_ns: int, status: StatusPublisher) -> Iterator[Message]:
+def _telling(simulator: Simulator, epoch_ns: int, status: StatusPublisher, brake: Brake) -> Iterator[Message]:
     """The messages, with a status now and then."""
     stamp_ns = 0
     for message in simulator.messages(epoch_ns):
         if status.due():
+            if brake.held_s:
+                simulator.counters["ms waited for slow nodes"] = round(1e3 * brake.held_s)
             status.publish("flying", {}, simulator, 0.0, 0, stamp_ns)
         stamp_ns = message.stamp_ns
         yield message

@@ -86,7 +86,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("observation/verdict", m.Verdict, _O, 0),
     Topic("observation/tie", m.TiePoint, _O, 50),
     Topic("observation/target", m.TargetLook, _O, 0),
-    Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
+    Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),

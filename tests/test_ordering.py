@@ -92,14 +92,27 @@ def test_a_message_after_its_turn_leaves_at_once_and_is_late():
 
 def test_a_machine_that_hesitates_does_not_make_a_steady_stream_late():
     """The trajectory stands still for 2 s of platform time that pass within 0.1 s of waiting."""
-    ties = [("observation/tie", Envelope(t * MS, "s", i)) for i, t in enumerate(range(0, 2000, 20))]
+    fixes = [("sensor/gnss", Envelope(t * MS, "s", i)) for i, t in enumerate(range(0, 2000, 20))]
     poses = [("trajectory/filtered", Envelope(t * MS, "n", i)) for i, t in enumerate(range(0, 2000, 5))]
     first = poses[:1]
-    out, late = run([*first, *ties, *poses[1:]], step_s=0.001)
+    out, late = run([*first, *fixes, *poses[1:]], step_s=0.001)
     assert not late
-    assert out == sorted([*poses, *ties], key=lambda m: order_key(*m))
-    _, late = run([*first, *ties, *poses[1:]], step_s=0.001, grace_s=0.0)
+    assert out == sorted([*poses, *fixes], key=lambda m: order_key(*m))
+    _, late = run([*first, *fixes, *poses[1:]], step_s=0.001, grace_s=0.0)
     assert len(late) > 300  # the same without patience
+
+
+def test_an_observation_that_is_stamped_ahead_makes_nothing_else_late():
+    """Ties are stamped a second ahead of the poses; a strip that arrives 30 ms late still comes before its poses."""
+    poses = [("trajectory/filtered", Envelope(t * MS, "n", i)) for i, t in enumerate(range(0, 2000, 5))]
+    ties = [("observation/tie", Envelope((t + 1000) * MS, "m", i)) for i, t in enumerate(range(0, 1000, 20))]
+    strip = ("configuration/strip", Envelope(500 * MS, "s", 0))
+    arriving = sorted([*poses, *ties], key=lambda m: m[1].stamp_ns - (1000 * MS if m[0] == "observation/tie" else 0))
+    at = next(i for i, (topic, e) in enumerate(arriving) if topic == "trajectory/filtered" and e.stamp_ns == 530 * MS)
+    arriving.insert(at, strip)
+    out, late = run(arriving, step_s=0.01)
+    assert not late
+    assert out == sorted(arriving, key=lambda m: order_key(*m))
 
 
 def test_a_steady_stream_that_has_died_holds_nothing_for_longer_than_its_grace():

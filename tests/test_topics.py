@@ -93,7 +93,8 @@ def test_loop_shifts_every_time_in_a_message(name, tmp_path):
         b for b in _times(codec.decode(name, shifted(name, data, shift_ns, ""))) if b
     }
     assert times or find(name).family is Family.STATUS or name in (
-        "configuration/project", "configuration/camera", "observation/control", "truth/point", "point/object",
+        "configuration/project", "configuration/camera", "observation/control", "observation/verdict", "truth/point",
+        "point/object",
     )  # fmt: skip
 
 
