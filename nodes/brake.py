@@ -14,8 +14,10 @@ from ..schemas import codec
 from ..schemas.envelope import RawMessage
 from .bus import Bus
 
-#: A node that is so far behind, s, holds the flight up until it is less far behind.
-HOLD_S, RELEASE_S = 3.0, 1.0
+#: A node that is so far behind, s, slows the flight down until it is less far behind.
+HOLD_S, RELEASE_S = 3.0, 2.0
+#: ... by so much a message, s. It never stands still: nodes take silence for the end and work off what they hold back.
+STEP_S = 0.02
 #: A living node that says nothing for so long is busy, s; after that time it is given up.
 SILENT_S, GIVEN_UP_S = 2.5, 15.0
 
@@ -36,17 +38,18 @@ class Brake:
         self._lock = threading.Lock()
         self._lag_s: dict[str, float] = {}
         self._heard_s: dict[str, float] = {}
+        self._holding = False
         self.held_s = 0.0
         bus.watch(self._changed)
         bus.subscribe("status/*", self._take)
 
     def wait(self) -> float:
-        """Wait while somebody is behind; returns for how long, s."""
-        if not self._behind(HOLD_S):
+        """Wait a moment if somebody is behind; returns for how long, s."""
+        self._holding = self._behind(RELEASE_S if self._holding else HOLD_S)
+        if not self._holding:
             return 0.0
         begun = time.monotonic()
-        while self._behind(RELEASE_S) and not self._stop.wait(0.05):
-            pass
+        self._stop.wait(STEP_S)
         waited = time.monotonic() - begun
         self.held_s += waited
         return waited

@@ -22,8 +22,10 @@ from ..processes import NodeGroup, NodeProcess
 EXAMPLE = "triline demo --headless --seconds 60 --seed 7"
 
 PLATFORM = "demo"
-#: Everything that must run before the flight begins, in the order in which it is stopped at the end.
-ESTIMATORS = ("navigator", "adjuster")
+#: What turns sensors into orientation, in the order in which it is stopped at the end: with image lines and without.
+ESTIMATORS, ESTIMATORS_OF_TIES = ("navigator", "matcher", "adjuster"), ("navigator", "adjuster")
+#: The flight with image lines: 3 x 1500 pixels, 200 times a second.
+IMAGERY = {"images": "true", "sensor": '"ads40-inner"', "height": "1690", "speed": "140", "relief": "50"}
 READY_S = 20.0
 #: Once the flight has landed: longest wait until every node has worked off what it has.
 DRAIN_S = 15.0
@@ -31,6 +33,9 @@ DRAIN_S = 15.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--headless", action="store_true", help="no window; the scene goes to a .rrd file instead")
+    parser.add_argument(
+        "--no-images", action="store_true", help="no image lines: tie points are simulated, not matched"
+    )
     parser.add_argument("--web", action="store_true", help="show the scene in a browser (loopback only)")
     parser.add_argument("--seconds", type=_seconds, default=60.0, metavar="N", help="length of the strip (default 60)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated flight (default 1)")
@@ -59,6 +64,7 @@ class Demo:
         self.recording = self.folder / "flight.mcap"
         self.stop = threading.Event()
         self.restarts = 0
+        self.estimators = ESTIMATORS_OF_TIES if args.no_images else ESTIMATORS
         self.viewer_mode = self._viewer_mode()
         self._silent = args.quiet or args.json
 
@@ -69,15 +75,13 @@ class Demo:
         with NodeGroup(self.folder / "log", PLATFORM, port) as group, _interruptible(self.stop):
             self._say(f"bus on 127.0.0.1:{port}; logs in {group.log_folder}; Ctrl-C ends the flight early")
             group.start("recorder", "-o", str(self.recording))
-            for name in ESTIMATORS:
+            for name in self.estimators:
                 group.start(name)
             group.start("viewer", "--set", f"mode={json.dumps(self.viewer_mode)}")
             with self._monitor(port) as (overview, alive):
                 self._wait_ready(group, alive)
                 self._tell_web_address(group)
-                simulator = group.start(
-                    "simulator", "--set", f"seed={self.args.seed}", "--set", f"seconds={self.args.seconds}"
-                )
+                simulator = group.start("simulator", *self._flight())
                 with display(overview, f"triline demo, seed {self.args.seed}", quiet=self._silent) as show:
                     self._watch(group, simulator, show)
                     self._land(group, overview, show)
@@ -126,6 +130,13 @@ class Demo:
             address = next((word for word in log.split() if word.startswith("http://")), None)
             self._say(f"scene at {address}" if address else f"no address of the scene; see {group.log_folder}")
 
+    def _flight(self) -> list[str]:
+        """Settings of the simulator."""
+        settings = {"seed": self.args.seed, "seconds": self.args.seconds}
+        if not self.args.no_images:
+            settings |= IMAGERY | {"wait_for": json.dumps(",".join(self.estimators))}
+        return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+
     # ---- in flight
 
     def _watch(self, group: NodeGroup, simulator: NodeProcess, show: Callable[[], None]) -> None:
@@ -157,10 +168,10 @@ class Demo:
             received = sum(
                 t.received for s in overview.nodes.values() for t in s.topics if not t.topic.startswith("st")
             )
-            busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in ESTIMATORS)
+            busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in self.estimators)
             if received != seen or busy:
                 seen, quiet_since = received, time.monotonic()
-        for name in (*ESTIMATORS, "viewer", "recorder"):
+        for name in (*self.estimators, "viewer", "recorder"):
             if name in group.processes:
                 group.processes[name].stop(30.0)
                 time.sleep(0.7)  # its last words are still on their way to the others
@@ -174,6 +185,7 @@ class Demo:
         from ..monitor import Monitor
 
         monitor, living = Monitor(), set[str]()
+        self._overview = monitor.overview
 
         def changed(node: str, is_alive: bool) -> None:
             (living.add if is_alive else living.discard)(node)
@@ -201,9 +213,26 @@ class Demo:
         result = write_report(self.recording, report)
         result.update(
             report=str(report), recordings=[str(path) for path in recordings], restarts=self.restarts,
-            landed_early=self.stop.is_set(), viewer=self.viewer_mode,
+            landed_early=self.stop.is_set(), viewer=self.viewer_mode, images=not self.args.no_images,
+            lost=self._lost(), waited_s=self._waited_s(),
         )  # fmt: skip
         return result
+
+    def _lost(self) -> dict[str, int]:
+        """What the nodes lost on the way, by kind; the viewer may."""
+        sums: dict[str, int] = {}
+        for name, status in self._overview.nodes.items():
+            for topic in status.topics if name != "viewer" else ():
+                for kind in ("gaps", "late", "malformed", "dropped"):
+                    if getattr(topic, kind):
+                        sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
+        return sums
+
+    def _waited_s(self) -> float:
+        """For how long the flight had to wait for nodes that were behind."""
+        status = self._overview.nodes.get("simulator")
+        counted = {} if status is None else {c.name: c.value for c in status.counters}
+        return counted.get("ms waited for slow nodes", 0) / 1e3
 
     def summary(self, result: dict[str, Any]) -> str:
         """What a person wants to know at the end."""
@@ -211,6 +240,10 @@ class Demo:
 
         lines = ["", *accuracy_lines(result)]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
+        if result["waited_s"]:
+            lines.append(f"this machine is slow: the flight waited {result['waited_s']:.1f} s for nodes that were behind")
+        if result["lost"]:
+            lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
         if self.restarts:
             lines.append(f"{self.restarts} nodes were started again")
         lines += ["", f"recording  {self.recording}", f"report     {result['report']}"]
@@ -220,7 +253,8 @@ class Demo:
             )
         lines += [
             f"replay it  triline replay {self.recording}",
-            f"again      triline process {self.recording} -o {self.folder / 'processed.mcap'}",
+            f"again      triline process {self.recording} -o {self.folder / 'processed.mcap'} "
+            f"--nodes {','.join(self.estimators)}",
         ]
         return "\n".join(lines)
 
