@@ -37,6 +37,7 @@ class Layout:
     units : units of the parameters, one plot each
     truth : whether errors against truth are shown
     mosaic : whether there is an orthoimage
+    lines : ids of the CCD lines whose image lines come in; and width and height of a view of them
     geographic_centre : latitude and longitude for the map, deg; None without a map
     """
 
@@ -49,6 +50,8 @@ class Layout:
     units: tuple[str, ...] = ()
     truth: bool = False
     mosaic: bool = False
+    lines: tuple[str, ...] = ()
+    lines_size: tuple[float, float] = (1.0, 1.0)
     geographic_centre: tuple[float, float] | None = None
 
 
@@ -78,6 +81,14 @@ class Canvas(Protocol):
 
     def picture(self, entity: str, corners: Array, grey: NDArray[np.uint8]) -> None:
         """A grey image (rows, columns) between four corners (4, 3): of its first row, then back along its last."""
+        ...
+
+    def image(self, entity: str, grey: NDArray[np.uint8], place: tuple[float, float], order: float) -> None:
+        """A grey image (rows, columns) in a plane view, its upper left corner at a place; higher orders lie on top."""
+        ...
+
+    def move(self, entity: str, place: tuple[float, float]) -> None:
+        """Put all that is below an entity of a plane view to a place."""
         ...
 
     def geographic_line(self, entity: str, lat_lon: Array, color: Color) -> None: ...
@@ -116,6 +127,12 @@ class NullCanvas:
         pass
 
     def picture(self, entity, corners, grey) -> None:
+        pass
+
+    def image(self, entity, grey, place, order) -> None:
+        pass
+
+    def move(self, entity, place) -> None:
         pass
 
     def geographic_line(self, entity, lat_lon, color) -> None:

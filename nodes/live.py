@@ -21,12 +21,8 @@ from .runner import StepDriver
 
 #: Waiting messages of lossless topics after which publishers are slowed down.
 LOSSLESS_DEPTH = 20_000
-#: Waiting messages of each newest-first topic.
-NEWEST_DEPTH = 16
-#: ... and more of them while they take fewer bytes than this.
-NEWEST_BYTES = 32 << 20
-#: The same for nodes that only look on: they take all topics newest-first.
-ONLOOKER_DEPTH = 2_000
+#: Waiting messages of each newest-first topic; fewer, but 16 at least, where they take more bytes than this.
+NEWEST_DEPTH, NEWEST_LEAST, NEWEST_BYTES = 2_000, 16, 32 << 20
 #: After so long without any message everything that waits is worked off. A node that lives on the results of others
 #: waits longer, so that theirs still come before.
 IDLE_S = 1.0
@@ -42,7 +38,7 @@ class Inbox:
     """The bounded queue between the bus and a worker: lossless topics block, newest-first topics lose their oldest."""
 
     def __init__(
-        self, lossless_depth: int = LOSSLESS_DEPTH, newest_depth: int = NEWEST_DEPTH, newest_bytes: int = 0
+        self, lossless_depth: int = LOSSLESS_DEPTH, newest_depth: int = NEWEST_DEPTH, newest_bytes: int = NEWEST_BYTES
     ) -> None:
         self._condition = threading.Condition()
         self._entries: deque[list[RawMessage | None]] = deque()
@@ -64,7 +60,8 @@ class Inbox:
                 self._lossless += 1
             else:
                 waiting = self._newest.setdefault(raw.topic, deque())
-                if len(waiting) >= self._newest_depth and len(waiting) * len(raw.data) >= self._newest_bytes:
+                n = len(waiting)
+                if n >= self._newest_depth or (n >= NEWEST_LEAST and n * len(raw.data) > self._newest_bytes):
                     waiting.popleft()[0] = None
                     self.dropped[raw.topic] += 1
                 waiting.append(entry)
@@ -137,9 +134,7 @@ class BusRunner:
         self._driver = StepDriver(node, time.perf_counter)
         self._check: StreamCheck[RawMessage] = StreamCheck(node.problem)
         self._sequencer: Sequencer[Message] = Sequencer(node.inputs)
-        self._inbox = (
-            Inbox(newest_bytes=NEWEST_BYTES) if node.outputs else Inbox(newest_depth=ONLOOKER_DEPTH)
-        )
+        self._inbox = Inbox(newest_depth=NEWEST_DEPTH, newest_bytes=NEWEST_BYTES)
         self._lock = threading.Lock()
         self._malformed: Counter[str] = Counter()
         self._stop = stop or threading.Event()

@@ -16,7 +16,7 @@ from .target_desk import TargetDesk
 
 DEFAULTS = MatchingOptions()
 #: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
-DELAY_S = 1.0
+DELAY_S = 0.8
 
 
 class Matcher(Node):

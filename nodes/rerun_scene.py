@@ -80,6 +80,13 @@ class RerunCanvas:
         )  # fmt: skip
         self.stream.log(entity, mesh)
 
+    def image(self, entity: str, grey: NDArray[np.uint8], place: tuple[float, float], order: float) -> None:
+        self.move(entity, place)
+        self.stream.log(entity, rr.Image(np.ascontiguousarray(grey), color_model="L", draw_order=order))
+
+    def move(self, entity: str, place: tuple[float, float]) -> None:
+        self.stream.log(entity, rr.Transform3D(translation=[*place, 0.0]))
+
     def geographic_line(self, entity: str, lat_lon: Array, color: Color) -> None:
         self.stream.log(entity, rr.GeoLineStrings(lat_lon=[lat_lon], colors=[color], radii=rr.Radius.ui_points(2.0)))
 
@@ -135,7 +142,8 @@ def open_canvas(mode: str) -> Canvas:
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
-    tabs = [_overview(layout), *([_mosaic(layout)] if layout.mosaic else []), _corrections(), _adjustment(layout)]
+    tabs = [_overview(layout), *([_residuals(layout)] if layout.lines else [])]
+    tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(), _adjustment(layout)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -148,7 +156,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 
 def _overview(layout: Layout) -> rrb.Container:
-    images = [_image(ccd, title, layout) for ccd, title in layout.ccds.items()]
+    images = [] if layout.lines else [_image(ccd, title, layout) for ccd, title in layout.ccds.items()]
     side = rrb.Tabs(
         rrb.TextLogView(origin="/log", name="Events"),
         rrb.TextDocumentView(origin="/about", name="About this view"),
@@ -162,6 +170,11 @@ def _overview(layout: Layout) -> rrb.Container:
         _plot("overview/attitude", "Final attitude [mdeg]"),
         grid_columns=2,
     )
+    if layout.lines:
+        lines = rrb.Horizontal(*(_lines(ccd, layout) for ccd in layout.lines))
+        left = rrb.Vertical(_flight(layout), _legend(layout), curves, row_shares=[10, 1.5, 8])
+        right = rrb.Vertical(lines, side, row_shares=[10, 2.2])
+        return rrb.Horizontal(left, right, column_shares=[1, 1], name="Overview")
     left = rrb.Vertical(_flight(layout), _legend(layout), side, row_shares=[10, 1.3, 3])
     right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
     return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
@@ -190,6 +203,20 @@ def _mosaic(layout: Layout) -> rrb.Container:
         for version, title in (("live", "Orthoimage, live orientation"), ("final", "Orthoimage, final orientation"))
     ]
     return (rrb.Vertical if wide else rrb.Horizontal)(*views, name="Orthoimage")
+
+
+def _residuals(layout: Layout) -> rrb.Container:
+    return rrb.Vertical(*(_image(ccd, title, layout) for ccd, title in layout.ccds.items()), name="Residuals")
+
+
+def _lines(ccd: str, layout: Layout) -> rrb.View:
+    width, height = layout.lines_size
+    return rrb.Spatial2DView(
+        origin=f"/lines/{ccd}",
+        name=f"{ccd}: newest line on top",
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
+    )
 
 
 def _corrections() -> rrb.Container:

@@ -19,6 +19,7 @@ from .convert import PoseSample
 from .node import Message
 from .scene_flight import FlightPart
 from .scene_image import ImagePart
+from .scene_lines import LinesPart
 from .scene_map import MapPart
 from .scene_mosaic import MosaicPart
 from .scene_parts import FILTERED, LEGEND
@@ -34,9 +35,12 @@ TOPICS: tuple[str, ...] = (
     "configuration/camera",
     "configuration/strip",
     "sensor/gnss",
+    "sensor/lines/*",
     "trajectory/filtered",
     "trajectory/smoothed",
     "observation/control",
+    "observation/tie",
+    "observation/target",
     "orientation/live",
     "orientation/final",
     "point/object",
@@ -46,7 +50,15 @@ TOPICS: tuple[str, ...] = (
     "event/log",
 )
 TRUTH_TOPICS: tuple[str, ...] = ("truth/trajectory",)
+LINES = "sensor/lines/"
 _SHOWN = frozenset(TOPICS + TRUTH_TOPICS)
+
+
+def is_shown(topic: str) -> bool:
+    """Whether a scene draws a topic."""
+    return topic in _SHOWN or topic.startswith(LINES)
+
+
 _HOLD_NS = convert.SECOND_NS // 2
 _NO_NAVIGATOR_NS = 30 * convert.SECOND_NS
 
@@ -61,6 +73,7 @@ class Scene:
             FlightPart(self.state),
             PointsPart(self.state),
             ImagePart(self.state),
+            LinesPart(self.state),
             PlotsPart(self.state),
             MapPart(self.state),
             MosaicPart(self.state),
@@ -78,9 +91,9 @@ class Scene:
         ValueError : a message without usable values
         """
         topic, body = message.topic, message.body
-        if topic not in _SHOWN:
+        if not is_shown(topic):
             return
-        if not all_finite(body):
+        if not topic.startswith(LINES) and not all_finite(body):
             raise ValueError("value is not finite")
         self.state.note(message)
         if topic.startswith("configuration/"):
@@ -135,8 +148,8 @@ class Scene:
         """Draw what has changed since the last call."""
         if self.state.start_ns is None:
             return
-        self._lay_out()
         self.canvas.at(self.state.now_s)
+        self._lay_out()
         for part in self.parts:
             part.draw(self.canvas)
 
@@ -158,7 +171,8 @@ class Scene:
     def _lay_out(self) -> None:
         """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
         s = self.state
-        key = (tuple(s.extent), s.camera is not None, s.has_truth, s.has_mosaic, tuple(s.units), s.frame is not None)
+        has = s.has_truth, s.has_mosaic, s.has_lines
+        key = (tuple(s.extent), s.camera is not None, has, tuple(s.units), s.frame is not None)
         if key == self._laid_out or not s.extent:
             return
         self._laid_out = key
@@ -180,6 +194,8 @@ class Scene:
             units=tuple(s.units),
             truth=s.has_truth,
             mosaic=s.has_mosaic,
+            lines=tuple(s.ccds) if s.has_lines else (),
+            lines_size=s.lines_size,
             geographic_centre=middle,
         )
         self.canvas.layout(layout)

@@ -21,6 +21,7 @@ _HISTORY_S = 120.0
 _HISTORY_STEP_S = 0.05
 _LARGEST_GAP_NS = convert.SECOND_NS
 _IMAGE_HEIGHT = 0.16  # of an image-space view, as a share of its width
+_LINES_WIDTH, _LINES_HIGH = 400, 2.4  # of a view of image lines, about, px; and its height at least, in widths
 _NO_LENGTH_S = 60.0  # of a strip whose end is not known
 
 
@@ -89,6 +90,7 @@ class SceneState:
         self.units: list[str] = []
         self.has_truth = False
         self.has_mosaic = False
+        self.has_lines = False
         self.newest: PoseSample | None = None
         self.speed_m_s = 70.0
         self._control: list[Array] = []
@@ -213,6 +215,24 @@ class SceneState:
     def residual_scale(self) -> float:
         """Of residuals in object space: a pixel becomes a 25th of the flying height."""
         return round_number(self.height_m / 25 / self.gsd_m)
+
+    @property
+    def lines_reduced(self) -> int:
+        """Pixels of a line, and lines, that are put together to one in a view of image lines."""
+        return max(round(self.image_size[0] / _LINES_WIDTH), 1)
+
+    @property
+    def lines_size(self) -> tuple[float, float]:
+        """Width and height of a view of image lines, in reduced pixels.
+
+        It is so high that all looks at a place are in view at once.
+        """
+        width = self.image_size[0] / self.lines_reduced
+        if self.camera is None:
+            return width, width
+        ahead = [line.xy_mm[len(line.xy_mm) // 2, 0] for line in self.camera.lines]
+        between = np.ptp(ahead) / float(self.camera.focal_length_mm.min()) * self.height_m / self.gsd_m
+        return width, float(np.clip(1.12 * between / self.lines_reduced, _LINES_HIGH * width, 2 * _LINES_HIGH * width))
 
     @property
     def image_size(self) -> tuple[float, float]:

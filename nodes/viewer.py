@@ -13,6 +13,7 @@ from .viewer_process import ViewerProcess
 
 _PERIOD_S = 0.4  # between two drawings
 _POSE_STEP_NS = 45_000_000  # poses that come faster are not looked at
+_MOST_LINES = 100  # blocks of image lines that wait
 _FINISH_S = 20.0
 
 
@@ -53,6 +54,7 @@ class Viewer(Node):
         self._hidden = frozenset() if truth else frozenset(scene.TRUTH_TOPICS)
         self._queue: deque[Message] = deque()
         self._queue_size = queue_size
+        self._lines_taken_in = self._lines_worked_off = 0  # each is counted by one thread
         self._last_pose_ns: dict[str, int] = {}
         self._wake = threading.Event()
         self._stop = threading.Event()
@@ -73,6 +75,11 @@ class Viewer(Node):
             if 0 <= time_ns - self._last_pose_ns.get(message.topic, 0) < _POSE_STEP_NS:
                 return ()
             self._last_pose_ns[message.topic] = time_ns
+        if message.topic.startswith(scene.LINES):
+            if self._lines_taken_in - self._lines_worked_off >= _MOST_LINES:  # blocks of lines are large
+                self.counters["view dropped"] += 1
+                return ()
+            self._lines_taken_in += 1
         if len(self._queue) >= self._queue_size:
             self.counters["view dropped"] += 1
         else:
@@ -111,6 +118,8 @@ class Viewer(Node):
         while self._queue:
             for _ in range(min(len(self._queue), 2000)):
                 message = self._queue.popleft()
+                if message.topic.startswith(scene.LINES):
+                    self._lines_worked_off += 1
                 try:
                     self._scene.take(message)
                 except ValueError as error:

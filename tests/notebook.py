@@ -40,6 +40,13 @@ class Notebook(NullCanvas):
         assert corners.shape == (4, 3) and grey.ndim == 2 and grey.dtype == np.uint8
         self._note(entity, np.array(corners), np.array(grey))
 
+    def image(self, entity, grey, place, order):
+        assert grey.ndim == 2 and grey.dtype == np.uint8
+        self._note(entity, np.array(grey), place)
+
+    def move(self, entity, place):
+        self._note(entity, place)
+
     def geographic_line(self, entity, lat_lon, color):
         self._note(entity, np.array(lat_lon))
 

@@ -55,11 +55,11 @@ def show(messages, canvas, truth: bool = True) -> Counter[str]:
     from .. import scene
 
     picture = scene.Scene(canvas)
-    wanted = frozenset(scene.TOPICS + (scene.TRUTH_TOPICS if truth else ()))
+    hidden = frozenset(() if truth else scene.TRUTH_TOPICS)
     counts: Counter[str] = Counter()
     next_ns = 0
     for message in messages:
-        if message.topic not in wanted:
+        if not scene.is_shown(message.topic) or message.topic in hidden:
             continue
         try:
             picture.take(message)
