@@ -15,6 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the live on-line triangulation demo"),
     "simulate": ("simulate", "a flight recording with truth, from a seed"),
     "node": ("node", "one node alone, for running across machines"),
+    "confirm": ("confirm", "confirm or reject a signalised point in a running system"),
     "replay": ("replay", "play a recording onto the bus with its timing"),
     "process": ("process", "the same nodes over a recording, as fast as it goes"),
     "adjust": ("adjust", "batch adjustment of a recording or a block folder"),
