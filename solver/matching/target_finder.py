@@ -30,6 +30,8 @@ WAIT_S, PAD = 2.0, 16
 PATIENCE_S = 1.5
 #: Targets are looked for so far along the flight about where the platform is, s: times of looks are guessed to that.
 HORIZON_S = 0.5
+#: Steps of poses whose noise is looked at, s; and its share in a sample: a target is an average over some lines.
+POSE_STEP_S, SHARE_ACROSS = 0.005, 0.5
 #: Steps of the pose by which derivatives of a prediction are made, m and rad.
 STEPS = (1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4)
 
@@ -45,8 +47,7 @@ class TargetOptions:
     least_radius_px : smaller targets are not measured
     least_reach_px, largest_reach_px : of the search
     largest_sigma_px : of a measurement that is believed
-    line_sigma_px, sample_sigma_px : what is added for what residuals of grey values do not show; along the flight
-        vibration that the poses do not tell moves single lines
+    image_sigma_px : what is added for what residuals of grey values do not show
     critical : chi-square (2) of what is measured against what is expected, beyond which a look is doubtful (0.1 %)
 
     Raises
@@ -60,8 +61,7 @@ class TargetOptions:
     least_reach_px: float = 6.0
     largest_reach_px: float = 80.0
     largest_sigma_px: float = 0.15
-    line_sigma_px: float = 0.04
-    sample_sigma_px: float = 0.02
+    image_sigma_px: float = 0.01
     critical: float = 13.8
 
     def __post_init__(self) -> None:
@@ -69,8 +69,8 @@ class TargetOptions:
             raise ValueError(f"scores {self.least_score}, {self.rival_score}: wanted 0 to 1")
         if not 0 < self.least_reach_px <= self.largest_reach_px:
             raise ValueError(f"largest_reach_px: wanted at least {self.least_reach_px:g}, got {self.largest_reach_px}")
-        if not min(self.line_sigma_px, self.sample_sigma_px, self.largest_sigma_px, self.critical) > 0:
-            raise ValueError("line_sigma_px, sample_sigma_px, largest_sigma_px and critical: wanted more than 0")
+        if not min(self.image_sigma_px, self.largest_sigma_px, self.critical) > 0:
+            raise ValueError("image_sigma_px, largest_sigma_px and critical: wanted more than 0")
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class TargetFinder:
         )  # fmt: skip
         if target.radius_m < o.least_radius_px * pixel:
             return replace(nothing, reason="too small")
-        found = self._search(target, scan, ring, line[0], pixel, travel, half)
+        found = self._search(target, scan, ring, line[0], pixel, travel, half, covariance)
         if isinstance(found, str):
             return replace(nothing, reason=found)
         return self._judge(nothing, target, scan, found, covariance, pixel, travel)
@@ -261,11 +261,24 @@ class TargetFinder:
         pose = self.orientation.covariance(time_s)
         return by_pose @ pose @ by_pose.T + by_point @ target.covariance @ by_point.T
 
+    def _shaken(self, scan: LineScan, line: float, height_m: float) -> Array:
+        """Noise (2,) of single poses, as X and Y on the ground, m: from third differences, which no flight has."""
+        time_s = self._first_s + line / self._rate + POSE_STEP_S * np.arange(-20, 21)
+        time_s = time_s[(time_s > self.orientation.start_s) & (time_s < self.orientation.end_s)]
+        if len(time_s) < 12:
+            return np.zeros(2)
+        position, R = self.orientation.at(time_s)
+        track = LineScan(scan.view, 0, position, R)
+        n = len(time_s)
+        ground, _ = track.to_plane(np.arange(n), np.full(n, 0.5 * (scan.view.pixels - 1)), np.full(n, height_m))
+        return np.sqrt(np.mean(np.diff(ground[:, :2], n=3, axis=0) ** 2, axis=0) / 20.0)
+
     # -- what --------------------------------------------------------------------------------------------------------
 
     def _search(
-        self, target: Target, scan: LineScan, ring: LineRing, line: float, pixel: float, travel: float, half: int
-    ) -> tuple[Centre, str] | str:
+        self, target: Target, scan: LineScan, ring: LineRing, line: float, pixel: float, travel: float, half: int,
+        expected: Array,
+    ) -> tuple[Centre, str] | str:  # fmt: skip
         """The target among the pixels about where it should be, with a doubt; or why there is none."""
         away = int((half + PAD) * max(pixel / travel, 1.0))
         stretch = ring.read(int(line) - away, int(line) + away + 1)
@@ -295,9 +308,14 @@ class TargetFinder:
         good = sorted((c for c in fits if c is not None and c.converged and c.white > c.black), key=lambda c: -c.score)
         if not good or good[0].score < 0.7:
             return "not found"
-        rivals = [c for c in good[1:] if np.hypot(*(c.xy - good[0].xy)) > 1.5 * pixel]
-        doubt = "two alike" if rivals and rivals[0].score > self.options.rival_score else ""
-        return good[0], doubt
+        best = good[0]
+        alike = [best] + [
+            c for c in good[1:] if c.score > self.options.rival_score and np.hypot(*(c.xy - best.xy)) > 1.5 * pixel
+        ]
+        off = np.array([c.xy - target.xyz_l[:2] for c in alike])
+        chi2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(expected + (0.1 * pixel) ** 2 * np.eye(2)), off)
+        likely = [c for c, value in zip(alike, chi2, strict=True) if value <= self.options.critical]
+        return (likely or alike)[0], "two alike" if len(likely) > 1 else ""
 
     def _centre(self, target: Target, scan: LineScan, stretch, u: float, v: float, pixel: float) -> Centre | None:
         """The centre of a target near a pixel, in ground coordinates."""
@@ -326,11 +344,13 @@ class TargetFinder:
         way = scan.position_l[-1, :2] - scan.position_l[0, :2]
         along = way / np.linalg.norm(way)
         across = np.array([-along[1], along[0]])
-        sigma_line = float(np.sqrt(along @ centre.covariance @ along / travel**2 + o.line_sigma_px**2))
-        sigma_sample = float(np.sqrt(across @ centre.covariance @ across / pixel**2 + o.sample_sigma_px**2))
+        shaken = self._shaken(scan, float(line[0]), target.xyz_l[2])
+        line_var = along @ centre.covariance @ along + (along @ shaken) ** 2
+        sample_var = across @ centre.covariance @ across + (SHARE_ACROSS * (across @ shaken)) ** 2
+        sigma_line = float(np.sqrt(line_var / travel**2 + o.image_sigma_px**2))
+        sigma_sample = float(np.sqrt(sample_var / pixel**2 + o.image_sigma_px**2))
         off = centre.xy - target.xyz_l[:2]
-        noise = centre.covariance + (o.line_sigma_px * max(pixel, travel)) ** 2 * np.eye(2)
-        chi2 = float(off @ np.linalg.solve(expected + noise, off))
+        chi2 = float(off @ np.linalg.solve(expected + (sigma_line * travel) ** 2 * np.eye(2), off))
         reason = doubt
         if chi2 > o.critical:
             reason = "far from where it should be"
