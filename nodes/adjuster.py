@@ -54,6 +54,7 @@ class Adjuster(Node):
         "observation/control",
         "observation/verdict",
         "observation/tie",
+        "observation/progress",  # for the order of ties alone
     )
     outputs = ("orientation/live", "orientation/final", "point/object", "adjustment/report", "event/log")
 
@@ -164,6 +165,8 @@ class Adjuster(Node):
             self._ground_point(body)
         elif topic == "observation/verdict":
             return self._verdict(body)
+        elif topic == "observation/progress":
+            return []
         elif topic == "configuration/strip":
             return self._strip(body)
         else:

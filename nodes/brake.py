@@ -15,7 +15,7 @@ from ..schemas.envelope import RawMessage
 from .bus import Bus
 
 #: A node that is so far behind, s, slows the flight down until it is less far behind.
-HOLD_S, RELEASE_S = 3.0, 2.0
+HOLD_S, RELEASE_S = 2.0, 1.4
 #: ... by so much a message, s. It never stands still: nodes take silence for the end and work off what they hold back.
 STEP_S = 0.02
 #: A living node that says nothing for so long is busy, s; after that time it is given up.

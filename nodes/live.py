@@ -170,7 +170,7 @@ class BusRunner:
             for message in self._sequencer.pop(now):
                 self._work(message)
             if len(self._sequencer) and now - heard > self._idle_s:
-                for message in self._sequencer.flush():
+                for message in self._sequencer.flush(ahead=False):
                     self._work(message)
             self._tell()
         self._end()

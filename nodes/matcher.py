@@ -9,6 +9,7 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
+from ..schemas.topics import find
 from ..solver.matching.tie_matcher import MatchedTie, MatchingOptions, TieMatcher
 from . import convert
 from .node import Message, Node
@@ -17,6 +18,8 @@ from .target_desk import TargetDesk
 DEFAULTS = MatchingOptions()
 #: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
 DELAY_S = 0.8
+#: Platform time between two words on how far the matcher is, ns.
+PROGRESS_NS = 40_000_000
 
 
 class Matcher(Node):
@@ -45,7 +48,7 @@ class Matcher(Node):
         "observation/control",
         "observation/verdict",
     )
-    outputs = ("observation/tie", "observation/target", "event/log")
+    outputs = ("observation/tie", "observation/target", "observation/progress", "event/log")
 
     def __init__(
         self,
@@ -75,16 +78,22 @@ class Matcher(Node):
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
         self._reference_ns = 0
-        self._stamp_ns = 0
+        self._stamp_ns = self._told_ns = 0
         self._filtered_seen = False
 
     def step(self, message: Message) -> Iterable[Message]:
+        out: list[Message] = []
+        if message.stamp_ns >= self._told_ns + PROGRESS_NS and not find(message.topic).latched:
+            # all that is older has been worked off; what has the same stamp as this message has not
+            self._told_ns = message.stamp_ns
+            progress = m.Progress(time_ns=message.stamp_ns - 1)
+            out.append(Message("observation/progress", message.stamp_ns - 1 + self._delay_ns, progress))
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         try:
-            return self._take(message)
+            out += self._take(message)
         except ValueError as error:
             self.problem("malformed", f"{message.topic}: {error}")
-            return ()
+        return out
 
     def state(self) -> str:
         return "running" if self._matcher is not None else "waiting for configuration/camera"

@@ -165,7 +165,7 @@ class _Watermark:
 
     place: tuple[int, str, str]
     lateness_ns: int
-    steady: bool
+    grace_s: float
     latest_ns: int
     heard_s: float
 
@@ -175,8 +175,8 @@ class Sequencer(Generic[T]):
 
     A message leaves when no other stream can still bring one that belongs before it: the stream has passed it, or has
     been silent while platform time went on by more than the allowed lateness of its topic. A steady stream (one with a
-    high rate) must also have been silent for ``grace_s`` of waiting time, so that a machine that hesitates does not
-    change the order. What arrives after its place has passed leaves at once, and is called late. Observations may be
+    high rate, or that the table grants grace) must also have been silent for ``grace_s`` (or that grace) of waiting
+    time, so that a machine that hesitates does not change the order. What arrives after its place has passed leaves at once, and is called late. Observations may be
     stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or
     a steady stream has died.
 
@@ -221,8 +221,8 @@ class Sequencer(Generic[T]):
             row = topics.find(topic)
             self._unheard.pop(row.name, None)
             place = (topics.rank(topic), topic, envelope.source)
-            lateness, steady = _patience(row)
-            stream = self._streams[topic, envelope.source] = _Watermark(place, lateness, steady, stamp, now_s)
+            lateness, grace_s = self._patience(row)
+            stream = self._streams[topic, envelope.source] = _Watermark(place, lateness, grace_s, stamp, now_s)
         stream.latest_ns = max(stream.latest_ns, stamp)
         stream.heard_s = now_s
         key = order_key(topic, envelope)
@@ -239,10 +239,11 @@ class Sequencer(Generic[T]):
             out.append(self._take())
         return out
 
-    def flush(self) -> list[T]:
-        """Everything that waits, in order."""
+    def flush(self, ahead: bool = True) -> list[T]:
+        """Everything that waits, in order; on request without observations that are stamped ahead of time."""
         out: list[T] = []
-        while self._heap:
+        newest_ns = self.newest_ns
+        while self._heap and (ahead or newest_ns is None or self._heap[0][0][0] <= newest_ns):
             out.append(self._take())
         return out
 
@@ -259,20 +260,20 @@ class Sequencer(Generic[T]):
             if stream.place == (rank, topic, source):
                 continue
             bound = stream.latest_ns
-            if not (stream.steady and now_s - stream.heard_s < self._grace_s):
-                bound = max(bound, (newest_ns if stream.steady else time_ns) - stream.lateness_ns)
+            if not now_s - stream.heard_s < stream.grace_s:
+                bound = max(bound, (newest_ns if stream.grace_s else time_ns) - stream.lateness_ns)
             if bound < stamp or (bound == stamp and stream.place < (rank, topic, source)):
                 return False
         for row in self._unheard.values():
-            lateness, steady = _patience(row)
-            if steady and now_s - self._started_s < self._grace_s:
+            lateness, grace_s = self._patience(row)
+            if now_s - self._started_s < min(grace_s, self._grace_s):
                 return False
-            if (newest_ns if steady else time_ns) - lateness <= stamp:
+            if (newest_ns if grace_s else time_ns) - lateness <= stamp:
                 return False
         return True
 
-
-def _patience(row: topics.Topic) -> tuple[int, bool]:
-    """Allowed lateness in ns, and whether a topic is expected to speak all the time."""
-    steady = row.rate_hz >= Sequencer.STEADY_HZ and not row.latched
-    return round(row.allowed_lateness_ms * MILLISECOND_NS), steady
+    def _patience(self, row: topics.Topic) -> tuple[int, float]:
+        """Allowed lateness in ns, and the waiting time granted to a topic that is expected to speak all the time."""
+        steady = row.rate_hz >= Sequencer.STEADY_HZ and not row.latched
+        grace_s = self._grace_s if steady else row.grace_s
+        return round(row.allowed_lateness_ms * MILLISECOND_NS), grace_s

@@ -45,6 +45,7 @@ class Topic:
     allowed_lateness_ms : platform time within which a message may arrive after its turn without changing a result
     recorded : whether the recorder keeps it
     latched : whether all that was sent so far is handed to whoever joins later
+    grace_s : waiting time for which whoever needs its order waits for it when it falls silent, s; 0 = by its rate alone
     """
 
     name: str
@@ -55,6 +56,7 @@ class Topic:
     allowed_lateness_ms: float = 50.0
     recorded: bool = True
     latched: bool = False
+    grace_s: float = 0.0
 
     @property
     def type_name(self) -> str:
@@ -86,7 +88,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic("observation/verdict", m.Verdict, _O, 0),
     Topic("observation/tie", m.TiePoint, _O, 50),
     Topic("observation/target", m.TargetLook, _O, 0),
-    Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000),
+    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=1000, recorded=False, grace_s=2.0),
+    Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),

@@ -65,6 +65,7 @@ def body(topic: str, i: int = 0) -> Any:
             point=f"G{i}", image=m.ImagePoint(**tie), state=m.TargetLook.State.Value("HELD"), reason="imprecise",
             score=0.99, expected_line=11.0, expected_sample=3.5, reach=6.0, off=[0.1, -0.2], chi2=3.0,
         ),
+        "observation/progress": m.Progress(time_ns=time_ns),
         "observation/tie": convert.tie_message(f"T{i}", [tie]),
         "orientation/live": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
         "orientation/final": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
