@@ -88,7 +88,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("observation/verdict", m.Verdict, _O, 0),
     Topic("observation/tie", m.TiePoint, _O, 50),
     Topic("observation/target", m.TargetLook, _O, 0),
-    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=1000, recorded=False, grace_s=2.0),
+    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=1000, recorded=False, grace_s=3.0),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
