@@ -176,9 +176,9 @@ class Sequencer(Generic[T]):
     A message leaves when no other stream can still bring one that belongs before it: the stream has passed it, or has
     been silent while platform time went on by more than the allowed lateness of its topic. A steady stream (one with a
     high rate, or that the table grants grace) must also have been silent for ``grace_s`` (or that grace) of waiting
-    time, so that a machine that hesitates does not change the order. What arrives after its place has passed leaves at once, and is called late. Observations may be
-    stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or
-    a steady stream has died.
+    time, so that a machine that hesitates does not change the order. What arrives after its place has passed leaves at
+    once, and is called late. Observations may be stamped ahead (when they are to be used), so they do not tell how far
+    platform time is, unless nobody else does or a steady stream has died.
 
     Parameters
     ----------

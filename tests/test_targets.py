@@ -148,7 +148,7 @@ def test_on_an_unstabilised_mount_they_are_measured_as_well():
 
 
 def test_nothing_is_taken_for_a_target_where_there_is_none(flown, images):
-    names, places = signalised(flown)
+    _, places = signalised(flown)
     rng = np.random.default_rng(7)
     elsewhere = rng.uniform(places[:, :2].min(axis=0), places[:, :2].max(axis=0), (250, 2))
     away = np.abs(elsewhere[:, None] - places[None, :, :2]).max(axis=2).min(axis=1)
@@ -178,7 +178,9 @@ def test_coordinates_that_are_two_metres_off_are_not_believed_in_silence(flown, 
     wrong[::4, 1] -= 1.4
     spoilt = set(names[::4])
     looks = looks_at(flown, images, names, wrong, position_m=0.2, attitude_deg=0.004)
-    told = {(x.target in spoilt): [y.reason for y in looks if (y.target in spoilt) == (x.target in spoilt)] for x in looks}
+    told = {
+        (x.target in spoilt): [y.reason for y in looks if (y.target in spoilt) == (x.target in spoilt)] for x in looks
+    }
     assert len(told[True]) > 8 and set(told[True]) == {"far from where it should be"}
     assert sum(reason != "" for reason in told[False]) <= 1
 
@@ -289,7 +291,8 @@ def test_rejected_coordinates_do_not_count_until_they_are_confirmed():
             queue = [message]
             if message.topic == "configuration/strip" and not body.ended:
                 queue += [
-                    Message("observation/verdict", message.stamp_ns, m.Verdict(point="GCP3", accepted=a)) for a in verdicts
+                    Message("observation/verdict", message.stamp_ns, m.Verdict(point="GCP3", accepted=a))
+                    for a in verdicts
                 ]
             while queue:
                 message = queue.pop(0)

@@ -241,7 +241,9 @@ class Demo:
         lines = ["", *accuracy_lines(result)]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
         if result["waited_s"]:
-            lines.append(f"this machine is slow: the flight waited {result['waited_s']:.1f} s for nodes that were behind")
+            lines.append(
+                f"this machine is slow: the flight waited {result['waited_s']:.1f} s for nodes that were behind"
+            )
         if result["lost"]:
             lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
         if self.restarts:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..camera import LineCamera
-from ..line_store import LineRing
+from ..line_store import LineRing, Stretch
 from ..rotation import angles_from_matrix, matrix_from_angles
 from .current_orientation import CurrentOrientation
-from .line_scan import LineScan, View, view_of
+from .line_scan import LineScan, view_of
 from .target_image import RING, Centre, candidates, fit
 
 Array = NDArray[np.floating]
@@ -213,7 +213,9 @@ class TargetFinder:
         aside = np.abs((ground[:, :2] - points[:, :2]) @ np.array([-velocity[1], velocity[0]]) / speed)
         above = position[1, 2] - points[:, 2]
         swath = above * float(np.ptp(view.y_mm)) / view.focal_length_mm
-        return [n for n, b, a, s in zip(names, behind_s, aside, swath, strict=True) if -HORIZON_S < b < WAIT_S and a < s]
+        return [
+            n for n, b, a, s in zip(names, behind_s, aside, swath, strict=True) if -HORIZON_S < b < WAIT_S and a < s
+        ]
 
     def _look(self, target: Target, scan: LineScan, ring: LineRing) -> TargetLook | None:
         """The look at a target, or None while it is not complete or not on these lines."""
@@ -223,7 +225,7 @@ class TargetFinder:
         if not inside[0]:
             return None
         i = int(np.clip(line[0] - scan.first_line, 0, len(scan.position_l) - 2))
-        above = scan.position_l[i, 2] - target.xyz_l[2]
+        above = float(scan.position_l[i, 2] - target.xyz_l[2])
         pixel = above * scan.view.pitch_mm / scan.view.focal_length_mm
         travel = float(np.linalg.norm(scan.position_l[-1] - scan.position_l[0])) / (len(scan.position_l) - 1)
         covariance = self._expected(target, scan, line[0], sample[0])
@@ -254,7 +256,7 @@ class TargetFinder:
         position, angles = scan.position_l[i], angles_from_matrix(scan.R_lc[i])
         poses = np.concatenate([position, angles]) + np.vstack([np.zeros(6), np.diag(STEPS)])
         moved = LineScan(scan.view, 0, poses[:, :3], matrix_from_angles(*poses[:, 3:].T))
-        xyz, slope = moved.to_plane(np.arange(7), np.full(7, sample), np.full(7, target.xyz_l[2]))
+        xyz, slope = moved.to_plane(np.arange(7.0), np.full(7, sample), np.full(7, target.xyz_l[2]))
         by_pose = ((xyz[1:, :2] - xyz[0, :2]) / np.array(STEPS)[:, None]).T
         by_point = np.column_stack([-np.eye(2), slope[0]])
         time_s = self._first_s + line / self._rate
@@ -270,7 +272,7 @@ class TargetFinder:
         position, R = self.orientation.at(time_s)
         track = LineScan(scan.view, 0, position, R)
         n = len(time_s)
-        ground, _ = track.to_plane(np.arange(n), np.full(n, 0.5 * (scan.view.pixels - 1)), np.full(n, height_m))
+        ground, _ = track.to_plane(np.arange(float(n)), np.full(n, 0.5 * (scan.view.pixels - 1)), np.full(n, height_m))
         return np.sqrt(np.mean(np.diff(ground[:, :2], n=3, axis=0) ** 2, axis=0) / 20.0)
 
     # -- what --------------------------------------------------------------------------------------------------------
@@ -301,10 +303,8 @@ class TargetFinder:
         if inside.mean() < 0.3:
             return "at the end of the line"
         places, _ = candidates(values, target.radius_m / pixel, 4)
-        fits = [
-            self._centre(target, scan, stretch, u.reshape(values.shape)[a, b], v.reshape(values.shape)[a, b], pixel)
-            for a, b in places
-        ]
+        u, v = u.reshape(values.shape), v.reshape(values.shape)
+        fits = [self._centre(target, scan, stretch, float(u[a, b]), float(v[a, b]), pixel) for a, b in places]
         good = sorted((c for c in fits if c is not None and c.converged and c.white > c.black), key=lambda c: -c.score)
         if not good or good[0].score < 0.7:
             return "not found"
@@ -317,16 +317,20 @@ class TargetFinder:
         likely = [c for c, value in zip(alike, chi2, strict=True) if value <= self.options.critical]
         return (likely or alike)[0], "two alike" if len(likely) > 1 else ""
 
-    def _centre(self, target: Target, scan: LineScan, stretch, u: float, v: float, pixel: float) -> Centre | None:
+    def _centre(
+        self, target: Target, scan: LineScan, stretch: Stretch, u: float, v: float, pixel: float
+    ) -> Centre | None:
         """The centre of a target near a pixel, in ground coordinates."""
         size = int(np.ceil(RING * target.radius_m / pixel)) + 3
-        first, left = round(float(u)) - 2 * size, round(float(v)) - size
-        lines = np.arange(max(first, stretch.first_line), min(first + 4 * size + 1, stretch.first_line + len(stretch.pixels)))
+        first, left = round(u) - 2 * size, round(v) - size
+        lines = np.arange(
+            max(first, stretch.first_line), min(first + 4 * size + 1, stretch.first_line + len(stretch.pixels))
+        )
         samples = np.arange(max(left, 0), min(left + 2 * size + 1, scan.view.pixels))
         if len(samples) < size + 1 or len(lines) < size + 1:
             return None
         line, sample = (a.ravel() for a in np.meshgrid(lines, samples, indexing="ij"))
-        xyz, _ = scan.to_plane(line, sample.astype(float), np.full(len(line), target.xyz_l[2]))
+        xyz, _ = scan.to_plane(line.astype(float), sample.astype(float), np.full(len(line), target.xyz_l[2]))
         grey = stretch.pixels[line - stretch.first_line, sample].astype(float)
         nearest = int(np.argmin(np.hypot(line - u, sample - v)))
         return fit(xyz[:, :2], grey, xyz[nearest, :2], target.radius_m, pixel)

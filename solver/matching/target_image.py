@@ -1,4 +1,4 @@
-"""Signalised targets in grey values: a white disc in a black ring, found by its pattern and centred by least squares."""
+"""Signalised targets in grey values: a white disc in a black ring, found by pattern and centred by least squares."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Centre:
 
 
 def pattern(radius: float, half: int) -> Array:
-    """The target on a grid (n, n) with n = 2 half + 1 and a spacing of 1: disc 1, ring 0, beyond it the mean of both."""
+    """The target on a grid (n, n), n = 2 half + 1, with a spacing of 1: disc 1, ring 0, beyond it the mean of both."""
     r = np.arange(-half, half + 1.0)
     distance = np.hypot(r[:, None], r[None, :])
     out = _disc(distance, radius, BLUR_PX)
