@@ -33,7 +33,8 @@ from .window_results import (
     WindowReport,
     WindowUpdate,
 )
-from .window_snooping import admit, snoop
+from .window_settle import Settler, settle
+from .window_snooping import admit, reweigh, snoop
 from .window_state import WindowState
 from .window_strip import WindowStrip, segment_length
 
@@ -98,6 +99,7 @@ class Window:
         )
         self._batches: list[Batch] = []
         self._history = CostHistory()
+        self._settler = Settler()
         self._now_s = -np.inf
         self._serial = 0
         self._newest_ray_s = -np.inf
@@ -249,8 +251,22 @@ class Window:
             refused, rounds = snoop(fresh + due, self.state, self._points, self.options.critical, self._serial)
             iterations += rounds
             result.refused += refused
+            iterations += self._settle(fresh, result)
         self._orienter.forget()
         return iterations
+
+    def _settle(self, fresh: list[Batch], result: WindowUpdate) -> int:
+        """Ask a young strip again which of its points agree; number of solutions computed."""
+        due = self._settler.due(self._batches, fresh[-1] if fresh else None)
+        weights = settle(due, self.state) if due else None
+        if weights is None:
+            return 0
+        result.refused += reweigh(due, weights, self.state, self._points)
+        self._follow(due)
+        self.state.solve()
+        refused, rounds = snoop(due, self.state, self._points, self.options.critical, self._serial)
+        result.refused += refused
+        return rounds + 2
 
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""

@@ -106,6 +106,30 @@ def admit(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> li
     return refused
 
 
+def reweigh(
+    batches: list[Batch], weights: list[Array], state: WindowState, points: dict[str, PointLooks]
+) -> list[Refusal]:
+    """Give the rays of batches in the state other weights (see `window_settle`); returns what changed.
+
+    Looks may be taken back once more, as they were judged by the fault of others.
+    """
+    changes = []
+    for batch, weight in zip(batches, weights, strict=True):
+        out = np.flatnonzero((batch.weight > 0) & (weight == 0))
+        back = np.flatnonzero((batch.weight == 0) & (weight > 0))
+        state.add(batch.columns, batch.information, -1)
+        batch.weight = weight
+        changes += _note(batch, points, out, back, np.zeros(len(weight)))
+        for name in batch.names:
+            points[name].returned.clear()
+        batch.eliminate()
+        state.add(batch.columns, batch.information)
+    state.solve()
+    for batch in batches:
+        batch.back_substitute(state.values(batch.columns))
+    return changes
+
+
 def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> bool:
     """Let points in that were left out as a whole if the orientation as known now agrees with them."""
     lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0

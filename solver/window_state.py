@@ -126,6 +126,10 @@ class WindowState:
         self._live_rhs[place] -= information.rhs
         self._fixed_rhs[place] += information.rhs
 
+    def normal(self) -> tuple[Array, Array]:
+        """Normal equations (n, n), (n,) of all information."""
+        return self._fixed + self._live, self._fixed_rhs + self._live_rhs
+
     @property
     def factor(self) -> DenseFactor:
         if self._factor is None:
