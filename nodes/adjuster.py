@@ -11,7 +11,6 @@ from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.slow_errors import SlowErrors
 from ..solver.window import AHEAD_S, Window
-from ..solver.window_output import light
 from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
@@ -398,7 +397,7 @@ class Adjuster(Node):
                 )
             )
             self._updates += 1
-            colour, why = light(update.report)
+            colour, why = update.report.watched.light, update.report.watched.reason
             if colour != self._light:
                 self._light = colour
                 outputs.append(self._log(f"{colour}: {why}" if why else colour, warning=colour != "good"))

@@ -13,6 +13,8 @@ share no unknowns but the additional parameters, so only those could take it for
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,6 +24,7 @@ from .selfcalibration import SelfCalibration
 from .slow_errors import SlowErrors
 from .window_backward import LeftPoints, Step, backward
 from .window_batch import Batch
+from .window_determinability import Standing
 from .window_intake import Intake
 from .window_output import CostHistory, Orienter, adjusted_points, parameters
 from .window_points import BatchMaker, ControlPoint
@@ -37,6 +40,7 @@ from .window_settle import Settler, settle
 from .window_snooping import admit, reweigh, snoop
 from .window_state import WindowState
 from .window_strip import WindowStrip, segment_length
+from .window_watch import Watch
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -105,6 +109,10 @@ class Window:
         self._newest_ray_s = -np.inf
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory)
+        self._watch = Watch(
+            camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
+            options.determine,
+        )  # fmt: skip
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -161,7 +169,7 @@ class Window:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
         result.refused += self._intake.take_refused()
-        result.report = self._report(iterations)
+        result.report = self._report(iterations, fresh, result)
         return result
 
     def finish(self) -> WindowUpdate:
@@ -173,7 +181,7 @@ class Window:
             strip.end(0)
         self._let_go(np.inf, result)
         result.refused += self._intake.take_refused()
-        result.report = self._report(iterations)
+        result.report = self._report(iterations, [], result)
         return result
 
     def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
@@ -306,6 +314,7 @@ class Window:
     def _remove(self, batch: Batch) -> None:
         self.state.add(batch.columns, batch.information, -1)
         self._batches = [b for b in self._batches if b is not batch]
+        self._watch.drop(batch)
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
 
@@ -326,6 +335,7 @@ class Window:
             points = adjusted_points(batch, self.state, self._points, self._control, final=True)
             result.points += points
             self._left.append(LeftPoints.of(batch, points))
+        self._watch.leaving(leaving, limit_s - self._length_s)
         for batch in leaving:
             self.state.fix(batch.columns, batch.information)
             self._intake.finish(batch)
@@ -342,7 +352,9 @@ class Window:
                 result.final.append(final)
                 design, noise = strip.design(final.time_s), self._orienter.noise(strip, final.time_s)
             strip.final_to_s = to_s
-            self._steps.append(Step(self.state.marginalise(numbers), final, design, noise, self._left))
+            marginal = self.state.marginalise(numbers)
+            self._watch.marginalised(marginal)
+            self._steps.append(Step(marginal, final, design, noise, self._left))
             self._left = []
             self._orienter.forget()
         if self._steps and all(strip.is_gone(self.state) for strip in self.strips.values()):
@@ -359,7 +371,15 @@ class Window:
             return None
         times = self.grid(strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
         times = times[self.trajectory.covers(times)] if len(times) else times
-        return self._orienter.at(strip, times) if len(times) else None
+        return self._protected(strip, self._orienter.at(strip, times)) if len(times) else None
+
+    def _protected(self, strip: WindowStrip, orientation: RefinedOrientation) -> RefinedOrientation:
+        """With protection levels as the middle of the times is exposed."""
+        exposure = self._watch.exposure_at(strip, float(orientation.time_s[len(orientation.time_s) // 2]))
+        if exposure is None:
+            return orientation
+        sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
+        return replace(orientation, protection=exposure.protection(sigma))
 
     def grid(self, from_s: float, to_s: float) -> Array:
         """Times of the published orientation in [from, to)."""
@@ -386,7 +406,11 @@ class Window:
         if strip.activate(time_s, self.state):
             self.state.solve()
             self._orienter.forget()
-        return self._orienter.at(strip, np.array([time_s]))
+        orientation = self._orienter.at(strip, np.array([time_s]))
+        if self._watch.exposure is None:
+            return orientation
+        sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
+        return replace(orientation, protection=self._watch.exposure.protection(sigma))
 
     def strip_at(self, time_s: float) -> WindowStrip | None:
         """The strip a time belongs to, if its orientation there is not final."""
@@ -395,12 +419,19 @@ class Window:
                 return strip
         return None
 
-    def _report(self, iterations: int) -> WindowReport:
+    def _report(self, iterations: int, changed: list[Batch], result: WindowUpdate) -> WindowReport:
         state, length = self.state, max(self._length_s, 1.0)
         cost = state.cost()
         sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
         total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
         active = [s for s in self.strips.values() if not s.is_gone(state)]
+        watched = self._watch.look(
+            self._now_s, self._length_s, active[-1] if active else None, self._batches, changed, sigma0, gained,
+            (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
+        )  # fmt: skip
+        if watched.events:
+            self._orienter.forget()
+        result.events += watched.events
         unknowns = len(state) + sum(b.determined for b in self._batches)
         return WindowReport(
             sigma0=sigma0,
@@ -416,12 +447,19 @@ class Window:
             points=sum(b.n_points for b in self._batches),
             control=sum(b.active_control for b in self._batches),
             strip=active[-1].id if active else "",
-            parameters=self.parameters(active[-1]) if active else (),
+            parameters=self.parameters(active[-1], watched.standing) if active else (),
+            watched=watched,
         )
 
-    def parameters(self, strip: WindowStrip) -> tuple[Parameter, ...]:
+    def parameters(self, strip: WindowStrip, standing: tuple[Standing, ...] = ()) -> tuple[Parameter, ...]:
         """Offset, shift and drift of a strip where its model has them, and the additional parameters."""
         with_globals = self.options.model in ("wander", "dgr")
+        slow = strip.slow
         return parameters(
-            self.state, strip.numbers[:9] if with_globals else (), self._self_calibration, self._camera_columns
+            self.state,
+            strip.numbers[:9] if with_globals else (),
+            np.concatenate([slow.offset_m, slow.shift, slow.drift]),
+            self._self_calibration,
+            self._camera_columns,
+            standing,
         )

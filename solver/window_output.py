@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,8 +12,9 @@ from .measured_trajectory import MeasuredTrajectory
 from .models.base import COMPONENTS
 from .selfcalibration import SelfCalibration
 from .window_batch import Batch
+from .window_determinability import ESTIMATED, NOT_YET, Standing
 from .window_points import ControlPoint, PointLooks
-from .window_results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, WindowReport
+from .window_results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation
 from .window_state import WindowState
 from .window_strip import WindowStrip
 
@@ -22,6 +23,8 @@ IntArray = NDArray[np.int64]
 
 #: Times worked on at once.
 CHUNK = 64
+#: Sigma of a strip's parameter, in units of the a-priori one, from which the observations know it better.
+BETTER = 0.7
 
 
 class Orienter:
@@ -87,8 +90,16 @@ def adjusted_points(
         )
         role = control[name].role if name in control else "tie"
         rays = sum(not r.rejected for r in residuals)
-        out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals))
+        checked = _checked(rays, len(residuals), bool((batch.control.weight[i] > 0).all()))
+        out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals, checked))
     return out
+
+
+def _checked(rays: int, looks: int, known: bool) -> str:
+    """See `AdjustedPoint`."""
+    if 2 * rays <= looks and looks > 2:
+        return "doubtful"
+    return "all" if rays > 2 or known else "across"
 
 
 class CostHistory:
@@ -111,27 +122,19 @@ class CostHistory:
         return float(np.sqrt(max(cost - old_cost, 0.0) / gained)), gained
 
 
-#: sigma0 over the window above which observations and a-priori sigmas contradict each other, and the redundancy needed.
-CONTRADICTION, ENOUGH = 1.5, 30
-
-
-def light(report: WindowReport) -> tuple[str, str]:
-    """The operator's light: good, weak or failed, and why."""
-    if not report.strip:
-        return "good", "no strip is flown"
-    if report.redundancy >= ENOUGH and report.sigma0 > CONTRADICTION:
-        return "failed", f"observations contradict each other: sigma0 {report.sigma0:.1f}"
-    if report.points == 0:
-        return "weak", "no tie points: the orientation is the measured one"
-    if report.control == 0:
-        return "weak", "no control in the window: position rests on GNSS and earlier control"
-    return "good", ""
-
-
 def parameters(
-    state: WindowState, strip_globals: ArrayLike, self_calibration: SelfCalibration | None, camera_columns: IntArray
+    state: WindowState,
+    strip_globals: ArrayLike,
+    apriori: Array,
+    self_calibration: SelfCalibration | None,
+    camera_columns: IntArray,
+    standing: Sequence[Standing] = (),
 ) -> tuple[Parameter, ...]:
-    """Offset, shift and drift of a strip (numbers (9,), or none) and the additional parameters."""
+    """Offset, shift and drift of a strip (numbers (9,), or none; a-priori sigmas (9,)) and the additional parameters.
+
+    Those of the strip are in the state from the start, with what is known of them beforehand: "estimated" says that the
+    observations know them better.
+    """
     names: list[tuple[str, str, int]] = []
     if len(np.asarray(strip_globals)):
         kinds = [f"d{c}" for c in COMPONENTS] + [f"{c} drift" for c in COMPONENTS[3:]]
@@ -144,6 +147,13 @@ def parameters(
         return ()
     sigma = np.sqrt(np.diagonal(state.covariance(numbers)))
     values = state.values(numbers)
-    return tuple(
-        Parameter(name, unit, float(v), float(s)) for (name, unit, _), v, s in zip(names, values, sigma, strict=True)
-    )
+    of_strip = len(names) - len(camera_columns)
+    result = []
+    for i, ((name, unit, _), v, s) in enumerate(zip(names, values, sigma, strict=True)):
+        known = Standing(ESTIMATED, "")
+        if i >= of_strip and standing:
+            known = standing[i - of_strip]
+        elif i < of_strip and s > BETTER * apriori[i]:
+            known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
+        result.append(Parameter(name, unit, float(v), float(s), known.status, known.reason))
+    return tuple(result)

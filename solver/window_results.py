@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .models import MODELS
 from .reliability import CRITICAL_W
+
+if TYPE_CHECKING:
+    from .window_watch import Watched
 
 Array = NDArray[np.floating]
 
@@ -27,6 +31,7 @@ class WindowOptions:
     settle_s : so long after the end of a strip late tie points are waited for; then the strip is final
     critical : of Baarda's |w|
     snoop : whether observations are tested at all
+    determine : whether an additional parameter enters only when the network can see it; else all are estimated
     retest : batches tested again per update, besides new ones
     """
 
@@ -38,6 +43,7 @@ class WindowOptions:
     settle_s: float = 3.0
     critical: float = CRITICAL_W
     snoop: bool = True
+    determine: bool = True
     retest: int = 4
 
     def __post_init__(self) -> None:
@@ -53,7 +59,10 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class Look:
-    """One image measurement of a point: strip and CCD line by name, line and sample in pixels with their sigmas."""
+    """One image measurement of a point: strip and CCD line by name, line and sample in pixels with their sigmas.
+
+    ``source`` is who measured it; the same measurement from two is one.
+    """
 
     strip: str
     ccd: str
@@ -61,11 +70,16 @@ class Look:
     sample: float
     sigma_line_px: float
     sigma_sample_px: float
+    source: str = field(default="", compare=False)
+
+
+#: Reason of a "refusal" that is the opposite: what was refused before is used again.
+TAKEN_BACK = "taken back"
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """A measurement that was not used, and why; ``w`` is 0 where no test decided."""
+    """A measurement that was not used, and why (or that is `TAKEN_BACK`); ``w`` is 0 where no test decided."""
 
     point: str
     look: Look
@@ -84,6 +98,7 @@ class RefinedOrientation:
     position_l, angles : (n, 3) m; omega, phi, kappa in rad
     covariance : (n, 6, 6) of correction and measurement noise together
     correction : (n, 6) added to the measured orientation
+    protection : (n, 6) protection levels, see `window_integrity`; None where they are not known
     """
 
     strip: str
@@ -92,6 +107,7 @@ class RefinedOrientation:
     angles: Array
     covariance: Array
     correction: Array
+    protection: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +132,8 @@ class AdjustedPoint:
     rays : looks that take part
     final : whether it has left the window
     residuals : of all its looks
+    checked : what a gross error in one of its rays would meet: "all" of them are checked by others; "across": two
+        rays, so that an error along the base goes into the height unseen; "doubtful": half of the rays are left out
     """
 
     name: str
@@ -125,16 +143,19 @@ class AdjustedPoint:
     rays: int
     final: bool
     residuals: tuple[RayResidual, ...]
+    checked: str = "all"
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the present strip or of the camera."""
+    """A parameter of the present strip or of the camera; status "estimated" or "not yet determined", and why."""
 
     name: str
     unit: str
     value: float
     sigma: float
+    status: str = "estimated"
+    reason: str = ""
 
     @property
     def t(self) -> float:
@@ -151,6 +172,7 @@ class WindowReport:
     sigma0_total, redundancy_total : since the start
     observations, unknowns : in the window, what was marginalised counting as one observation an unknown
     start_s, end_s : orientation before the start is final; newest ray
+    watched : light, protection levels and sources that drift
     """
 
     sigma0: float
@@ -167,6 +189,7 @@ class WindowReport:
     control: int
     strip: str
     parameters: tuple[Parameter, ...]
+    watched: Watched | None = None
 
 
 @dataclass(frozen=True)

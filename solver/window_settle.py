@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,9 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 #: Points of a strip at which it is asked again; the later ones are judged by many.
-YOUNG = (6, 10, 16, 26, 42, 68, 110)
+YOUNG = (6, 10, 16, 26, 42, 68, 110, 178)
+#: New points after which a control point that is refused as a whole is reason enough to ask.
+SINCE = 4
 #: Newest points, and share of them that is refused, from which on it is asked again later.
 RECENT, MOSTLY = 24, 0.6
 #: Points asked at once at most, the newest ones.
@@ -33,6 +36,8 @@ MOST_POINTS = 160
 DISAGREES = 1e-4
 #: Squared width of the kernel, in squared sigmas, at the end; and by how much it narrows from one solution to the next.
 NARROWEST, NARROWING = 8.0, 0.4
+#: Rays of a point of which subsets are tried.
+MOST_RAYS = 6
 #: Share of the points that has to agree for their opinion to count.
 MAJORITY = 0.4
 
@@ -57,13 +62,13 @@ class Settler:
         count = sum(b.n_points for b in mine)
         asked = self.asked.get(strip, 0)
         step = next((n for n in YOUNG if n > asked), None)
-        if step is not None and count < step:
+        if step is None and count < asked:  # what was counted has left
+            self.asked[strip] = asked = max(count, YOUNG[-1])
+        due = step is not None and count >= step
+        due = due or (count >= asked + RECENT and self._mostly_refused(mine))
+        if not due and not (count >= asked + SINCE and _refuses_control(newest)):
             return []
-        if step is None and not (count >= asked + RECENT and self._mostly_refused(mine)):
-            if step is None and count < asked:  # what was counted has left
-                self.asked[strip] = max(count, YOUNG[-1])
-            return []
-        self.asked[strip] = count
+        self.asked[strip] = max(count, asked)
         chosen: list[Batch] = []
         points = 0
         for batch in sorted(mine, key=lambda b: -b.newest_s):
@@ -83,6 +88,17 @@ class Settler:
             if seen >= RECENT:
                 break
         return seen >= RECENT and refused > MOSTLY * seen
+
+
+def _refuses_control(batch: Batch) -> bool:
+    kept = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points)
+    return bool((batch.control.weight.any(axis=1) & (kept == 0)).any())
+
+
+def _subsets(rays: int, known: bool) -> list[tuple[int, ...]]:
+    """Looks of a point that may be left out together: none, one, or two of many; all but one at known coordinates."""
+    most = rays - 1 if known else min(rays - 2, 2 if rays > 3 else 1)
+    return [out for n in range(max(most, 0) + 1) for out in combinations(range(rays), n)] if rays <= MOST_RAYS else [()]
 
 
 def settle(batches: list[Batch], state: WindowState) -> list[Array] | None:
@@ -114,7 +130,7 @@ def settle(batches: list[Batch], state: WindowState) -> list[Array] | None:
 def _consensus(c: _Conditions, N: Array, rhs: Array) -> Array:
     """Orientation (n,) that most points agree on, with what else is known of it as prior (n, n), (n,)."""
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(N), 1e-30))
-    weight = np.where(c.left_out < 0, 1.0, 0.0)
+    weight = np.where(c.n_out == 0, 1.0, 0.0)
     width = np.inf
     theta = np.zeros(len(rhs))
     while True:
@@ -128,7 +144,7 @@ def _consensus(c: _Conditions, N: Array, rhs: Array) -> Array:
         square = c.squares(theta)
         over = np.maximum(square - c.rows, 0.0)
         if not np.isfinite(width):
-            width = max(float(over[c.left_out < 0].max()), NARROWEST)
+            width = max(float(over[c.n_out == 0].max()), NARROWEST)
         width = max(NARROWING * width, NARROWEST)
         chosen = c.choose(square, width)
         weight = np.zeros(len(over))
@@ -142,7 +158,8 @@ class _Conditions:
     Attributes
     ----------
     point : (m,) place of the point among those of all batches
-    left_out : (m,) place of the look at its point that is left out; -1 none
+    left_out : (m) places of the looks at its point that are left out
+    n_out : (m,) how many
     rows : (m,) conditions of the set
     first : (m,) where they begin
     design, misclosure : (n, u), (n,)
@@ -150,7 +167,8 @@ class _Conditions:
     """
 
     point: IntArray
-    left_out: IntArray
+    left_out: tuple[tuple[int, ...], ...]
+    n_out: IntArray
     rows: IntArray
     first: IntArray
     design: Array
@@ -159,7 +177,10 @@ class _Conditions:
 
     @classmethod
     def of(cls, batches: list[Batch], state: WindowState) -> _Conditions:
-        point, left_out, rows, designs, misclosures = [], [], [], [], []
+        point: list[int] = []
+        left_out: list[tuple[int, ...]] = []
+        rows: list[int] = []
+        designs, misclosures = [], []
         number = 0
         for batch in batches:
             A = batch.full_rows(np.arange(len(batch.rays)))
@@ -171,10 +192,10 @@ class _Conditions:
             for p in range(batch.n_points):
                 own = np.arange(batch.first_ray[p], batch.first_ray[p + 1])
                 given = np.flatnonzero(root[p])
-                for out in (-1, *range(len(own))) if len(own) > 2 or len(given) else (-1,):
-                    rays = np.delete(own, out) if out >= 0 else own
+                for out in _subsets(len(own), len(given) == 3):
+                    rays = np.delete(own, out)
                     k = 2 * len(rays) + len(given) - 3
-                    if k < 1 or not len(rays):
+                    if k < 1:
                         continue
                     j = np.vstack([J[rays].reshape(-1, 3), np.diag(root[p])[given]])
                     free = np.linalg.qr(j, mode="complete")[0][:, 3:].T
@@ -190,7 +211,8 @@ class _Conditions:
         rows_ = np.array(rows, dtype=np.int64)
         return cls(
             np.array(point, dtype=np.int64),
-            np.array(left_out, dtype=np.int64),
+            tuple(left_out),
+            np.array([len(out) for out in left_out]),
             rows_,
             np.concatenate([[0], np.cumsum(rows_)[:-1]]).astype(np.int64),
             np.concatenate(designs),
@@ -204,7 +226,7 @@ class _Conditions:
 
     def choose(self, square: Array, price: float) -> IntArray:
         """The set of each point with the least squares, where a look left out costs a price."""
-        cost = square - self.rows + np.where(self.left_out >= 0, price, 0.0)
+        cost = square - self.rows + price * self.n_out
         order = np.lexsort((cost, self.point))
         return order[np.concatenate([[True], np.diff(self.point[order]) != 0])]
 
@@ -218,15 +240,14 @@ class _Conditions:
 
     def weights(self, theta: Array, batches: list[Batch]) -> list[Array]:
         """Weights of the rays of the batches: 1 in sets that agree, else 0."""
-        taken = {int(self.point[i]): int(self.left_out[i]) for i in np.flatnonzero(self.agreeing(theta))}
+        taken = {int(self.point[i]): self.left_out[i] for i in np.flatnonzero(self.agreeing(theta))}
         result, number = [], 0
         for batch in batches:
             weight = np.zeros(len(batch.rays))
             for p in range(batch.n_points):
                 if number + p in taken:
                     weight[batch.first_ray[p] : batch.first_ray[p + 1]] = 1.0
-                    if taken[number + p] >= 0:
-                        weight[batch.first_ray[p] + taken[number + p]] = 0.0
+                    weight[batch.first_ray[p] + np.array(taken[number + p], dtype=np.int64)] = 0.0
             result.append(weight)
             number += batch.n_points
         return result

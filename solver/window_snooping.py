@@ -12,7 +12,7 @@ from .snooping import TOGETHER, joint_limit
 from .window_batch import Batch
 from .window_entry import DECISIVE, entry_weight
 from .window_points import PointLooks
-from .window_results import Refusal
+from .window_results import TAKEN_BACK, Refusal
 from .window_state import WindowState
 
 Array = NDArray[np.floating]
@@ -42,14 +42,14 @@ def snoop(
 
     Returns
     -------
-    refused : looks left out now
+    refused : looks left out now, and those taken back
     rounds : solutions computed
     """
     limit = _joint_limit(critical)
     refused: list[Refusal] = []
     rounds = 0
     for batch in batches:
-        if batch.tested >= 0 and _try_again(batch, state, points):
+        if batch.tested >= 0 and _try_again(batch, state, points, refused):
             rounds = 1
         batch.tested = serial
     if rounds:
@@ -130,7 +130,7 @@ def reweigh(
     return changes
 
 
-def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> bool:
+def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks], changes: list[Refusal]) -> bool:
     """Let points in that were left out as a whole if the orientation as known now agrees with them."""
     lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0
     if not lost.any():
@@ -141,7 +141,7 @@ def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks]) 
         return False
     state.add(batch.columns, batch.information, -1)
     batch.weight = weight
-    _note(batch, points, back[:0], back, weight)
+    changes += _note(batch, points, back[:0], back, np.zeros(len(weight)))
     batch.eliminate()
     state.add(batch.columns, batch.information)
     return True
@@ -222,6 +222,9 @@ def _note(batch: Batch, points: dict[str, PointLooks], out: IntArray, back: IntA
         name, source = batch.names[batch.rays.point[ray]], int(batch.rays.source[ray])
         points[name].weight[source] = 1.0
         points[name].returned.add(source)
+        if source in points[name].reported:
+            points[name].reported.discard(source)
+            refused.append(Refusal(name, points[name].looks[source], TAKEN_BACK, float(w[ray])))
     return refused
 
 

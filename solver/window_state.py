@@ -14,6 +14,9 @@ from .window_batch import Information
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
+#: Weight of what is held, which makes its cofactors nothing.
+HELD = 1e30
+
 
 @dataclass(frozen=True)
 class Marginal:
@@ -61,6 +64,7 @@ class WindowState:
         self._factor: DenseFactor | None = None
         self._inverted = False
         self.solution = 0
+        self._held: IntArray = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -130,16 +134,35 @@ class WindowState:
         """Normal equations (n, n), (n,) of all information."""
         return self._fixed + self._live, self._fixed_rhs + self._live_rhs
 
+    def hold(self, numbers: IntArray) -> None:
+        """Hold these unknowns at zero from now on, and no others; what is known of them is kept."""
+        self._held = np.asarray(numbers, dtype=np.int64)
+        self._factor = None
+
+    def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
+        """Factor and values (n,) with other unknowns held at zero."""
+        matrix, rhs = self.normal()
+        _hold(matrix, self.places(held))
+        factor = DenseFactor(matrix)
+        rhs[self.places(held)] = 0.0
+        return factor, factor.solve(rhs)
+
     @property
     def factor(self) -> DenseFactor:
         if self._factor is None:
-            self._factor = DenseFactor(self._fixed + self._live)
+            matrix = self._fixed + self._live
+            if len(self._held):
+                _hold(matrix, self.places(self._held))
+            self._factor = DenseFactor(matrix)
             self._inverted = False
         return self._factor
 
     def solve(self) -> None:
         """Values from all information."""
-        self.theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        rhs = self._fixed_rhs + self._live_rhs
+        if len(self._held):
+            rhs[self.places(self._held)] = 0.0
+        self.theta = self.factor.solve(rhs)
         self.solution += 1
 
     def cost(self) -> float:
@@ -188,3 +211,10 @@ class WindowState:
         self._place[self.numbers] = np.arange(len(stay))
         self._factor = None
         return marginal
+
+
+def _hold(matrix: Array, places: IntArray) -> None:
+    """Cut unknowns off from the others, so that they are zero and certain."""
+    matrix[places, :] = 0.0
+    matrix[:, places] = 0.0
+    matrix[places, places] = HELD

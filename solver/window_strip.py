@@ -87,6 +87,7 @@ class WindowStrip:
     first_line_time_s, line_rate_hz : image line u is taken at first_line_time_s + u / line_rate_hz
     lines : number of lines, 0 = not known
     model : its correction functions
+    slow : its slow errors, as known beforehand
     ended : whether the last line has been taken
     final_to_s : orientation up to here is final
     """
@@ -104,6 +105,7 @@ class WindowStrip:
         self.id = id
         self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
         self.lines = lines
+        self.slow = slow
         self.ended = False
         self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
         self.final_to_s = first_line_time_s

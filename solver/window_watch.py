@@ -1,0 +1,175 @@
+"""What watches over the window besides data snooping: integrity, sources that drift, determinability, the light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import LineCamera
+from .determinability import Limits
+from .selfcalibration import SelfCalibration
+from .window_batch import Batch
+from .window_determinability import Determinability, Standing, ranks
+from .window_integrity import Exposure, Integrity
+from .window_light import Situation, light
+from .window_points import PointLooks
+from .window_sources import BiasedSource, Group, SourceMonitor
+from .window_state import Marginal, WindowState
+from .window_strip import WindowStrip
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Level of the tests of parameters on line; they are made again and again.
+ALPHA = 0.01
+#: Updates between two steps of the determinability test.
+STEP_EVERY = 2
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The findings of one update.
+
+    Attributes
+    ----------
+    light, reason : see `window_light`
+    exposure : at the newest time, None without tie points
+    time_s : of that
+    sources : those that drift
+    standing : of the additional parameters
+    events : for the operator
+    """
+
+    light: str
+    reason: str
+    exposure: Exposure | None
+    time_s: float
+    sources: tuple[BiasedSource, ...]
+    standing: tuple[Standing, ...]
+    events: tuple[str, ...]
+
+
+class Watch:
+    """Runs once an update; what costs much is spread over updates.
+
+    Parameters
+    ----------
+    determine : whether additional parameters enter only when they are determined
+    """
+
+    def __init__(
+        self,
+        camera: LineCamera,
+        critical: float,
+        points: dict[str, PointLooks],
+        self_calibration: SelfCalibration | None,
+        camera_columns: IntArray,
+        state: WindowState,
+        determine: bool,
+    ) -> None:
+        self._integrity = Integrity(critical)
+        self._sources = SourceMonitor()
+        self._points, self._state = points, state
+        self._ccds = [line.id for line in camera.lines]
+        self._pitch = float(np.median(np.linalg.norm(np.diff(camera.lines[0].xy_mm[:2], axis=0), axis=1)))
+        self._focal = float(camera.focal_length_mm[0])
+        self._determinability: Determinability | None = None
+        if self_calibration is not None and determine:
+            nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id
+            order = ranks(self_calibration, nadir)
+            self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
+            self._determinability.hold(state)
+        self._count = 0
+        self.exposure: Exposure | None = None
+
+    def drop(self, batch: Batch) -> None:
+        """A batch is taken apart."""
+        self._integrity.drop(batch)
+
+    def leaving(self, batches: list[Batch], before_s: float) -> None:
+        """Batches leave the window; what left before a time is forgotten."""
+        self._integrity.note(batches)
+        self._integrity.leave(batches, self._state, before_s)
+
+    def marginalised(self, marginal: Marginal) -> None:
+        """Unknowns have left the window."""
+        self._integrity.marginalised(marginal)
+
+    def exposure_at(self, strip: WindowStrip, time_s: float, renew: bool = False) -> Exposure | None:
+        """Exposure of the orientation at a time of a strip; None if its unknowns are not there."""
+        design = strip.design([time_s])
+        numbers = np.unique(design.columns)
+        numbers = numbers[numbers >= 0].astype(np.int64)
+        if not len(numbers) or (self._state.places(numbers) < 0).any():
+            return None
+        A = np.zeros((6, len(numbers) + 1))
+        local = np.where(design.columns[0] >= 0, np.searchsorted(numbers, design.columns[0]), len(numbers))
+        A[np.arange(6), local] += design.coefficients[0][:, None]
+        return self._integrity.at(numbers, A[:, :-1], self._state, renew)
+
+    def look(
+        self,
+        now_s: float,
+        length_s: float,
+        strip: WindowStrip | None,
+        batches: list[Batch],
+        changed: list[Batch],
+        sigma0: float,
+        redundancy: int,
+        total: tuple[float, int],
+        apriori_m: Array,
+    ) -> Watched:
+        """Findings of an update.
+
+        Parameters
+        ----------
+        strip : the newest one, None if all are over
+        batches, changed : of the window; those judged in this update
+        sigma0, redundancy, total : over the window, since the start
+        apriori_m : (3,) sigma of the position beforehand
+        """
+        self._count += 1
+        self._integrity.note(changed)
+        time_s = -np.inf
+        self.exposure = None
+        if strip is not None and batches:
+            time_s = min(now_s, strip.end_s)
+            self.exposure = self.exposure_at(strip, time_s, renew=True)
+        self._sources.update(now_s, batches, self._state, self._groups)
+        events: list[str] = []
+        d = self._determinability
+        if d is not None and self._count % STEP_EVERY == 0:
+            events = d.step(self._state, batches, total[0], total[1], self._gsd(batches))
+        kept = [np.bincount(b.rays.point, b.weight > 0, b.n_points) > 0 for b in batches]
+        control = np.zeros(3)
+        for b, k in zip(batches, kept, strict=True):
+            if b.active_control:
+                control += ((b.control.weight > 0) & k[:, None]).sum(axis=0)
+        points = sum(b.n_points for b in batches)
+        colour, reason = light(
+            Situation(
+                strip is not None, length_s, now_s - strip.first_line_time_s if strip is not None else 0.0, sigma0,
+                redundancy, points, points - int(sum(k.sum() for k in kept)), control, apriori_m, self.exposure,
+                self._sources.biased,
+            )
+        )  # fmt: skip
+        standing = tuple(d.standing()) if d is not None else ()
+        return Watched(colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events))
+
+    def _groups(self, batch: Batch) -> list[Group]:
+        """Source and CCD line of each ray."""
+        rays = batch.rays
+        looks = [self._points[name].looks for name in batch.names]
+        return [
+            (looks[p][s].source, self._ccds[c])
+            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
+        ]
+
+    def _gsd(self, batches: list[Batch]) -> float:
+        if not batches:
+            return 1.0
+        rays = batches[-1].rays
+        height = np.abs(rays.position_l[:, 2] - batches[-1].points_l[rays.point, 2])
+        return float(np.median(height)) * self._pitch / self._focal
