@@ -92,10 +92,12 @@ class Watch:
         """Batches leave the window; what left before a time is forgotten."""
         self._integrity.note(batches)
         self._integrity.leave(batches, self._state, before_s)
+        self._sources.leave(batches, self._state, self._groups)
 
     def marginalised(self, marginal: Marginal) -> None:
         """Unknowns have left the window."""
         self._integrity.marginalised(marginal)
+        self._sources.marginalised(marginal)
 
     def exposure_at(self, strip: WindowStrip, time_s: float, renew: bool = False) -> Exposure | None:
         """Exposure of the orientation at a time of a strip; None if its unknowns are not there."""
