@@ -27,8 +27,8 @@ IntArray = NDArray[np.int64]
 ESTIMATED, NOT_YET = "estimated", "not yet determined"
 #: Share of the a-priori variance that may be left of a parameter the network sees.
 LEFT_OF_PRIOR = 0.25
-#: Sweeps that have to agree.
-AGREEING = 2
+#: Sweeps that have to agree; one is enough for a parameter as significant as this.
+AGREEING, CLEAR = 2, 4.5
 #: Redundancy below which nothing is examined.
 ENOUGH = 60
 #: Batches whose points stand for all.
@@ -52,6 +52,12 @@ class Determinability:
     numbers : (m,) of its unknowns in the window
     rank : (m,) as in `Evidence`
     limits : critical values
+
+    Attributes
+    ----------
+    inside : (m,) which are in the state
+    reasons : (m) why (not)
+    swept : whether a first sweep is over
     """
 
     def __init__(
@@ -71,6 +77,7 @@ class Determinability:
         self._open = np.ones(m, dtype=bool)  # of the sweep under way
         self._found = [""] * m
         self._votes = np.zeros(m, dtype=np.int64)
+        self.swept = False
 
     def hold(self, state: WindowState) -> None:
         """Hold what is not inside."""
@@ -104,13 +111,14 @@ class Determinability:
                 return []
             for name, why in verdict.kept.items():
                 self._found[self.names.index(name)] = why
+            self._votes[open_[np.abs(evidence.t) > CLEAR]] += 1
         return self._conclude(state)
 
     def _conclude(self, state: WindowState) -> list[str]:
         """A sweep is over: parameters that two of them agree about come or go."""
         differs = self._open != self.inside
         self._votes = np.where(differs, self._votes + 1, 0)
-        change = self._votes >= AGREEING
+        change = differs & (self._votes >= AGREEING)
         events = []
         for i in np.flatnonzero(change):
             self.inside[i] = self._open[i]
@@ -120,10 +128,11 @@ class Determinability:
             self.reasons[i] = self._found[i]
             if self.inside[i] != self._open[i]:
                 self.reasons[i] = self._found[i] or "just determined"
+        self._votes[change] = 0
+        self.swept = True
         self._open[:] = True
         self._found = [""] * len(self.names)
         if change.any():
-            self._votes[change] = 0
             self.hold(state)
             state.solve()
         return events
@@ -144,7 +153,8 @@ class Determinability:
         q = np.maximum(np.diagonal(own), 1e-300)
         others = np.ones(len(state), dtype=bool)
         others[state.places(self.numbers)] = False
-        variances = np.maximum(factor.variances(), 1e-300)
+        everything = factor.inverse()
+        variances = np.maximum(np.diagonal(everything), 1e-300)
         r = Q[others] / np.sqrt(variances[others, None] * q)
         strongest = np.argmax(np.abs(r), axis=0)
         correlation = r[strongest, np.arange(len(places))]
@@ -155,10 +165,8 @@ class Determinability:
             columns = state.places(batch.columns)
             through = batch.coupling @ Q[columns]  # (p, 3, m)
             to_points = -np.swapaxes(L, 1, 2) @ through
-            # the point's own variance, and what it gets from the unknowns near by, are at least its own
-            own_variance = np.einsum("pij,pij->pj", L, L)
-            if batch.judged is not None:
-                own_variance = np.einsum("pii->pi", batch.judged[1].points)
+            inner = batch.coupling @ everything[np.ix_(columns, columns)] @ np.swapaxes(batch.coupling, 1, 2) + np.eye(3)
+            own_variance = np.einsum("pki,pkl,pli->pi", L, inner, L)
             rp = to_points[known] / np.sqrt(np.maximum(own_variance[known], 1e-12)[:, :, None] * q)
             if rp.size:
                 flat = np.clip(rp.reshape(-1, len(places)), -1.0, 1.0)

@@ -24,8 +24,8 @@ IntArray = NDArray[np.int64]
 
 #: Level of the tests of parameters on line; they are made again and again.
 ALPHA = 0.01
-#: Updates between two steps of the determinability test.
-STEP_EVERY = 2
+#: Steps of the determinability test in one update before the first sweep is over, and updates between two later on.
+STEPS, STEP_EVERY = 2, 2
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class Watch:
         self._sources.update(now_s, batches, self._state, self._groups)
         events: list[str] = []
         d = self._determinability
-        if d is not None and self._count % STEP_EVERY == 0:
-            events = d.step(self._state, batches, total[0], total[1], self._gsd(batches))
+        for _ in range(0 if d is None else STEPS if not d.swept else int(self._count % STEP_EVERY == 0)):
+            events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
         kept = [np.bincount(b.rays.point, b.weight > 0, b.n_points) > 0 for b in batches]
         control = np.zeros(3)
         for b, k in zip(batches, kept, strict=True):
