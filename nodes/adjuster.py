@@ -11,7 +11,7 @@ from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.slow_errors import SlowErrors
 from ..solver.window import AHEAD_S, Window
-from ..solver.window_results import Look, Refusal, WindowOptions, WindowUpdate
+from ..solver.window_results import TAKEN_BACK, Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
 from .adjuster_poses import OrientationStore, PoseBuffer, SlowHistory
@@ -102,12 +102,14 @@ class Adjuster(Node):
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
         self._handed_s = self._used_to_s = -np.inf
         self._held_strips: dict[str, Any] = {}
-        self._held_ties: list[Any] = []
+        self._held_ties: list[tuple[Any, str]] = []
         self._store = OrientationStore()
         self._refusals: list[Refusal] = []
         self._rejected_total = 0
         self._updates = 0
-        self._light = "good"
+        self._sources: frozenset[tuple[str, str]] = frozenset()
+        self._returned_total = 0
+        self._light = ("good", "no strip is flown")
         self._next_live = -np.inf
 
     # -- node ----------------------------------------------------------------------------------------------------------
@@ -132,6 +134,9 @@ class Adjuster(Node):
             return "running"
         missing = [n for n, c in (("project", self._project), ("camera", self._camera)) if c is None]
         return "waiting for " + ", ".join(f"configuration/{n}" for n in missing)
+
+    def light(self) -> tuple[str, str]:
+        return self._light if self._window is not None else ("", "")
 
     def query(self, name: str, parameters: dict[str, str]) -> Message | None:
         """Refined orientation at a time: ``query/orientation?t=..``, seconds (or nanoseconds) since the Unix epoch.
@@ -159,7 +164,7 @@ class Adjuster(Node):
         if topic.startswith("trajectory/"):
             return self._pose(body, topic == "trajectory/smoothed")
         if topic == "observation/tie":
-            self._tie(body)
+            self._tie(body, message.source)
         elif topic == "observation/control":
             self._ground_point(body)
         elif topic == "observation/verdict":
@@ -240,8 +245,8 @@ class Adjuster(Node):
             self._begin(strip)
         if not self._held_strips:
             ties, self._held_ties = self._held_ties, []
-            for body in ties:
-                self._tie(body)
+            for body, source in ties:
+                self._tie(body, source)
 
     def _ground_point(self, body: Any) -> None:
         if not body.point:
@@ -273,18 +278,19 @@ class Adjuster(Node):
         verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
         return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
 
-    def _tie(self, body: Any) -> None:
+    def _tie(self, body: Any, source: str) -> None:
         if self._window is None:
             self.problem("before configuration", "observation/tie came before configuration/project and camera")
             return
         if self._held_strips and any(image.strip in self._held_strips for image in body.images):
-            self._held_ties.append(body)
+            self._held_ties.append((body, source))
             return
         sigma = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX
         for image in body.images:
             look = Look(
-                image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma, image.sigma_sample or sigma
-            )
+                image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma,
+                image.sigma_sample or sigma, source,
+            )  # fmt: skip
             if body.point:
                 self._window.add_look(body.point, look)
             else:
@@ -375,7 +381,9 @@ class Adjuster(Node):
         for refusal in update.refused:
             self.counters["observations rejected" if refusal.reason == "snooping" else refusal.reason] += 1
         refusals, self._refusals = self._refusals + update.refused, []
-        self._rejected_total += len(refusals)
+        back = sum(r.reason == TAKEN_BACK for r in refusals)
+        self._returned_total += back
+        self._rejected_total += len(refusals) - back
         outputs: list[Message] = []
         for orientation in update.final:
             messages = out.orientations(
@@ -393,14 +401,15 @@ class Adjuster(Node):
         if update.report is not None:
             outputs.append(
                 out.report(
-                    update.report, refusals, self._rejected_total, self._updates, self._reference_ns, self._stamp_ns
+                    update.report, refusals, self._rejected_total, self._returned_total, self._updates,
+                    self._reference_ns, self._stamp_ns,
                 )
-            )
+            )  # fmt: skip
             self._updates += 1
-            colour, why = update.report.watched.light, update.report.watched.reason
-            if colour != self._light:
-                self._light = colour
-                outputs.append(self._log(f"{colour}: {why}" if why else colour, warning=colour != "good"))
+            watched, before = update.report.watched, (self._light[0], self._sources)
+            self._light, self._sources = (watched.light, watched.reason), watched.names
+            if before != (self._light[0], self._sources):
+                outputs.append(self._log(": ".join(filter(None, self._light)), warning=self._light[0] != "good"))
         outputs += [self._log(text) for text in update.events]
         return outputs
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from ..schemas import messages as m
 from ..solver.rotation import matrix_from_angles, quaternion_from_matrix
-from ..solver.window_results import AdjustedPoint, RefinedOrientation, Refusal, WindowReport
+from ..solver.window_results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal, WindowReport
 from . import convert
 from .node import Message
 
@@ -35,6 +36,7 @@ def orientations(
             reason=reason,
             strip=orientation.strip,
             correction=orientation.correction[i],
+            protection=None if orientation.protection is None else orientation.protection[i],
         )
         result.append(Message(topic, stamp_ns, body))
     return result
@@ -46,7 +48,7 @@ def object_point(point: AdjustedPoint, stamp_ns: int) -> Message:
     status = m.ObjectPoint.Status.Value("FINAL" if point.final else "LIVE")
     body = m.ObjectPoint(
         point=point.name, x=x, y=y, z=z, covariance=point.covariance.ravel().tolist(), rays=point.rays, role=point.role,
-        status=status,
+        status=status, checked=point.checked,
         residuals=[
             m.RayResidual(
                 strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, v_line=r.v_line,
@@ -62,6 +64,7 @@ def report(
     figures: WindowReport,
     refusals: Sequence[Refusal],
     rejected_total: int,
+    returned_total: int,
     number: int,
     reference_ns: int,
     stamp_ns: int,
@@ -72,6 +75,7 @@ def report(
         return reference_ns + round(time_s * convert.SECOND_NS) if np.isfinite(time_s) else 0
 
     newest = at(figures.end_s)
+    watched = figures.watched
     body = m.AdjustmentReport(
         update=number,
         sigma0=_number(figures.sigma0),
@@ -89,19 +93,38 @@ def report(
         redundancy_total=figures.redundancy_total,
         rejected_total=rejected_total,
         strip=figures.strip,
-        rejected=[
-            m.RejectedObservation(
-                point=r.point, strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, w=r.w,
-                reason=r.reason,
-            )
-            for r in refusals
-        ],
+        rejected=[_refusal(r) for r in refusals if r.reason != TAKEN_BACK],
+        returned=[_refusal(r) for r in refusals if r.reason == TAKEN_BACK],
+        returned_total=returned_total,
         parameters=[
-            m.ParameterEstimate(name=p.name, unit=p.unit, value=p.value, sigma=p.sigma, t=p.t, status="estimated")
+            m.ParameterEstimate(
+                name=p.name, unit=p.unit, value=p.value, sigma=p.sigma, t=p.t, status=p.status, reason=p.reason
+            )
             for p in figures.parameters
         ],
+        light=watched.light,
+        light_reason=watched.reason,
+        sources=[
+            m.BiasedSource(
+                source=s.source, ccd=s.ccd, line=s.line_px, sample=s.sample_px, line_rate=s.line_px_s,
+                sample_rate=s.sample_px_s, test=s.test, limit=s.limit, since_ns=at(s.since_s),
+                rivals=[f"{source}/{ccd}" for source, ccd in s.rivals],
+            )
+            for s in watched.sources
+        ],
     )  # fmt: skip
+    if watched.exposure is not None:
+        body.protection.extend(watched.protection.tolist())
+        body.sigma.extend(watched.sigma.tolist())
+        body.exposed = watched.exposure.observation
     return Message("adjustment/report", stamp_ns, body)
+
+
+def _refusal(r: Refusal) -> Any:
+    return m.RejectedObservation(
+        point=r.point, strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, w=r.w,
+        reason=r.reason,
+    )  # fmt: skip
 
 
 def log(node: str, text: str, stamp_ns: int, warning: bool = False) -> Message:

@@ -73,6 +73,7 @@ def pose_message(
     strip: str = "",
     correction: ArrayLike | None = None,
     velocity_l: ArrayLike | None = None,
+    protection: ArrayLike | None = None,
 ) -> Any:
     """A PoseInFrame of the image frame in the local frame; angles are omega, phi, kappa in radians.
 
@@ -90,6 +91,8 @@ def pose_message(
         message.covariance.extend(np.asarray(covariance, dtype=float).ravel().tolist())
     if correction is not None:
         message.correction.extend(np.asarray(correction, dtype=float).tolist())
+    if protection is not None:
+        message.protection.extend(np.asarray(protection, dtype=float).tolist())
     if velocity_l is not None:
         v = message.velocity
         v.x, v.y, v.z = (float(c) for c in np.asarray(velocity_l))

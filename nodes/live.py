@@ -327,11 +327,12 @@ class StatusPublisher:
     ) -> None:
         """Publish what the arguments say; ``stamp_ns`` is the newest platform time known (0: none yet)."""
         now = time.monotonic()
+        light, reason = node.light()
         elapsed = now - self._last if self._last else 0.0
         self._last = now
         status = m.NodeStatus(
             node=self._name, state=state, uptime_s=now - self._begun, lag_s=lag_s, queued=queued,
-            last_problem=node.last_problem,
+            last_problem=node.last_problem, light=light, light_reason=reason,
         )  # fmt: skip
         extra = malformed_envelopes or {}
         for topic in sorted(set(counts) | set(extra)):

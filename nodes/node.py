@@ -60,6 +60,10 @@ class Node:
         """One phrase for the status line, e.g. ``running`` or ``waiting for configuration/camera``."""
         return "running"
 
+    def light(self) -> tuple[str, str]:
+        """The operator's light, "good", "weak" or "failed", and the reason; empty for nodes without one."""
+        return "", ""
+
     def problem(self, kind: str, text: str) -> None:
         """Count bad data of a kind (a short counter name) and keep one line about the newest case."""
         self.counters[kind] += 1

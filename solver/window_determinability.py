@@ -165,7 +165,9 @@ class Determinability:
             columns = state.places(batch.columns)
             through = batch.coupling @ Q[columns]  # (p, 3, m)
             to_points = -np.swapaxes(L, 1, 2) @ through
-            inner = batch.coupling @ everything[np.ix_(columns, columns)] @ np.swapaxes(batch.coupling, 1, 2) + np.eye(3)
+            inner = batch.coupling @ everything[np.ix_(columns, columns)] @ np.swapaxes(batch.coupling, 1, 2) + np.eye(
+                3
+            )
             own_variance = np.einsum("pki,pkl,pli->pi", L, inner, L)
             rp = to_points[known] / np.sqrt(np.maximum(own_variance[known], 1e-12)[:, :, None] * q)
             if rp.size:

@@ -253,7 +253,7 @@ class _Left:
             order = np.argsort(marginal.gone)
             first = np.zeros((len(marginal.gone), self._rhs.shape[1]))
             first[order[np.searchsorted(marginal.gone, self._numbers[gone], sorter=order)]] = self._rhs[gone]
-            moved = marginal.R12.T @ solve_triangular(marginal.R11, first, trans="T", check_finite=False)
+            moved = marginal.R12.T @ solve_triangular(marginal.R11, first, trans=1, check_finite=False)
             rest = np.zeros((len(marginal.stayed), self._rhs.shape[1]))
             order = np.argsort(marginal.stayed)
             rest[order[np.searchsorted(marginal.stayed, self._numbers[stayed], sorter=order)]] = self._rhs[stayed]
@@ -282,7 +282,8 @@ class _Left:
         order = np.argsort([-e.leverage for e in self._exposed])
         keep = np.sort(order[:OF_WINDOW])
         self._bounds.append((self._bounds[-1][0], self._exposed[order[OF_WINDOW]].leverage))
-        columns = np.concatenate([np.arange(ends[i] - len(self._exposed[i].rows), ends[i]) for i in keep])
+        kept = np.repeat(np.isin(np.arange(len(ends)), keep), [len(e.rows) for e in self._exposed])
+        columns = np.flatnonzero(kept)
         self._rhs, self._exposed = self._rhs[:, columns], [self._exposed[i] for i in keep]
 
     def bound(self) -> float:

@@ -189,7 +189,7 @@ class WindowReport:
     control: int
     strip: str
     parameters: tuple[Parameter, ...]
-    watched: Watched | None = None
+    watched: Watched
 
 
 @dataclass(frozen=True)

@@ -95,10 +95,13 @@ def _refuses_control(batch: Batch) -> bool:
     return bool((batch.control.weight.any(axis=1) & (kept == 0)).any())
 
 
-def _subsets(rays: int, known: bool) -> list[tuple[int, ...]]:
-    """Looks of a point that may be left out together: none, one, or two of many; all but one at known coordinates."""
-    most = rays - 1 if known else min(rays - 2, 2 if rays > 3 else 1)
-    return [out for n in range(max(most, 0) + 1) for out in combinations(range(rays), n)] if rays <= MOST_RAYS else [()]
+def _subsets(rays: int) -> list[tuple[int, ...]]:
+    """Looks of a point that may be left out together: none, one, or two of many; two stay.
+
+    At known coordinates one look alone would be two conditions, but the orientation can bend to any one look.
+    """
+    most = min(rays - 2, 2) if rays <= MOST_RAYS else 0
+    return [out for n in range(max(most, 0) + 1) for out in combinations(range(rays), n)]
 
 
 def settle(batches: list[Batch], state: WindowState) -> list[Array] | None:
@@ -192,7 +195,7 @@ class _Conditions:
             for p in range(batch.n_points):
                 own = np.arange(batch.first_ray[p], batch.first_ray[p + 1])
                 given = np.flatnonzero(root[p])
-                for out in _subsets(len(own), len(given) == 3):
+                for out in _subsets(len(own)):
                     rays = np.delete(own, out)
                     k = 2 * len(rays) + len(given) - 3
                     if k < 1:

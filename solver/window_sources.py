@@ -74,7 +74,9 @@ class BiasedSource:
     def __str__(self) -> str:
         of = f" of source {self.source}" if self.source else ""
         bias = f"line {self.line_px:+.2f} px, sample {self.sample_px:+.2f} px"
-        rivals = [ccd if source == self.source else f"{ccd} of {source or 'another source'}" for source, ccd in self.rivals]
+        rivals = [
+            ccd if source == self.source else f"{ccd} of {source or 'another source'}" for source, ccd in self.rivals
+        ]
         return f"tie points{of} on CCD {self.ccd} drift: {bias}" + (f" (or {' or '.join(rivals)})" if rivals else "")
 
 
@@ -172,7 +174,7 @@ class SourceMonitor:
         stayed = np.isin(marginal.stayed, self._numbers)
         rest = np.zeros((len(self._score), len(marginal.stayed)))
         rest[:, stayed] = self._coupling[:, place_of(self._numbers, marginal.stayed[stayed])]
-        T = solve_triangular(marginal.R11, first.T, trans="T", check_finite=False).T
+        T = solve_triangular(marginal.R11, first.T, trans=1, check_finite=False).T
         self._score = self._score - T @ marginal.d1
         self._normal = self._normal - T @ T.T
         self._numbers, self._coupling = marginal.stayed.copy(), rest - T @ marginal.R12
@@ -254,8 +256,17 @@ class SourceMonitor:
         self._since = {i: self._since.get(i, now_s) for i, *_ in found}
         return tuple(
             BiasedSource(
-                *names[i], *map(float, (*bias, *drift, test, limit)), self._since[i], tuple(names[r] for r in rivals)
-            )
+                names[i][0],
+                names[i][1],
+                float(bias[0]),
+                float(bias[1]),
+                float(drift[0]),
+                float(drift[1]),
+                test,
+                limit,
+                self._since[i],
+                tuple(names[r] for r in rivals),
+            )  # fmt: skip
             for i, bias, drift, test, limit, rivals in found
         )
 

@@ -40,6 +40,7 @@ class Watched:
     sources : those that drift
     standing : of the additional parameters
     events : for the operator
+    sigma, protection : (6,) of the newest orientation, m and rad
     """
 
     light: str
@@ -49,6 +50,13 @@ class Watched:
     sources: tuple[BiasedSource, ...]
     standing: tuple[Standing, ...]
     events: tuple[str, ...]
+    sigma: Array
+    protection: Array
+
+    @property
+    def names(self) -> frozenset[Group]:
+        """The sources that drift."""
+        return frozenset((s.source, s.ccd) for s in self.sources)
 
 
 class Watch:
@@ -142,8 +150,9 @@ class Watch:
         self._sources.update(now_s, batches, self._state, self._groups)
         events: list[str] = []
         d = self._determinability
-        for _ in range(0 if d is None else STEPS if not d.swept else int(self._count % STEP_EVERY == 0)):
-            events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
+        if d is not None:
+            for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
+                events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
         kept = [np.bincount(b.rays.point, b.weight > 0, b.n_points) > 0 for b in batches]
         control = np.zeros(3)
         for b, k in zip(batches, kept, strict=True):
@@ -158,7 +167,11 @@ class Watch:
             )
         )  # fmt: skip
         standing = tuple(d.standing()) if d is not None else ()
-        return Watched(colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events))
+        sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
+        protection = sigma if self.exposure is None else self.exposure.protection(sigma)
+        return Watched(
+            colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events), sigma, protection
+        )
 
     def _groups(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""

@@ -159,7 +159,8 @@ def test_several_strips():
 
 def test_additional_parameters_are_estimated_along(flight):
     simulation, poses = flight
-    result = adjust_online(simulation, poses, self_calibration=tls(simulation.flight.camera), live=False, update_s=0.5)
+    options = WindowOptions(determine=False)
+    result = adjust_online(simulation, poses, options, tls(simulation.flight.camera), live=False, update_s=0.5)
     names = [p.name for p in result.reports[-5].parameters]
     assert names[9:] == list(tls(simulation.flight.camera).names)
     values = {p.name: p for p in result.reports[-5].parameters}
