@@ -51,7 +51,7 @@ class RerunCanvas:
         self, entity: str, strips: Sequence[Array], colors: Sequence[Color], radius: float,
         labels: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
-        kind = rr.LineStrips3D if strips[0].shape[1] == 3 else rr.LineStrips2D
+        kind = rr.LineStrips3D if not len(strips) or strips[0].shape[1] == 3 else rr.LineStrips2D
         size = rr.Radius.ui_points(radius)
         self.stream.log(
             entity, kind(list(strips), colors=list(colors), radii=size, labels=labels, show_labels=labels is not None)
@@ -167,15 +167,15 @@ def _overview(layout: Layout) -> rrb.Container:
         _plot("sigma0", "sigma0 and its 95 % band", (0.7, 1.3), legend=False),
         _plot("latency", "Latency [ms]"),
         _plot("overview/position", "Final dX, dY, dZ [m]"),
-        _plot("overview/attitude", "Final attitude [mdeg]"),
+        _plot("integrity/position", "Protection level and sigma of the position [m]"),
         grid_columns=2,
     )
     if layout.lines:
         lines = rrb.Horizontal(*(_lines(ccd, layout) for ccd in layout.lines))
-        left = rrb.Vertical(_flight(layout), _legend(layout), curves, row_shares=[10, 1.5, 8])
+        left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[1.6, 10, 1.5, 8])
         right = rrb.Vertical(lines, side, row_shares=[10, 2.2])
         return rrb.Horizontal(left, right, column_shares=[1, 1], name="Overview")
-    left = rrb.Vertical(_flight(layout), _legend(layout), side, row_shares=[10, 1.3, 3])
+    left = rrb.Vertical(_light(), _flight(layout), _legend(layout), side, row_shares=[1.5, 10, 1.3, 2.6])
     right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
     return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
 
@@ -226,7 +226,10 @@ def _corrections() -> rrb.Container:
 
 
 def _adjustment(layout: Layout) -> rrb.Container:
-    views = [_plot("window", "Window: rays, points, rejected")]
+    views = [
+        _plot("window", "Window: rays, points, rejected"),
+        _plot("integrity/attitude", "Protection level and sigma of the attitude [mdeg]"),
+    ]
     if layout.truth:
         views += [
             _plot("errors/position", "Position error against truth [m]"),
@@ -273,6 +276,16 @@ def _flight(layout: Layout) -> rrb.View:
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=[0.0, 0.0, 1.0]
         ),
+    )
+
+
+def _light() -> rrb.View:
+    return rrb.Spatial2DView(
+        origin="/light",
+        name="Light",
+        titlebar=False,
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(x_range=[-300.0, 300.0], y_range=[-14.0, 46.0]),
     )
 
 

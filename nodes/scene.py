@@ -26,6 +26,7 @@ from .scene_parts import FILTERED, LEGEND
 from .scene_plots import PlotsPart
 from .scene_points import PointsPart
 from .scene_state import SceneState
+from .scene_window import WindowPart
 
 Array = NDArray[np.floating]
 
@@ -77,6 +78,7 @@ class Scene:
             PlotsPart(self.state),
             MapPart(self.state),
             MosaicPart(self.state),
+            WindowPart(self.state),
         )
         self._laid_out: Any = None
         self._held: list[tuple[str, PoseSample]] = []
@@ -208,7 +210,12 @@ class Scene:
             f"Live, final and true trajectory: deviation from the {s.measured} one x {s.exaggeration:g}; ellipsoids: "
             f"3 sigma of the final one x {s.exaggeration:g}.\n\n"
             f"Residuals x {s.residual_scale:g}: thin arrows are those of single rays laid on the ground, in the "
-            "colour of their CCD line; thick arrows at control and check points are adjusted minus given coordinates.",
+            "colour of their CCD line; they fade when the point is final. Thick arrows at control and check points "
+            "are adjusted minus given coordinates.\n\n"
+            "Outlines on the ground: the part of the strip in the *live* window; the *marginal* part before it is "
+            "final and kept as a prior on what follows; the *whole* strip has been through the backward pass.\n\n"
+            "Protection level: with a risk of 0.001 the orientation is not further off, even if one gross error that "
+            "the tests do not find is among the observations.",
         )
 
     def _corners(self) -> Array:

@@ -9,13 +9,14 @@ import numpy as np
 
 from .canvas import Canvas
 from .node import Message
-from .scene_parts import CCD_COLORS, REJECTED, Part
+from .scene_parts import CCD_COLORS, REJECTED, Part, faded
 from .scene_state import SceneState
 
 _NEWEST = 1500  # rays a view shows
 _PERIOD_S = 1.0  # all of them are drawn again
 _LENGTH_S = 60.0  # of a strip whose end is not known
 _PIXEL = 0.05  # of the view's width is one pixel of residual
+_SETTLED = 0.5  # of the colour is left of the residuals of final points
 _GREY = (110, 110, 120, 255)
 
 
@@ -33,6 +34,7 @@ class ImagePart(Part):
     def take(self, message: Message) -> None:
         if message.topic != "point/object":
             return
+        settled = message.body.status != message.body.LIVE
         for r in message.body.residuals:
             if r.strip != self._strip:
                 self._strip = r.strip
@@ -40,7 +42,7 @@ class ImagePart(Part):
                 self._changed = set(self._rays)
             rays = self._rays.get(r.ccd)
             if rays is not None:
-                rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected
+                rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected, settled
                 if len(rays) > _NEWEST:
                     rays.popitem(last=False)
                 self._changed.add(r.ccd)
@@ -59,7 +61,7 @@ class ImagePart(Part):
         along = height / lines
         scale = _PIXEL * width
         for ccd in sorted(self._changed):
-            rows = np.array([row for row in self._rays[ccd].values()], dtype=float).reshape(-1, 5)
+            rows = np.array([row for row in self._rays[ccd].values()], dtype=float).reshape(-1, 6)
             origin = np.column_stack([rows[:, 1], height - rows[:, 0] * along])
             vector = scale * np.column_stack([rows[:, 3], -rows[:, 2]])
             bad = rows[:, 4] > 0
@@ -67,8 +69,10 @@ class ImagePart(Part):
             longest = 2 * scale  # a rejected ray may be far off; its arrow shows where to
             vector[bad] *= np.minimum(1.0, longest / np.maximum(length[bad], 1e-9))[:, None]
             color = CCD_COLORS[self.state.ccds.index(ccd) % len(CCD_COLORS)]
-            for name, chosen, shade in (("residuals", ~bad, color), ("rejected", bad, REJECTED)):
-                canvas.arrows(f"image/{ccd}/{name}", origin[chosen], vector[chosen], [shade] * int(chosen.sum()), 0.9)
+            shades = [faded(color, _SETTLED) if settled else color for settled in rows[:, 5] > 0]
+            for name, chosen in (("residuals", ~bad), ("rejected", bad)):
+                own = [REJECTED if bad[i] else shades[i] for i in np.flatnonzero(chosen)]
+                canvas.arrows(f"image/{ccd}/{name}", origin[chosen], vector[chosen], own, 0.9)
         self._changed.clear()
         if self._framed != (self._strip, round(lines)):
             self._framed = self._strip, round(lines)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from .canvas import Canvas
+from .canvas import Canvas, Color
 from .convert import PoseSample
 from .node import Message
 from .scene_state import SceneState
@@ -14,6 +14,7 @@ from .scene_state import SceneState
 FILTERED = (150, 165, 190, 255)
 LIVE = (255, 170, 40, 255)
 FINAL = (70, 220, 120, 255)
+WHOLE = (40, 150, 110, 255)
 TRUTH = (255, 255, 255, 255)
 CONTROL = (255, 80, 80, 255)
 CHECK = (80, 190, 255, 255)
@@ -30,6 +31,15 @@ LEGEND = (
     ("rejected ray", REJECTED),
 )
 CCD_COLORS = ((255, 140, 120, 255), (235, 225, 140, 255), (130, 170, 255, 255), (190, 140, 255, 255))
+
+
+_GROUND = (18, 20, 26)
+
+
+def faded(color: Color, share: float) -> Color:
+    """A colour of which only a share is left on the dark ground of the views."""
+    r, g, b = (round(share * c + (1 - share) * ground) for c, ground in zip(color, _GROUND, strict=False))
+    return r, g, b, 255
 
 
 class Part:

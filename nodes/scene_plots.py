@@ -15,7 +15,7 @@ from . import convert
 from .canvas import Canvas, Color, Series
 from .convert import PoseSample
 from .node import Message
-from .scene_parts import AXES, FILTERED, FINAL, LIVE, TRUTH, Part
+from .scene_parts import AXES, FILTERED, FINAL, LIVE, TRUTH, Part, faded
 from .scene_state import SceneState
 
 Array = NDArray[np.floating]
@@ -129,8 +129,15 @@ class PlotsPart(Part):
         self._add("window/rays", t, report.rays, Series("rays", FILTERED))
         self._add("window/points", t, report.points, Series("points", FINAL))
         self._add("window/rejected", t, report.rejected_total, Series("rejected, total", (255, 60, 230, 255)))
+        for group, part, scale in (("position", slice(0, 3), 1.0), ("attitude", slice(3, 6), _MDEG)):
+            for kind, values, width in (("protection", report.protection, 2.0), ("sigma", report.sigma, 1.0)):
+                for axis, value in enumerate(values[part]):
+                    name = COMPONENTS[part][axis].removeprefix("d")
+                    series = Series(f"{name}, {kind}", AXES[axis] if width > 1 else faded(AXES[axis], 0.5), width)
+                    self._add(f"integrity/{group}/{name}_{kind}", t, scale * value, series)
         for k, parameter in enumerate(report.parameters):
-            self._parameter(t, k, parameter)
+            if parameter.status != "not yet determined" or parameter.sigma > 0:
+                self._parameter(t, k, parameter)
 
     def _parameter(self, t: float, k: int, parameter: Any) -> None:
         unit, scale = parameter.unit or "1", 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 from . import convert
 from .canvas import Canvas, Color
 from .node import Message
-from .scene_parts import CCD_COLORS, CHECK, CONTROL, FINAL, LIVE, REJECTED, Part, Pieces
+from .scene_parts import CCD_COLORS, CHECK, CONTROL, FINAL, LIVE, REJECTED, Part, Pieces, faded
 from .scene_state import SceneState, forward
 
 Array = NDArray[np.floating]
 
+_FADING_S, _SETTLED = 12.0, 0.3  # residuals of a final point fade so long to so much
+_FADED_EVERY_S = 0.8
 _LABELLED = 12  # control points; with more of them names would cover the view
 
 
@@ -27,6 +30,9 @@ class PointsPart(Part):
         self._live_changed = False
         self._final = Pieces("points/final", 150)
         self._residuals = Pieces("points/residuals", 150)
+        self._fresh: dict[str, tuple[float, list[tuple[Array, Array, Color]]]] = {}  # of live points
+        self._settling: deque[tuple[float, list[tuple[Array, Array, Color]]]] = deque()
+        self._faded_s = -np.inf
         self._given: dict[str, tuple[Array, str]] = {}
         self._given_changed = False
         self._misfit: dict[str, Array] = {}
@@ -50,17 +56,20 @@ class PointsPart(Part):
             self._misfit_changed = True
         if body.status == body.LIVE:
             self._live[body.point] = xyz, REJECTED if bad else LIVE
+            self._fresh[body.point] = self.state.now_s, self._vectors(xyz, body.residuals)
         else:
             self._live.pop(body.point, None)
             self._final.add((xyz, REJECTED if bad else FINAL))
-            self._add_residuals(xyz, body.residuals)
+            self._fresh.pop(body.point, None)
+            self._settling.append((self.state.now_s, self._vectors(xyz, body.residuals)))
         self._live_changed = True
 
-    def _add_residuals(self, xyz: Array, residuals: Any) -> None:
+    def _vectors(self, xyz: Array, residuals: Any) -> list[tuple[Array, Array, Color]]:
         """Image residuals of a tie point, laid on the ground: lines along the flight, samples to the left."""
         pose, ccds = self.state.newest, self.state.ccds
+        rows: list[tuple[Array, Array, Color]] = []
         if pose is None:
-            return
+            return rows
         along = forward(pose.quaternion)
         left = np.array([-along[1], along[0], 0.0])
         for r in residuals:
@@ -70,7 +79,23 @@ class PointsPart(Part):
             advance = self.state.speed_m_s / strip.line_rate_hz
             vector = r.v_line * advance * along + r.v_sample * self.state.gsd_m * left
             color = CCD_COLORS[ccds.index(r.ccd) % len(CCD_COLORS)]
-            self._residuals.add((xyz, self.state.residual_scale * vector, color))
+            rows.append((xyz, self.state.residual_scale * vector, color))
+        return rows
+
+    def _fade(self, canvas: Canvas) -> None:
+        """Residuals of live points in full colour; those of final ones fade, and then stay as they are."""
+        now = self.state.now_s
+        while self._settling and (self.state.closing or now - self._settling[0][0] > _FADING_S):
+            for xyz, vector, color in self._settling.popleft()[1]:
+                self._residuals.add((xyz, vector, faded(color, _SETTLED)))
+        rows = [row for _, rows in self._fresh.values() for row in rows]
+        for since, old in self._settling:
+            share = 1.0 - (1.0 - _SETTLED) * min((now - since) / _FADING_S, 1.0)
+            rows += [(xyz, vector, faded(color, share)) for xyz, vector, color in old]
+        self._faded_s = now
+        origins = np.array([xyz for xyz, _, _ in rows]).reshape(-1, 3)
+        arrows = np.array([vector for _, vector, _ in rows]).reshape(-1, 3)
+        canvas.arrows("points/fresh", self.state.display(origins), arrows, [color for *_, color in rows], 0.9)
 
     def draw(self, canvas: Canvas) -> None:
         display = self.state.display
@@ -88,6 +113,8 @@ class PointsPart(Part):
             canvas.arrows(entity, display(np.array(origins)), np.array(arrows), colors, 0.6)
 
         self._final.draw(points)
+        if self.state.closing or self.state.now_s - self._faded_s >= _FADED_EVERY_S:
+            self._fade(canvas)
         self._residuals.draw(vectors)
         if self._given_changed:
             self._given_changed = False

@@ -254,21 +254,12 @@ class SourceMonitor:
             V = V - cross @ V[own, :]
         names = {i: group for group, i in self._groups.items()}
         self._since = {i: self._since.get(i, now_s) for i, *_ in found}
-        return tuple(
-            BiasedSource(
-                names[i][0],
-                names[i][1],
-                float(bias[0]),
-                float(bias[1]),
-                float(drift[0]),
-                float(drift[1]),
-                test,
-                limit,
-                self._since[i],
-                tuple(names[r] for r in rivals),
-            )  # fmt: skip
-            for i, bias, drift, test, limit, rivals in found
-        )
+        result = []
+        for i, bias, drift, test, limit, rivals in found:
+            (line, sample), (line_s, sample_s) = bias.tolist(), drift.tolist()
+            others = tuple(names[r] for r in rivals)
+            result.append(BiasedSource(*names[i], line, sample, line_s, sample_s, test, limit, self._since[i], others))
+        return tuple(result)
 
 
 def _test_of(score: Array, V: Array, i: int, scale: Array, alpha: float) -> tuple[float, float, Array, Array]:
