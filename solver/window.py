@@ -265,7 +265,7 @@ class Window:
 
     def _settle(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Ask a young strip again which of its points agree; number of solutions computed."""
-        due = self._settler.due(self._batches, fresh[-1] if fresh else None)
+        due = self._settler.due(self._batches, fresh)
         weights = settle(due, self.state) if due else None
         if weights is None:
             return 0
@@ -278,7 +278,9 @@ class Window:
 
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""
-        waiting = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: b.tested)[: self.options.retest]
+        first = self._watch.most_exposed
+        waiting = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: (b is not first, b.tested))
+        waiting = waiting[: self.options.retest]
         due, rays = [], 0
         for batch in waiting:
             if due and rays + len(batch.rays) > MOST_RETESTED:

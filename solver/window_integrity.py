@@ -100,12 +100,18 @@ class _OfBatch:
 
 
 class Integrity:
-    """Keeps the most exposed observations of every batch, and what those that left did to the normal equations."""
+    """Keeps the most exposed observations of every batch, and what those that left did to the normal equations.
+
+    Attributes
+    ----------
+    most_exposed : batch of the observation that the newest position was most exposed to
+    """
 
     def __init__(self, critical: float) -> None:
         self._delta = noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
         self._left = _Left()
+        self.most_exposed: Batch | None = None
 
     def note(self, batches: list[Batch]) -> None:
         """Look at batches that have been judged since."""
@@ -210,6 +216,7 @@ class Integrity:
                 largest, worst = float(np.linalg.norm(effect[:3])), e
         if renew:
             self._left.thin(state)
+            self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
         return Exposure(bias, sigma, *self._name(worst))
 
     def _name(self, e: _Exposed | None) -> tuple[str, bool, float]:

@@ -35,6 +35,7 @@ class Situation:
     since_s : how long the strip is being flown
     sigma0, redundancy : over the window
     points, refused : object points in the window, and those of which nothing is left
+    control_refused : control points of which nothing is left
     control : (3,) known X, Y and Z coordinates in the window
     apriori_m : (3,) sigma of X, Y and Z before any observation
     exposure : of the newest orientation, None without
@@ -48,6 +49,7 @@ class Situation:
     redundancy: int
     points: int
     refused: int
+    control_refused: int
     control: Array
     apriori_m: Array
     exposure: Exposure | None
@@ -62,6 +64,8 @@ def light(s: Situation) -> tuple[str, str]:
         return FAILED, f"observations contradict each other: sigma0 {s.sigma0:.1f}"
     if s.points >= ENOUGH_POINTS and s.refused > MOSTLY_REFUSED * s.points:
         return FAILED, f"{s.refused} of {s.points} tie points contradict the others"
+    if s.control_refused >= max(2, int(s.control.max())):
+        return FAILED, f"{s.control_refused} control points contradict the orientation"
     if s.points - s.refused == 0:
         if s.since_s < s.length_s or not s.length_s:
             return WEAK, "no tie points yet: the orientation is the measured one"
@@ -77,9 +81,8 @@ def _datum(s: Situation) -> tuple[str, str]:
     held = known | (sigma < HELD * s.apriori_m)
     within = f"no control within {min(s.length_s, max(s.since_s, 1.0)):.0f} s"
     if not held.all():
-        missing = (
-            "no control" if not known.any() else "no height control" if known[:2].all() else "no planimetric control"
-        )
+        partly = "no height control" if known[:2].all() else "no planimetric control"
+        missing = partly if known.any() else "no control"
         rests = {(False, False): "position and height datum rest", (False, True): "position datum rests"}.get(
             (bool(held[:2].all()), bool(held[2])), "height datum rests"
         )

@@ -26,12 +26,10 @@ IntArray = NDArray[np.int64]
 
 #: Points of a strip at which it is asked again; the later ones are judged by many.
 YOUNG = (6, 10, 16, 26, 42, 68, 110, 178)
-#: New points after which a control point that is refused as a whole is reason enough to ask.
-SINCE = 4
 #: Newest points, and share of them that is refused, from which on it is asked again later.
 RECENT, MOSTLY = 24, 0.6
-#: Points asked at once at most, the newest ones.
-MOST_POINTS = 160
+#: Points asked at once at most, the newest ones; and the control points.
+MOST_POINTS = 200
 #: Probability that a good point is said not to agree.
 DISAGREES = 1e-4
 #: Squared width of the kernel, in squared sigmas, at the end; and by how much it narrows from one solution to the next.
@@ -49,15 +47,17 @@ class Settler:
     Attributes
     ----------
     asked : by strip, the number of points at which it was asked last
+    refused : by strip, the number of control points of which nothing was left then
     """
 
     asked: dict[int, int] = field(default_factory=dict)
+    refused: dict[int, int] = field(default_factory=dict)
 
-    def due(self, batches: Sequence[Batch], newest: Batch | None) -> list[Batch]:
+    def due(self, batches: Sequence[Batch], fresh: Sequence[Batch]) -> list[Batch]:
         """The batches to ask, the newest points of a strip first; none if there is nothing to ask about."""
-        if newest is None:
+        if not fresh:
             return []
-        strip = newest.strips[-1]
+        strip = max(batch.strips[-1] for batch in fresh)
         mine = [b for b in batches if strip in b.strips]
         count = sum(b.n_points for b in mine)
         asked = self.asked.get(strip, 0)
@@ -66,14 +66,17 @@ class Settler:
             self.asked[strip] = asked = max(count, YOUNG[-1])
         due = step is not None and count >= step
         due = due or (count >= asked + RECENT and self._mostly_refused(mine))
-        if not due and not (count >= asked + SINCE and _refuses_control(newest)):
+        before, refused = self.refused.get(strip, 0), sum(map(refused_control, mine))
+        self.refused[strip] = min(before, refused)
+        if not due and refused <= before:
             return []
+        self.refused[strip] = refused
         self.asked[strip] = max(count, asked)
         chosen: list[Batch] = []
         points = 0
         for batch in sorted(mine, key=lambda b: -b.newest_s):
-            if chosen and points + batch.n_points > MOST_POINTS:
-                break
+            if chosen and points + batch.n_points > MOST_POINTS and not batch.active_control:
+                continue
             chosen.append(batch)
             points += batch.n_points
         return chosen if any((b.weight == 0).any() for b in chosen) else []
@@ -90,9 +93,12 @@ class Settler:
         return seen >= RECENT and refused > MOSTLY * seen
 
 
-def _refuses_control(batch: Batch) -> bool:
+def refused_control(batch: Batch) -> int:
+    """Control points of a batch of which no ray is left."""
+    if not batch.active_control:
+        return 0
     kept = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points)
-    return bool((batch.control.weight.any(axis=1) & (kept == 0)).any())
+    return int((batch.control.weight.any(axis=1) & (kept == 0)).sum())
 
 
 def _subsets(rays: int) -> list[tuple[int, ...]]:

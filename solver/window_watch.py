@@ -15,6 +15,7 @@ from .window_determinability import Determinability, Standing, ranks
 from .window_integrity import Exposure, Integrity
 from .window_light import Situation, light
 from .window_points import PointLooks
+from .window_settle import refused_control
 from .window_sources import BiasedSource, Group, SourceMonitor
 from .window_state import Marginal, WindowState
 from .window_strip import WindowStrip
@@ -92,6 +93,11 @@ class Watch:
         self._count = 0
         self.exposure: Exposure | None = None
 
+    @property
+    def most_exposed(self) -> Batch | None:
+        """The batch to be tested before all others, if it is in the window."""
+        return self._integrity.most_exposed
+
     def drop(self, batch: Batch) -> None:
         """A batch is taken apart."""
         self._integrity.drop(batch)
@@ -154,16 +160,18 @@ class Watch:
             for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
                 events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
         kept = [np.bincount(b.rays.point, b.weight > 0, b.n_points) > 0 for b in batches]
-        control = np.zeros(3)
+        control, control_refused = np.zeros(3), 0
         for b, k in zip(batches, kept, strict=True):
             if b.active_control:
                 control += ((b.control.weight > 0) & k[:, None]).sum(axis=0)
+                control_refused += refused_control(b)
         points = sum(b.n_points for b in batches)
+        refused = points - int(sum(k.sum() for k in kept))
+        since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
         colour, reason = light(
             Situation(
-                strip is not None, length_s, now_s - strip.first_line_time_s if strip is not None else 0.0, sigma0,
-                redundancy, points, points - int(sum(k.sum() for k in kept)), control, apriori_m, self.exposure,
-                self._sources.biased,
+                strip is not None, length_s, since_s, sigma0, redundancy, points, refused, control_refused, control,
+                apriori_m, self.exposure, self._sources.biased,
             )
         )  # fmt: skip
         standing = tuple(d.standing()) if d is not None else ()
