@@ -37,7 +37,9 @@ class WindowPart(Part):
         self._whole = 0
 
     def pose(self, topic: str, sample: PoseSample) -> None:
-        if topic != "trajectory" or self.state.camera is None or not self.state.on_strip(sample.time_ns):
+        if topic != "trajectory" or self.state.camera is None or self.state.strip not in self.state.extent:
+            return
+        if not self.state.on_strip(sample.time_ns):
             return
         if self.state.strip != self._strip:
             self._finish()
@@ -68,7 +70,8 @@ class WindowPart(Part):
             self._light = report.light, report.light_reason
             text = _wrapped(": ".join(filter(None, (report.light.upper(), report.light_reason))))
             color = _LIGHTS.get(report.light, (150, 150, 150, 255))
-            canvas.points("light", np.array([[0.0, 0.0]]), [color], 11.0, [text])
+            canvas.points("light/lamp", np.array([[0.0, -9.0]]), [color], 10.0)
+            canvas.points("light/reason", np.array([[0.0, 4.0]]), [color], 0.5, [text])
         if self._pending:
             canvas.lines(f"flight/window/whole/{self._whole}", [self._outline(self._pending)], [WHOLE], 1.0)
             self._pending = []

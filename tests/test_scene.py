@@ -238,3 +238,35 @@ def test_who_joins_late_sees_the_whole_strip_in_its_place(messages):
     show(messages, usual)
     # display origins are the same (from control), so the corners can be compared; the flight weaves a little
     np.testing.assert_allclose(canvas.layouts[-1].corners, usual.layouts[-1].corners, atol=120)
+
+
+def test_the_window_is_shown_on_the_ground_and_the_light_beside_it(messages):
+    """Outlines of the marginal and the live part meet where the window begins; residuals of live points are bright."""
+    canvas = Notebook()
+    show(messages, canvas)
+    assert not any(entity.startswith("light") for entity in canvas.drawn)  # reports that do not say: no light
+    told = []
+    for message in messages:
+        body = message.body
+        if message.topic == "adjustment/report":
+            body = type(body)()
+            body.CopyFrom(message.body)
+            body.light, body.light_reason, body.strip = (
+                "weak",
+                "no control within 40 s; height datum rests on GNSS",
+                "S1",
+            )
+            body.window_start_ns = max(body.window_end_ns - 8 * convert.SECOND_NS, 0)
+            body.protection.extend([1.0] * 6)
+        told.append(Message(message.topic, message.stamp_ns, body, message.source, message.sequence))
+    show([m for m in told if not (m.topic == "point/object" and m.body.status == 1)], canvas)
+    _, colors, labels = canvas.drawn["light/reason"]
+    assert labels[0].startswith("WEAK: no control within 40 s;") and colors[0][0] > colors[0][2]
+    assert len(canvas.drawn["light/lamp"][0]) == 1
+    marginal, live = (canvas.drawn[f"flight/window/{name}"][0][0] for name in ("marginal", "live"))
+    assert len(canvas.drawn["flight/window/border"][0]) == 1
+    assert np.abs(marginal[:, None] - live[None]).sum(axis=2).min() < 1e-6
+    lengths = [np.ptp(outline[:, :2], axis=0).max() for outline in (marginal, live)]
+    assert lengths[0] > lengths[1] > 300.0
+    assert len(canvas.drawn["points/fresh"][0]) > 20
+    assert canvas.curves["plots/integrity/position/X_protection"][1][-1] == 1.0
