@@ -285,7 +285,7 @@ def _light() -> rrb.View:
         name="Light",
         titlebar=False,
         background=_BACKGROUND,
-        visual_bounds=rrb.VisualBounds2D(x_range=[-300.0, 300.0], y_range=[-14.0, 46.0]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-300.0, 300.0], y_range=[-34.0, 46.0]),
     )
 
 

@@ -80,9 +80,11 @@ class WindowPart(Part):
             return
         self._changed = False
         self._drawn_s = self.state.now_s
-        start_ns = report.window_start_ns if report is not None and report.strip else 0
-        over = report is not None and not report.strip and report.points == 0 and report.update > 0
-        over = over and self._track[-1][0] < report.window_end_ns + SECOND_NS
+        start_ns, over = 0, False
+        if report is not None:
+            start_ns = report.window_start_ns if report.strip else 0
+            empty = not report.strip and report.points == 0 and report.update > 0
+            over = empty and self._track[-1][0] < report.window_end_ns + SECOND_NS
         gone = [row for row in self._track if row[0] <= start_ns] if not over else self._track
         live = [row for row in self._track if row[0] > start_ns] if not over else []
         if gone and live:

@@ -11,8 +11,10 @@ their lambda can only have become smaller. One error is thought of at a time, in
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +33,7 @@ RISK = 1e-3
 #: Observations of a batch, and of the window, that are looked at exactly, if their lambda is not small.
 OF_BATCH, OF_WINDOW, SMALL = 12, 24, 0.15
 #: Observations whose lambda is computed anew in one update.
-RENEWED = 8
+RENEWED = 4
 #: Cofactors of residuals below this are those of a direction that nothing checks: along the base at two rays.
 UNCHECKED = 1e-6
 AXES = "XYZ"
@@ -58,8 +60,7 @@ class Exposure:
 
     def protection(self, sigma: Array, risk: float = RISK) -> Array:
         """Protection levels (n, 6) where the orientation has standard deviations (n, 6)."""
-        k = float(norm.isf(risk / 2))
-        return (k + self.bias / np.maximum(self.sigma, 1e-300)) * sigma
+        return (_of_risk(risk) + self.bias / np.maximum(self.sigma, 1e-300)) * sigma
 
 
 @dataclass
@@ -301,8 +302,18 @@ class _Left:
             self._bounds.popleft()
 
 
+@cache
+def _of_risk(risk: float) -> float:
+    return float(norm.isf(risk / 2))
+
+
 def _inverse(C: Array) -> Array:
     """Inverse (k, k) without the directions that nothing checks."""
+    if len(C) == 2:  # the usual case, without an eigenvalue decomposition
+        (a, b), (_, d) = C.tolist()
+        det, trace = a * d - b * b, a + d
+        if trace > 0 and det > 10 * UNCHECKED * trace:
+            return np.array([[d / det, -b / det], [-b / det, a / det]])
     values, vectors = np.linalg.eigh(C)
     good = values > UNCHECKED
     return (vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)) @ vectors.T
@@ -312,7 +323,12 @@ def _ratio(R: Array, C: Array) -> float:
     """Largest eigenvalue of ``C^-1 R`` (k, k)."""
     if len(C) == 1:
         return float(R[0, 0] / max(C[0, 0], UNCHECKED))
-    return float(_largest_ratio(R[None], C[None])[0])
+    (r, s), (_, t) = R.tolist()
+    (a, b), (_, d) = C.tolist()
+    a, d = a + UNCHECKED, d + UNCHECKED
+    det = max(a * d - b * b, UNCHECKED**2)
+    half = 0.5 * (d * r - 2.0 * b * s + a * t) / det
+    return max(half + math.sqrt(max(half * half - (r * t - s * s) / det, 0.0)), 0.0)
 
 
 def _largest_ratio(R: Array, C: Array) -> Array:

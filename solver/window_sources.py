@@ -37,7 +37,7 @@ MATTERS_PX, TELLING_PX = 0.08, 0.3
 #: Rays of a group needed for a test.
 ENOUGH = 12
 #: Age at which a batch is taken in, s: data snooping has had its say about it.
-SETTLED_S = 1.5
+SETTLED_S = 3.0
 #: Batches taken in at one update.
 AT_ONCE = 2
 #: Time between tests, s; unit of the drift, s.
@@ -151,8 +151,10 @@ class SourceMonitor:
         for batch in batches:
             if batch.strips[-1] != self._strip:
                 continue
-            self._take(batch, state, group_of)
             known = self._cells.pop(id(batch), None)
+            if known is None or known[1].information is not batch.information:
+                self._take(batch, state, group_of)
+                known = self._cells.pop(id(batch), None)
             if known is None:
                 continue
             cell = known[1]
@@ -211,9 +213,10 @@ class SourceMonitor:
         full = np.zeros((n, 2, k, EACH))
         full[np.arange(n), :, of_ray] = B
         flat = full.reshape(2 * n, k * EACH)
-        on_point = np.zeros((batch.n_points, k * EACH, 3))
-        np.add.at(on_point, point, np.einsum("nib,nik->nbk", full.reshape(n, 2, -1), W))
-        normal = flat.T @ flat - np.einsum("pbk,pck->bc", on_point, on_point)
+        begins = np.flatnonzero(np.diff(point, prepend=-1))  # rays are sorted by point
+        on_point = np.add.reduceat(np.swapaxes(full.reshape(n, 2, -1), 1, 2) @ W, begins, axis=0)
+        on_points = np.swapaxes(on_point, 0, 1).reshape(k * EACH, -1)
+        normal = flat.T @ flat - on_points @ on_points.T
         coupling = flat.T @ rows.reshape(2 * n, -1)
         score = flat.T @ v.ravel() + coupling @ state.values(batch.columns)
         places = (EACH * present[:, None] + np.arange(EACH)).ravel()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .camera import LineCamera
 from .determinability import Limits
 from .selfcalibration import SelfCalibration
-from .window_batch import Batch
+from .window_batch import Batch, Information
 from .window_determinability import Determinability, Standing, ranks
 from .window_integrity import Exposure, Integrity
 from .window_light import Situation, light
@@ -60,6 +60,18 @@ class Watched:
         return frozenset((s.source, s.ccd) for s in self.sources)
 
 
+@dataclass(frozen=True)
+class _Count:
+    """Of a batch, as long as its information is this: points of which nothing is left, control coordinates (3,) in use,
+    control points of which nothing is left."""
+
+    information: Information
+    refused: int
+    has_control: bool
+    control: Array
+    control_refused: int
+
+
 class Watch:
     """Runs once an update; what costs much is spread over updates.
 
@@ -91,6 +103,7 @@ class Watch:
             self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
             self._determinability.hold(state)
         self._count = 0
+        self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None
 
     @property
@@ -159,14 +172,12 @@ class Watch:
         if d is not None:
             for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
                 events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
-        kept = [np.bincount(b.rays.point, b.weight > 0, b.n_points) > 0 for b in batches]
-        control, control_refused = np.zeros(3), 0
-        for b, k in zip(batches, kept, strict=True):
-            if b.active_control:
-                control += ((b.control.weight > 0) & k[:, None]).sum(axis=0)
-                control_refused += refused_control(b)
+        self._counts = {id(b): self._count_of(b) for b in batches}
         points = sum(b.n_points for b in batches)
-        refused = points - int(sum(k.sum() for k in kept))
+        refused = sum(c.refused for c in self._counts.values())
+        known = [c for c in self._counts.values() if c.has_control]
+        control = sum((c.control for c in known), np.zeros(3))
+        control_refused = sum(c.control_refused for c in known)
         since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
         colour, reason = light(
             Situation(
@@ -180,6 +191,16 @@ class Watch:
         return Watched(
             colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events), sigma, protection
         )
+
+    def _count_of(self, batch: Batch) -> _Count:
+        """Anew only if the batch has changed."""
+        count = self._counts.get(id(batch))
+        if count is not None and count.information is batch.information:
+            return count
+        kept = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points) > 0
+        control = ((batch.control.weight > 0) & kept[:, None]).sum(axis=0)
+        refused = batch.n_points - int(kept.sum())
+        return _Count(batch.information, refused, bool(batch.active_control), control, refused_control(batch))
 
     def _groups(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""
