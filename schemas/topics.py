@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 from typing import Any
 
 from . import messages as m
@@ -102,6 +103,7 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 
+@lru_cache(maxsize=1024)
 def find(topic: str) -> Topic:
     """The row of a topic; raises KeyError for one that is not in the table."""
     for row in TOPICS:
@@ -110,6 +112,7 @@ def find(topic: str) -> Topic:
     raise KeyError(topic)
 
 
+@lru_cache(maxsize=1024)
 def rank(topic: str) -> int:
     """Place in the table: decides between messages with equal stamps."""
     return TOPICS.index(find(topic))

@@ -49,8 +49,9 @@ MOVED_M, MOVED_RAD = 1.5, 1e-3
 LOOKED_AFTER = 16
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
-#: So many batches at most are linearised again then.
-MOST_AGAIN = 6
+#: So many batches at most are linearised again in one update, and if new data moved far: the newest first, the others
+#: when their turn comes.
+MOST_AGAIN, MOST_AGAIN_FAR = 6, 1000
 #: Steps kept for the backward pass; of a strip that never ends the earliest part is not refined again.
 MOST_STEPS = 600
 
@@ -228,12 +229,14 @@ class Window:
 
     def _replace_filtered(self) -> None:
         """Put smoothed orientation under batches that had to do with the filtered one."""
-        for batch in self._batches:
-            if batch.provisional and batch.newest_s <= self.trajectory.smoothed_to_s:
-                self.state.add(batch.columns, batch.information, -1)
-                self._maker.refresh(batch)
+        smoothed_s = self.trajectory.smoothed_to_s
+        due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
+        if due:
+            self._maker.refresh(due)
+            for batch in due:
+                before = batch.information
                 batch.linearise(self.state.values(batch.columns), reweigh=True)
-                self.state.add(batch.columns, batch.information)
+                self.state.exchange(batch.columns, before, batch.information)
 
     def _solve(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Gauss-Newton from the warm state, then tests; number of solutions computed."""
@@ -271,20 +274,21 @@ class Window:
         values = [self.state.values(batch.columns) for batch in fresh]
         far = any(b.has_moved(theta, MOVED_M, MOVED_RAD) for b, theta in zip(fresh, values, strict=True))
         turn = self._serial % LOOKED_AFTER
-        others = self._batches if far else self._batches[turn::LOOKED_AFTER]
+        others = self._batches[::-1] if far else self._batches[turn::LOOKED_AFTER]
+        most = MOST_AGAIN_FAR if far else MOST_AGAIN
         new = {id(b) for b in fresh}
         due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
         for batch in others:
-            theta = self.state.values(batch.columns)
-            if not far and len(due) >= MOST_AGAIN:
+            if len(due) >= most:
                 break
+            theta = self.state.values(batch.columns)
             if id(batch) not in new and batch.has_moved(theta, MOVED_M, MOVED_RAD):
                 batch.back_substitute(theta)
                 due.append((batch, theta))
         for batch, theta in due:
-            self.state.add(batch.columns, batch.information, -1)
+            before = batch.information
             batch.linearise(theta, reweigh=False)
-            self.state.add(batch.columns, batch.information)
+            self.state.exchange(batch.columns, before, batch.information)
         return bool(due)
 
     def _remove(self, batch: Batch) -> None:
@@ -300,7 +304,9 @@ class Window:
             settled = strip.ended and self._now_s >= strip.end_s + self.options.settle_s
             limits[strip.id] = np.inf if settled else limit_s
         by_index = [limits[id] for id in self.strips]
-        leaving = [b for b in self._batches if b.oldest_s <= max(by_index[i] for i in b.strips)]
+        latest = max(by_index, default=-np.inf)
+        old = [b for b in self._batches if b.oldest_s <= latest]
+        leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
         if self.options.snoop and leaving:
             refused, rounds = snoop(leaving, self.state, self._points, self.options.critical, self._serial)
             result.refused += refused
@@ -385,20 +391,27 @@ class Window:
         sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
         total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
         active = [s for s in self.strips.values() if not s.is_gone(state)]
-        unknowns = len(state) + sum(b.determined for b in self._batches)
+        determined = rows = rays = points = control = 0
+        for batch in self._batches:
+            determined += batch.determined
+            rows += batch.information.rows
+            rays += batch.active_rays
+            points += len(batch.names)
+            control += batch.active_control
+        unknowns = len(state) + determined
         return WindowReport(
             sigma0=sigma0,
             redundancy=gained,
             sigma0_total=total,
             redundancy_total=state.redundancy,
-            observations=unknowns + sum(b.information.rows for b in self._batches),
+            observations=unknowns + rows,
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in active), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=sum(b.active_rays for b in self._batches),
-            points=sum(b.n_points for b in self._batches),
-            control=sum(b.active_control for b in self._batches),
+            rays=rays,
+            points=points,
+            control=control,
             strip=active[-1].id if active else "",
             parameters=self.parameters(active[-1]) if active else (),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +95,7 @@ class RefinedOrientation:
     correction: Array
 
 
-@dataclass(frozen=True)
-class RayResidual:
+class RayResidual(NamedTuple):
     """Residual of one look, measured minus computed, px; ``w`` is the larger normalised one."""
 
     look: Look
