@@ -49,9 +49,11 @@ MOVED_M, MOVED_RAD = 1.5, 1e-3
 LOOKED_AFTER = 16
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
-#: So many batches at most are linearised again in one update, and if new data moved far: the newest first, the others
-#: when their turn comes.
-MOST_AGAIN, MOST_AGAIN_FAR = 6, 1000
+#: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
+#: which leave first, the others in the updates after it.
+MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
+#: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
+MOST_LEAVING = 1000
 #: Steps kept for the backward pass; of a strip that never ends the earliest part is not refined again.
 MOST_STEPS = 600
 
@@ -98,6 +100,8 @@ class Window:
             camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
         )
         self._batches: list[Batch] = []
+        self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
+        self._following = False  # whether they are what was left when new data moved far
         self._history = CostHistory()
         self._now_s = -np.inf
         self._serial = 0
@@ -273,18 +277,25 @@ class Window:
         """
         values = [self.state.values(batch.columns) for batch in fresh]
         far = any(b.has_moved(theta, MOVED_M, MOVED_RAD) for b, theta in zip(fresh, values, strict=True))
-        turn = self._serial % LOOKED_AFTER
-        others = self._batches[::-1] if far else self._batches[turn::LOOKED_AFTER]
-        most = MOST_AGAIN_FAR if far else MOST_AGAIN
-        new = {id(b) for b in fresh}
         due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
-        for batch in others:
-            if len(due) >= most:
+        new = {id(b) for b in fresh}
+        if far:
+            self._suspects = {id(b): b for b in self._batches if id(b) not in new}
+            self._following = True
+        elif not self._suspects:
+            self._following = False
+            turn = self._batches[self._serial % LOOKED_AFTER :: LOOKED_AFTER]
+            self._suspects = {id(b): b for b in turn if id(b) not in new}
+        rays = 0
+        for key, batch in list(self._suspects.items()):
+            if rays > MOST_RAYS_AGAIN if self._following else len(due) >= MOST_AGAIN:
                 break
+            del self._suspects[key]
             theta = self.state.values(batch.columns)
-            if id(batch) not in new and batch.has_moved(theta, MOVED_M, MOVED_RAD):
+            if batch.has_moved(theta, MOVED_M, MOVED_RAD):
                 batch.back_substitute(theta)
                 due.append((batch, theta))
+                rays += len(batch.rays)
         for batch, theta in due:
             before = batch.information
             batch.linearise(theta, reweigh=False)
@@ -294,6 +305,7 @@ class Window:
     def _remove(self, batch: Batch) -> None:
         self.state.add(batch.columns, batch.information, -1)
         self._batches = [b for b in self._batches if b is not batch]
+        self._suspects.pop(id(batch), None)
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
 
@@ -302,7 +314,7 @@ class Window:
         limits = {}
         for strip in self.strips.values():
             settled = strip.ended and self._now_s >= strip.end_s + self.options.settle_s
-            limits[strip.id] = np.inf if settled else limit_s
+            limits[strip.id] = max(self._settled_to(strip), limit_s) if settled else limit_s
         by_index = [limits[id] for id in self.strips]
         latest = max(by_index, default=-np.inf)
         old = [b for b in self._batches if b.oldest_s <= latest]
@@ -322,6 +334,7 @@ class Window:
         if leaving:
             gone = {id(b) for b in leaving}
             self._batches = [b for b in self._batches if id(b) not in gone]
+            self._suspects = {key: b for key, b in self._suspects.items() if key not in gone}
         for strip in self.strips.values():
             numbers, to_s = strip.leaving(limits[strip.id], self.state)
             if not len(numbers):
@@ -341,6 +354,16 @@ class Window:
             self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, result)
+
+    def _settled_to(self, strip: WindowStrip) -> float:
+        """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
+        index = list(self.strips).index(strip.id)
+        rays = 0
+        for batch in sorted((b for b in self._batches if index in b.strips), key=lambda b: b.oldest_s):
+            rays += len(batch.rays)
+            if rays > MOST_LEAVING:
+                return batch.oldest_s
+        return np.inf
 
     def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
         """Orientation at the grid times that become final now."""
