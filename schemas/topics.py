@@ -29,6 +29,7 @@ class Family(Enum):
     OBSERVATION = "observation"
     RESULT = "result"
     STATUS = "status"
+    DECISION = "decision"  # what a live node decided by the load of its machine; recorded, and followed by `process`
     TRUTH = "truth"  # of a simulation; no estimating node may read it
 
 
@@ -96,6 +97,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
     Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("orthoimage/final", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
+    Topic("adjustment/pace", m.Pace, Family.DECISION, 0),
     Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
     Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
     Topic("event/log", m.Log, Family.STATUS, 0),
