@@ -22,6 +22,7 @@ from .node import Message, Node
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
+PACES = ("load", "normal")
 #: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
 NEAR_START_S = 1.0
 #: Length of the window while it is not known, s.
@@ -45,7 +46,8 @@ class Adjuster(Node):
     window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
     update_s : platform time between updates
     update_rays : waiting image points after which an update does not wait for its time
-    follow_pace : whether `process` works as a recorded live run did under load; if not, with all data
+    pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
+        the flight was recorded; "normal", everything at its time, however long it takes
     self_calibration : set of additional parameters, or "none"
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
@@ -79,8 +81,8 @@ class Adjuster(Node):
         settle_s: float = WindowOptions.settle_s,
         snoop: bool = True,
         update_s: float = 0.2,
-        update_rays: int = 12,
-        follow_pace: bool = True,
+        update_rays: int = 16,
+        pace: str = "load",
         self_calibration: str = "none",
         apriori: str = "trajectory",
     ) -> None:
@@ -94,6 +96,8 @@ class Adjuster(Node):
         if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
             known = ", ".join(("none", *SELF_CALIBRATIONS))
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
+        if pace not in PACES:
+            raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if apriori not in APRIORI:
             raise ValueError(f"apriori: {apriori!r} is not known, wanted one of {', '.join(APRIORI)}")
         self.options = WindowOptions(
@@ -101,7 +105,7 @@ class Adjuster(Node):
             settle_s=settle_s, snoop=snoop,
         )  # fmt: skip
         self._update_ns = round(update_s * convert.SECOND_NS)
-        self._update_rays, self._follow_pace = update_rays, follow_pace
+        self._update_rays, self._by_load = update_rays, pace == "load"
         self._rays_waiting = 0
         self._pacing, self._governor = Pacing(), Governor()
         self._self_calibration = self_calibration
@@ -141,7 +145,7 @@ class Adjuster(Node):
         return outputs
 
     def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
-        if self._window is None or self._next_update_ns is None:
+        if self._window is None or self._next_update_ns is None or not self._by_load:
             return ()
         interval_s = self._interval_ns / convert.SECOND_NS
         if not self._governor.look(lag_s, now_s, interval_s, self._window.length_s or DEFAULT_WINDOW_S):
@@ -192,7 +196,7 @@ class Adjuster(Node):
         if topic == "observation/tie":
             return self._tie_came(body, message.stamp_ns)
         if topic == "adjustment/pace":
-            if self._follow_pace:
+            if self._by_load:
                 self._pacing.announce(body)
         elif topic == "observation/control":
             self._ground_point(body)

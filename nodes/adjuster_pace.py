@@ -16,10 +16,10 @@ from . import convert
 
 #: Factor on the time and the number of rays between updates, and share of the tie points kept, by level.
 LEVELS = ((1, 1.0), (2, 1.0), (5, 1.0), (5, 0.5), (5, 0.25), (5, 0.125), (5, 0.05), (5, 0.0))
-#: Behind by more, s (and two intervals), a level up, unless it is catching up; behind by less for a while, one down.
-BEHIND_S, CAUGHT_UP_S = 0.8, 0.4
+#: Behind by more, s (and an interval), a level up, unless it is catching up; behind by less for a while, one down.
+BEHIND_S, CAUGHT_UP_S = 0.4, 0.2
 #: Waiting time between two steps up, before a step down, and the longest that grows to where steps down were too early.
-UP_S, DOWN_S, LONGEST_DOWN_S = 0.5, 5.0, 80.0
+UP_S, DOWN_S, LONGEST_DOWN_S = 0.3, 5.0, 80.0
 #: Of the window, the share to be behind at which nothing is tried out any more.
 ALARM = 0.4
 
@@ -57,6 +57,7 @@ class Governor:
     def __init__(self) -> None:
         self.level = 0
         self._changed_s = -1e9
+        self._went_down = False
         self._fine_since_s: float | None = None
         self._down_s = DOWN_S
         self._worst_s = 0.0  # behind by so much at the last look
@@ -64,16 +65,16 @@ class Governor:
     def look(self, lag_s: float, now_s: float, interval_s: float, window_s: float) -> bool:
         """Look at the lag of platform time, s; whether the level has changed."""
         before = self.level
-        behind = lag_s > BEHIND_S + 2.0 * interval_s
+        behind = lag_s > BEHIND_S + interval_s
         if behind:
             self._fine_since_s = None
             growing = lag_s > 0.95 * self._worst_s
             if now_s - self._changed_s > UP_S and growing:
                 step = len(LEVELS) if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
                 self.level = min(self.level + step, len(LEVELS) - 1)
-                if now_s - self._changed_s < self._down_s:  # the last step down was too early
+                if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early
                     self._down_s = min(2.0 * self._down_s, LONGEST_DOWN_S)
-                self._changed_s, self._worst_s = now_s, lag_s
+                self._changed_s, self._worst_s, self._went_down = now_s, lag_s, False
             elif not growing:
                 self._worst_s = max(0.98 * self._worst_s, lag_s)
         elif lag_s < CAUGHT_UP_S + interval_s:
@@ -81,7 +82,7 @@ class Governor:
                 self._fine_since_s = now_s
             if self.level and now_s - max(self._fine_since_s, self._changed_s) > self._down_s:
                 self.level -= 1
-                self._changed_s, self._worst_s = now_s, 0.0
+                self._changed_s, self._worst_s, self._went_down = now_s, 0.0, True
         return self.level != before
 
 
@@ -104,7 +105,7 @@ class Pacing:
         """
         if not 0 <= body.level < len(LEVELS):
             raise ValueError(f"pace of level {body.level}, wanted 0 to {len(LEVELS) - 1}")
-        self._announced.append((body.from_ns, Pace(body.level, body.lag_s)))
+        self._announced.append((body.start_ns, Pace(body.level, body.lag_s)))
 
     def follow(self, stamp_ns: int) -> Pace | None:
         """The pace that begins by now, if one does."""
@@ -150,4 +151,4 @@ class Pacing:
 def pace_message(level: int, lag_s: float, from_ns: int) -> Any:
     """The body of ``adjustment/pace``."""
     factor, kept = LEVELS[level]
-    return m.Pace(from_ns=from_ns, level=level, interval_factor=factor, kept_share=kept, lag_s=lag_s)
+    return m.Pace(start_ns=from_ns, level=level, interval_factor=factor, kept_share=kept, lag_s=lag_s)

@@ -140,7 +140,7 @@ class BusRunner:
         self._report = report or (lambda text: None)
         self._driver = StepDriver(node, time.perf_counter)
         self._check: StreamCheck[RawMessage] = StreamCheck(node.problem)
-        self._sequencer: Sequencer[Message] = Sequencer(node.inputs)
+        self._sequencer: Sequencer[tuple[Message, int]] = Sequencer(node.inputs)  # with the time of reception
         self._inbox = Inbox(newest_depth=NEWEST_DEPTH, newest_bytes=NEWEST_BYTES)
         self._lock = threading.Lock()
         self._malformed: Counter[str] = Counter()
@@ -176,11 +176,13 @@ class BusRunner:
                 heard = now
             for raw in raws:
                 self._arrive(raw, now)
-            for message in self._sequencer.pop(now, MOST_AT_ONCE):
+            received_ns = 0
+            for message, received_ns in self._sequencer.pop(now, MOST_AT_ONCE):
                 self._work(message)
-            self._look_behind()
+            # what is held back for its order does not mean that too much is to be done
+            self._look_behind(received_ns if self._sequencer.ready else 0)
             if len(self._sequencer) and now - heard > self._idle_s:
-                for message in self._sequencer.flush(ahead=False):
+                for message, _ in self._sequencer.flush(ahead=False):
                     self._work(message)
             self._tell()
         self._end()
@@ -207,7 +209,7 @@ class BusRunner:
         now = self._patience.now_s()
         for raw in self._inbox.take(0.0):
             self._arrive(raw, now)
-        for message in self._sequencer.flush():
+        for message, _ in self._sequencer.flush():
             self._work(message)
         with self._lock:
             outputs = self._driver.finish()
@@ -241,12 +243,13 @@ class BusRunner:
             if not self._ordered:
                 self._work(message)
                 continue
-            late = self._sequencer.push(accepted.topic, accepted.envelope, message, now)
+            item = message, accepted.receive_ns
+            late = self._sequencer.push(accepted.topic, accepted.envelope, item, now)
             if late is not None:
                 self._check.counts[accepted.topic].late += 1
                 behind_s = ((self._sequencer.newest_ns or 0) - accepted.envelope.stamp_ns) / 1e9
                 self.node.problem("late", f"{accepted.topic} {accepted.envelope.sequence} came {behind_s:.3f} s behind")
-                self._work(late)
+                self._work(message)
 
     def _decode(self, raw: RawMessage) -> Message | None:
         try:
@@ -267,20 +270,20 @@ class BusRunner:
             self.bus.publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)
 
-    def _look_behind(self) -> None:
-        """Tell the node how far it is behind, and publish what it decides."""
+    def _look_behind(self, received_ns: int) -> None:
+        """Tell the node for how long the message has waited that it worked on last, and publish what it decides.
+
+        0 = nothing waits. Waiting time, not platform time: a replay may be faster than life.
+        """
         now = time.monotonic()
         if now - self._looked_s < LAG_PERIOD_S or not self._worked_ns:
             return
         self._looked_s = now
         with self._lock:
-            decisions = self._driver.behind(self._lag_s(), now)
+            lag_s = max(time.time_ns() - received_ns, 0) / 1e9 if received_ns else 0.0
+            decisions = self._driver.behind(lag_s, now)
         for decision in decisions:
             self.bus.publish(decision)
-
-    def _lag_s(self) -> float:
-        newest = self._sequencer.newest_ns or self._worked_ns
-        return max(0, newest - self._worked_ns) / 1e9 if self._worked_ns else 0.0
 
     # ---- what others see
 
@@ -311,7 +314,8 @@ class BusRunner:
             self._collections.if_due()
         newest = self._sequencer.newest_ns or self._worked_ns
         queued = len(self._inbox) + len(self._sequencer)
-        extra, lag_s = dict(self._malformed), self._lag_s()
+        lag_s = max(0, newest - self._worked_ns) / 1e9 if self._worked_ns else 0.0
+        extra = dict(self._malformed)
         self._status.publish(state or self.node.state(), self._statistics(), self.node, lag_s, queued, newest, extra)
 
 

@@ -59,7 +59,7 @@ class Node:
         return ()
 
     def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
-        """What follows from being behind by ``lag_s`` of platform time at waiting time ``now_s``; live only."""
+        """What follows from working on messages that have waited for ``lag_s`` at time ``now_s``; live only."""
         return ()
 
     def state(self) -> str:

@@ -227,7 +227,7 @@ class Sequencer(Generic[T]):
             self._unheard.pop(row.name, None)
             place = (topics.rank(topic), topic, envelope.source)
             lateness, grace_s = self._patience(row)
-            on_events = row.rate_hz == 0 and row.family is not Family.OBSERVATION or row.in_bursts
+            on_events = row.in_bursts or (row.rate_hz == 0 and row.family is not Family.OBSERVATION)
             stream = _Watermark(place, lateness, grace_s, on_events, stamp, now_s)
             self._streams[topic, envelope.source] = stream
         stream.latest_ns = max(stream.latest_ns, stamp)
@@ -242,7 +242,7 @@ class Sequencer(Generic[T]):
         return None
 
     def pop(self, now_s: float, most: int | None = None) -> list[T]:
-        """The messages whose turn has come, in order; ``most`` of them at most, then `ready` says that there are more."""
+        """The messages whose turn has come, in order; if there are more than ``most``, `ready` is set."""
         out: list[T] = []
         self.ready = False
         while self._heap and self._may_leave(self._heap[0][0], now_s):

@@ -48,6 +48,8 @@ class Topic:
     recorded : whether the recorder keeps it
     latched : whether all that was sent so far is handed to whoever joins later
     grace_s : waiting time for which whoever needs its order waits for it when it falls silent, s; 0 = by its rate alone
+    in_bursts : whether many messages come together and then none for a while; only what its publisher says on other
+        topics tells whether something is missing
     """
 
     name: str
@@ -59,6 +61,7 @@ class Topic:
     recorded: bool = True
     latched: bool = False
     grace_s: float = 0.0
+    in_bursts: bool = False
 
     @property
     def type_name(self) -> str:
@@ -85,7 +88,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("sensor/gnss", m.LocationFix, _S, 5, allowed_lateness_ms=20),
     Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST),
     Topic("trajectory/filtered", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
-    Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
+    Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100, in_bursts=True),
     Topic("observation/control", m.GroundPoint, _O, 0, latched=True),
     Topic("observation/verdict", m.Verdict, _O, 0),
     Topic("observation/tie", m.TiePoint, _O, 50),
