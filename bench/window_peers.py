@@ -5,7 +5,8 @@
 One strip, DGR-type globals, a segment each 2 s, window 40 s, TLS-18. GTSAM (wheel ``gtsam``) gets the window's own
 linearised rows, one custom factor a point, evaluated once; so hardly any time goes into residuals. Ceres
 (libceres-dev) solves a network of the same size (LIM with 20 fixes, TLS-18), residuals in C++ with automatic
-derivatives; a warm window needs about two steps of it. All on one thread; our updates also test, publish and
+derivatives; a warm window needs about two steps of it. All on one thread
+(set OPENBLAS_NUM_THREADS=1); our updates also test, publish and
 marginalise. What is not installed is left out, and said.
 """
 
@@ -13,16 +14,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
-
-for library in ("OPENBLAS", "OMP"):
-    os.environ[f"{library}_NUM_THREADS"] = "1"
 
 import numpy as np
 
@@ -121,7 +118,7 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
         return blocks
 
     times, point, border, started = [], 0, -2, False
-    for now_s, rays, points in recorded.updates:
+    for now_s, _, points in recorded.updates:
         graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
 
         def enter(key: int, stamp: float, values=values, stamps=stamps) -> None:
@@ -219,15 +216,15 @@ def main() -> None:
         print("GTSAM: not installed (pip install gtsam), left out")
     else:
         p50, p99 = np.percentile(theirs, [50, 99])
-        print(f"GTSAM IncrementalFixedLagSmoother, p50 and p99, ms: {p50:.1f} {p99:.1f}"
-              f"   ours / GTSAM: {np.percentile(ours, 50) / p50:.3f} {np.percentile(ours, 99) / p99:.3f}", flush=True)  # fmt: skip
+        ratios = f"{np.percentile(ours, 50) / p50:.3f} {np.percentile(ours, 99) / p99:.3f}"
+        print(f"GTSAM IncrementalFixedLagSmoother, p50 and p99, ms: {p50:.1f} {p99:.1f}   ours / GTSAM: {ratios}")
     solved = ceres_ms(rays)
     if solved is None:
         print("Ceres: not installed (apt-get install cmake g++ libceres-dev), left out")
     else:
         whole, step = solved
-        print(f"Ceres, from the start and two warm steps, ms: {whole:.1f} {2 * step:.1f}"
-              f"   ours / Ceres: {np.percentile(ours, 50) / whole:.3f} {np.percentile(ours, 50) / (2 * step):.3f}")  # fmt: skip
+        ratios = f"{np.percentile(ours, 50) / whole:.3f} {np.percentile(ours, 50) / (2 * step):.3f}"
+        print(f"Ceres, from the start and two warm steps, ms: {whole:.1f} {2 * step:.1f}   ours / Ceres: {ratios}")
 
 
 if __name__ == "__main__":

@@ -138,7 +138,7 @@ def _square(values: Any, n: int, name: str) -> Array | None:
         raise ValueError(f"{name} has {len(values)} values, wanted {n * n}")
     numbers = list(values)
     matrix = np.array(numbers).reshape(n, n)
-    if not math.isfinite(sum(numbers)) and not np.isfinite(matrix).all() or min(numbers[:: n + 1]) < 0:
+    if not (math.isfinite(sum(numbers)) or np.isfinite(matrix).all()) or min(numbers[:: n + 1]) < 0:
         raise ValueError(f"{name} is not finite or has a negative variance")
     return matrix
 

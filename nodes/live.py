@@ -176,11 +176,11 @@ class BusRunner:
                 heard = now
             for raw in raws:
                 self._arrive(raw, now)
-            received_ns = 0
-            for message, received_ns in self._sequencer.pop(now, MOST_AT_ONCE):
+            turn = self._sequencer.pop(now, MOST_AT_ONCE)
+            for message, _ in turn:
                 self._work(message)
             # what is held back for its order does not mean that too much is to be done
-            self._look_behind(received_ns if self._sequencer.ready else 0)
+            self._look_behind(turn[-1][1] if self._sequencer.ready else 0)
             if len(self._sequencer) and now - heard > self._idle_s:
                 for message, _ in self._sequencer.flush(ahead=False):
                     self._work(message)
