@@ -52,7 +52,8 @@ def latency(args: argparse.Namespace) -> dict[str, object]:
     p50, p90, p99 = np.percentile(ms, [50, 90, 99])
     unknowns = max(r.unknowns - 3 * r.points for r in result.reports)
     return {
-        "rays in window": [int(rays.min()), int(rays.max())], "unknowns without points": unknowns, "updates": int(full.sum()),
+        "rays in window": [int(rays.min()), int(rays.max())], "unknowns without points": unknowns,
+        "updates": int(full.sum()),
         "p50_ms": p50, "p90_ms": p90, "p99_ms": p99, "max_ms": ms.max(),
         "max_ms at the end of the strip": all_ms[now_s > end_s].max(),
     }  # fmt: skip
