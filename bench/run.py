@@ -17,7 +17,11 @@ BENCHMARKS = {
     "inertial navigation": ["navigation.py"],
     "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
     "a-priori weights from the trajectory": ["apriori.py"],
-    "sliding window": ["window.py"],
+    "sliding window: latency of updates": ["window.py", "latency", "--selfcal"],
+    "sliding window beside GTSAM and Ceres": ["window_peers.py"],
+    "tie point to orientation over the bus": ["tie_latency.py"],
+    "an hour of flight through process": ["process_hour.py", "--share", "0.2"],
+    "memory and latency over hours": ["long_flight.py", "--hours", "1"],
     "orthoimage": ["orthoimage.py"],
 }
 

@@ -14,22 +14,29 @@ from ..solver.window import AHEAD_S, Window
 from ..solver.window_results import TAKEN_BACK, Look, Refusal, WindowOptions, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
+from .adjuster_pace import Governor, Pace, Pacing, pace_message
 from .adjuster_poses import OrientationStore, PoseBuffer, SlowHistory
 from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
+PACES = ("load", "normal")
 #: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
 NEAR_START_S = 1.0
+#: Length of the window while it is not known, s.
+DEFAULT_WINDOW_S = 25.0
 
 
 class Adjuster(Node):
     """Runs the sliding window.
 
     The window is updated when the first message comes whose stamp lies beyond the next multiple of ``update_s`` of
-    platform time, with what came before it; so batches depend on stamps alone. The live orientation follows every pose
-    at once.
+    platform time, with what came before it, and as soon as ``update_rays`` new image points wait; so batches depend on
+    the messages alone. The live orientation follows every pose on its grid, and every update for waiting image points.
+
+    Where updates take longer than the data allows, a live adjuster takes larger batches, then leaves out tie points
+    (`adjuster_pace`); it never falls behind by a window.
 
     Parameters
     ----------
@@ -37,6 +44,9 @@ class Adjuster(Node):
     segment_s : longest segment of the model, s; without it a fifteenth of the correlation time of the wander
     window_s, window_looks, grid_hz, settle_s, snoop : as in `WindowOptions`
     update_s : platform time between updates
+    update_rays : waiting image points after which an update does not wait for its time
+    pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
+        the flight was recorded; "normal", everything at its time, however long it takes
     self_calibration : set of additional parameters, or "none"
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
@@ -57,6 +67,8 @@ class Adjuster(Node):
     )
     outputs = ("orientation/live", "orientation/final", "point/object", "adjustment/report", "event/log")
 
+    decisions = ("adjustment/pace",)
+
     def __init__(
         self,
         *,
@@ -68,6 +80,8 @@ class Adjuster(Node):
         settle_s: float = WindowOptions.settle_s,
         snoop: bool = True,
         update_s: float = 0.2,
+        update_rays: int = 16,
+        pace: str = "load",
         self_calibration: str = "none",
         apriori: str = "trajectory",
     ) -> None:
@@ -76,9 +90,13 @@ class Adjuster(Node):
             raise ValueError(f"update_s: wanted more than 0, got {update_s}")
         if segment_s is not None and not segment_s > 0:
             raise ValueError(f"segment_s is {segment_s:g}, wanted more than 0 s (leave it out for the default)")
+        if not update_rays > 0:
+            raise ValueError(f"update_rays: wanted more than 0, got {update_rays}")
         if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
             known = ", ".join(("none", *SELF_CALIBRATIONS))
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
+        if pace not in PACES:
+            raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if apriori not in APRIORI:
             raise ValueError(f"apriori: {apriori!r} is not known, wanted one of {', '.join(APRIORI)}")
         self.options = WindowOptions(
@@ -86,6 +104,9 @@ class Adjuster(Node):
             settle_s=settle_s, snoop=snoop,
         )  # fmt: skip
         self._update_ns = round(update_s * convert.SECOND_NS)
+        self._update_rays, self._by_load = update_rays, pace == "load"
+        self._rays_waiting = 0
+        self._pacing, self._governor = Pacing(), Governor()
         self._self_calibration = self_calibration
         self._window: Window | None = None
         self._project: Any = None
@@ -111,27 +132,40 @@ class Adjuster(Node):
         self._returned_total = 0
         self._light = ("good", "no strip is flown")
         self._next_live = -np.inf
+        self._newest_pose_s: float | None = None
 
     # -- node ----------------------------------------------------------------------------------------------------------
 
     def step(self, message: Message) -> Iterable[Message]:
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
-        outputs = self._update_if_due(message.stamp_ns)
+        outputs = self._begin_pace(message.stamp_ns) + self._update_if_due(message.stamp_ns)
         try:
             outputs += self._take(message)
         except ValueError as error:
             self.problem("malformed", f"{message.topic}: {error}")
         return outputs
 
+    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
+        if self._window is None or self._next_update_ns is None or not self._by_load:
+            return ()
+        interval_s = self._interval_ns / convert.SECOND_NS
+        if not self._governor.look(lag_s, now_s, interval_s, self._window.length_s or DEFAULT_WINDOW_S):
+            return ()
+        body = pace_message(self._governor.level, lag_s, max(self._next_update_ns, self._stamp_ns + 1))
+        self._pacing.announce(body)
+        return [Message("adjustment/pace", self._stamp_ns, body)]
+
     def finish(self) -> Iterable[Message]:
         if self._window is None:
             return ()
         self._hand_over_poses()
+        self._take_ties()
         return self._results(self._window.finish())
 
     def state(self) -> str:
         if self._window is not None:
-            return "running"
+            pace = self._pacing.pace
+            return f"running, {pace.words(self._update_ns / convert.SECOND_NS)}" if pace.level else "running"
         missing = [n for n, c in (("project", self._project), ("camera", self._camera)) if c is None]
         return "waiting for " + ", ".join(f"configuration/{n}" for n in missing)
 
@@ -164,7 +198,10 @@ class Adjuster(Node):
         if topic.startswith("trajectory/"):
             return self._pose(body, topic == "trajectory/smoothed")
         if topic == "observation/tie":
-            self._tie(body, message.source)
+            return self._tie_came(body, message.source, message.stamp_ns)
+        if topic == "adjustment/pace":
+            if self._by_load:
+                self._pacing.announce(body)
         elif topic == "observation/control":
             self._ground_point(body)
         elif topic == "observation/verdict":
@@ -278,10 +315,38 @@ class Adjuster(Node):
         verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
         return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
 
-    def _tie(self, body: Any, source: str) -> None:
+    def _tie_came(self, body: Any, source: str, stamp_ns: int) -> list[Message]:
+        """Take a tie point, or let it wait for the choice; an update, if enough have come."""
         if self._window is None:
             self.problem("before configuration", "observation/tie came before configuration/project and camera")
+            return []
+        self._rays_waiting += len(body.images)
+        if self._pacing.pace.kept < 1.0 and body.point not in self._control:
+            self._pacing.waiting.append((body, source))
+        else:
+            self._tie(body, source)
+        if self._rays_waiting < self._update_rays * self._pacing.pace.factor or self._pacing.pace.kept < 1.0:
+            return []
+        outputs = self._update(stamp_ns)
+        if self._newest_pose_s is not None:
+            outputs += self._live(self._newest_pose_s, at_once=True)
+        return outputs
+
+    def _take_ties(self) -> None:
+        """Of the tie points that wait because of the load, take those that tell most."""
+        if not self._pacing.waiting:
             return
+        rates = {id: s.line_rate_hz for id, s in self._strips.items()}
+        starts = {id: s.first_line_time_ns for id, s in self._strips.items()}
+        pixels = {line.id: len(line.x_mm) for line in self._camera.lines}
+        before = self._pacing.left_out_total
+        for body, source in self._pacing.take_waiting(rates, starts, pixels):
+            self._tie(body, source)
+        if self._pacing.left_out_total > before:
+            self.counters["left out because of the load"] += self._pacing.left_out_total - before
+
+    def _tie(self, body: Any, source: str) -> None:
+        assert self._window is not None
         if self._held_strips and any(image.strip in self._held_strips for image in body.images):
             self._held_ties.append((body, source))
             return
@@ -307,6 +372,8 @@ class Adjuster(Node):
         self._poses.add(time_s, sample, smoothed, body.reason)
         if self._held_strips:
             self._begin_held()
+        if not (smoothed and self._poses.filtered_seen):
+            self._newest_pose_s = time_s
         # without a filter (an imported trajectory) the smoothed poses lead
         if smoothed and self._poses.filtered_seen:
             return []
@@ -314,13 +381,17 @@ class Adjuster(Node):
 
     # -- output --------------------------------------------------------------------------------------------------------
 
-    def _live(self, time_s: float) -> list[Message]:
+    def _live(self, time_s: float, at_once: bool = False) -> list[Message]:
+        """Live orientation on the grid up to a pose, or at the time of the pose at once."""
         assert self._window is not None
         hz = self.options.grid_hz
-        if time_s < self._next_live:
+        if at_once:
+            due = np.array([time_s])
+        elif time_s < self._next_live:
             return []
-        due = self._window.grid(max(self._next_live, time_s - 1.0), time_s + 1e-6)
-        self._next_live = (np.floor(time_s * hz + 1e-6) + 1) / hz - 1e-6
+        else:
+            due = self._window.grid(max(self._next_live, time_s - 1.0), time_s + 1e-6)
+            self._next_live = (np.floor(time_s * hz + 1e-6) + 1) / hz - 1e-6
         if not len(due) or self._window.strip_at(time_s) is None:
             return []
         self._hand_over_poses()
@@ -337,15 +408,35 @@ class Adjuster(Node):
     def _update_if_due(self, stamp_ns: int) -> list[Message]:
         if self._window is None:
             return []
+        interval = self._interval_ns
         if self._next_update_ns is None:
-            self._next_update_ns = (stamp_ns // self._update_ns + 1) * self._update_ns
+            self._next_update_ns = (stamp_ns // interval + 1) * interval
         if stamp_ns < self._next_update_ns:
             return []
-        now_ns = stamp_ns // self._update_ns * self._update_ns
-        self._next_update_ns = now_ns + self._update_ns
+        now_ns = stamp_ns // interval * interval
+        self._next_update_ns = now_ns + interval
+        return self._update(now_ns)
+
+    def _update(self, now_ns: int) -> list[Message]:
+        assert self._window is not None
+        self._rays_waiting = 0
         self._hand_over_poses()
         self._used_to_s = self._seconds(now_ns) + AHEAD_S
+        self._take_ties()
         return self._results(self._window.update(self._seconds(now_ns)))
+
+    @property
+    def _interval_ns(self) -> int:
+        """Platform time between updates at the present pace."""
+        return self._update_ns * self._pacing.pace.factor
+
+    def _begin_pace(self, stamp_ns: int) -> list[Message]:
+        """Go over to a pace that was announced, and say so."""
+        pace: Pace | None = self._pacing.follow(stamp_ns)
+        if pace is None:
+            return []
+        words = pace.words(self._update_ns / convert.SECOND_NS)
+        return [self._log(words, warning=pace.level > 0)]
 
     def _hand_over_poses(self) -> None:
         assert self._window is not None
@@ -405,6 +496,9 @@ class Adjuster(Node):
                     self._reference_ns, self._stamp_ns,
                 )
             )  # fmt: skip
+            pace, body = self._pacing.pace, outputs[-1].body
+            body.update_interval_s = self._interval_ns / convert.SECOND_NS
+            body.kept_share, body.left_out_total = pace.kept, self._pacing.left_out_total
             self._updates += 1
             watched, before = update.report.watched, (self._light[0], self._sources)
             self._light, self._sources = (watched.light, watched.reason), watched.names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -107,17 +108,23 @@ def pose_sample(message: Any) -> PoseSample:
     ValueError : a value that is not finite, a quaternion that is not a rotation, a covariance of the wrong size
     """
     p, q = message.pose.position, message.pose.orientation
+    x, y, z, w = q.x, q.y, q.z, q.w
     position = np.array([p.x, p.y, p.z])
-    quaternion = np.array([q.x, q.y, q.z, q.w])
-    if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
+    if not math.isfinite(p.x + p.y + p.z + x + y + z + w):
         raise ValueError("pose is not finite")
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
     if abs(norm - 1.0) > 1e-3:
         raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
     covariance = _square(message.covariance, 6, "covariance")
     correction = np.array(message.correction) if message.correction else None
     return PoseSample(
-        time_ns(message.timestamp), position, quaternion / norm, covariance, message.valid, message.strip, correction
+        time_ns(message.timestamp),
+        position,
+        np.array([x / norm, y / norm, z / norm, w / norm]),
+        covariance,
+        message.valid,
+        message.strip,
+        correction,
     )
 
 
@@ -132,8 +139,9 @@ def _square(values: Any, n: int, name: str) -> Array | None:
         return None
     if len(values) != n * n:
         raise ValueError(f"{name} has {len(values)} values, wanted {n * n}")
-    matrix = np.array(values).reshape(n, n)
-    if not np.isfinite(matrix).all() or (np.diagonal(matrix) < 0).any():
+    numbers = list(values)
+    matrix = np.array(numbers).reshape(n, n)
+    if not (math.isfinite(sum(numbers)) or np.isfinite(matrix).all()) or min(numbers[:: n + 1]) < 0:
         raise ValueError(f"{name} is not finite or has a negative variance")
     return matrix
 

@@ -15,6 +15,7 @@ from ..schemas import messages as m
 from ..schemas.envelope import RawMessage
 from ..schemas.topics import Family, Queue
 from .bus import Bus
+from .collection import RareCollections
 from .node import Message, Node
 from .ordering import Sequencer, StreamCheck, TopicCounts, order_key
 from .runner import StepDriver
@@ -30,6 +31,10 @@ IDLE_RESULTS_S = 2.0
 #: Time in which latched topics arrive before the first message is worked off.
 JOIN_S = 0.5
 STATUS_PERIOD_S = 0.5
+#: Messages worked off before it is looked what has arrived meanwhile.
+MOST_AT_ONCE = 64
+#: How often a node is told how far it is behind.
+LAG_PERIOD_S = 0.1
 #: Between the last message and the end of the session, for what is still on its way.
 LAST_WORDS_S = 0.2
 
@@ -118,6 +123,7 @@ class BusRunner:
     bus : an open bus
     report : called with one line for things a person should see
     stop : set from outside when the node shall end
+    collections : where garbage is collected only when the runner says so
     """
 
     def __init__(
@@ -127,19 +133,22 @@ class BusRunner:
         report: Callable[[str], None] | None = None,
         *,
         stop: threading.Event | None = None,
+        collections: RareCollections | None = None,
     ) -> None:
         self.node = node
         self.bus = bus
         self._report = report or (lambda text: None)
         self._driver = StepDriver(node, time.perf_counter)
         self._check: StreamCheck[RawMessage] = StreamCheck(node.problem)
-        self._sequencer: Sequencer[Message] = Sequencer(node.inputs)
+        self._sequencer: Sequencer[tuple[Message, int]] = Sequencer(node.inputs)  # with the time of reception
         self._inbox = Inbox(newest_depth=NEWEST_DEPTH, newest_bytes=NEWEST_BYTES)
         self._lock = threading.Lock()
         self._malformed: Counter[str] = Counter()
         self._stop = stop or threading.Event()
         self._patience = _Patience()
         self._worked_ns = 0
+        self._looked_s = 0.0
+        self._collections = collections
         self._status = StatusPublisher(bus, node.name)
         results = any(topics.find(name).family is Family.RESULT for name in node.inputs)
         # Who publishes nothing needs no order, and must not slow down those who do.
@@ -154,23 +163,26 @@ class BusRunner:
         """Work until `stop`, then work off what waits, finish the node and publish what follows."""
         for name in self.node.inputs:
             self.bus.subscribe(name, self._receive, self._malformed_envelope)
-        self.bus.prepare(self.node.outputs)
+        self.bus.prepare((*self.node.outputs, *self.node.decisions))
         self._declare_queries()
         self.bus.announce(self.node.name)
         self._status.publish("starting", self._statistics(), self.node, 0.0, 0, 0)
         self._join()
         heard = self._patience.now_s()
         while not self._stop.is_set():
-            raws = self._inbox.take(0.02)
+            raws = self._inbox.take(0.0 if self._sequencer.ready else 0.02)
             now = self._patience.now_s()
             if raws:
                 heard = now
             for raw in raws:
                 self._arrive(raw, now)
-            for message in self._sequencer.pop(now):
+            turn = self._sequencer.pop(now, MOST_AT_ONCE)
+            for message, _ in turn:
                 self._work(message)
+            # what is held back for its order does not mean that too much is to be done
+            self._look_behind(turn[-1][1] if self._sequencer.ready else 0)
             if len(self._sequencer) and now - heard > self._idle_s:
-                for message in self._sequencer.flush(ahead=False):
+                for message, _ in self._sequencer.flush(ahead=False):
                     self._work(message)
             self._tell()
         self._end()
@@ -197,7 +209,7 @@ class BusRunner:
         now = self._patience.now_s()
         for raw in self._inbox.take(0.0):
             self._arrive(raw, now)
-        for message in self._sequencer.flush():
+        for message, _ in self._sequencer.flush():
             self._work(message)
         with self._lock:
             outputs = self._driver.finish()
@@ -231,12 +243,13 @@ class BusRunner:
             if not self._ordered:
                 self._work(message)
                 continue
-            late = self._sequencer.push(accepted.topic, accepted.envelope, message, now)
+            item = message, accepted.receive_ns
+            late = self._sequencer.push(accepted.topic, accepted.envelope, item, now)
             if late is not None:
                 self._check.counts[accepted.topic].late += 1
                 behind_s = ((self._sequencer.newest_ns or 0) - accepted.envelope.stamp_ns) / 1e9
                 self.node.problem("late", f"{accepted.topic} {accepted.envelope.sequence} came {behind_s:.3f} s behind")
-                self._work(late)
+                self._work(message)
 
     def _decode(self, raw: RawMessage) -> Message | None:
         try:
@@ -256,6 +269,21 @@ class BusRunner:
         for output in outputs:
             self.bus.publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)
+
+    def _look_behind(self, received_ns: int) -> None:
+        """Tell the node for how long the message has waited that it worked on last, and publish what it decides.
+
+        0 = nothing waits. Waiting time, not platform time: a replay may be faster than life.
+        """
+        now = time.monotonic()
+        if now - self._looked_s < LAG_PERIOD_S or not self._worked_ns:
+            return
+        self._looked_s = now
+        with self._lock:
+            lag_s = max(time.time_ns() - received_ns, 0) / 1e9 if received_ns else 0.0
+            decisions = self._driver.behind(lag_s, now)
+        for decision in decisions:
+            self.bus.publish(decision)
 
     # ---- what others see
 
@@ -282,9 +310,11 @@ class BusRunner:
     def _tell(self, force: bool = False, state: str | None = None) -> None:
         if not force and not self._status.due():
             return
+        if self._collections is not None:
+            self._collections.if_due()
         newest = self._sequencer.newest_ns or self._worked_ns
-        lag_s = max(0, newest - self._worked_ns) / 1e9 if self._worked_ns else 0.0
         queued = len(self._inbox) + len(self._sequencer)
+        lag_s = max(0, newest - self._worked_ns) / 1e9 if self._worked_ns else 0.0
         extra = dict(self._malformed)
         self._status.publish(state or self.node.state(), self._statistics(), self.node, lag_s, queued, newest, extra)
 

@@ -43,6 +43,8 @@ class Node:
     name: ClassVar[str]
     inputs: ClassVar[tuple[str, ...]]
     outputs: ClassVar[tuple[str, ...]]
+    #: Outputs that are decided live by the load of the machine; in `process` the recorded ones are inputs instead.
+    decisions: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -54,6 +56,10 @@ class Node:
 
     def finish(self) -> Iterable[Message]:
         """What was still held back when the last message has come."""
+        return ()
+
+    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
+        """What follows from working on messages that have waited for ``lag_s`` at time ``now_s``; live only."""
         return ()
 
     def state(self) -> str:

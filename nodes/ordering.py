@@ -166,6 +166,7 @@ class _Watermark:
     place: tuple[int, str, str]
     lateness_ns: int
     grace_s: float
+    on_events: bool
     latest_ns: int
     heard_s: float
 
@@ -176,9 +177,11 @@ class Sequencer(Generic[T]):
     A message leaves when no other stream can still bring one that belongs before it: the stream has passed it, or has
     been silent while platform time went on by more than the allowed lateness of its topic. A steady stream (one with a
     high rate, or that the table grants grace) must also have been silent for ``grace_s`` (or that grace) of waiting
-    time, so that a machine that hesitates does not change the order. What arrives after its place has passed leaves at
-    once, and is called late. Observations may be stamped ahead (when they are to be used), so they do not tell how far
-    platform time is, unless nobody else does or a steady stream has died.
+    time, so that a machine that hesitates does not change the order. A topic on which something is said only now and
+    then (control, strips) or in bursts holds nothing up while its publisher is heard on other topics: a session
+    delivers in the order in which it was published. What arrives after its place has passed leaves at once, and is
+    called late. Observations may be stamped ahead (when they are to be used), so they do not tell how far platform time
+    is, unless nobody else does or a steady stream has died.
 
     Parameters
     ----------
@@ -191,11 +194,13 @@ class Sequencer(Generic[T]):
     def __init__(self, inputs: Iterable[str], *, grace_s: float = 0.5) -> None:
         self._heap: list[tuple[Key, int, T]] = []
         self._grace_s = grace_s
+        self.ready = False
         self._arrivals = 0
         self._newest_ns: int | None = None
         self._time_ns: int | None = None  # the same without observations
         self._released: Key | None = None
         self._streams: dict[tuple[str, str], _Watermark] = {}
+        self._sources: dict[str, int] = {}  # newest stamp of each, without observations
         self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
         self._started_s: float | None = None
 
@@ -222,8 +227,12 @@ class Sequencer(Generic[T]):
             self._unheard.pop(row.name, None)
             place = (topics.rank(topic), topic, envelope.source)
             lateness, grace_s = self._patience(row)
-            stream = self._streams[topic, envelope.source] = _Watermark(place, lateness, grace_s, stamp, now_s)
+            on_events = row.in_bursts or (row.rate_hz == 0 and row.family is not Family.OBSERVATION)
+            stream = _Watermark(place, lateness, grace_s, on_events, stamp, now_s)
+            self._streams[topic, envelope.source] = stream
         stream.latest_ns = max(stream.latest_ns, stamp)
+        if topics.find(topic).family is not Family.OBSERVATION:  # those may be stamped ahead
+            self._sources[envelope.source] = max(self._sources.get(envelope.source, stamp), stamp)
         stream.heard_s = now_s
         key = order_key(topic, envelope)
         if self._released is not None and key < self._released:
@@ -232,10 +241,14 @@ class Sequencer(Generic[T]):
         heapq.heappush(self._heap, (key, self._arrivals, item))
         return None
 
-    def pop(self, now_s: float) -> list[T]:
-        """The messages whose turn has come, in order."""
+    def pop(self, now_s: float, most: int | None = None) -> list[T]:
+        """The messages whose turn has come, in order; if there are more than ``most``, `ready` is set."""
         out: list[T] = []
+        self.ready = False
         while self._heap and self._may_leave(self._heap[0][0], now_s):
+            if most is not None and len(out) == most:
+                self.ready = True
+                break
             out.append(self._take())
         return out
 
@@ -259,7 +272,7 @@ class Sequencer(Generic[T]):
         for stream in self._streams.values():
             if stream.place == (rank, topic, source):
                 continue
-            bound = stream.latest_ns
+            bound = self._sources.get(stream.place[2], stream.latest_ns) if stream.on_events else stream.latest_ns
             if not now_s - stream.heard_s < stream.grace_s:
                 bound = max(bound, (newest_ns if stream.grace_s else time_ns) - stream.lateness_ns)
             if bound < stamp or (bound == stamp and stream.place < (rank, topic, source)):

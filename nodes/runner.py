@@ -46,6 +46,10 @@ class StepDriver:
         self.time_ns = max(self.time_ns, message.stamp_ns)
         return self._collect(lambda: self.node.step(message), f"{message.topic} {message.sequence}")
 
+    def behind(self, lag_s: float, now_s: float) -> list[Message]:
+        """The decisions that follow from being behind; see `Node.behind`."""
+        return self._collect(lambda: self.node.behind(lag_s, now_s), "being behind")
+
     def finish(self) -> list[Message]:
         """The outputs that were held back."""
         return self._collect(self.node.finish, "the end")
@@ -62,7 +66,8 @@ class StepDriver:
         return [self._stamped(output, elapsed) for output in outputs]
 
     def _stamped(self, output: Message, elapsed: float) -> Message:
-        if not any(topics.find(name).matches(output.topic) for name in self.node.outputs):
+        allowed = (*self.node.outputs, *self.node.decisions)
+        if not any(topics.find(name).matches(output.topic) for name in allowed):
             raise ValueError(f"{self.node.name} gave {output.topic}, its outputs are {', '.join(self.node.outputs)}")
         if self._clock and getattr(output.body, "compute_s", None) == 0.0:
             output.body.compute_s = elapsed
@@ -180,7 +185,9 @@ def process(
 
     def listening(topic: str) -> list[StepDriver]:
         if topic not in listeners:
-            listeners[topic] = [d for d in drivers if any(topics.find(n).matches(topic) for n in d.node.inputs)]
+            listeners[topic] = [
+                d for d in drivers if any(topics.find(n).matches(topic) for n in (*d.node.inputs, *d.node.decisions))
+            ]
         return listeners[topic]
 
     pending: list[tuple[Key, Message, RawMessage]] = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 from typing import Any
 
 from . import messages as m
@@ -28,6 +29,7 @@ class Family(Enum):
     OBSERVATION = "observation"
     RESULT = "result"
     STATUS = "status"
+    DECISION = "decision"  # what a live node decided by the load of its machine; recorded, and followed by `process`
     TRUTH = "truth"  # of a simulation; no estimating node may read it
 
 
@@ -46,6 +48,8 @@ class Topic:
     recorded : whether the recorder keeps it
     latched : whether all that was sent so far is handed to whoever joins later
     grace_s : waiting time for which whoever needs its order waits for it when it falls silent, s; 0 = by its rate alone
+    in_bursts : whether many messages come together and then none for a while; only what its publisher says on other
+        topics tells whether something is missing
     """
 
     name: str
@@ -57,6 +61,7 @@ class Topic:
     recorded: bool = True
     latched: bool = False
     grace_s: float = 0.0
+    in_bursts: bool = False
 
     @property
     def type_name(self) -> str:
@@ -83,7 +88,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("sensor/gnss", m.LocationFix, _S, 5, allowed_lateness_ms=20),
     Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST),
     Topic("trajectory/filtered", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
-    Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
+    Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100, in_bursts=True),
     Topic("observation/control", m.GroundPoint, _O, 0, latched=True),
     Topic("observation/verdict", m.Verdict, _O, 0),
     Topic("observation/tie", m.TiePoint, _O, 50),
@@ -95,6 +100,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
     Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("orthoimage/final", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
+    Topic("adjustment/pace", m.Pace, Family.DECISION, 0),
     Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
     Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
     Topic("event/log", m.Log, Family.STATUS, 0),
@@ -102,6 +108,7 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 
+@lru_cache(maxsize=1024)
 def find(topic: str) -> Topic:
     """The row of a topic; raises KeyError for one that is not in the table."""
     for row in TOPICS:
@@ -110,6 +117,7 @@ def find(topic: str) -> Topic:
     raise KeyError(topic)
 
 
+@lru_cache(maxsize=1024)
 def rank(topic: str) -> int:
     """Place in the table: decides between messages with equal stamps."""
     return TOPICS.index(find(topic))

@@ -15,6 +15,9 @@ from .selfcalibration import CameraDesign, SelfCalibration
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
+#: Up to so many rays all terms of the corrections are formed at once.
+FEW_RAYS = 512
+
 
 @dataclass(frozen=True)
 class CorrectionSet:
@@ -78,6 +81,9 @@ class Layout:
         """Orientation corrections (6, n) of the rays, or of a range of them."""
         padded = np.append(theta[: self.n_model], 0.0)
         coefficients = self.coefficients[:, rays]
+        if coefficients.shape[1] <= FEW_RAYS:  # one product costs less than many calls
+            sums = (self.component == np.arange(6)[:, None]).astype(float)
+            return sums @ (padded.take(self.columns[:, rays]) * coefficients.take(self.node, axis=0))
         total = np.zeros((6, coefficients.shape[1]))
         for node, component, columns in zip(self.node, self.component, self.columns, strict=True):
             value = padded.take(columns[rays])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -100,7 +101,9 @@ class DenseFactor:
     def inverse(self) -> Array:
         """(n, n) cofactor matrix."""
         if self._inverse is None:
-            self._inverse = _inverse_of(self._factor) * self.scale[:, None] * self.scale
+            self._inverse = _inverse_of(self._factor)
+            self._inverse *= self.scale[:, None]
+            self._inverse *= self.scale
         return self._inverse
 
     def cofactors(self, columns: NDArray[np.int64]) -> Array:
@@ -305,4 +308,10 @@ def _inverse_of(factor: Array | None) -> Array:
     if factor is None or not len(factor):
         return np.empty((0, 0))
     lower, _ = _potri(factor, lower=1)
-    return np.tril(lower) + np.tril(lower, -1).T
+    return np.where(_upper(len(lower)), lower.T, lower)
+
+
+@lru_cache(maxsize=8)
+def _upper(n: int) -> NDArray[np.bool_]:
+    """Which elements of an (n, n) matrix stand above its diagonal."""
+    return ~np.tri(n, dtype=bool)

@@ -65,14 +65,16 @@ def angles_jacobian(angles: ArrayLike) -> Array:
     a = np.asarray(angles, dtype=float)
     so, co = np.sin(a[..., 0]), np.cos(a[..., 0])
     sp, cp = np.sin(a[..., 1]), np.cos(a[..., 1])
-    axes = np.zeros((*a.shape[:-1], 3, 3))
-    axes[..., 0, 0] = 1.0
-    axes[..., 1, 1] = co
-    axes[..., 2, 1] = so
-    axes[..., 0, 2] = sp
-    axes[..., 1, 2] = -so * cp
-    axes[..., 2, 2] = co * cp
-    return np.linalg.inv(axes)
+    # the inverse of [1 0 sp; 0 co -so cp; 0 so co cp], the axes of the three turns
+    J = np.zeros((*a.shape[:-1], 3, 3))
+    J[..., 0, 0] = 1.0
+    J[..., 0, 1] = so * sp / cp
+    J[..., 0, 2] = -co * sp / cp
+    J[..., 1, 1] = co
+    J[..., 1, 2] = so
+    J[..., 2, 1] = -so / cp
+    J[..., 2, 2] = co / cp
+    return J
 
 
 def matrix_from_navigation(roll: ArrayLike, pitch: ArrayLike, heading: ArrayLike) -> Array:

@@ -14,6 +14,7 @@ from .rotation import (
     quaternion_conjugate,
     quaternion_from_vector,
     quaternion_multiply,
+    skew,
     vector_from_quaternion,
 )
 
@@ -105,10 +106,11 @@ class Trajectory:
         ValueError : a time outside the trajectory
         """
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
-        if not self.covers(t).all():
-            bad = t[~self.covers(t)][0]
+        covered = self.covers(t)
+        if not covered.all():
+            bad = t[~covered][0]
             raise ValueError(f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s")
-        i = np.clip(np.searchsorted(self.time_s, t, side="right") - 1, 0, len(self) - 2)
+        i = np.minimum(np.maximum(self.time_s.searchsorted(t, side="right") - 1, 0), len(self) - 2)
         h = (self.time_s[i + 1] - self.time_s[i])[:, None]
         s = (t - self.time_s[i])[:, None] / h
         p0, p1 = self.position_l[i], self.position_l[i + 1]
@@ -118,7 +120,7 @@ class Trajectory:
         R = matrix_from_quaternion(q)
         angles = angles_from_matrix(R)
         # angles between two samples are small, so theta_rate is the body rate to first order; one more term is kept
-        rate_c = theta_rate - 0.5 * np.cross(theta, theta_rate)
+        rate_c = theta_rate - 0.5 * np.einsum("nij,nj->ni", skew(theta), theta_rate)
         rate_l = np.einsum("nij,nj->ni", R, rate_c)
         angle_rate = np.einsum("nij,nj->ni", angles_jacobian(angles), rate_l)
         return Poses(t, p0 + position, angles, velocity, angle_rate)

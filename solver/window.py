@@ -54,8 +54,11 @@ MOVED_M, MOVED_RAD = 1.5, 1e-3
 LOOKED_AFTER = 16
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
-#: So many batches at most are linearised again then.
-MOST_AGAIN = 6
+#: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
+#: which leave first, the others in the updates after it.
+MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
+#: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
+MOST_LEAVING = 1000
 #: Steps kept for the backward pass; of a strip that never ends the earliest part is not refined again.
 MOST_STEPS = 600
 
@@ -102,6 +105,8 @@ class Window:
             camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
         )
         self._batches: list[Batch] = []
+        self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
+        self._following = False  # whether they are what was left when new data moved far
         self._history = CostHistory()
         self._settler = Settler()
         self._now_s = -np.inf
@@ -238,12 +243,14 @@ class Window:
 
     def _replace_filtered(self) -> None:
         """Put smoothed orientation under batches that had to do with the filtered one."""
-        for batch in self._batches:
-            if batch.provisional and batch.newest_s <= self.trajectory.smoothed_to_s:
-                self.state.add(batch.columns, batch.information, -1)
-                self._maker.refresh(batch)
+        smoothed_s = self.trajectory.smoothed_to_s
+        due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
+        if due:
+            self._maker.refresh(due)
+            for batch in due:
+                before = batch.information
                 batch.linearise(self.state.values(batch.columns), reweigh=True)
-                self.state.add(batch.columns, batch.information)
+                self.state.exchange(batch.columns, before, batch.information)
 
     def _solve(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Gauss-Newton from the warm state, then tests; number of solutions computed."""
@@ -296,27 +303,36 @@ class Window:
         """
         values = [self.state.values(batch.columns) for batch in fresh]
         far = any(b.has_moved(theta, MOVED_M, MOVED_RAD) for b, theta in zip(fresh, values, strict=True))
-        turn = self._serial % LOOKED_AFTER
-        others = self._batches if far else self._batches[turn::LOOKED_AFTER]
-        new = {id(b) for b in fresh}
         due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
-        for batch in others:
-            theta = self.state.values(batch.columns)
-            if not far and len(due) >= MOST_AGAIN:
+        new = {id(b) for b in fresh}
+        if far:
+            self._suspects = {id(b): b for b in self._batches if id(b) not in new}
+            self._following = True
+        elif not self._suspects:
+            self._following = False
+            turn = self._batches[self._serial % LOOKED_AFTER :: LOOKED_AFTER]
+            self._suspects = {id(b): b for b in turn if id(b) not in new}
+        rays = 0
+        for key, batch in list(self._suspects.items()):
+            if rays > MOST_RAYS_AGAIN if self._following else len(due) >= MOST_AGAIN:
                 break
-            if id(batch) not in new and batch.has_moved(theta, MOVED_M, MOVED_RAD):
+            del self._suspects[key]
+            theta = self.state.values(batch.columns)
+            if batch.has_moved(theta, MOVED_M, MOVED_RAD):
                 batch.back_substitute(theta)
                 due.append((batch, theta))
+                rays += len(batch.rays)
         for batch, theta in due:
-            self.state.add(batch.columns, batch.information, -1)
+            before = batch.information
             batch.linearise(theta, reweigh=False)
-            self.state.add(batch.columns, batch.information)
+            self.state.exchange(batch.columns, before, batch.information)
         return bool(due)
 
     def _remove(self, batch: Batch) -> None:
         self.state.add(batch.columns, batch.information, -1)
         self._batches = [b for b in self._batches if b is not batch]
         self._watch.drop(batch)
+        self._suspects.pop(id(batch), None)
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
 
@@ -325,9 +341,11 @@ class Window:
         limits = {}
         for strip in self.strips.values():
             settled = strip.ended and self._now_s >= strip.end_s + self.options.settle_s
-            limits[strip.id] = np.inf if settled else limit_s
+            limits[strip.id] = max(self._settled_to(strip), limit_s) if settled else limit_s
         by_index = [limits[id] for id in self.strips]
-        leaving = [b for b in self._batches if b.oldest_s <= max(by_index[i] for i in b.strips)]
+        latest = max(by_index, default=-np.inf)
+        old = [b for b in self._batches if b.oldest_s <= latest]
+        leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
         if self.options.snoop and leaving:
             refused, rounds = snoop(leaving, self.state, self._points, self.options.critical, self._serial)
             result.refused += refused
@@ -344,6 +362,7 @@ class Window:
         if leaving:
             gone = {id(b) for b in leaving}
             self._batches = [b for b in self._batches if id(b) not in gone]
+            self._suspects = {key: b for key, b in self._suspects.items() if key not in gone}
         for strip in self.strips.values():
             numbers, to_s = strip.leaving(limits[strip.id], self.state)
             if not len(numbers):
@@ -365,6 +384,16 @@ class Window:
             self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, result)
+
+    def _settled_to(self, strip: WindowStrip) -> float:
+        """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
+        index = list(self.strips).index(strip.id)
+        rays = 0
+        for batch in sorted((b for b in self._batches if index in b.strips), key=lambda b: b.oldest_s):
+            rays += len(batch.rays)
+            if rays > MOST_LEAVING:
+                return batch.oldest_s
+        return np.inf
 
     def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
         """Orientation at the grid times that become final now."""
@@ -434,20 +463,27 @@ class Window:
         if watched.events:
             self._orienter.forget()
         result.events += watched.events
-        unknowns = len(state) + sum(b.determined for b in self._batches)
+        determined = rows = rays = points = control = 0
+        for batch in self._batches:
+            determined += batch.determined
+            rows += batch.information.rows
+            rays += batch.active_rays
+            points += len(batch.names)
+            control += batch.active_control
+        unknowns = len(state) + determined
         return WindowReport(
             sigma0=sigma0,
             redundancy=gained,
             sigma0_total=total,
             redundancy_total=state.redundancy,
-            observations=unknowns + sum(b.information.rows for b in self._batches),
+            observations=unknowns + rows,
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in active), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=sum(b.active_rays for b in self._batches),
-            points=sum(b.n_points for b in self._batches),
-            control=sum(b.active_control for b in self._batches),
+            rays=rays,
+            points=points,
+            control=control,
             strip=active[-1].id if active else "",
             parameters=self.parameters(active[-1], watched.standing) if active else (),
             watched=watched,

@@ -93,6 +93,9 @@ class Batch:
     normals: PointNormals = field(init=False)
     information: Information = field(init=False)
     _rows: Array = field(init=False, repr=False)
+    _places: tuple[IntArray, IntArray] = field(init=False, repr=False)
+    _coefficients: Array = field(init=False, repr=False)
+    _incomplete: bool = field(init=False, repr=False)
     coupling: Array = field(init=False, repr=False)
 
     @property
@@ -103,6 +106,7 @@ class Batch:
         self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
         self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
         self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
+        self._template()
 
     def linearise(self, theta: Array, reweigh: bool) -> None:
         """Linearise at values (u,) of the unknowns and the present points; ``reweigh`` renews the rays' weights."""
@@ -129,25 +133,20 @@ class Batch:
         """Information about the orientation, with the points eliminated, at the present linearisation and weights."""
         n, u, p = len(self.rays), len(self.columns), self.n_points
         lin = self.lin if (self.weight == 1.0).all() else self.lin.reweighted(self.weight)
-        layout, rays = self.layout, np.arange(n)
-        A = np.zeros((n, 2, u + 1))  # the last column takes what a ray does not have
-        for axis in range(2):
-            A[rays, axis, layout.columns] = layout.coefficients[layout.node] * lin.orientation[axis, layout.component]
-        if layout.camera is not None:
-            place = layout.camera.columns[layout.camera.pattern]
-            place = np.where(place >= 0, place + layout.n_model, u).T
-            for axis in range(2):
-                A[rays, axis, place] = lin.camera[axis]
-        A = np.ascontiguousarray(A[:, :, :u])
+        A = self._design_rows(lin)
+        flat = A.reshape(2 * n, u)
         # the right-hand side for theta counted from zero, the points from where they are
-        lin = replace(lin, residual=lin.residual + np.einsum("nau,u->an", A, self.theta))
+        lin = replace(lin, residual=lin.residual + (flat @ self.theta).reshape(n, 2).T)
         plan = cast("Elimination", _PointsOf(self.rays.point, p))
         normals = point_normals(lin, plan, self.control, self.origin_l)
         a, b, c, d, e, f = normals.inverse_factor[:, self.rays.point]
         j = lin.point
-        w = np.stack([a * j[:, 0], b * j[:, 0] + c * j[:, 1], d * j[:, 0] + e * j[:, 1] + f * j[:, 2]])  # (3, 2, n)
-        D = np.add.reduceat(np.einsum("kan,nau->nku", w, A), self.first_ray[:-1], axis=0)  # (p, 3, u)
-        flat, of_points = A.reshape(2 * n, u), D.reshape(3 * p, u)
+        w = np.empty((n, 3, 2))
+        w[:, 0] = (a * j[:, 0]).T
+        w[:, 1] = (b * j[:, 0] + c * j[:, 1]).T
+        w[:, 2] = (d * j[:, 0] + e * j[:, 1] + f * j[:, 2]).T
+        D = np.add.reduceat(w @ A, self.first_ray[:-1], axis=0)  # (p, 3, u)
+        of_points = D.reshape(3 * p, u)
         y = normals.y.T.ravel()
         matrix = flat.T @ flat - of_points.T @ of_points
         rhs = lin.residual.T.ravel() @ flat - y @ of_points
@@ -187,13 +186,9 @@ class Batch:
         D, u = self.coupling, len(self.columns)
         inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
         points = np.swapaxes(L, 1, 2) @ inner @ L
-        root = np.where(self.weight > 0, 1.0, 0.0)
         j = self.lin.point.transpose(2, 0, 1)  # (n, 2, 3), of full weight
         W = j @ np.swapaxes(L, 1, 2)[self.rays.point]
-        scale = np.where(self.weight > 0, np.sqrt(np.where(self.weight > 0, self.weight, 1.0)), 1.0)
-        own = self._rows / scale[:, None, None]
-        if (root == 0.0).any():
-            own[root == 0.0] = self.full_rows(np.flatnonzero(root == 0.0))
+        own = self._rows if (self.weight == 1.0).all() else self._design_rows(self.lin)
         rows = own - W @ D[self.rays.point]
         through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
         observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
@@ -201,18 +196,36 @@ class Batch:
 
     def full_rows(self, which: IntArray) -> Array:
         """Rows (m, 2, u) of rays at full weight."""
-        layout, m = self.layout, np.arange(len(which))
-        A = np.zeros((len(which), 2, len(self.columns) + 1))
+        if len(which) == len(self.rays) and (self.weight == 1.0).all():
+            return self._rows
+        return self._design_rows(self.lin)[which]
+
+    def _design_rows(self, lin: Linearisation) -> Array:
+        """Derivatives (n, 2, u) of all rays to the unknowns, with the weights of a linearisation."""
+        n, u = len(self.rays), len(self.columns)
+        place, of_camera = self._places
+        rows = np.zeros(2 * n * u + 1)  # the last one takes what a ray does not have
         for axis in range(2):
-            A[m, axis, layout.columns[:, which]] = (
-                layout.coefficients[layout.node][:, which] * self.lin.orientation[axis, layout.component][:, which]
-            )
+            step = np.where(place < 2 * n * u, place + axis * u, place) if self._incomplete else place + axis * u
+            rows[step] = self._coefficients * lin.orientation[axis].take(self.layout.component, axis=0)
+            if self.layout.camera is not None:
+                end = of_camera >= 2 * n * u
+                rows[np.where(end, of_camera, of_camera + axis * u)] = lin.camera[axis]
+        return rows[:-1].reshape(n, 2, u)
+
+    def _template(self) -> None:
+        """Where the terms of the design stand in the rows of all rays, one row after the other."""
+        layout, n, u = self.layout, len(self.rays), len(self.columns)
+        first = 2 * u * np.arange(n)
+        nowhere = 2 * n * u
+        self._incomplete = bool((layout.columns < 0).any())
+        place = np.where(layout.columns >= 0, first + layout.columns, nowhere)
+        of_camera = np.empty((0, n), dtype=np.int64)
         if layout.camera is not None:
-            place = layout.camera.columns[layout.camera.pattern[which]]
-            place = np.where(place >= 0, place + layout.n_model, len(self.columns)).T
-            for axis in range(2):
-                A[m, axis, place] = self.lin.camera[axis][:, which]
-        return A[:, :, :-1]
+            column = layout.camera.columns[layout.camera.pattern].T
+            of_camera = np.where(column >= 0, first + column + layout.n_model, nowhere)
+        self._places = place, of_camera
+        self._coefficients = layout.coefficients.take(layout.node, axis=0)
 
     def judge(self, state: WindowState) -> tuple[Cofactors, RayStatistics]:
         """Points, cofactors and statistics at the present solution; computed once for each solution."""

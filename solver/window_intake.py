@@ -88,21 +88,22 @@ class Intake:
         Looks for which no orientation will come are refused.
         """
         names = list(self._arrived)
-        times = [np.asarray(self.points[name].time_s) for name in names]
-        if not times:
-            return []
-        covered = np.split(self._trajectory.covers(np.concatenate(times)), np.cumsum([len(t) for t in times])[:-1])
+        time_s = np.array([t for name in names for t in self.points[name].time_s])
+        covered = self._trajectory.covers(time_s)
         late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
+        good, lost = covered.tolist(), (~covered & (time_s < late_s)).tolist()
         ready = []
-        for name, t, good in zip(names, times, covered, strict=True):
-            lost = np.flatnonzero(~good & (t < late_s))
+        end = 0
+        for name in names:
             point = self.points[name]
-            for i in lost[::-1]:
-                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
-                del point.looks[i], point.time_s[i], point.weight[i]
-            if len(lost) + int(good.sum()) == len(t):
+            first, end = end, end + len(point.looks)
+            gone = [i for i in range(end - first) if lost[first + i]] if not all(good[first:end]) else []
+            if len(gone) + sum(good[first:end]) == end - first:
                 ready.append(name)
                 del self._arrived[name]
+            for i in gone[::-1]:
+                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
+                del point.looks[i], point.time_s[i], point.weight[i]
         return ready
 
     def place(self, name: str, batch: Batch | None) -> None:

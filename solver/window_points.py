@@ -172,11 +172,19 @@ class BatchMaker:
                 xyz[i] = self.control[name].xyz_l
         return xyz
 
-    def refresh(self, batch: Batch) -> None:
-        """Put newer measured orientation under the rays of a batch."""
-        measured, batch.pose_covariance = self._measured(batch.rays.time_s, batch.rays.strip)
-        p = measured.poses
-        batch.rays = replace(
-            batch.rays, position_l=p.position_l, angles=p.angles, velocity_l=p.velocity_l, angle_rate=p.angle_rate
+    def refresh(self, batches: list[Batch]) -> None:
+        """Put newer measured orientation under the rays of batches."""
+        rays = [batch.rays for batch in batches]
+        measured, covariance = self._measured(
+            np.concatenate([r.time_s for r in rays]), np.concatenate([r.strip for r in rays])
         )
-        batch.provisional = not bool(measured.smoothed.all())
+        p = measured.poses
+        end = np.cumsum([len(r) for r in rays]).tolist()
+        for batch, low, high in zip(batches, [0, *end], end, strict=False):
+            part = slice(low, high)
+            batch.pose_covariance = covariance[part]
+            batch.rays = replace(
+                batch.rays, position_l=p.position_l[part], angles=p.angles[part], velocity_l=p.velocity_l[part],
+                angle_rate=p.angle_rate[part],
+            )  # fmt: skip
+            batch.provisional = not bool(measured.smoothed[part].all())

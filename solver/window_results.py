@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +110,7 @@ class RefinedOrientation:
     protection: Array | None = None
 
 
-@dataclass(frozen=True)
-class RayResidual:
+class RayResidual(NamedTuple):
     """Residual of one look, measured minus computed, px; ``w`` is the larger normalised one."""
 
     look: Look

@@ -16,6 +16,7 @@ IntArray = NDArray[np.int64]
 
 #: Weight of what is held, which makes its cofactors nothing.
 HELD = 1e30
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=float)
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class WindowState:
         self.square = 0.0
         self.redundancy = 0
         self._factor: DenseFactor | None = None
-        self._inverted = False
+        self._asked = 0
         self.solution = 0
         self._held: IntArray = np.empty(0, dtype=np.int64)
 
@@ -121,6 +122,15 @@ class WindowState:
         self.redundancy += sign * information.rows
         self._factor = None
 
+    def exchange(self, columns: IntArray, old: Information, new: Information) -> None:
+        """Put a batch's new information in the live part in place of what it said before."""
+        place = self.places(columns)
+        self._live[np.ix_(place, place)] += new.matrix - old.matrix
+        self._live_rhs[place] += new.rhs - old.rhs
+        self.square += new.square - old.square
+        self.redundancy += new.rows - old.rows
+        self._factor = None
+
     def fix(self, columns: IntArray, information: Information) -> None:
         """Move a batch's information from the live to the fixed part."""
         place = self.places(columns)
@@ -154,7 +164,7 @@ class WindowState:
             if len(self._held):
                 _hold(matrix, self.places(self._held))
             self._factor = DenseFactor(matrix)
-            self._inverted = False
+            self._asked = 0
         return self._factor
 
     def solve(self) -> None:
@@ -172,8 +182,9 @@ class WindowState:
     def covariance(self, numbers: IntArray) -> Array:
         """Cofactors (m, m) of present unknowns."""
         place, factor = self.places(numbers), self.factor
-        if self._inverted or 4 * len(place) > len(self):
-            self._inverted = True
+        # the whole inverse costs as much as the columns of a third of it
+        self._asked += len(place)
+        if 3 * self._asked > len(self):
             return factor.cofactors(place)
         unit = np.zeros((len(self), len(place)))
         unit[place, np.arange(len(place))] = 1.0
@@ -188,24 +199,21 @@ class WindowState:
         """
         gone = self.places(numbers)
         stay = np.setdiff1d(np.arange(len(self)), gone)
-        order = np.concatenate([gone, stay])
-        m = len(gone)
-        fixed = self._fixed[np.ix_(order, order)]
-        diagonal = np.diagonal(fixed)
+        own = self._fixed[np.ix_(gone, gone)]
+        diagonal = np.diagonal(own)
         scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        (dpotrf,) = get_lapack_funcs(("potrf",), (fixed,))
-        R, failed = dpotrf(fixed * scale[:, None] * scale, lower=0, clean=1)
+        R11, failed = _potrf(own * scale[:, None] * scale, lower=0, clean=1)
         if failed:
-            raise ValueError(f"unknown {int(self.numbers[order[failed - 1]])} is undetermined and cannot leave")
-        d = solve_triangular(R.T, scale * self._fixed_rhs[order], lower=True, check_finite=False)
-        R = R / scale
-        marginal = Marginal(
-            self.numbers[gone].copy(), self.numbers[stay].copy(), R[:m, :m].copy(), R[:m, m:].copy(), d[:m].copy()
-        )
-        rest = R[m:, m:]
-        self._fixed, self._fixed_rhs = rest.T @ rest, rest.T @ d[m:]
-        self._live, self._live_rhs = self._live[np.ix_(stay, stay)], self._live_rhs[stay]
-        self.square -= float(d[:m] @ d[:m])
+            raise ValueError(f"unknown {int(self.numbers[gone[failed - 1]])} is undetermined and cannot leave")
+        R11 /= scale
+        R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
+        d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
+        marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
+        inside = np.ix_(stay, stay)
+        self._fixed = self._fixed[inside] - R12.T @ R12
+        self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
+        self._live, self._live_rhs = self._live[inside], self._live_rhs[stay]
+        self.square -= float(d @ d)
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))

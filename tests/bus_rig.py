@@ -56,9 +56,13 @@ class Rig:
     def start(self, *arguments: object, name: str = "") -> subprocess.Popen[bytes]:
         """A command in the background, its output in ``<name>.log``."""
         name = name or str(arguments[1] if arguments[0] == "node" else arguments[0])
+        return self.start_program([*TRILINE, *map(str, arguments)], name)
+
+    def start_program(self, command: list[str], name: str) -> subprocess.Popen[bytes]:
+        """Any program that takes ``--port``."""
         with open(self.folder / f"{name}.log", "ab") as log:
             process = subprocess.Popen(
-                [*TRILINE, *map(str, arguments), "--port", str(self.port)],
+                [*command, "--port", str(self.port)],
                 stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=ENVIRONMENT, start_new_session=True,
             )  # fmt: skip
         self.processes.append(process)

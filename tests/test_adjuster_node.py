@@ -70,6 +70,9 @@ def test_it_publishes_what_it_says(done, flight):
     live, final = bodies(outputs, "orientation/live"), bodies(outputs, "orientation/final")
     for poses in (live, final):
         times = np.array([seconds(p) for p in poses])
+        if poses is live:  # besides the grid it follows updates for waiting image points
+            times = times[np.abs(10 * times - np.round(10 * times)) < 1e-6]
+            times = np.unique(times.round(6))
         assert np.diff(times) == pytest.approx(0.1)
         assert times[0] == pytest.approx(2.0, abs=0.11) and times[-1] > 29.8
         assert all(p.strip == "S1" and p.valid and len(p.correction) == 6 for p in poses)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import registry
+from ..collection import RareCollections
 from ..config import Tables, build, load
 from ..errors import UserError
 from ..live import BusRunner
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 def run_on_bus(node: Node, options: ProgramOptions) -> int:
     """Run a step node until it is told to stop."""
     with options.open_bus() as bus:
-        runner = BusRunner(node, bus, options.report, stop=options.stop)
+        runner = BusRunner(node, bus, options.report, stop=options.stop, collections=RareCollections())
         options.report(f"{node.name} on platform {options.platform}")
         url = getattr(node, "url", None)
         if url:

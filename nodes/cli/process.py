@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from .. import registry
+from ..collection import RareCollections
 from ..config import build, load
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_file
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
             RecordingWriter(part, args.compression, platform=_platform(reader)) as writer,
             progress("processing", args.quiet or args.json) as told,
         ):
+            RareCollections()
             summary = process(reader, nodes, writer.write_raw, told)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")

@@ -1,0 +1,142 @@
+"""Flat over hours: memory and latency of a long flight through the nodes, faster than real time.
+
+    python bench/long_flight.py [--hours 4] [--recording FILE] [-o out/bench]
+
+Prints a table with a row each half hour, and whether memory after warm-up stays within 5 % and the latency has no
+trend; draws both. Latency is processor time of the window's updates while a strip is flown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from triline.nodes import registry
+from triline.nodes.collection import RareCollections
+from triline.nodes.config import build
+from triline.nodes.recording import RecordingReader, RecordingWriter
+from triline.nodes.runner import process
+from triline.schemas.envelope import RawMessage
+from triline.solver.window import Window
+
+#: The flight is warm after so long, s.
+WARM_S = 1800.0
+#: Of a parallel strip, and with its turn, s.
+STRIP_S, TURN_S = 238.0, 93.0
+
+
+def simulate(folder: Path, hours: float) -> Path:
+    """A block of strips, 8 tie points a second, attitude at 50 Hz."""
+    path = folder / "flight.mcap"
+    strips = max(2, round(hours * 3600.0 / (STRIP_S + TURN_S)))
+    subprocess.run(
+        [sys.executable, "-m", "triline.nodes.cli", "simulate", "-o", str(path), "--strips", str(strips), "--seconds",
+         str(STRIP_S), "--ties", "8", "--attitude-rate", "50", "-q"],
+        check=True,
+    )  # fmt: skip
+    return path
+
+
+def resident_mb() -> float:
+    """Resident memory without the mapped recordings."""
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
+
+
+def fly(recording: Path, output: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Memory (n, 2: s, MB) each minute, and updates (m, 2: s, ms)."""
+    memory: list[tuple[float, float]] = []
+    updates: list[tuple[float, float]] = []
+    plain = Window.update
+
+    def timed(self: Window, now_s: float):
+        begun = time.process_time()
+        result = plain(self, now_s)
+        if result.report is not None and result.report.points:
+            updates.append((now_s, 1e3 * (time.process_time() - begun)))
+        return result
+
+    Window.update = timed  # type: ignore[method-assign]  # the program measures from outside
+    collections = RareCollections()
+    reader = RecordingReader(recording)
+    nodes = [build(registry.node_class(name), {}) for name in registry.ESTIMATING]
+    first_ns = int(reader.index.stamp_ns.min())
+    with RecordingWriter(output) as writer:
+        due = 0.0
+
+        def write(raw: RawMessage) -> None:
+            nonlocal due
+            writer.write_raw(raw)
+            now_s = (raw.envelope.stamp_ns - first_ns) / 1e9
+            if now_s >= due:
+                due = now_s + 60.0
+                collections.if_due()
+                memory.append((now_s, resident_mb()))
+
+        process(reader, nodes, write)
+    return np.array(memory), np.array(updates)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=4.0)
+    parser.add_argument("--recording", type=Path, help="a recording instead of a simulated flight")
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/bench"), help="folder of the drawing")
+    args = parser.parse_args()
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        memory, updates = fly(args.recording or simulate(folder, args.hours), folder / "out.mcap")
+    print("     hour  memory MB  updates  p50 ms  p99 ms")
+    step = 1800.0
+    for low in np.arange(0.0, memory[-1, 0], step):
+        m = memory[(memory[:, 0] >= low) & (memory[:, 0] < low + step), 1]
+        u = updates[(updates[:, 0] >= low) & (updates[:, 0] < low + step), 1]
+        if len(u):
+            p50, p99 = np.percentile(u, [50, 99])
+            print(
+                f"{low / 3600:4.1f} - {(low + step) / 3600:3.1f}  {m.mean():9.1f}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}"
+            )
+    warm = memory[memory[:, 0] > WARM_S]
+    late = updates[updates[:, 0] > WARM_S]
+    half = len(late) // 2
+    result = {
+        "hours": round(memory[-1, 0] / 3600.0, 2),
+        "wall time, s": round(time.monotonic() - begun),
+        "memory after warm-up, MB": [round(float(warm[:, 1].min()), 1), round(float(warm[:, 1].max()), 1)],
+        "memory, last half over first": round(
+            float(np.median(warm[len(warm) // 2 :, 1]) / np.median(warm[: len(warm) // 2, 1])), 4
+        ),
+        "latency p50, last half over first": round(float(np.median(late[half:, 1]) / np.median(late[:half, 1])), 3),
+    }
+    print(json.dumps(result, indent=2))
+    draw(memory, updates, args.output)
+    return 0
+
+
+def draw(memory: np.ndarray, updates: np.ndarray, folder: Path) -> None:
+    """``long_flight.png`` with memory and latency over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
+    above.plot(memory[:, 0] / 3600.0, memory[:, 1])
+    above.set(ylabel="resident memory, MB", ylim=(0, None))
+    below.plot(updates[:, 0] / 3600.0, updates[:, 1], ",", alpha=0.4)
+    below.set(ylabel="update, ms of processor time", xlabel="hours", yscale="log")
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / "long_flight.png", dpi=110)
+    print(f"drawn: {folder / 'long_flight.png'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

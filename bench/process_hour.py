@@ -1,0 +1,56 @@
+"""An hour of flight through ``triline process``: 200 Hz attitude or inertial data, 5 Hz GNSS, 100 tie rays a second.
+
+    python bench/process_hour.py [--imu] [--recording FILE] [--share 1.0]
+
+Prints wall and processor time of the whole command and how many times faster than life it is. ``--share`` flies a part
+of the hour and says what the whole would take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
+#: Strips of the hour, their length in seconds, and tie points a second that give 100 rays a second.
+STRIPS, STRIP_S, TIES = 11, 238, 23
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--imu", action="store_true", help="inertial data, not attitude")
+    parser.add_argument("--recording", type=Path, help="a recording instead of a simulated flight")
+    parser.add_argument("--share", type=float, default=1.0)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        recording = args.recording or Path(name) / "hour.mcap"
+        if args.recording is None:
+            plan = ["--strips", str(max(1, round(STRIPS * args.share))), "--seconds", str(STRIP_S), "--ties", str(TIES)]
+            sensor = ["--imu", "tactical"] if args.imu else []
+            subprocess.run([*TRILINE, "simulate", "-o", str(recording), *plan, *sensor, "-q"], check=True)
+        before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        output = Path(name) / "out.mcap"
+        done = subprocess.run(
+            [*TRILINE, "process", str(recording), "-o", str(output), "--json"], check=True, capture_output=True
+        )
+        wall, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
+        result = json.loads(done.stdout)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    flight = result["flight_s"]
+    print(json.dumps({
+        "flight, s": round(flight), "messages in": sum(result["inputs"].values()),
+        "messages out": sum(result["outputs"].values()), "wall, s": round(wall, 1), "processor, s": round(cpu, 1),
+        "times real time": round(flight / wall, 1), "an hour takes, s": round(3600.0 * wall / flight, 1),
+        "an hour takes, processor s": round(3600.0 * cpu / flight, 1),
+    }, indent=2))  # fmt: skip
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

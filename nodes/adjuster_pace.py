@@ -1,0 +1,156 @@
+"""The adjuster's pace: how it keeps up where updates take longer than the data allows.
+
+First it takes larger batches, then it leaves out tie points that tell least. What it decides while it is behind is
+published as ``adjustment/pace`` with the platform time from which it holds; `process` reads these messages and does the
+same at the same places, so that both give the same answers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..schemas import messages as m
+from ..solver.window_thinning import Candidate, Thinning
+from . import convert
+
+#: Factor on the time and the number of rays between updates, and share of the tie points kept, by level.
+LEVELS = ((1, 1.0), (2, 1.0), (5, 1.0), (5, 0.5), (5, 0.25), (5, 0.125), (5, 0.05), (5, 0.0))
+#: Behind by more, s (and an interval), a level up, unless it is catching up; behind by less for a while, one down.
+BEHIND_S, CAUGHT_UP_S = 0.4, 0.2
+#: Waiting time between two steps up, before a step down, and the longest that grows to where steps down were too early.
+UP_S, DOWN_S, LONGEST_DOWN_S = 0.3, 5.0, 80.0
+#: Of the window, the share to be behind at which nothing is tried out any more.
+ALARM = 0.4
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How data are taken in; ``level`` 0 is the normal pace."""
+
+    level: int = 0
+    lag_s: float = 0.0
+
+    @property
+    def factor(self) -> int:
+        """On the time and the number of rays between updates."""
+        return LEVELS[self.level][0]
+
+    @property
+    def kept(self) -> float:
+        """Share of the tie points that are worked in."""
+        return LEVELS[self.level][1]
+
+    def words(self, update_s: float) -> str:
+        """For the operator."""
+        if not self.level:
+            return "caught up: normal pace again"
+        text = f"{self.lag_s:.1f} s behind: updates every {self.factor * update_s:g} s"
+        if self.kept == 0.0:
+            return text + ", only control"
+        return text + (f", {100 * self.kept:g} % of the tie points" if self.kept < 1.0 else "")
+
+
+class Governor:
+    """Decides on the pace from how far behind the node is. Only live runs ask it; times are waiting times."""
+
+    def __init__(self) -> None:
+        self.level = 0
+        self._changed_s = -1e9
+        self._went_down = False
+        self._fine_since_s: float | None = None
+        self._down_s = DOWN_S
+        self._worst_s = 0.0  # behind by so much at the last look
+
+    def look(self, lag_s: float, now_s: float, interval_s: float, window_s: float) -> bool:
+        """Look at the lag of platform time, s; whether the level has changed."""
+        before = self.level
+        behind = lag_s > BEHIND_S + interval_s
+        if behind:
+            self._fine_since_s = None
+            growing = lag_s > 0.95 * self._worst_s
+            if now_s - self._changed_s > UP_S and growing:
+                step = len(LEVELS) if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
+                self.level = min(self.level + step, len(LEVELS) - 1)
+                if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early
+                    self._down_s = min(2.0 * self._down_s, LONGEST_DOWN_S)
+                self._changed_s, self._worst_s, self._went_down = now_s, lag_s, False
+            elif not growing:
+                self._worst_s = max(0.98 * self._worst_s, lag_s)
+        elif lag_s < CAUGHT_UP_S + interval_s:
+            if self._fine_since_s is None:
+                self._fine_since_s = now_s
+            if self.level and now_s - max(self._fine_since_s, self._changed_s) > self._down_s:
+                self.level -= 1
+                self._changed_s, self._worst_s, self._went_down = now_s, 0.0, True
+        return self.level != before
+
+
+class Pacing:
+    """The pace in force, those that are announced, and the tie points that wait while points are left out."""
+
+    def __init__(self) -> None:
+        self.pace = Pace()
+        self._announced: list[tuple[int, Pace]] = []
+        self.waiting: list[tuple[Any, str]] = []  # with the source
+        self.left_out_total = 0
+        self._thinning = Thinning()
+
+    def announce(self, body: Any) -> None:
+        """Take a message ``adjustment/pace``.
+
+        Raises
+        ------
+        ValueError : a level there is not
+        """
+        if not 0 <= body.level < len(LEVELS):
+            raise ValueError(f"pace of level {body.level}, wanted 0 to {len(LEVELS) - 1}")
+        self._announced.append((body.start_ns, Pace(body.level, body.lag_s)))
+
+    def follow(self, stamp_ns: int) -> Pace | None:
+        """The pace that begins by now, if one does."""
+        begun = [pace for from_ns, pace in self._announced if from_ns <= stamp_ns]
+        if not begun:
+            return None
+        del self._announced[: len(begun)]
+        self.pace = begun[-1]
+        return self.pace
+
+    def take_waiting(
+        self, rates_hz: dict[str, float], starts_ns: dict[str, int], pixels: dict[str, int]
+    ) -> list[tuple[Any, str]]:
+        """The tie points among those that wait which are worked in; the others are counted.
+
+        Parameters
+        ----------
+        rates_hz, starts_ns : line rate and time of the first line, by strip
+        pixels : of the CCD lines
+        """
+        waiting, self.waiting = self.waiting, []
+        if self.pace.kept >= 1.0 or not waiting:
+            return waiting
+        candidates = [
+            Candidate(
+                [
+                    (
+                        starts_ns[i.strip] / convert.SECOND_NS + i.line / rates_hz[i.strip],
+                        i.ccd,
+                        min(max(i.sample / pixels[i.ccd], 0.0), 1.0),
+                    )
+                    for i in body.images
+                    if i.strip in rates_hz and i.ccd in pixels
+                ]
+            )
+            for body, _ in waiting
+        ]
+        chosen = self._thinning.choose(candidates, round(self.pace.kept * len(waiting)))
+        newest = max((time for c in candidates for time, _, _ in c.looks), default=0.0)
+        self._thinning.forget(newest - 120.0)
+        self.left_out_total += len(waiting) - len(chosen)
+        return [waiting[i] for i in chosen]
+
+
+def pace_message(level: int, lag_s: float, from_ns: int) -> Any:
+    """The body of ``adjustment/pace``."""
+    factor, kept = LEVELS[level]
+    return m.Pace(start_ns=from_ns, level=level, interval_factor=factor, kept_share=kept, lag_s=lag_s)
