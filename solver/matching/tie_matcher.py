@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import LineCamera
-from ..line_store import LineStore, Stretch
+from ..line_store import LineStore
 from .consistency import Disagreement, SlowDisagreement, height_of
 from .current_orientation import CurrentOrientation
 from .height_guess import HeightGuess
 from .interest_points import interest_points
 from .line_quality import GOOD, REASONS, judge_lines
 from .line_scan import LineScan, View, view_of
-from .patches import Picture
 from .search import (
     COARSE_REACH,
     COARSEST,
@@ -77,7 +76,7 @@ class MatchingOptions:
     least_reach_px: float = 40.0
     largest_reach_px: float = 80.0
     relief_sigma_m: float = 60.0
-    image_sigma_px: float = 0.03
+    image_sigma_px: float = 0.025
     sigma_factor: float = 1.0
     least_rays: int = 3
     budget_mb: float = 1024.0
@@ -412,10 +411,8 @@ class TieMatcher:
         axes = np.stack([ground.along, ground.across]) / ground.spacing_m
         parallax = (slope - other_slope) @ axes.T
         reach = self._reach(index, ground, sigma_height, parallax)
-        self._widest_px = max(reach, 0.9 * self._widest_px)
-        half = (CORRELATION_HALF + 2) * coarsest_factor(reach) + PAD
-        master = self._image(self._master, master_scan, line, half, travel)
-        image = self._image(index, wide, other_line, half + reach, travel)
+        master = self._image(self._master, master_scan, travel)
+        image = self._image(index, wide, travel)
         base_line = other_line - expected[:, 0] * ground.spacing_m / travel
         found = find(master, line, ground, image, expected, base_line, reach)
         return found, image.scan, base_line, parallax
@@ -487,12 +484,9 @@ class TieMatcher:
         position, R = o.at(self._first_s + np.arange(low, high + 1) / self._rate)
         return LineScan(self.views[index], low, position, R)
 
-    def _image(self, index: int, scan: LineScan, line: Array, half: float, travel: float) -> Image:
+    def _image(self, index: int, scan: LineScan, travel: float) -> Image:
         assert self._store is not None
-        first, last = int(line.min() - half) - 2, int(line.max() + half) + 3
-        stretch: Stretch = self._store.rings[self.views[index].ccd].read(first, last)
-        picture = Picture(stretch.first_line, stretch.pixels.astype(np.float32), stretch.usable)
-        return Image(scan, {1: picture}, travel)
+        return Image(scan, self._store.rings[self.views[index].ccd], travel)
 
     def _ground(self, scan: LineScan, centre: Array) -> Ground:
         way = scan.position_l[-1, :2] - scan.position_l[0, :2]
