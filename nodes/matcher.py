@@ -9,8 +9,8 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
-from ..schemas.topics import find
-from ..solver.matching.tie_matcher import MatchedTie, MatchingOptions, TieMatcher
+from ..solver.matching.options import MatchedTie, MatchingOptions
+from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
 from .node import Message, Node
 from .target_desk import TargetDesk
@@ -30,10 +30,8 @@ class Matcher(Node):
 
     Parameters
     ----------
-    points_per_s, largest_sigma_px, least_score, least_reach_px, largest_reach_px, relief_sigma_m, least_rays,
-    budget_mb, full_scale : as in `MatchingOptions`
-    delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
-        that time, so they may be so long on their way: live and from a recording it sees them at the same place.
+    points_per_s, window_rays, window_points, largest_sigma_px, least_score, least_reach_px, largest_reach_px,
+    relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
     """
 
     name = "matcher"
@@ -45,8 +43,7 @@ class Matcher(Node):
         "trajectory/filtered",
         "trajectory/smoothed",
         "orientation/live",
-        "observation/control",
-        "observation/verdict",
+        "adjustment/report",
     )
     outputs = ("observation/tie", "observation/target", "observation/progress", "event/log")
 
@@ -54,6 +51,8 @@ class Matcher(Node):
         self,
         *,
         points_per_s: float = DEFAULTS.points_per_s,
+        window_rays: float = DEFAULTS.window_rays,
+        window_points: float = DEFAULTS.window_points,
         largest_sigma_px: float = DEFAULTS.largest_sigma_px,
         least_score: float = DEFAULTS.least_score,
         least_reach_px: float = DEFAULTS.least_reach_px,
@@ -61,6 +60,7 @@ class Matcher(Node):
         relief_sigma_m: float = DEFAULTS.relief_sigma_m,
         least_rays: int = DEFAULTS.least_rays,
         budget_mb: float = DEFAULTS.budget_mb,
+        chips_mb: float = DEFAULTS.chips_mb,
         full_scale: int = DEFAULTS.full_scale,
         delay_s: float = DELAY_S,
     ) -> None:
@@ -68,7 +68,8 @@ class Matcher(Node):
         if not 0 <= delay_s <= 10:
             raise ValueError(f"delay_s: wanted 0 to 10, got {delay_s}")
         self.options = MatchingOptions(
-            points_per_s=points_per_s, largest_sigma_px=largest_sigma_px, least_score=least_score,
+            points_per_s=points_per_s, window_rays=window_rays, window_points=window_points, chips_mb=chips_mb,
+            largest_sigma_px=largest_sigma_px, least_score=least_score,
             least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
             least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
         )  # fmt: skip
@@ -112,10 +113,8 @@ class Matcher(Node):
             self._pose(body, topic == "trajectory/smoothed")
         elif topic == "orientation/live":
             self._correction(body)
-        elif topic == "observation/control":
-            self._targets.ground_point(body)
-        elif topic == "observation/verdict":
-            return self._targets.verdict(body, self._observed_ns)
+        elif topic == "adjustment/report" and self._matcher is not None:
+            self._matcher.window_holds(int(body.points), int(body.rays))
         return []
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -192,12 +191,7 @@ class Matcher(Node):
             }
             for ray in tie.rays
         ]
-        return Message("observation/tie", self._observed_ns, convert.tie_message(f"{strip.id}-M{tie.number}", images))
-
-    @property
-    def _observed_ns(self) -> int:
-        """Stamp of observations that follow from the newest message."""
-        return self._stamp_ns + self._delay_ns
+        return Message("observation/tie", self._stamp_ns, convert.tie_message(tie.name, images))
 
     def _log(self, text: str, warning: bool = False) -> Message:
         body = m.Log(name=self.name, message=text, level=3 if warning else 2)

@@ -48,9 +48,7 @@ class LineRing:
     ValueError : nothing to keep, lanes that overlap or lie outside
     """
 
-    def __init__(
-        self, samples: int, capacity: int, dtype: np.dtype | type = np.uint16, lanes: IntArray | None = None
-    ):
+    def __init__(self, samples: int, capacity: int, dtype: np.dtype | type = np.uint16, lanes: IntArray | None = None):
         if samples < 1 or capacity < 1:
             raise ValueError(f"a ring of {capacity} lines of {samples} samples, wanted at least one of each")
         self.lanes = np.array([[0, samples]]) if lanes is None else np.asarray(lanes, dtype=np.int64)

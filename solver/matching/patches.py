@@ -43,7 +43,7 @@ class Windows:
         return Windows(self.first_line, self.first_sample, values, lines, samples, factor * self.factor)
 
     def sample(self, line: Array, sample: Array, cubic: bool) -> tuple[Float32, Mask]:
-        """Bicubic (Keys) or bilinear grey values at lines and samples (k, ...), full-size pixels; and which are known."""
+        """Bicubic (Keys) or bilinear grey values at full-size lines and samples (k, ...), and which are known."""
         k, n, m = self.values.shape
         off, wide = 0.5 * (self.factor - 1), (k,) + (1,) * (line.ndim - 1)
         u = (line - self.first_line.reshape(wide) - off) / self.factor

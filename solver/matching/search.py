@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 #: Half sides, px: template of the correlation, template of least squares, margin around it, reach at finer levels.
 CORRELATION_HALF, LEAST_SQUARES_HALF, MARGIN, FINE_REACH = 7, 9, 4, 2
 #: Furthest a correlation looks in its own pixels; further ones are found at a coarser level.
-COARSE_REACH, COARSEST = 10, 8
+REACH_PX, COARSEST = 10, 8
 #: Where vibration pulls lines apart or together by more than this factor (logarithm), the ground is not well sampled.
 LARGEST_UNEVENNESS = float(np.log(1.8))
 #: Shares of a template at coarser levels and of what it is searched in that must be known.
@@ -50,7 +50,7 @@ class Ground:
         xy = self.spacing_m * (shift[:, :1] * self.along + shift[:, 1:] * self.across)
         return replace(self, centre_l=self.centre_l + np.column_stack([xy, np.zeros(len(xy))]))
 
-    def select(self, chosen: Mask) -> Ground:
+    def select(self, chosen: Mask | NDArray[np.intp]) -> Ground:
         """Some of the places."""
         return replace(self, centre_l=self.centre_l[chosen])
 
@@ -66,7 +66,14 @@ class Ground:
 class Imagery(Protocol):
     """Whatever gives patches on grids on the ground."""
 
-    line_m: float
+    @property
+    def line_m(self) -> float:
+        """Way of the platform from one line to the next, m."""
+        ...
+
+    def select(self, chosen: Mask) -> Imagery:
+        """For some of the places."""
+        ...
 
     def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Array, Array]:
         """Grey values (k, n, n) on grids with n = 2 half + 1 and a spacing of ``factor`` pixels.
@@ -96,19 +103,30 @@ class Image:
     ring: LineRing
     line_m: float
 
-    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Array, Array]:
-        """See `Imagery`; every row of a grid through the orientation of the lines it falls on."""
+    def select(self, chosen: Mask) -> Image:
+        """An image is the same for all places."""
+        return self
+
+    def patches(
+        self, ground: Ground, line: Array, half: int, factor: int, lines_per: Array | None = None
+    ) -> tuple[NDArray[np.floating], Array, Array]:
+        """See `Imagery`; every row of a grid through the orientation of the lines it falls on.
+
+        ``lines_per``: lines for a step along rows and columns of grids that do not lie along the flight.
+        """
         k, n = len(line), 2 * half + 1
         grid = factor * np.arange(-half, half + 1.0)
         # along a row of the grid, lines and samples change smoothly: a few places are exact, the rest between them
         nodes = np.linspace(grid[0], grid[-1], max((n - 1) // NODE_PX, 1) + 1)
         points = ground.points(grid, nodes)
-        guess = line[:, None, None] + ground.spacing_m / self.line_m * grid[:, None]
+        along, across = (ground.spacing_m / self.line_m, 0.0) if lines_per is None else lines_per
+        guess = line[:, None, None] + along * grid[:, None] + across * nodes
         guess = np.broadcast_to(guess, points.shape[:3])
-        u, v, inside = (
-            a.reshape(points.shape[:3]) for a in self.scan.locate(points.reshape(-1, 3), guess.ravel(), rounds=4)
-        )
-        density = np.diff(u[:, :, [0, len(nodes) // 2, -1]], axis=1) * (self.line_m / (ground.spacing_m * factor))
+        u, v, inside = self.scan.locate(points.reshape(-1, 3), guess.ravel(), rounds=4)
+        u, v, inside = u.reshape(guess.shape), v.reshape(guess.shape), inside.reshape(guess.shape)
+        # how lines follow each other, along the axis of the grid that goes with the flight
+        step, axis = (along, 1) if abs(along) >= abs(across) else (across * np.diff(nodes)[0] / factor, 2)
+        density = np.diff(u, axis=axis) / (step * factor)
         uneven = np.abs(np.log(np.clip(density, 0.05, 20.0))).reshape(k, -1).max(axis=1)
         between = _between(grid, nodes)
         values, known = self._sample(u, v, between, factor)
@@ -125,7 +143,7 @@ class Image:
         first = [np.floor(np.clip(a.min(axis=(1, 2)), -1e6, 1e9)).astype(np.int64) - pad for a in (u, v)]
         size = [int(np.ceil(np.quantile(np.ptp(a, axis=(1, 2)), 0.95) * 1.05)) + 2 * pad + 6 for a in (u, v)]
         n, m = (min(x, widest) // factor * factor + factor for x in size)
-        windows = Windows(*first, *self.ring.windows(*first, n, m)).reduced(factor)
+        windows = Windows(first[0], first[1], *self.ring.windows(first[0], first[1], n, m)).reduced(factor)
         return windows.sample(u @ between, v @ between, cubic=factor == 1)
 
 
@@ -157,13 +175,19 @@ class Found:
 def coarsest_factor(reach_px: float) -> int:
     """Reduction at which a search of a reach (px) begins."""
     factor = 1
-    while reach_px > COARSE_REACH * factor and factor < COARSEST:
+    while reach_px > REACH_PX * factor and factor < COARSEST:
         factor *= 2
     return factor
 
 
 def find(
-    master: Imagery, master_line: Array, ground: Ground, other: Image, guess: Array, other_line: Array, reach_px: float
+    master: Imagery,
+    master_line: Array,
+    ground: Ground,
+    other: Imagery,
+    guess: Array,
+    other_line: Array,
+    reach_px: float,
 ) -> Found:
     """Find the places under the master's pixels in another view.
 
@@ -180,7 +204,7 @@ def find(
     reason = np.full(k, "", dtype="U24")
     alive = np.ones(k, dtype=bool)
     factor = coarsest_factor(reach_px)
-    reach = int(np.ceil(min(reach_px / factor, COARSE_REACH))) + 1
+    reach = int(np.ceil(min(reach_px / factor, REACH_PX))) + 1
     line_per_row = ground.spacing_m / other.line_m
     while True:
         t, known_t, _ = master.patches(ground, master_line, CORRELATION_HALF, factor)
@@ -205,7 +229,7 @@ def find(
 
 
 def _refine(
-    master: Imagery, master_line: Array, ground: Ground, other: Image, other_line: Array, shift: Array, alive: Mask,
+    master: Imagery, master_line: Array, ground: Ground, other: Imagery, other_line: Array, shift: Array, alive: Mask,
     reason: NDArray[np.str_],
 ) -> Found:  # fmt: skip
     k, half = len(shift), LEAST_SQUARES_HALF
@@ -213,7 +237,7 @@ def _refine(
     wide = half + MARGIN
     if alive.any():
         here, moved = ground.select(alive), ground.select(alive).moved(shift[alive])
-        t, known_t, uneven_t = master.patches(here, master_line[alive], wide, 1)
+        t, known_t, uneven_t = master.select(alive).patches(here, master_line[alive], wide, 1)
         at = other_line[alive] + shift[alive, 0] * ground.spacing_m / other.line_m
         s, known_s, uneven_s = other.patches(moved, at, wide, 1)
         inner = slice(MARGIN, MARGIN + 2 * half + 1)
