@@ -39,7 +39,7 @@ class Chips:
         """See `search.Imagery`; the grids must be those of the chips."""
         k, n, _ = self.values.shape
         middle, reach = n // 2, half * factor
-        smooth = self.values if factor == 1 else uniform_filter(self.values, (0, factor, factor), mode="nearest")
+        smooth = self.values if factor == 1 else uniform_filter(self.values, factor, mode="nearest", axes=(1, 2))
         if reach > middle:
             raise ValueError(f"a patch of {half} x {factor} px from chips of {middle}")
         # boxes of an even number of pixels lie half a pixel off: that is far below a pixel of theirs

@@ -10,6 +10,9 @@ Array = NDArray[np.floating]
 
 #: Larger cells than this, px, are looked over in steps first, so that the work does not grow with them.
 LARGE_CELL = 160 * 160
+#: Gradients far above so many times the noise count as that: texture all over a window is measured better than one hard
+#: edge, which detectors alias and which moves where it lies in front of something.
+STRONG = 8.0
 
 
 def image_noise(image: NDArray[np.floating]) -> float:
@@ -41,7 +44,7 @@ def interest_point(
     step = int(np.ceil(np.sqrt(image.size / LARGE_CELL)))
     top = left = 0
     if step > 1:
-        coarse = _least(image[::step, ::step], usable[::step], max(window // step, 3), max(half // step, 2))
+        coarse = _least(image[::step, ::step], usable[::step], max(window // step, 3), max(half // step, 2), noise)
         row, column = (int(i) for i in np.unravel_index(int(coarse.argmax()), coarse.shape))
         reach = half + max(window, 2 * step)
         top, left = max(row * step - reach, 0), max(column * step - reach, 0)
@@ -51,7 +54,7 @@ def interest_point(
         )
         if min(image.shape) < 2 * half + 1:
             return None
-    least = _least(image, usable, window, half)
+    least = _least(image, usable, window, half, noise)
     row, column = (int(i) for i in np.unravel_index(int(least.argmax()), least.shape))
     # template and searched image are both noisy
     if least[row, column] <= 2 * noise**2 / largest_sigma_px**2:
@@ -59,9 +62,11 @@ def interest_point(
     return row + top, column + left, float(np.sqrt(2 * noise**2 / least[row, column]))
 
 
-def _least(image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, half: int) -> Array:
+def _least(image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, half: int, noise: float) -> Array:
     """Smaller eigenvalue of the structure tensor, summed over the window; 0 where no place is wanted."""
     gu, gv = np.gradient(gaussian_filter(image, 0.7))
+    strong = 1.0 / np.sqrt(1.0 + (gu * gu + gv * gv) / (STRONG * noise) ** 2)
+    gu, gv = gu * strong, gv * strong
     a, b, c = (float(window * window) * uniform_filter(g, window) for g in (gu * gu, gu * gv, gv * gv))
     least = 0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b)
     for line in np.flatnonzero(~usable):

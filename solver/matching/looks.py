@@ -109,7 +109,11 @@ class LookMatcher:
         xyz = np.column_stack([centre[:, :2] + slope * dz[:, None], height + dz])
         pixel_m = np.column_stack([np.full(views + 1, travel), [sample_m(master, centre, line), *scale_across]])
         chosen = np.flatnonzero(enough)
-        rays = [self._rays(places[i], located[i], covariance[i], ground.spacing_m / pixel_m) for i in chosen]
+        # a place is where a noisy pose sees it: line by attitude about y, sample about x, position for both
+        noise = p.orientation.noise_left
+        wobble = (noise[:2].mean() + p.height_and_travel()[0] ** 2 * noise[[4, 3]]) / pixel_m**2
+        per_px = ground.spacing_m / pixel_m
+        rays = [self._rays(places[i], located[i], covariance[i], per_px, wobble) for i in chosen]
         known = np.isfinite(located).all(axis=2)
         chip = np.empty((len(chosen), 0, 0))
         if self._chip_half:
@@ -154,17 +158,23 @@ class LookMatcher:
         self.counters.update(dict(zip(names.tolist(), counts.tolist(), strict=True)))
         return reason == ""
 
-    def _rays(self, place: Place, located: Array, covariance: Array, px: Array) -> tuple[MatchedRay, ...]:
-        """Half of a match's variance belongs to each of its two images; ``px`` is ground grid to pixels, per view."""
+    def _rays(
+        self, place: Place, located: Array, covariance: Array, px: Array, wobble: Array
+    ) -> tuple[MatchedRay, ...]:
+        """Half of a match's variance belongs to each of its two images.
+
+        ``px`` is ground grid to pixels, ``wobble`` the variance by noisy poses, px^2, both of lines and samples per view.
+        """
         p = self.prediction
         known = np.flatnonzero(np.isfinite(located).all(axis=1))
         half = 0.5 * np.diagonal(covariance[known], axis1=1, axis2=2)
         floor = 0.5 * p.options.image_sigma_px**2
         own = half.mean(axis=0) * px[0] ** 2 + floor if place.variance is None else np.array(place.variance)
+        own = own + wobble[0]
         ccd = p.views[p.master].ccd
         rays = [MatchedRay(ccd, place.line, place.sample, float(own[0] ** 0.5), float(own[1] ** 0.5))]
         for j, variance in zip(known, half, strict=True):
-            v = np.sqrt(variance * px[1 + j] ** 2 + floor)
+            v = np.sqrt(variance * px[1 + j] ** 2 + floor + wobble[1 + j])
             line, sample = located[j]
             ccd = p.views[p.others[j]].ccd
             rays.append(MatchedRay(ccd, float(line), float(sample), float(v[0]), float(v[1])))
