@@ -163,7 +163,7 @@ class LookMatcher:
     ) -> tuple[MatchedRay, ...]:
         """Half of a match's variance belongs to each of its two images.
 
-        ``px`` is ground grid to pixels, ``wobble`` the variance by noisy poses, px^2, both of lines and samples per view.
+        ``px`` is ground grid to pixels, ``wobble`` the variance by noisy poses, px^2; per view, of line and sample.
         """
         p = self.prediction
         known = np.flatnonzero(np.isfinite(located).all(axis=1))

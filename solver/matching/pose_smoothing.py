@@ -48,7 +48,7 @@ class PoseSmoother:
 
     @property
     def noise_left(self) -> Array:
-        """(6,) variance of the white noise that is left in position, m^2, and attitude (x, y, z of the camera), rad^2."""
+        """(6,) variance of the white noise that is left in position, m^2, and attitude about camera axes, rad^2."""
         share = [float(self._weights[REACHES.index(r)][r]) if r else 1.0 for r in self.reach]
         return np.repeat(share, 3) * self._noise
 

@@ -42,6 +42,7 @@ class Prediction:
         self.slow = SlowDisagreement(len(self.others))
         self.first_s = self.rate = 0.0
         self._axes: tuple[Array, Array] | None = None
+        self._told = (-np.inf, (1.0, 1.0))
         self._least = LEAST_REACH
 
     def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
@@ -50,6 +51,7 @@ class Prediction:
         self.slow.forget()
         self.orientation.forget_corrections()
         self._axes, self._least = None, LEAST_REACH
+        self._told = (-np.inf, (1.0, 1.0))
 
     @property
     def known_lines(self) -> float:
@@ -59,9 +61,12 @@ class Prediction:
     def height_and_travel(self) -> tuple[float, float]:
         """Height above ground, and way from one line to the next, now; m."""
         t = self.orientation.end_s
+        if t == self._told[0]:
+            return self._told[1]
         position, _ = self.orientation.at([t - 1.0 / self.rate * 20, t])
         height = float(position[1, 2]) - float(self.heights.at(position[1:, :2])[0][0])
-        return max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6)
+        self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6))
+        return self._told[1]
 
     def scan(self, index: int, first: float, last: float) -> LineScan | None:
         """Lines of a view with their orientation, as far as there is one."""

@@ -31,8 +31,8 @@ Array = NDArray[np.floating]
 PATIENCE_S = 5.0
 #: Looks that are wanted from a line store, s, beyond the time between the first look and the last.
 STORE_MARGIN_S = 4.0
-#: Places that are matched together.
-BATCH = 64
+#: Places that are matched together: at most so many; fewer than half wait until lines of so many seconds have come.
+BATCH, BATCH_S = 64, 0.08
 
 
 class TieMatcher:
@@ -68,6 +68,7 @@ class TieMatcher:
         self._pending: list[Place] = []
         self._unjudged: list[Looked] = []
         self._next_number = 0
+        self._matched_to = -np.inf
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -97,6 +98,7 @@ class TieMatcher:
             raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip = strip
         self._pending, self._unjudged, self._next_number = [], [], 0
+        self._matched_to = -np.inf
         self._lines.begin_strip()
         self._chooser.begin_strip()
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
@@ -203,10 +205,15 @@ class TieMatcher:
         height, travel = p.height_and_travel()
         master = self.views[p.master]
         later = max(0.0, max(master.forward - view.forward for view in self.views) * height / travel)
-        reach = (MARGIN + LEAST_SQUARES_HALF) + PAD + p.lines_around()
+        reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
         until = min(*ends, p.known_lines)
         ready = [place for place in self._pending if place.line + later + reach < until]
-        waiting = [place for place in self._pending if not place.line + later + reach < until]
+        if len(ready) < BATCH // 2 and until < self._matched_to + BATCH_S * p.rate:
+            ready = []
+        elif ready:
+            self._matched_to = until
+        taken = set(map(id, ready))
+        waiting = [place for place in self._pending if id(place) not in taken]
         # a CCD line that has fallen silent must not hold up everything for ever
         oldest = max(ends) - later - reach - PATIENCE_S * p.rate
         self._pending = [place for place in waiting if place.line >= oldest]
