@@ -31,6 +31,8 @@ Array = NDArray[np.floating]
 PATIENCE_S = 5.0
 #: Looks that are wanted from a line store, s, beyond the time between the first look and the last.
 STORE_MARGIN_S = 4.0
+#: Ground may be lower than thought: places are looked at more closely so long before they are due, s.
+SOON_S = 0.3
 #: Places that are matched together: at most so many; fewer than half wait until lines of so many seconds have come.
 BATCH, BATCH_S = 64, 0.08
 
@@ -207,7 +209,9 @@ class TieMatcher:
         later = max(0.0, max(master.forward - view.forward for view in self.views) * height / travel)
         reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
         until = min(*ends, p.known_lines)
-        ready = [place for place in self._pending if place.line + later + reach < until]
+        soon = [place for place in self._pending if place.line + later + reach < until + SOON_S * p.rate]
+        due = self._last_looks(soon, travel) + reach if soon else np.empty(0)
+        ready = [place for place, line in zip(soon, due, strict=True) if line < until]
         if len(ready) < BATCH // 2 and until < self._matched_to + BATCH_S * p.rate:
             ready = []
         elif ready:
@@ -219,6 +223,18 @@ class TieMatcher:
         self._pending = [place for place in waiting if place.line >= oldest]
         self.counters["looks never came"] += len(waiting) - len(self._pending)
         return ready
+
+    def _last_looks(self, places: list[Place], travel: float) -> Array:
+        """Lines in which places (k) are seen last, at the heights that are guessed there."""
+        p = self.prediction
+        line, sample = np.array([[place.line, place.sample] for place in places]).T
+        scan = p.scan(p.master, line.min() - 1, line.max() + 1)
+        if scan is None:
+            return np.full(len(places), np.inf)
+        xy, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
+        above = scan.position_l[:, 2].mean() - p.heights.at(xy[:, :2])[0]
+        forward = p.views[p.master].forward - min(view.forward for view in p.views)
+        return line + np.maximum(forward, 0.0) * above / travel
 
     # -- store and counters --------------------------------------------------------------------------------------------
 
