@@ -12,6 +12,8 @@ from ..line_store import LineStore
 from .line_quality import GOOD, REASONS, judge_lines
 from .options import MatchingOptions
 
+#: Events of a strip that are told.
+MOST_TOLD = 100
 #: Names of lines that cannot be used, in events.
 _WORDS = {"dark": "black (lens cap, no light or no data)", "saturated": "saturated", "frozen": "frozen"}
 
@@ -42,10 +44,12 @@ class LineIntake:
         self._last_line: dict[str, NDArray[np.unsignedinteger]] = {}
         self._state: dict[str, int] = {}
         self._events: list[str] = []
+        self._told = 0
 
     def begin_strip(self) -> None:
         """What is in store is forgotten."""
         self.store = None
+        self._told = 0
         self._last_line.clear()
 
     def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
@@ -75,7 +79,7 @@ class LineIntake:
         missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
         if missing:
             self.counters["lines missing"] += missing
-            self._events.append(f"{ccd}: {missing} lines are missing before line {first_line}")
+            self.tell(f"{ccd}: {missing} lines are missing before line {first_line}")
         if late:
             self.counters["lines twice or late"] += late
 
@@ -85,23 +89,24 @@ class LineIntake:
         return events
 
     def tell(self, text: str) -> None:
-        """Another line to be told."""
-        self._events.append(text)
+        """Another line to be told; a camera that fails all the time is told of so many times, then only counted."""
+        self._told += 1
+        if self._told <= MOST_TOLD:
+            self._events.append(text)
+        elif self._told == MOST_TOLD + 1:
+            self._events.append("more of the kind is counted, but no longer told in this strip")
 
     def _tell(self, ccd: str, first_line: int, verdict: NDArray[np.int8]) -> None:
         """Count bad lines; tell where bad ones begin and where they end."""
         bad = verdict[verdict != GOOD]
         for code, n in zip(*np.unique(bad, return_counts=True), strict=True):
             self.counters[f"lines {REASONS[code]}"] += int(n)
-        before = self._state.get(ccd, GOOD)
-        state = int(np.bincount(bad).argmax()) if 2 * len(bad) > len(verdict) else GOOD
-        if state == before and not (len(bad) and state == GOOD):
-            return
-        if state != before:
-            self._state[ccd] = state
-            what = "lines are good again" if state == GOOD else f"lines are {_WORDS[REASONS[state]]}"
-            self._events.append(f"{ccd}: {what} from about line {first_line}")
-        else:  # a few bad lines among good ones
+        before, state = self._state.get(ccd, GOOD), int(verdict[-1])
+        self._state[ccd] = state
+        if state == before == GOOD and len(bad):  # a few bad lines among good ones
             first = first_line + int(np.flatnonzero(verdict != GOOD)[0])
-            reason = _WORDS[REASONS[int(np.bincount(bad).argmax())]]
-            self._events.append(f"{ccd}: {len(bad)} lines are {reason} from line {first} on")
+            self.tell(f"{ccd}: {len(bad)} lines are {_WORDS[REASONS[int(np.bincount(bad).argmax())]]} from {first} on")
+        elif state != before:
+            run = first_line + int(np.flatnonzero(np.append(-1, verdict[:-1]) != state)[-1])
+            what = "lines are good again" if state == GOOD else f"lines are {_WORDS[REASONS[state]]}"
+            self.tell(f"{ccd}: {what} from line {run} on")
