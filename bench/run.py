@@ -19,6 +19,7 @@ BENCHMARKS = {
     "a-priori weights from the trajectory": ["apriori.py"],
     "sliding window": ["window.py"],
     "orthoimage": ["orthoimage.py"],
+    "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }
 
 
