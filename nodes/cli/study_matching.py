@@ -18,6 +18,7 @@ from ..errors import UserError
 from ..flight_settings import simulated_flight
 from ..matcher import Matcher
 from ..navigator import Navigator
+from ..node import Message
 from ..recording import RecordingReader, RecordingWriter
 from ..report.evaluation import evaluate_flight
 from ..report.flight import collect
@@ -30,8 +31,6 @@ EXAMPLE = "triline study matching --seeds 3"
 EPOCH_NS = 1_780_000_000_000_000_000
 #: Good matches are nearer to the truth than this, wrong ones farther, px.
 GOOD_PX, WRONG_PX = 0.3, 2.0
-#: Noise of simulated rays: against each other they scatter sqrt(2) times as much, as matched ones do.
-RAY_SIGMA_PX = 0.027
 #: Flights besides the plain ones: name -> settings. The angle of 30 px depends on the pixels and is set for them.
 ROUGH: dict[str, dict[str, Any]] = {
     "three times the turbulence": {"turbulence": 3.0},
@@ -70,22 +69,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def fly(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A flight with image lines, and the same flight with simulated ties of the same density and noise."""
-    # targets are measured by others: as well in both flights
-    settings = {**settings, "image_sigma": RAY_SIGMA_PX}
+    """A flight with image lines; and the same with simulated rays in place of the matched ones: truth and noise."""
     flown = simulated_flight({**settings, "images": True})
-    ties, evaluated = _processed(
-        Simulator(flown.simulation, flown.imager), [Navigator(), Matcher(), Adjuster()], folder
-    )
-    flight = flown.simulation.flight
-    matched = [tie for tie in ties if "-M" in tie.point]
-    quality = tie_quality(flight, matched)
-    # matched points need all looks: they cover the strip without its ends
-    first = [image.time_ns for tie in matched for image in tie.images]
-    seconds = (max(first) - min(first)) * 1e-9 if first else 1.0
-    density = len(matched) / max(seconds - _look_s(matched), 1.0)
-    simulated = simulated_flight({**settings, "ties": density})
-    _, reference = _processed(Simulator(simulated.simulation), [Navigator(), Adjuster()], folder)
+    simulator, flight = Simulator(flown.simulation, flown.imager), flown.simulation.flight
+    messages = list(simulator.messages(EPOCH_NS))
+    ties, evaluated = _processed(messages, [Navigator(), Matcher(), Adjuster()], folder)
+    matched = [message for message in ties if "-M" in message.body.point]
+    others = [message for message in messages if not message.topic.startswith("sensor/lines/")]
+    rng = np.random.default_rng(settings["seed"])
+    _, reference = _processed([*others, *simulated_ties(flight, matched, rng)], [Navigator(), Adjuster()], folder)
     accuracy = {
         name: {
             "rms_m": part["orientation"]["final"]["rmse_m"], "rms_deg": part["orientation"]["final"]["rmse_deg"],
@@ -93,23 +85,38 @@ def fly(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         }
         for name, part in (("matched", evaluated), ("simulated", reference))
     }  # fmt: skip
-    return {**quality, "density": density, "accuracy": accuracy}
+    return {**tie_quality(flight, [message.body for message in matched]), "accuracy": accuracy}
 
 
-def _look_s(ties: list[Any]) -> float:
-    spans = [max(i.time_ns for i in t.images) - min(i.time_ns for i in t.images) for t in ties]
-    return float(np.median(spans)) * 1e-9 if spans else 0.0
-
-
-def _processed(simulator: Simulator, nodes: list[Any], folder: Path) -> tuple[list[Any], dict[str, Any]]:
+def _processed(messages: list[Message], nodes: list[Any], folder: Path) -> tuple[list[Message], dict[str, Any]]:
     recording, out = folder / "flight.mcap", folder / "out.mcap"
     with RecordingWriter(recording) as writer:
-        for message in simulator.messages(EPOCH_NS):
+        for message in messages:
             writer.write(message)
     with RecordingWriter(out) as writer:
         process(RecordingReader(recording), nodes, writer.write_raw)
-    ties = [message.body for message in RecordingReader(out).messages(["observation/tie"])]
+    ties = list(RecordingReader(out).messages(["observation/tie"]))
     return ties, evaluate_flight(collect(messages_of(out)))
+
+
+def simulated_ties(flight: Flight, ties: list[Message], rng: np.random.Generator) -> list[Message]:
+    """The ties with their true rays, and noise of the sigmas that the matcher gave."""
+    true, index = _true_rays(flight, [message.body for message in ties])
+    number = {strip.id: i for i, strip in enumerate(flight.strips)}
+    out = []
+    for message in ties:
+        body = type(message.body)()
+        body.CopyFrom(message.body)
+        for ray in body.images:
+            strip = number[ray.strip]
+            at = true.get((index[body.point], strip, flight.camera.line_index[ray.ccd]))
+            if at is None:
+                continue
+            line = at[0] + ray.sigma_line * rng.standard_normal()
+            ray.time_ns += round((line - ray.line) * 1e9 / flight.strips[strip].line_rate_hz)
+            ray.line, ray.sample = line, at[1] + ray.sigma_sample * rng.standard_normal()
+        out.append(Message(message.topic, message.stamp_ns, body, "simulator of ties"))
+    return out
 
 
 def tie_quality(flight: Flight, ties: list[Any]) -> dict[str, Any]:
@@ -131,6 +138,26 @@ def tie_quality(flight: Flight, ties: list[Any]) -> dict[str, Any]:
 
 def tie_errors(flight: Flight, ties: list[Any]) -> tuple[Array, Array]:
     """(rays, 2) errors of line and sample against the point's first ray, and their sigma (rays, 2), px."""
+    true, index = _true_rays(flight, ties)
+    number = {strip.id: i for i, strip in enumerate(flight.strips)}
+    first: dict[str, Any] = {}
+    rows = []
+    for tie in ties:
+        base = first.setdefault(tie.point, tie.images[0])
+        for ray in tie.images:
+            at = true.get((index[tie.point], number[ray.strip], flight.camera.line_index[ray.ccd]))
+            if at is None or (ray.strip == base.strip and ray.ccd == base.ccd):
+                continue
+            sigma = np.hypot([ray.sigma_line, ray.sigma_sample], [base.sigma_line, base.sigma_sample])
+            rows.append((ray.line - at[0], ray.sample - at[1], *sigma))
+    table = np.array(rows).reshape(-1, 4)
+    return table[:, :2], table[:, 2:]
+
+
+def _true_rays(
+    flight: Flight, ties: list[Any]
+) -> tuple[dict[tuple[int, int, int], tuple[float, float]], dict[str, int]]:
+    """True line and sample by (point, strip, CCD line) of the ground under each point's first ray; points by name."""
     camera, strips = flight.camera, flight.strips
     number = {strip.id: i for i, strip in enumerate(strips)}
     first: dict[str, Any] = {}
@@ -144,22 +171,9 @@ def tie_errors(flight: Flight, ties: list[Any]) -> tuple[Array, Array]:
         direction = pose.R_lc[0] @ np.array([*xy, -camera.focal_length_mm[ccd]])
         point_l[i] = flight.terrain.intersect(pose.position_l, direction[None])[0]
     looks = find_looks(point_l, strips, camera)
-    true = {
-        (p, s, c): (u, v)
-        for p, s, c, u, v in zip(looks.point, looks.strip, looks.ccd, looks.line, looks.sample, strict=True)
-    }
-    index = {name: i for i, name in enumerate(first)}
-    rows = []
-    for tie in ties:
-        base = first[tie.point]
-        for ray in tie.images:
-            at = true.get((index[tie.point], number[ray.strip], camera.line_index[ray.ccd]))
-            if at is None or (ray.strip == base.strip and ray.ccd == base.ccd):
-                continue
-            sigma = np.hypot([ray.sigma_line, ray.sigma_sample], [base.sigma_line, base.sigma_sample])
-            rows.append((ray.line - at[0], ray.sample - at[1], *sigma))
-    table = np.array(rows).reshape(-1, 4)
-    return table[:, :2], table[:, 2:]
+    columns = looks.point, looks.strip, looks.ccd, looks.line, looks.sample
+    true = {(p, s, c): (u, v) for p, s, c, u, v in zip(*(a.tolist() for a in columns), strict=True)}
+    return true, {name: i for i, name in enumerate(first)}
 
 
 def lines(rows: list[dict[str, Any]]) -> list[str]:
@@ -170,7 +184,7 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
             f"  {r['flight']:<27} {r['ties']:5d} {100 * r['good']:8.1f} % {100 * r['wrong']:8.2f} %"
             f" {r['sigma_px']:6.3f} px {r['normalised']:6.2f}"
         )
-    out.append("on-line, final: RMS against truth, matched ties / simulated ties of the same density and noise")
+    out.append("on-line, final: RMS against truth, matched ties / the same points with simulated rays")
     out.append(
         "                                X, Y, Z (m)           omega, phi, kappa (mdeg)        points X, Y, Z (m)"
     )
@@ -179,13 +193,8 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
             title = r["flight"] if name == "matched" else "   simulated"
             values = [part["rms_m"], [1e3 * v for v in part["rms_deg"]], part["points_m"]]
             out.append(f"  {title:<27} " + "   ".join(" ".join(f"{v:7.3f}" for v in value) for value in values))
-    ratios = np.array([[_relative(r, key) for key in ("rms_m", "rms_deg", "points_m")] for r in rows])
-    mean = np.sqrt((ratios**2).mean(axis=(0, 2)))
-    text = ", ".join(f"{name} {v:.2f}" for name, v in zip(("position", "attitude", "points"), mean, strict=True))
-    out.append(f"  matched over simulated, RMS of all: {text}")
+    for key, name in (("rms_m", "position"), ("rms_deg", "attitude"), ("points_m", "points")):
+        both = [np.array([r["accuracy"][kind][key] for r in rows]) for kind in ("matched", "simulated")]
+        ratio = np.sqrt((both[0] ** 2).mean(axis=0) / (both[1] ** 2).mean(axis=0))
+        out.append(f"  matched over simulated, {name:<9}" + " ".join(f"{v:6.2f}" for v in ratio))
     return out
-
-
-def _relative(row: dict[str, Any], key: str) -> list[float]:
-    a, b = row["accuracy"]["matched"][key], row["accuracy"]["simulated"][key]
-    return (np.asarray(a) / np.asarray(b)).tolist()

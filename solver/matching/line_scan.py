@@ -111,7 +111,7 @@ class LineScan:
         """
         last = len(self.position_l) - 2
         u = np.clip(np.asarray(line, dtype=float) - self.first_line, 0, last + 1)
-        travel = float(np.linalg.norm(self.position_l[-1] - self.position_l[0])) / (last + 1)
+        travel = max(float(np.linalg.norm(self.position_l[-1] - self.position_l[0])) / (last + 1), 1e-9)
         before, ahead_before = u, np.zeros(len(u))
         pixel = np.ones(len(u))
         for turn in range(rounds):
