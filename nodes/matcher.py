@@ -9,6 +9,7 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
+from ..schemas.topics import find
 from ..solver.matching.options import MatchedTie, MatchingOptions
 from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
@@ -32,6 +33,8 @@ class Matcher(Node):
     ----------
     points_per_s, window_rays, window_points, largest_sigma_px, least_score, least_reach_px, largest_reach_px,
     relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
+    delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
+        that time, so they may be so long on their way: live and from a recording it sees them at the same place.
     """
 
     name = "matcher"
@@ -44,6 +47,8 @@ class Matcher(Node):
         "trajectory/smoothed",
         "orientation/live",
         "adjustment/report",
+        "observation/control",
+        "observation/verdict",
     )
     outputs = ("observation/tie", "observation/target", "observation/progress", "event/log")
 
@@ -115,6 +120,10 @@ class Matcher(Node):
             self._correction(body)
         elif topic == "adjustment/report" and self._matcher is not None:
             self._matcher.window_holds(int(body.points), int(body.rays))
+        elif topic == "observation/control":
+            self._targets.ground_point(body)
+        elif topic == "observation/verdict":
+            return self._targets.verdict(body, self._observed_ns)
         return []
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -191,7 +200,12 @@ class Matcher(Node):
             }
             for ray in tie.rays
         ]
-        return Message("observation/tie", self._stamp_ns, convert.tie_message(tie.name, images))
+        return Message("observation/tie", self._observed_ns, convert.tie_message(tie.name, images))
+
+    @property
+    def _observed_ns(self) -> int:
+        """Stamp of observations that follow from the newest message."""
+        return self._stamp_ns + self._delay_ns
 
     def _log(self, text: str, warning: bool = False) -> Message:
         body = m.Log(name=self.name, message=text, level=3 if warning else 2)

@@ -44,6 +44,7 @@ class Prediction:
         self._axes: tuple[Array, Array] | None = None
         self._told = (-np.inf, (1.0, 1.0))
         self._least = LEAST_REACH
+        self._widest = 0.0  # search of late
 
     def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
         """Lines begin anew."""
@@ -100,7 +101,9 @@ class Prediction:
         else:
             by_orientation = self._orientation_reach(self.views[index], ground.spacing_m) / 3
             least = o.least_reach_px
-        return float(np.clip(3 * np.hypot(by_height, by_orientation), least, o.largest_reach_px))
+        reach = float(np.clip(3 * np.hypot(by_height, by_orientation), least, o.largest_reach_px))
+        self._widest = max(reach, 0.9 * self._widest)
+        return reach
 
     def searched(self, beyond: float) -> None:
         """A share of the last matches was found to lie beyond the search."""
@@ -109,8 +112,8 @@ class Prediction:
 
     def lines_around(self) -> float:
         """Lines that a search may need around the predicted ones."""
-        if self.slow.known and self._least <= LEAST_REACH:
-            return 10.0
+        if self.slow.known:
+            return float((CORRELATION_HALF + REACH_PX + 2) * coarsest_factor(max(self._widest, self._least)))
         _, travel = self.height_and_travel()
         reach = max(self._orientation_reach(view, travel) for view in self.views)
         base = max(abs(view.forward) for view in self.views) * 3 * self.options.relief_sigma_m / travel
