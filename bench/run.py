@@ -23,6 +23,7 @@ BENCHMARKS = {
     "an hour of flight through process": ["process_hour.py", "--share", "0.2"],
     "memory and latency over hours": ["long_flight.py", "--hours", "1"],
     "orthoimage": ["orthoimage.py"],
+    "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
 from ..schemas.topics import find
-from ..solver.matching.tie_matcher import MatchedTie, MatchingOptions, TieMatcher
+from ..solver.matching.options import MatchedTie, MatchingOptions
+from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
 from .node import Message, Node
 from .target_desk import TargetDesk
@@ -30,8 +31,8 @@ class Matcher(Node):
 
     Parameters
     ----------
-    points_per_s, largest_sigma_px, least_score, least_reach_px, largest_reach_px, relief_sigma_m, least_rays,
-    budget_mb, full_scale : as in `MatchingOptions`
+    points_per_s, window_rays, window_points, largest_sigma_px, least_score, least_reach_px, largest_reach_px,
+    relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
     delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
         that time, so they may be so long on their way: live and from a recording it sees them at the same place.
     """
@@ -45,6 +46,7 @@ class Matcher(Node):
         "trajectory/filtered",
         "trajectory/smoothed",
         "orientation/live",
+        "adjustment/report",
         "observation/control",
         "observation/verdict",
     )
@@ -54,6 +56,8 @@ class Matcher(Node):
         self,
         *,
         points_per_s: float = DEFAULTS.points_per_s,
+        window_rays: float = DEFAULTS.window_rays,
+        window_points: float = DEFAULTS.window_points,
         largest_sigma_px: float = DEFAULTS.largest_sigma_px,
         least_score: float = DEFAULTS.least_score,
         least_reach_px: float = DEFAULTS.least_reach_px,
@@ -61,6 +65,7 @@ class Matcher(Node):
         relief_sigma_m: float = DEFAULTS.relief_sigma_m,
         least_rays: int = DEFAULTS.least_rays,
         budget_mb: float = DEFAULTS.budget_mb,
+        chips_mb: float = DEFAULTS.chips_mb,
         full_scale: int = DEFAULTS.full_scale,
         delay_s: float = DELAY_S,
     ) -> None:
@@ -68,7 +73,8 @@ class Matcher(Node):
         if not 0 <= delay_s <= 10:
             raise ValueError(f"delay_s: wanted 0 to 10, got {delay_s}")
         self.options = MatchingOptions(
-            points_per_s=points_per_s, largest_sigma_px=largest_sigma_px, least_score=least_score,
+            points_per_s=points_per_s, window_rays=window_rays, window_points=window_points, chips_mb=chips_mb,
+            largest_sigma_px=largest_sigma_px, least_score=least_score,
             least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
             least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
         )  # fmt: skip
@@ -112,6 +118,8 @@ class Matcher(Node):
             self._pose(body, topic == "trajectory/smoothed")
         elif topic == "orientation/live":
             self._correction(body)
+        elif topic == "adjustment/report" and self._matcher is not None:
+            self._matcher.window_holds(int(body.points), int(body.rays))
         elif topic == "observation/control":
             self._targets.ground_point(body)
         elif topic == "observation/verdict":
@@ -192,7 +200,7 @@ class Matcher(Node):
             }
             for ray in tie.rays
         ]
-        return Message("observation/tie", self._observed_ns, convert.tie_message(f"{strip.id}-M{tie.number}", images))
+        return Message("observation/tie", self._observed_ns, convert.tie_message(tie.name, images))
 
     @property
     def _observed_ns(self) -> int:

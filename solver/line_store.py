@@ -8,6 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+IntArray = NDArray[np.int64]
+
+#: A lane is so wide, samples: the search window at the coarsest level of matching, and as much again to choose from.
+LANE = 512
+#: Fewer lanes than this do not carry an adjustment: then the lines are kept for a shorter time as well.
+FEWEST_LANES = 4
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -26,15 +33,34 @@ class Stretch:
 
 
 class LineRing:
-    """The newest ``capacity`` lines of one CCD line.
+    """The newest ``capacity`` lines of one CCD line, or of lanes of it.
 
     Lines that never came are known as missing; lines that come twice or out of order are left out.
+
+    Parameters
+    ----------
+    samples, capacity : length of a line, and how many lines
+    dtype : of the pixels
+    lanes : (l, 2) first and end sample of each stretch of the line that is kept, in order, apart; None = all of it
+
+    Raises
+    ------
+    ValueError : nothing to keep, lanes that overlap or lie outside
     """
 
-    def __init__(self, samples: int, capacity: int, dtype: np.dtype | type = np.uint16):
+    def __init__(self, samples: int, capacity: int, dtype: np.dtype | type = np.uint16, lanes: IntArray | None = None):
         if samples < 1 or capacity < 1:
             raise ValueError(f"a ring of {capacity} lines of {samples} samples, wanted at least one of each")
-        self._pixels = np.zeros((capacity, samples), dtype=dtype)
+        self.lanes = np.array([[0, samples]]) if lanes is None else np.asarray(lanes, dtype=np.int64)
+        borders = self.lanes.ravel()
+        if not (len(borders) and borders[0] >= 0 and borders[-1] <= samples and (np.diff(borders) >= 0).all()):
+            raise ValueError(f"lanes {self.lanes.tolist()} of a line of {samples} samples")
+        self.samples = samples
+        wide = np.diff(self.lanes, axis=1)[:, 0]
+        self._column = np.full(samples, -1, dtype=np.int64)
+        for (first, end), at in zip(self.lanes, np.cumsum(wide) - wide, strict=True):
+            self._column[first:end] = at + np.arange(end - first)
+        self._pixels = np.zeros((capacity, int(wide.sum())), dtype=dtype)
         self._usable = np.zeros(capacity, dtype=bool)
         self.start = self.end = 0  # lines from start to end - 1 are in the ring
 
@@ -60,8 +86,8 @@ class LineRing:
         ------
         ValueError : lines of another length
         """
-        if pixels.ndim != 2 or pixels.shape[1] != self._pixels.shape[1]:
-            raise ValueError(f"lines of shape {pixels.shape}, wanted {self._pixels.shape[1]} samples")
+        if pixels.ndim != 2 or pixels.shape[1] != self.samples:
+            raise ValueError(f"lines of shape {pixels.shape}, wanted {self.samples} samples")
         usable = np.ones(len(pixels), dtype=bool) if usable is None else usable
         if self.start == self.end:
             self.start = self.end = first_line
@@ -76,28 +102,71 @@ class LineRing:
         end = first_line + len(pixels)
         kept = min(len(pixels), self.capacity)
         at = np.arange(end - kept, end) % self.capacity
-        self._pixels[at] = pixels[-kept:]
+        turn = int(np.argmin(at))  # two runs: up to the end of the ring, and from its start
+        for run in (slice(0, turn), slice(turn, kept)):
+            if at[run].size:
+                self._put(int(at[run][0]), pixels[len(pixels) - kept :][run])
         self._usable[at] = usable[-kept:]
         self.end = end
         self.start = max(self.start, end - self.capacity)
         return missing, late
 
-    def read(self, first_line: int, end_line: int) -> Stretch:
-        """Lines ``first_line .. end_line - 1`` as far as they are in the ring (a copy)."""
+    def _put(self, row: int, pixels: NDArray[np.unsignedinteger]) -> None:
+        at = 0
+        for first, end in self.lanes:
+            self._pixels[row : row + len(pixels), at : at + end - first] = pixels[:, first:end]
+            at += end - first
+
+    def read(self, first_line: int, end_line: int, first_sample: int = 0, end_sample: int | None = None) -> Stretch:
+        """Lines ``first_line .. end_line - 1`` as far as they are in the ring (a copy), perhaps some samples of them.
+
+        Samples that are not kept are 0.
+        """
         first, end = max(first_line, self.start), min(end_line, self.end)
         at = np.arange(first, max(end, first)) % self.capacity
-        return Stretch(first, self._pixels[at], self._usable[at])
+        column = self._column[first_sample:end_sample]
+        if len(column) and column[0] >= 0 and column[-1] - column[0] == len(column) - 1:
+            return Stretch(first, self._pixels[at, column[0] : column[-1] + 1], self._usable[at])
+        pixels = self._pixels[at[:, None], column]
+        pixels[:, column < 0] = 0
+        return Stretch(first, pixels, self._usable[at])
+
+    def windows(
+        self, first_line: IntArray, first_sample: IntArray, lines: int, samples: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Pieces of (lines, samples) pixels that begin at given pixels (k,), as 32-bit floats (k, lines, samples).
+
+        Also which lines (k, lines) and samples (k, samples) are known; what is not known is arbitrary.
+        """
+        line = first_line[:, None] + np.arange(lines)
+        row = line % self.capacity
+        lines_known = (line >= self.start) & (line < self.end) & self._usable[row]
+        sample = first_sample[:, None] + np.arange(samples)
+        column = self._column[np.clip(sample, 0, self.samples - 1)]
+        samples_known = (sample >= 0) & (sample < self.samples) & (column >= 0)
+        values = self._pixels[row[:, :, None], np.maximum(column, 0)[:, None, :]].astype(np.float32)
+        return values, lines_known, samples_known
 
 
 class LineStore:
-    """Rings for the CCD lines of a camera.
+    """Rings for the CCD lines of a camera that together stay within a budget.
+
+    If the budget holds all lines that are wanted, they are kept. If not, lanes of them are kept: `LANE` samples wide,
+    evenly spread across the first CCD line, as many as go in; if fewer than `FEWEST_LANES` do, the rings are shortened.
 
     Parameters
     ----------
     samples : length of each CCD line
     lines : how many lines of each are wanted
-    budget_bytes : all rings together take no more; if that is too little, all are shortened alike
+    budget_bytes : all rings together take no more
     dtype : of the pixels
+    counterpart : sample of each CCD line that sees what the first one sees at given samples, for lanes; None = the same
+
+    Attributes
+    ----------
+    rings : by CCD line
+    share : of the lines that are wanted in memory: 1, or less for rings that had to be shortened
+    lanes : (l, 2) first and end sample of the lanes of the first CCD line; all of it where the budget suffices
 
     Raises
     ------
@@ -110,20 +179,53 @@ class LineStore:
         lines: Mapping[str, int],
         budget_bytes: int,
         dtype: np.dtype | type = np.uint16,
+        counterpart: Mapping[str, NDArray[np.floating]] | None = None,
     ):
-        size = {ccd: samples[ccd] * np.dtype(dtype).itemsize + 1 for ccd in samples}
-        wanted = sum(lines[ccd] * size[ccd] for ccd in samples)
-        self.share = min(1.0, budget_bytes / wanted) if wanted else 1.0
+        item = np.dtype(dtype).itemsize
+        leading = next(iter(samples))
+        whole = sum(lines[ccd] * (samples[ccd] * item + 1) for ccd in samples)
+        slice_bytes = sum(lines[ccd] * (LANE * item + 1) for ccd in samples)
+        fitting = min(budget_bytes // slice_bytes if slice_bytes else 0, min(samples.values()) // LANE)
+        kept: dict[str, IntArray | None] = dict.fromkeys(samples)
+        self.share = 1.0
+        if whole > budget_bytes and fitting >= 1 and min(samples.values()) >= FEWEST_LANES * LANE:
+            number = max(int(fitting), FEWEST_LANES)
+            self.share = min(1.0, budget_bytes / (number * slice_bytes))
+            middle = (np.arange(number) + 0.5) * samples[leading] / number
+            for ccd in samples:
+                there = middle
+                if counterpart is not None:
+                    there = np.interp(middle, np.arange(samples[leading]), counterpart[ccd])
+                kept[ccd] = _lanes(there, samples[ccd])
+        elif whole > budget_bytes:
+            self.share = budget_bytes / whole
         capacity = {ccd: int(lines[ccd] * self.share) for ccd in samples}
         if min(capacity.values(), default=0) < 8:
-            raise ValueError(f"a budget of {budget_bytes} bytes for image lines is too small: {wanted} are wanted")
-        self.rings = {ccd: LineRing(samples[ccd], capacity[ccd], dtype) for ccd in samples}
+            raise ValueError(f"a budget of {budget_bytes} bytes for image lines is too small: {whole} are wanted")
+        self.rings = {ccd: LineRing(samples[ccd], capacity[ccd], dtype, kept[ccd]) for ccd in samples}
+        self.lanes = self.rings[leading].lanes
 
     @property
     def nbytes(self) -> int:
         return sum(ring.nbytes for ring in self.rings.values())
 
+    @property
+    def cover(self) -> float:
+        """Share of the lines' width that is kept."""
+        ring = next(iter(self.rings.values()))
+        return float(np.diff(self.lanes, axis=1).sum() / ring.samples)
+
     def clear(self) -> None:
         """Forget all lines."""
         for ring in self.rings.values():
             ring.clear()
+
+
+def _lanes(middle: NDArray[np.floating], samples: int) -> IntArray:
+    """Lanes about given samples, pushed inside the line and apart."""
+    first = np.clip(np.sort(np.rint(middle).astype(np.int64)) - LANE // 2, 0, samples - LANE)
+    for i in range(1, len(first)):
+        first[i] = max(first[i], first[i - 1] + LANE)
+    for i in range(len(first) - 1, -1, -1):
+        first[i] = min(first[i], samples - LANE * (len(first) - i))
+    return np.stack([first, first + LANE], axis=1)

@@ -10,6 +10,7 @@ from typing import Any
 STUDIES: dict[str, tuple[str, str]] = {
     "testfields": ("study_testfields", "the testfields of the dissertation, simulated: published accuracy beside ours"),
     "online": ("study_online", "the demo flight with many seeds through the on-line nodes, against truth"),
+    "matching": ("study_matching", "tie points from image lines alone: quality, and what the adjustment makes of them"),
     "consistency": ("study_consistency", "whether errors of adjusted blocks are as large as their sigmas say"),
 }
 

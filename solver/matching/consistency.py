@@ -113,7 +113,7 @@ class SlowDisagreement:
                 fit[:, v, i], scale[v, i] = _robust_fit(design, together.residual[:, v, i])
         left = new.residual - np.einsum("kp,pvi->kvi", _design(new.time_s - middle, new.across), fit)
         limit = np.maximum(LIMIT_SIGMA * scale, LEAST_LIMIT_PX)
-        good = (np.abs(left) <= limit).all(axis=2)
+        good = np.asarray((np.abs(left) <= limit).all(axis=2))
         self._fit, self._scale, self._middle_s = fit, scale, middle
         return good
 

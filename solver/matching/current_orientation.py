@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..measured_trajectory import GrowingTrajectory
 from ..rotation import matrix_from_angles
+from .pose_smoothing import PoseSmoother
 
 Array = NDArray[np.floating]
 
@@ -21,6 +22,8 @@ class CurrentOrientation:
 
     def __init__(self) -> None:
         self._poses = GrowingTrajectory()
+        self._smoother = PoseSmoother()
+        self._last_s = -np.inf
         self._knots: dict[int, list[Array | int]] = {}
         self._covariance: dict[int, Array] = {}
 
@@ -30,14 +33,23 @@ class CurrentOrientation:
         return float(self._poses.time_s[-2]) if len(self._poses) >= 4 else -np.inf
 
     @property
+    def noise_left(self) -> Array:
+        """(6,) variance of what is left of the poses' white noise: X, Y, Z, m^2, about x, y, z of the camera, rad^2."""
+        return self._smoother.noise_left
+
+    @property
     def start_s(self) -> float:
         return self._poses.start_s if len(self._poses) >= 2 else np.inf
 
     def add_pose(self, time_s: float, position_l: Array, quaternion: Array, covariance: Array) -> bool:
         """Add a measured pose; False for one that does not come after the last."""
-        if len(self._poses) and time_s <= self._poses.end_s:
+        if time_s <= self._last_s:
             return False
-        self._poses.append(np.array([time_s]), position_l[None], quaternion[None], covariance[None])
+        self._last_s = time_s
+        known = self._smoother.push(time_s, position_l, quaternion, covariance)
+        if known is None:
+            return True
+        self._poses.append(np.array([known[0]]), known[1][None], known[2][None], known[3][None])
         if len(self._poses) > 4096 and self._poses.start_s < time_s - 2 * KEPT_S:
             self._poses.forget(time_s - KEPT_S)
         return True

@@ -18,8 +18,15 @@ CONVERGED_PX = 0.003
 WEIGHT_SHARE = 0.3
 #: Residuals are alike over so many pixels, at most.
 BOX = 7
-#: A window hardly larger than the box, with eight unknowns fitted in it, shows less than all of it.
-SHORTFALL = 1.6
+#: The eight unknowns take out of the residuals what moves them: over boxes of this size, white noise then shows only
+#: 1 / 1.7 of what it does (derived by `tests/test_least_squares_matching.py`).
+SHORTFALL = 1.7
+#: Share of white noise's variance that is left in residuals of patches that were resampled: bicubic values keep 0.81
+#: along and 0.81 across (mean of the squared weights over all phases), the searched patch is interpolated twice:
+#: (0.66 + 0.44) / 2. What moves a patch, the low frequencies of the noise, stays.
+SMOOTHED = 0.55
+#: Difference of bicubic values half a pixel to either side.
+GRADIENT_TAPS = np.array([-1.0, 10.0, 0.0, -10.0, 1.0]) / 16.0
 #: Scale and shear stay within this of none.
 LARGEST_SHEAR = 0.35
 
@@ -52,70 +59,110 @@ def match_patches(
     ``template(r, c) = gain search(a + A (r, c)) + offset``: eight unknowns, Gauss-Newton, both images taken as noisy.
     """
     k, t, _ = template.shape
-    n = search.shape[1]
-    middle = 0.5 * (n - 1)
-    r = np.arange(t) - 0.5 * (t - 1)
-    rows, columns = (a.ravel() for a in np.meshgrid(r, r, indexing="ij"))
-    weight = np.exp(-0.5 * (rows**2 + columns**2) / (WEIGHT_SHARE * t) ** 2)
+    window = _Window(t)
     wanted = template.reshape(k, -1).astype(float)
     shift, affine = np.array(start, dtype=float), np.repeat(np.eye(2)[None], k, axis=0)
     moved = np.full(k, np.inf)
-    shape = np.stack([np.ones_like(rows), rows, columns])
-    design = np.empty((k, t * t, 8))
-    cofactors = np.zeros((k, 8, 8))
-    residual, found = wanted, wanted
     for _ in range(iterations):
-        y = middle + shift[:, :1] + affine[:, 0, :1] * rows + affine[:, 0, 1:] * columns
-        x = middle + shift[:, 1:] + affine[:, 1, :1] * rows + affine[:, 1, 1:] * columns
+        on = np.flatnonzero(moved >= CONVERGED_PX)
+        if not len(on):
+            break
+        design, residual, _ = window.linearise(search[on], wanted[on], shift[on], affine[on])
+        weighted = design * window.weight[None, :, None]
+        cofactors = np.linalg.inv(_normal(design, weighted))
+        step = (cofactors @ np.einsum("kpi,kp->ki", weighted, residual)[:, :, None])[:, :, 0]
+        step[:, [0, 3]] = np.clip(step[:, [0, 3]], -1.0, 1.0)
+        shift[on] += step[:, [0, 3]]
+        change = np.clip(step[:, [[1, 2], [4, 5]]], -0.1, 0.1)
+        affine[on] = np.eye(2) + np.clip(affine[on] + change - np.eye(2), -LARGEST_SHEAR, LARGEST_SHEAR)
+        moved[on] = np.abs(step[:, [0, 3]]).max(axis=1)
+    design, residual, found = window.linearise(search, wanted, shift, affine)
+    covariance = _shift_covariance(design, window.weight, residual, t)
+    return PatchMatch(shift, covariance, affine, _score(found, wanted, window.weight), moved < 0.05)
+
+
+class _Window:
+    """The pixels of a template of side ``t`` about its middle, and their weights."""
+
+    def __init__(self, t: int):
+        r = np.arange(t) - 0.5 * (t - 1)
+        self.rows, self.columns = (a.ravel() for a in np.meshgrid(r, r, indexing="ij"))
+        self.weight = np.exp(-0.5 * (self.rows**2 + self.columns**2) / (WEIGHT_SHARE * t) ** 2)
+        self.shape = np.stack([np.ones_like(self.rows), self.rows, self.columns])
+
+    def linearise(
+        self, search: NDArray[np.floating], wanted: Array, shift: Array, affine: Array
+    ) -> tuple[Array, Array, Array]:
+        """Design (k, p, 8), residuals (k, p) and grey values that were found (k, p)."""
+        middle = 0.5 * (search.shape[1] - 1)
+        y = middle + shift[:, :1] + affine[:, 0, :1] * self.rows + affine[:, 0, 1:] * self.columns
+        x = middle + shift[:, 1:] + affine[:, 1, :1] * self.rows + affine[:, 1, 1:] * self.columns
         found = interpolate_stack(search, y, x).astype(float)
         gy = interpolate_stack(search, y + 0.5, x).astype(float) - interpolate_stack(search, y - 0.5, x)
         gx = interpolate_stack(search, y, x + 0.5).astype(float) - interpolate_stack(search, y, x - 0.5)
         # gain and offset of the grey values, so that the residual is one of the search image
-        gain, offset = _grey_fit(found, wanted, weight)
+        gain, offset = _grey_fit(found, wanted, self.weight)
         residual = (wanted - offset) / gain - found
         spread = np.maximum(found.std(axis=1), 1.0)[:, None]
-        design[:, :, 0:3] = gy[:, :, None] * shape.T
-        design[:, :, 3:6] = gx[:, :, None] * shape.T
+        design = np.empty((*found.shape, 8))
+        design[:, :, 0:3] = gy[:, :, None] * self.shape.T
+        design[:, :, 3:6] = gx[:, :, None] * self.shape.T
         design[:, :, 6] = (found - found.mean(axis=1, keepdims=True)) / spread
         design[:, :, 7] = 1.0
-        weighted = design * weight[None, :, None]
-        normal = np.swapaxes(design, 1, 2) @ weighted
-        normal += 1e-6 * np.einsum("kii->ki", normal)[:, :, None] * np.eye(8) + 1e-9 * np.eye(8)
-        cofactors = np.linalg.inv(normal)
-        step = (cofactors @ np.einsum("kpi,kp->ki", weighted, residual)[:, :, None])[:, :, 0]
-        step[:, [0, 3]] = np.clip(step[:, [0, 3]], -1.0, 1.0)
-        shift += step[:, [0, 3]]
-        affine[:, 0] += np.clip(step[:, 1:3], -0.1, 0.1)
-        affine[:, 1] += np.clip(step[:, 4:6], -0.1, 0.1)
-        affine = np.eye(2) + np.clip(affine - np.eye(2), -LARGEST_SHEAR, LARGEST_SHEAR)
-        moved = np.abs(step[:, [0, 3]]).max(axis=1)
-        if (moved < CONVERGED_PX).all():
-            break
-    gain, offset = _grey_fit(found, wanted, weight)
-    left = (wanted - offset) / gain - found
-    covariance = _shift_covariance(design, weight, cofactors, left, t)
-    return PatchMatch(shift, covariance, affine, _score(found, wanted, weight), moved < 0.05)
+        return design, residual, found
 
 
-def _shift_covariance(design: Array, weight: Array, cofactors: Array, left: Array, t: int) -> Array:
+def _normal(design: Array, weighted: Array) -> Array:
+    """Normal equations (k, 8, 8), kept regular."""
+    normal = np.swapaxes(design, 1, 2) @ weighted
+    return normal + 1e-6 * np.einsum("kii->ki", normal)[:, :, None] * np.eye(8) + 1e-9 * np.eye(8)
+
+
+def _shift_covariance(design: Array, weight: Array, left: Array, t: int) -> Array:
     """Covariance (k, 2, 2) of the shifts from the residuals (k, p): noise, and everything the model does not know.
 
-    Noise is white, but what else two images do not have in common (tree crowns, waves, relief) is alike over several
-    pixels and moves the result more. Sums of what residuals do to the shift over boxes show it (a long-run variance
-    with triangular weights); it counts where it is more than white noise makes of the same residuals.
+    Gradients are taken from a noisy image: what noise adds to their squares is taken off the normal equations, else
+    strong noise would look like strong texture. Noise is nearly white, but what else two images do not have in common
+    (tree crowns, waves, relief) is alike over several pixels and moves the result more. Sums of what residuals do to
+    the shift over boxes show it (a long-run variance with triangular weights); it counts where it is more than white
+    noise makes of the same residuals.
     """
     k = len(left)
     total = weight.sum()
     square = np.sum(weight * left**2, axis=1) / (total - 8 * np.sum(weight**2) / total)
+    normal = _normal(design, design * weight[None, :, None])
+    cofactors = np.linalg.inv(normal - _gradient_noise(weight, left, t))
     gain = (cofactors[:, [0, 3]] @ np.swapaxes(design, 1, 2)) * weight  # (k, 2, p)
-    white = square[:, None, None] * (gain @ np.swapaxes(gain, 1, 2))
+    white = square[:, None, None] / SMOOTHED * (gain @ np.swapaxes(gain, 1, 2))
     moves = (gain * left[:, None]).reshape(k, 2, t, t)
     padded = np.zeros((k, 2, t + 2 * BOX, t + 2 * BOX))
     padded[:, :, BOX : BOX + t, BOX : BOX + t] = moves
     sums = (BOX * uniform_filter(padded, BOX, mode="constant", axes=(2, 3))).reshape(k, 2, -1)
     alike = sums @ np.swapaxes(sums, 1, 2)
     more = np.einsum("kii->k", alike) / np.maximum(np.einsum("kii->k", white), 1e-12)
-    return white * np.maximum(SHORTFALL * more, 1.0)[:, None, None]
+    covariance = white * np.maximum(SHORTFALL * more, 1.0)[:, None, None]
+    # less texture than noise: nothing was measured
+    lost = ~(np.diagonal(cofactors, axis1=1, axis2=2)[:, :6] > 0).all(axis=1)
+    covariance[lost] = np.inf
+    return covariance
+
+
+def _gradient_noise(weight: Array, left: Array, t: int) -> Array:
+    """What noise adds to normal equations (k, 8, 8) through the gradients of the searched image, from the residuals.
+
+    Half of a residual's variance is the searched image's. The gradients of the residuals are taken as those of the
+    image are: bicubic values half a pixel to either side. Their median counts: at sharp edges residuals are no noise.
+    """
+    k = len(left)
+    grid = left.reshape(k, t, t)
+    shape = _Window(t).shape
+    blocks = (shape * weight) @ shape.T
+    out = np.zeros((k, 8, 8))
+    for at, values in ((0, grid), (3, np.swapaxes(grid, 1, 2))):
+        g = sum(tap * values[:, i : i + t - 4] for i, tap in enumerate(GRADIENT_TAPS))
+        variance = 0.5 * (1.4826 * np.median(np.abs(g).reshape(k, -1), axis=1)) ** 2
+        out[:, at : at + 3, at : at + 3] = variance[:, None, None] * blocks
+    return out
 
 
 def _grey_fit(found: Array, wanted: Array, weight: Array) -> tuple[Array, Array]:

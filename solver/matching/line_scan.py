@@ -83,13 +83,25 @@ class LineScan:
     R_lc: Array
 
     def to_plane(self, line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:
-        """Ground points (n, 3) of pixels at whole lines, at given heights, and the rays' slopes dX/dZ, dY/dZ (n, 2)."""
-        i = np.asarray(line).astype(int) - self.first_line
-        direction = np.einsum("nij,nj->ni", self.R_lc[i], self.view.rays_c(sample))
+        """Ground points (n, 3) of pixels at given heights, and the rays' slopes dX/dZ, dY/dZ (n, 2).
+
+        Between two lines, both are linear.
+        """
+        u = np.clip(np.asarray(line) - self.first_line, 0, len(self.position_l) - 1)
+        rays = self.view.rays_c(sample)
+        i = np.floor(u).astype(int)
+        share = (u - i)[:, None]
+        xy, slope = self._on_plane(i, rays, height_m)
+        if share.any():
+            after_xy, after_slope = self._on_plane(np.minimum(i + 1, len(self.position_l) - 1), rays, height_m)
+            xy, slope = xy + share * (after_xy - xy), slope + share * (after_slope - slope)
+        return np.column_stack([xy, height_m]), slope
+
+    def _on_plane(self, i: NDArray[np.int_], rays: Array, height_m: Array) -> tuple[Array, Array]:
+        direction = np.einsum("nij,nj->ni", self.R_lc[i], rays)
         slope = direction[:, :2] / direction[:, 2:]
         position = self.position_l[i]
-        xy = position[:, :2] + slope * (height_m - position[:, 2])[:, None]
-        return np.column_stack([xy, height_m]), slope
+        return position[:, :2] + slope * (height_m - position[:, 2])[:, None], slope
 
     def locate(self, point_l: Array, line: Array, rounds: int = 3) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Line and sample (n,) of ground points (n, 3), from guesses of the line; and which lie on the lines at hand.
@@ -99,7 +111,7 @@ class LineScan:
         """
         last = len(self.position_l) - 2
         u = np.clip(np.asarray(line, dtype=float) - self.first_line, 0, last + 1)
-        travel = float(np.linalg.norm(self.position_l[-1] - self.position_l[0])) / (last + 1)
+        travel = max(float(np.linalg.norm(self.position_l[-1] - self.position_l[0])) / (last + 1), 1e-9)
         before, ahead_before = u, np.zeros(len(u))
         pixel = np.ones(len(u))
         for turn in range(rounds):

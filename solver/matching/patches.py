@@ -1,4 +1,4 @@
-"""Grey values between pixels: image stretches, their reduced levels, and patches out of them."""
+"""Grey values between pixels: windows of image lines about many places at once, reduced levels, patches out of them."""
 
 from __future__ import annotations
 
@@ -9,82 +9,85 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 Float32 = NDArray[np.floating]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Lines of one CCD as an image, perhaps reduced.
+class Windows:
+    """Pieces of one CCD's lines about k places, perhaps reduced.
 
     Attributes
     ----------
-    first_line : number of its first full-size line
-    values : (n, m) grey values
-    usable : (n,) rows that may be used
+    first_line, first_sample : (k,) full-size pixel that each begins with
+    values : (k, n, m) grey values
+    lines_known, samples_known : (k, n), (k, m) which lines and samples are there and fit for use
     factor : full-size pixels to one of these, along and across
     """
 
-    first_line: int
+    first_line: NDArray[np.int64]
+    first_sample: NDArray[np.int64]
     values: Float32
-    usable: NDArray[np.bool_]
+    lines_known: Mask
+    samples_known: Mask
     factor: int = 1
 
-    def reduced(self, factor: int) -> Picture:
-        """The picture with blocks of ``factor`` x ``factor`` pixels put together."""
+    def reduced(self, factor: int) -> Windows:
+        """The same with blocks of ``factor`` x ``factor`` pixels put together."""
         if factor == 1:
             return self
-        n, m = (size // factor * factor for size in self.values.shape)
-        values = self.values[:n, :m].reshape(n // factor, factor, m // factor, factor).mean(axis=(1, 3))
-        usable = self.usable[:n].reshape(-1, factor).min(axis=1)
-        return Picture(self.first_line, values.astype(np.float32), usable, factor * self.factor)
+        k = len(self.values)
+        n, m = (size // factor * factor for size in self.values.shape[1:])
+        values = self.values[:, :n, :m].reshape(k, n // factor, factor, m // factor, factor).mean(axis=(2, 4))
+        lines = self.lines_known[:, :n].reshape(k, -1, factor).min(axis=2)
+        samples = self.samples_known[:, :m].reshape(k, -1, factor).min(axis=2)
+        return Windows(self.first_line, self.first_sample, values, lines, samples, factor * self.factor)
 
-    def sample(self, line: Array, sample: Array, cubic: bool) -> tuple[Float32, NDArray[np.bool_]]:
-        """Grey values at lines and samples (...), full-size pixels; and which of them are known."""
-        off = 0.5 * (self.factor - 1)
-        u = (line - self.first_line - off) / self.factor
-        v = (sample - off) / self.factor
-        return interpolate(self.values, self.usable, u, v, cubic)
-
-
-def interpolate(
-    values: Float32, usable: NDArray[np.bool_], u: Array, v: Array, cubic: bool
-) -> tuple[Float32, NDArray[np.bool_]]:
-    """Bicubic (Keys) or bilinear values of an image (n, m) at rows and columns (...); False where some are missing."""
-    before, taps = (1, 4) if cubic else (0, 2)
-    i, j = np.floor(u), np.floor(v)
-    a, b = (u - i).astype(np.float32), (v - j).astype(np.float32)
-    n, m = values.shape
-    known = (i >= before) & (i + taps - before <= n) & (j >= before) & (j + taps - before <= m)
-    i = np.clip(i, before, max(n - taps + before, before)).astype(np.int64) - before
-    j = np.clip(j, before, max(m - taps + before, before)).astype(np.int64) - before
-    if n < taps or m < taps:
-        return np.zeros(u.shape, dtype=np.float32), np.zeros(u.shape, dtype=bool)
-    through = np.concatenate([[0], np.cumsum(~usable)])
-    known &= through[i + taps] == through[i]
-    flat, at = values.ravel(), i * m + j
-    wu, wv = (_cubic(a), _cubic(b)) if cubic else ((1 - a, a), (1 - b, b))
-    total = np.zeros(u.shape, dtype=np.float32)
-    for k in range(taps):
-        row = wv[0] * flat[at + k * m]
-        for l in range(1, taps):
-            row += wv[l] * flat[at + k * m + l]
-        total += wu[k] * row
-    return total, known
+    def sample(self, line: Array, sample: Array, cubic: bool) -> tuple[Float32, Mask]:
+        """Bicubic (Keys) or bilinear grey values at full-size lines and samples (k, ...), and which are known."""
+        k, n, m = self.values.shape
+        off, wide = 0.5 * (self.factor - 1), (k,) + (1,) * (line.ndim - 1)
+        u = (line - self.first_line.reshape(wide) - off) / self.factor
+        v = (sample - self.first_sample.reshape(wide) - off) / self.factor
+        before, taps = (1, 4) if cubic else (0, 2)
+        if n < taps or m < taps:
+            return np.zeros(u.shape, dtype=np.float32), np.zeros(u.shape, dtype=bool)
+        i, j = np.floor(u), np.floor(v)
+        a, b = (u - i).astype(np.float32), (v - j).astype(np.float32)
+        known = (i >= before) & (i + taps - before <= n) & (j >= before) & (j + taps - before <= m)
+        i = np.clip(i, before, n - taps + before).astype(np.int64) - before
+        j = np.clip(j, before, m - taps + before).astype(np.int64) - before
+        for at, there in ((i, self.lines_known), (j, self.samples_known)):
+            if not there.all():
+                gaps = np.concatenate([np.zeros((k, 1), np.int64), np.cumsum(~there, axis=1)], axis=1)
+                flat = at.reshape(k, -1)
+                none = np.take_along_axis(gaps, flat + taps, axis=1) == np.take_along_axis(gaps, flat, axis=1)
+                known &= none.reshape(known.shape)
+        total = _weighted(self.values, i, j, *((_cubic(a), _cubic(b)) if cubic else ((1 - a, a), (1 - b, b))))
+        return total, known
 
 
 def interpolate_stack(stack: Float32, y: Array, x: Array) -> Float32:
     """Bicubic values of patches (k, n, m) at rows and columns (k, ...), each in its own; beyond the border its edge."""
-    k, n, m = stack.shape
+    n, m = stack.shape[1:]
     y, x = np.clip(y, 1.0, n - 2.001), np.clip(x, 1.0, m - 2.001)
     i, j = y.astype(np.int64), x.astype(np.int64)
     wu, wv = _cubic((y - i).astype(np.float32)), _cubic((x - j).astype(np.float32))
+    return _weighted(stack, i - 1, j - 1, wu, wv)
+
+
+def _weighted(
+    stack: Float32, i: NDArray[np.int64], j: NDArray[np.int64], wu: tuple[Float32, ...], wv: tuple[Float32, ...]
+) -> Float32:
+    """Sums of pixels from rows ``i`` and columns ``j`` (k, ...) of patches (k, n, m) on, with weights."""
+    k, n, m = stack.shape
     flat = stack.ravel()
-    at = (np.arange(k) * n * m).reshape((k,) + (1,) * (y.ndim - 1)) + (i - 1) * m + (j - 1)
-    total = np.zeros(y.shape, dtype=np.float32)
-    for a in range(4):
+    at = (np.arange(k) * n * m).reshape((k,) + (1,) * (i.ndim - 1)) + i * m + j
+    total = np.zeros(at.shape, dtype=np.float32)
+    for a, w in enumerate(wu):
         row = wv[0] * flat[at + a * m]
-        for b in range(1, 4):
-            row += wv[b] * flat[at + a * m + b]
-        total += wu[a] * row
+        for b in range(1, len(wv)):
+            row += wv[b] * flat[at + (a * m + b)]
+        total += w * row
     return total
 
 

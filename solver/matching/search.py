@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..line_store import LineRing
 from .correlation import best_place, correlate
 from .least_squares import PatchMatch, match_patches
 from .line_scan import LineScan
-from .patches import Picture, interpolate_stack
+from .patches import Windows, interpolate_stack
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -18,9 +20,13 @@ Mask = NDArray[np.bool_]
 #: Half sides, px: template of the correlation, template of least squares, margin around it, reach at finer levels.
 CORRELATION_HALF, LEAST_SQUARES_HALF, MARGIN, FINE_REACH = 7, 9, 4, 2
 #: Furthest a correlation looks in its own pixels; further ones are found at a coarser level.
-COARSE_REACH, COARSEST = 10, 8
+REACH_PX, COARSEST = 10, 8
 #: Where vibration pulls lines apart or together by more than this factor (logarithm), the ground is not well sampled.
 LARGEST_UNEVENNESS = float(np.log(1.8))
+#: Shares of a template at coarser levels and of what it is searched in that must be known.
+LEAST_TEMPLATE, LEAST_SEARCH = 0.7, 0.4
+#: Along a row of a grid every so many pixels are computed exactly; a patch covers at most so many times its size.
+NODE_PX, MOST_STRETCH = 4, 2.0
 
 
 @dataclass(frozen=True)
@@ -42,20 +48,44 @@ class Ground:
     def moved(self, shift: Array) -> Ground:
         """About places that lie (k, 2) rows and columns further."""
         xy = self.spacing_m * (shift[:, :1] * self.along + shift[:, 1:] * self.across)
-        return Ground(self.centre_l + np.column_stack([xy, np.zeros(len(xy))]), self.along, self.across, self.spacing_m)
+        return replace(self, centre_l=self.centre_l + np.column_stack([xy, np.zeros(len(xy))]))
 
-    def select(self, chosen: Mask) -> Ground:
+    def select(self, chosen: Mask | NDArray[np.intp]) -> Ground:
         """Some of the places."""
-        return Ground(self.centre_l[chosen], self.along, self.across, self.spacing_m)
+        return replace(self, centre_l=self.centre_l[chosen])
 
-    def points(self, half: int, factor: int) -> Array:
-        """(k, n, n, 3) grid points with n = 2 half + 1 and a spacing of ``factor`` pixels."""
-        r = self.spacing_m * factor * np.arange(-half, half + 1)
-        out = np.empty((len(self.centre_l), len(r), len(r), 3))
-        xy = r[:, None, None] * self.along + r[None, :, None] * self.across
+    def points(self, rows: Array, columns: Array) -> Array:
+        """(k, rows, columns, 3) points of a grid; rows and columns in units of the spacing."""
+        out = np.empty((len(self.centre_l), len(rows), len(columns), 3))
+        xy = self.spacing_m * (rows[:, None, None] * self.along + columns[None, :, None] * self.across)
         out[..., :2] = self.centre_l[:, None, None, :2] + xy
         out[..., 2] = self.centre_l[:, None, None, 2]
         return out
+
+
+class Imagery(Protocol):
+    """Whatever gives patches on grids on the ground."""
+
+    @property
+    def line_m(self) -> float:
+        """Way of the platform from one line to the next, m."""
+        ...
+
+    def select(self, chosen: Mask) -> Imagery:
+        """For some of the places."""
+        ...
+
+    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Array, Array]:
+        """Grey values (k, n, n) on grids with n = 2 half + 1 and a spacing of ``factor`` pixels.
+
+        Also the share of each (k,) that is known - the rest has the mean of it -, and how uneven their lines lie: (k,)
+        the largest distance of neighbouring lines on the ground against the mean (logarithm).
+
+        Parameters
+        ----------
+        line : (k,) line of the middle of each, roughly
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -65,34 +95,61 @@ class Image:
     Attributes
     ----------
     scan : geometry
-    levels : factor -> picture
+    ring : the lines
     line_m : way of the platform from one line to the next, m
     """
 
     scan: LineScan
-    levels: dict[int, Picture]
+    ring: LineRing
     line_m: float
 
-    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Mask, Array]:
-        """Grey values (k, n, n) on the grids, which of the k are known throughout, and how uneven their lines lie.
+    def select(self, chosen: Mask) -> Image:
+        """An image is the same for all places."""
+        return self
 
-        The unevenness (k,) is the largest distance of neighbouring lines on the ground against the mean (logarithm).
+    def patches(
+        self, ground: Ground, line: Array, half: int, factor: int, lines_per: Array | None = None
+    ) -> tuple[NDArray[np.floating], Array, Array]:
+        """See `Imagery`; every row of a grid through the orientation of the lines it falls on.
 
-        Parameters
-        ----------
-        line : (k,) line of the middle of each, roughly
+        ``lines_per``: lines for a step along rows and columns of grids that do not lie along the flight.
         """
-        points = ground.points(half, factor)
-        r = ground.spacing_m * factor / self.line_m * np.arange(-half, half + 1)
-        guess = np.broadcast_to((line[:, None] + r)[:, :, None], points.shape[:3])
+        k, n = len(line), 2 * half + 1
+        grid = factor * np.arange(-half, half + 1.0)
+        # along a row of the grid, lines and samples change smoothly: a few places are exact, the rest between them
+        nodes = np.linspace(grid[0], grid[-1], max((n - 1) // NODE_PX, 1) + 1)
+        points = ground.points(grid, nodes)
+        along, across = (ground.spacing_m / self.line_m, 0.0) if lines_per is None else lines_per
+        guess = line[:, None, None] + along * grid[:, None] + across * nodes
+        guess = np.broadcast_to(guess, points.shape[:3])
         u, v, inside = self.scan.locate(points.reshape(-1, 3), guess.ravel(), rounds=4)
-        picture = self.levels.get(factor) or self.levels[1].reduced(factor)
-        self.levels[factor] = picture
-        values, known = picture.sample(u, v, cubic=factor == 1)
-        shape = points.shape[:3]
-        density = np.diff(u.reshape(shape)[:, :, :: max(half, 1)], axis=1) * (self.line_m / (ground.spacing_m * factor))
-        uneven = np.abs(np.log(np.clip(density, 0.05, 20.0))).reshape(len(line), -1).max(axis=1)
-        return values.reshape(shape), (inside & known).reshape(len(line), -1).min(axis=1), uneven
+        u, v, inside = u.reshape(guess.shape), v.reshape(guess.shape), inside.reshape(guess.shape)
+        # how lines follow each other, along the axis of the grid that goes with the flight
+        step, axis = (along, 1) if abs(along) >= abs(across) else (across * np.diff(nodes)[0] / factor, 2)
+        density = np.diff(u, axis=axis) / (step * factor)
+        uneven = np.abs(np.log(np.clip(density, 0.05, 20.0))).reshape(k, -1).max(axis=1)
+        between = _between(grid, nodes)
+        values, known = self._sample(u, v, between, factor)
+        known &= inside @ between > 0.999
+        share = known.reshape(k, -1).mean(axis=1)
+        mean = np.sum(values, axis=(1, 2), where=known) / np.maximum(share * n * n, 1.0)
+        values = np.where(known, values, mean[:, None, None].astype(np.float32))
+        return values, share, uneven
+
+    def _sample(self, u: Array, v: Array, between: Array, factor: int) -> tuple[NDArray[np.floating], Mask]:
+        """Grey values (k, n, n) at lines and samples known in some columns (k, n, c)."""
+        widest = int(MOST_STRETCH * factor * u.shape[1]) + 8
+        pad = factor + 2 if factor > 1 else 2
+        first = [np.floor(np.clip(a.min(axis=(1, 2)), -1e6, 1e9)).astype(np.int64) - pad for a in (u, v)]
+        size = [int(np.ceil(np.quantile(np.ptp(a, axis=(1, 2)), 0.95) * 1.05)) + 2 * pad + 6 for a in (u, v)]
+        n, m = (min(x, widest) // factor * factor + factor for x in size)
+        windows = Windows(first[0], first[1], *self.ring.windows(first[0], first[1], n, m)).reduced(factor)
+        return windows.sample(u @ between, v @ between, cubic=factor == 1)
+
+
+def _between(grid: Array, nodes: Array) -> Array:
+    """(c, n) weights that interpolate linearly from nodes to all columns of a grid."""
+    return np.stack([np.interp(grid, nodes, row) for row in np.eye(len(nodes))])
 
 
 @dataclass(frozen=True)
@@ -118,19 +175,25 @@ class Found:
 def coarsest_factor(reach_px: float) -> int:
     """Reduction at which a search of a reach (px) begins."""
     factor = 1
-    while reach_px > COARSE_REACH * factor and factor < COARSEST:
+    while reach_px > REACH_PX * factor and factor < COARSEST:
         factor *= 2
     return factor
 
 
 def find(
-    master: Image, master_line: Array, ground: Ground, other: Image, guess: Array, other_line: Array, reach_px: float
+    master: Imagery,
+    master_line: Array,
+    ground: Ground,
+    other: Imagery,
+    guess: Array,
+    other_line: Array,
+    reach_px: float,
 ) -> Found:
     """Find the places under the master's pixels in another view.
 
     Parameters
     ----------
-    master, other : the two views
+    master, other : the two views; the first may be a store of patches
     master_line, other_line : (k,) lines of the grids' middles in the two, roughly
     ground : grids about the places, at their guessed heights
     guess : (k, 2) shift to be expected, rows and columns
@@ -141,14 +204,15 @@ def find(
     reason = np.full(k, "", dtype="U24")
     alive = np.ones(k, dtype=bool)
     factor = coarsest_factor(reach_px)
-    reach = int(np.ceil(min(reach_px / factor, COARSE_REACH))) + 1
+    reach = int(np.ceil(min(reach_px / factor, REACH_PX))) + 1
     line_per_row = ground.spacing_m / other.line_m
     while True:
         t, known_t, _ = master.patches(ground, master_line, CORRELATION_HALF, factor)
         at = other_line + shift[:, 0] * line_per_row
         s, known_s, _ = other.patches(ground.moved(shift), at, CORRELATION_HALF + reach, factor)
-        reason[alive & ~(known_t & known_s)] = "no lines"
-        alive &= known_t & known_s
+        there = (known_t >= (LEAST_TEMPLATE if factor > 1 else 1.0)) & (known_s >= LEAST_SEARCH)
+        reason[alive & ~there] = "no lines"
+        alive &= there
         row, column, top = best_place(correlate(t, s))
         edge = (np.minimum(row, column) == 0) | (np.maximum(row, column) == 2 * reach)
         reason[alive & edge] = "beyond search"
@@ -165,7 +229,7 @@ def find(
 
 
 def _refine(
-    master: Image, master_line: Array, ground: Ground, other: Image, other_line: Array, shift: Array, alive: Mask,
+    master: Imagery, master_line: Array, ground: Ground, other: Imagery, other_line: Array, shift: Array, alive: Mask,
     reason: NDArray[np.str_],
 ) -> Found:  # fmt: skip
     k, half = len(shift), LEAST_SQUARES_HALF
@@ -173,7 +237,7 @@ def _refine(
     wide = half + MARGIN
     if alive.any():
         here, moved = ground.select(alive), ground.select(alive).moved(shift[alive])
-        t, known_t, uneven_t = master.patches(here, master_line[alive], wide, 1)
+        t, known_t, uneven_t = master.select(alive).patches(here, master_line[alive], wide, 1)
         at = other_line[alive] + shift[alive, 0] * ground.spacing_m / other.line_m
         s, known_s, uneven_s = other.patches(moved, at, wide, 1)
         inner = slice(MARGIN, MARGIN + 2 * half + 1)
@@ -183,7 +247,7 @@ def _refine(
         shift[index] += there.shift
         covariance[index], score[index] = there.covariance, there.score
         closing[index] = np.hypot(*back.shift.T)
-        reason[index[~(known_t & known_s)]] = "no lines"
+        reason[index[np.minimum(known_t, known_s) < 1.0]] = "no lines"
         shaken = np.maximum(uneven_t, uneven_s) > LARGEST_UNEVENNESS
         reason[index[shaken & (reason[index] == "")]] = "shaken"
         lost = ~there.converged | (np.abs(there.shift) > 2.0).any(axis=1)

@@ -1,0 +1,112 @@
+"""Image lines on their way into the store: judged, counted, and what is wrong with them told in one line."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..line_store import LineStore
+from .line_quality import GOOD, REASONS, judge_lines
+from .options import MatchingOptions
+
+#: Events of a strip that are told.
+MOST_TOLD = 100
+#: Names of lines that cannot be used, in events.
+_WORDS = {"dark": "black (lens cap, no light or no data)", "saturated": "saturated", "frozen": "frozen"}
+
+
+class LineIntake:
+    """Takes the lines of a strip.
+
+    Parameters
+    ----------
+    samples : length of each CCD line
+    options : see `MatchingOptions`
+    make_store : makes the store for pixels of a type, or None as long as it is not known how long a store is needed
+
+    Attributes
+    ----------
+    counters : lines by what was wrong with them
+    """
+
+    def __init__(
+        self,
+        samples: Mapping[str, int],
+        options: MatchingOptions,
+        make_store: Callable[[np.dtype], LineStore | None],
+    ):
+        self.counters: Counter[str] = Counter()
+        self.store: LineStore | None = None
+        self._samples, self._options, self._make_store = samples, options, make_store
+        self._last_line: dict[str, NDArray[np.unsignedinteger]] = {}
+        self._state: dict[str, int] = {}
+        self._events: list[str] = []
+        self._told = 0
+
+    def begin_strip(self) -> None:
+        """What is in store is forgotten."""
+        self.store = None
+        self._told = 0
+        self._last_line.clear()
+
+    def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
+        """Lines of one CCD.
+
+        Raises
+        ------
+        ValueError : a CCD line the camera does not have, lines of another length or pixel type
+        """
+        if ccd not in self._samples:
+            raise ValueError(f"unknown CCD line {ccd!r}")
+        if pixels.ndim != 2 or pixels.shape[1] != self._samples[ccd]:
+            raise ValueError(f"lines of {ccd} of shape {pixels.shape}, wanted {self._samples[ccd]} samples")
+        if pixels.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"lines of {ccd} of {pixels.dtype}, wanted uint8 or uint16")
+        if not len(pixels) or first_line < 0:
+            raise ValueError(f"no lines of {ccd}, or their number {first_line} is below 0")
+        full_scale = self._options.full_scale or (255 if pixels.dtype == np.uint8 else 4095)
+        verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
+        self._last_line[ccd] = pixels[-1].copy()
+        self._tell(ccd, first_line, verdict)
+        if self.store is None:
+            self.store = self._make_store(pixels.dtype)
+        if self.store is None:
+            self.counters["lines before poses"] += len(pixels)
+            return
+        missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
+        if missing:
+            self.counters["lines missing"] += missing
+            self.tell(f"{ccd}: {missing} lines are missing before line {first_line}")
+        if late:
+            self.counters["lines twice or late"] += late
+
+    def take_events(self) -> list[str]:
+        """What is worth telling since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def tell(self, text: str) -> None:
+        """Another line to be told; a camera that fails all the time is told of so many times, then only counted."""
+        self._told += 1
+        if self._told <= MOST_TOLD:
+            self._events.append(text)
+        elif self._told == MOST_TOLD + 1:
+            self._events.append("more of the kind is counted, but no longer told in this strip")
+
+    def _tell(self, ccd: str, first_line: int, verdict: NDArray[np.int8]) -> None:
+        """Count bad lines; tell where bad ones begin and where they end."""
+        bad = verdict[verdict != GOOD]
+        for code, n in zip(*np.unique(bad, return_counts=True), strict=True):
+            self.counters[f"lines {REASONS[code]}"] += int(n)
+        before, state = self._state.get(ccd, GOOD), int(verdict[-1])
+        self._state[ccd] = state
+        if state == before == GOOD and len(bad):  # a few bad lines among good ones
+            first = first_line + int(np.flatnonzero(verdict != GOOD)[0])
+            self.tell(f"{ccd}: {len(bad)} lines are {_WORDS[REASONS[int(np.bincount(bad).argmax())]]} from {first} on")
+        elif state != before:
+            run = first_line + int(np.flatnonzero(np.append(-1, verdict[:-1]) != state)[-1])
+            what = "lines are good again" if state == GOOD else f"lines are {_WORDS[REASONS[state]]}"
+            self.tell(f"{ccd}: {what} from line {run} on")

@@ -1,0 +1,135 @@
+"""Where the looks at a place are to be expected, and how far around: orientation, heights, and what matches showed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .consistency import SlowDisagreement
+from .current_orientation import CurrentOrientation
+from .height_guess import HeightGuess
+from .line_scan import LineScan, View
+from .options import MatchingOptions
+from .search import CORRELATION_HALF, REACH_PX, Ground, coarsest_factor
+
+Array = NDArray[np.floating]
+
+#: Lines around what is needed, for vibration and reduced levels.
+PAD = 24
+#: Lines of which the orientation is computed around a batch: the widest patch at the coarsest level.
+WIDE = 7 * PAD
+#: Least reach once neighbours tell where to look, px; it doubles while more than a share is found to lie beyond.
+LEAST_REACH, MOST_BEYOND = 4.0, 0.25
+
+
+class Prediction:
+    """What is known of a strip's geometry so far.
+
+    Parameters
+    ----------
+    views, master : the CCD lines, and which of them places are chosen in
+    options : see `MatchingOptions`
+    """
+
+    def __init__(self, views: Sequence[View], master: int, options: MatchingOptions):
+        self.views, self.master = views, master
+        self.others = [i for i in range(len(views)) if i != master]
+        self.options = options
+        self.orientation = CurrentOrientation()
+        self.heights = HeightGuess(0.0, options.relief_sigma_m)
+        self.slow = SlowDisagreement(len(self.others))
+        self.first_s = self.rate = 0.0
+        self._axes: tuple[Array, Array] | None = None
+        self._told = (-np.inf, (1.0, 1.0))
+        self._least = LEAST_REACH
+        self._widest = 0.0  # search of late
+
+    def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
+        """Lines begin anew."""
+        self.first_s, self.rate = first_line_time_s, line_rate_hz
+        self.slow.forget()
+        self.orientation.forget_corrections()
+        self._axes, self._least = None, LEAST_REACH
+        self._told = (-np.inf, (1.0, 1.0))
+
+    @property
+    def known_lines(self) -> float:
+        """Lines before this one have their orientation."""
+        return (self.orientation.end_s - self.first_s) * self.rate
+
+    def height_and_travel(self) -> tuple[float, float]:
+        """Height above ground, and way from one line to the next, now; m."""
+        t = self.orientation.end_s
+        if t == self._told[0]:
+            return self._told[1]
+        position, _ = self.orientation.at([t - 1.0 / self.rate * 20, t])
+        height = float(position[1, 2]) - float(self.heights.at(position[1:, :2])[0][0])
+        self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6))
+        return self._told[1]
+
+    def scan(self, index: int, first: float, last: float) -> LineScan | None:
+        """Lines of a view with their orientation, as far as there is one."""
+        o = self.orientation
+        low = max(int(np.floor(first)), int(np.ceil((o.start_s - self.first_s) * self.rate)) + 1)
+        high = min(int(np.ceil(last)), int(np.floor(self.known_lines)) - 1)
+        if high - low < 4:
+            return None
+        position, R = o.at(self.first_s + np.arange(low, high + 1) / self.rate)
+        return LineScan(self.views[index], low, position, R)
+
+    def ground(self, scan: LineScan, centre_l: Array) -> Ground:
+        """Grids about places (k, 3); all of a strip have the same directions."""
+        if self._axes is None:
+            way = scan.position_l[-1, :2] - scan.position_l[0, :2]
+            along = way / np.linalg.norm(way)
+            left = np.array([-along[1], along[0]])
+            sample = self.views[self.master].sample
+            self._axes = along, left if sample[0] < sample[-1] else -left
+        spacing = sample_m(scan, centre_l, np.full(len(centre_l), scan.first_line + len(scan.position_l) // 2))
+        return Ground(centre_l, *self._axes, spacing)
+
+    def reach(self, index: int, ground: Ground, sigma_height: Array, parallax: Array) -> float:
+        """Three sigma of the prediction in px: orientation of both looks, height, and what the past has shown."""
+        o = self.options
+        by_height = float((sigma_height * np.abs(parallax).max(axis=1)).max())
+        if self.slow.known:
+            scale = self.slow.scale_px[self.others.index(index)]
+            by_orientation = float(np.max(np.where(np.isfinite(scale), scale, o.least_reach_px / 3)))
+            least = self._least
+        else:
+            by_orientation = self._orientation_reach(self.views[index], ground.spacing_m) / 3
+            least = o.least_reach_px
+        reach = float(np.clip(3 * np.hypot(by_height, by_orientation), least, o.largest_reach_px))
+        self._widest = max(reach, 0.9 * self._widest)
+        return reach
+
+    def searched(self, beyond: float) -> None:
+        """A share of the last matches was found to lie beyond the search."""
+        wider = 2 * self._least if beyond > MOST_BEYOND else self._least / 1.4
+        self._least = float(np.clip(wider, LEAST_REACH, self.options.least_reach_px))
+
+    def lines_around(self) -> float:
+        """Lines that a search may need around the predicted ones."""
+        if self.slow.known:
+            return float((CORRELATION_HALF + REACH_PX + 2) * coarsest_factor(max(self._widest, self._least)))
+        _, travel = self.height_and_travel()
+        reach = max(self._orientation_reach(view, travel) for view in self.views)
+        base = max(abs(view.forward) for view in self.views) * 3 * self.options.relief_sigma_m / travel
+        most = self.options.largest_reach_px
+        factor = coarsest_factor(float(np.clip(np.hypot(reach, base), self.options.least_reach_px, most)))
+        return float((CORRELATION_HALF + REACH_PX + 2) * factor)
+
+    def _orientation_reach(self, view: View, pixel_m: float) -> float:
+        """Three sigma, px, by which the orientation of two looks may be wrong."""
+        sigma = np.sqrt(np.diagonal(self.orientation.covariance(self.orientation.end_s)))
+        look = np.hypot(sigma[:3].max(), self.height_and_travel()[0] * sigma[3:].max() * (1 + view.forward**2))
+        return float(3 * np.sqrt(2.0) * look / pixel_m)
+
+
+def sample_m(scan: LineScan, point_l: Array, line: Array) -> float:
+    """Size of a pixel across on the ground, m."""
+    i = np.clip(np.nan_to_num(line) - scan.first_line, 0, len(scan.position_l) - 1).astype(int)
+    depth = np.median(scan.position_l[i, 2] - point_l[:, 2])
+    return float(depth * scan.view.pitch_mm / scan.view.focal_length_mm)

@@ -1,0 +1,173 @@
+"""The matcher among real nodes: bad imagery, several strips, a window that asks for more or less."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from triline.nodes.adjuster import Adjuster
+from triline.nodes.flight_settings import simulated_flight
+from triline.nodes.matcher import Matcher
+from triline.nodes.navigator import Navigator
+from triline.nodes.recording import RecordingReader, RecordingWriter
+from triline.nodes.runner import process
+from triline.nodes.simulator import Simulator
+from triline.schemas.image_lines import LineBlock
+from triline.solver.matching.options import MatchingOptions
+from triline.solver.matching.places import Density
+
+EPOCH_NS = 1_780_000_000_000_000_000
+SETTINGS = {
+    "sensor": "ads40-small",
+    "pixels": 500,
+    "images": True,
+    "height": 600.0,
+    "seconds": 20.0,
+    "lead_in": 2.0,
+    "seed": 6,
+}
+
+
+@pytest.fixture(scope="module")
+def messages():
+    flight = simulated_flight(SETTINGS)
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
+def run(tmp_path, messages, **matcher):
+    """Process messages with navigator, matcher and adjuster; returns summary, ties and what was told."""
+    flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(flight) as writer:
+        for message in messages:
+            writer.write(message)
+    with RecordingWriter(out) as writer:
+        summary = process(RecordingReader(flight), [Navigator(), Matcher(**matcher), Adjuster()], writer.write_raw)
+    reader = RecordingReader(out)
+    ties = [m.body for m in reader.messages(["observation/tie"]) if "-M" in m.body.point]
+    told = [m.body.message for m in reader.messages(["event/log"]) if m.body.name == "matcher"]
+    return summary, ties, told
+
+
+def spoilt(messages, change):
+    """Messages whose line blocks went through ``change(ccd, first line, pixels)``; None is a lost block."""
+    for message in messages:
+        if not message.topic.startswith("sensor/lines/"):
+            yield message
+            continue
+        b = message.body
+        pixels = change(b.ccd, int(b.first_line), b.pixels.copy())
+        if pixels is not None:
+            block = LineBlock(pixels, b.ccd, b.strip, b.first_line, b.time_ns, b.line_period_ns)
+            yield replace(message, body=block)
+
+
+def lines_between(first, end, value):
+    """A change that sets lines of all CCD lines; ``value`` is a grey value or a function of the pixels."""
+
+    def change(ccd, line, pixels):
+        number = line + np.arange(len(pixels))
+        bad = (number >= first) & (number < end)
+        pixels[bad] = value(pixels[bad]) if callable(value) else value
+        return pixels
+
+    return change
+
+
+def water(pixels):
+    return np.random.default_rng(1).normal(300, 4, pixels.shape).astype(pixels.dtype)
+
+
+FROZEN = {}
+
+
+def frozen_backward(ccd, line, pixels):
+    """From line 200 to 300 the backward line repeats what it saw last."""
+    if ccd != "B" or not 200 <= line < 300:
+        FROZEN[ccd] = pixels[-1]
+        return pixels
+    pixels[:] = FROZEN[ccd]
+    return pixels
+
+
+def chain(*changes):
+    def change(ccd, line, pixels):
+        for one in changes:
+            pixels = one(ccd, line, pixels)
+            if pixels is None:
+                return None
+        return pixels
+
+    return change
+
+
+def lost_block(ccd, line, pixels):
+    return None if ccd == "N" and 100 <= line < 120 else pixels
+
+
+def short_lines(ccd, line, pixels):
+    return pixels[:, :100] if 60 <= line < 70 and ccd == "F" else pixels
+
+
+FAULTS = {
+    "faults of the camera": (
+        chain(lost_block, short_lines, lines_between(150, 155, 0), frozen_backward, lines_between(330, 350, 4095)),
+        {"lines missing": 4, "malformed": 1, "lines dark": 15, "lines frozen": 90, "lines saturated": 60},
+        ("N: 20 lines are missing", "N: lines are black", "B: lines are frozen", "N: lines are saturated"),
+    ),
+    "lens cap, then water": (
+        chain(lines_between(40, 100, 0), lines_between(110, 220, water)),
+        {"lines dark": 180, "cells without texture": 30},
+        ("N: lines are black (lens cap", "N: lines are good again", "poor in texture", "has texture again"),
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tmp_path, messages, fault):
+    change, counters, words = FAULTS[fault]
+    summary, ties, told = run(tmp_path, spoilt(messages, change))
+    counted = summary.counters["matcher"]
+    for name, least in counters.items():
+        assert counted.get(name, 0) >= least, name
+    assert not counted.get("failed") and not summary.counters["adjuster"].get("failed")
+    for text in words:
+        assert sum(text in line for line in told) in range(1, 4), (text, told)
+    assert all("\n" not in text for text in told) and len(told) < 20
+    assert len(ties) > 10 and counted["ties"] == len(ties)
+    assert summary.outputs["orientation/final"] > 300
+
+
+def test_points_keep_their_names_from_strip_to_strip(tmp_path):
+    settings = {**SETTINGS, "strips": 1, "cross": 1, "no_turns": True}
+    flight = simulated_flight(settings)
+    messages = list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+    summary, ties, _ = run(tmp_path, messages)
+    strips = {}
+    for tie in ties:
+        strips.setdefault(tie.point, set()).update(image.strip for image in tie.images)
+    again = [point for point, seen in strips.items() if len(seen) == 2]
+    assert len(again) >= 10
+    assert all(point.startswith("S1-M") for point in again)
+    counted = summary.counters["matcher"]
+    assert counted["ties with earlier strips"] == len(again)
+    assert counted["earlier points not found"] < 0.3 * counted["earlier points tried"]
+    # the window takes them for what they are
+    rejected = summary.counters["adjuster"].get("rejected", 0)
+    assert rejected < 0.03 * sum(len(tie.images) for tie in ties)
+
+
+def test_density_follows_the_window_and_the_success_of_its_places():
+    density = Density(MatchingOptions(points_per_s=8.0, window_points=60, window_rays=600))
+    first, borders = density.cells(10.0)
+    assert first == pytest.approx(160, abs=2) and np.ptp(np.diff(borders)) < 1e-9
+    density.window_holds(points=20, rays=60)
+    assert density.cells(10.0)[0] == pytest.approx(320, abs=4)
+    density.window_holds(points=400, rays=1200)
+    assert density.cells(10.0)[0] == pytest.approx(80, abs=2)
+    density.window_holds(points=100, rays=300)
+    across = np.linspace(-0.99, 0.99, 800)
+    for _ in range(5):  # the left half fails more often
+        density.judged(across, (np.arange(800) % 2 == 0) | (across > 0))
+    n, borders = density.cells(0.1)
+    left = int(np.searchsorted(borders, 0.5))
+    assert left == pytest.approx(2 / 3 * n, abs=2)
