@@ -18,6 +18,9 @@ BENCHMARKS = {
     "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
     "a-priori weights from the trajectory": ["apriori.py"],
     "sliding window": ["window.py"],
+    "sliding window against the batch adjustment, one strip": ["efficiency.py", "table", "--seeds", "6"],
+    "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
+    "sliding window: normalised errors": ["consistency.py", "seeds"],
     "orthoimage": ["orthoimage.py"],
 }
 

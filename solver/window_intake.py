@@ -85,7 +85,7 @@ class Intake:
     def ready(self, now_s: float) -> list[str]:
         """Points with news all of whose looks have a measured orientation; they have no news any more.
 
-        Looks for which no orientation will come are refused.
+        Looks for which no orientation will come are refused, and those that waited for a partner too long.
         """
         names = list(self._arrived)
         times = [np.asarray(self.points[name].time_s) for name in names]
@@ -95,10 +95,14 @@ class Intake:
         late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
         ready = []
         for name, t, good in zip(names, times, covered, strict=True):
-            lost = np.flatnonzero(~good & (t < late_s))
             point = self.points[name]
+            final_s = np.array([self._strips[look.strip].final_to_s for look in point.looks])
+            over = (t < final_s) if point.batch is None else np.zeros(len(t), dtype=bool)
+            lost = np.flatnonzero(over | (~good & (t < late_s)))
+            good &= ~over
             for i in lost[::-1]:
-                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
+                reason = "too few looks" if over[i] else "no orientation"
+                self._refused.append(Refusal(name, point.looks[i], reason))
                 del point.looks[i], point.time_s[i], point.weight[i]
             if len(lost) + int(good.sum()) == len(t):
                 ready.append(name)
