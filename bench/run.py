@@ -22,6 +22,9 @@ BENCHMARKS = {
     "tie point to orientation over the bus": ["tie_latency.py"],
     "an hour of flight through process": ["process_hour.py", "--share", "0.2"],
     "memory and latency over hours": ["long_flight.py", "--hours", "1"],
+    "sliding window against the batch adjustment, one strip": ["efficiency.py", "table", "--seeds", "6"],
+    "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
+    "sliding window: normalised errors": ["consistency.py", "seeds"],
     "orthoimage": ["orthoimage.py"],
     "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }

@@ -1,8 +1,7 @@
-"""The sliding window, measured: latency, consistency, efficiency, a long flight.
+"""The sliding window, measured: latency, consistency, a long flight. Efficiency: `efficiency.py`.
 
     python bench/window.py latency [--selfcal]
     python bench/window.py consistency [--seeds 20] [--rough] [--model wander]
-    python bench/window.py efficiency [--seeds 20] [--rough] [--model wander] [--selfcal]
     python bench/window.py long [--minutes 20]
 
 Set OPENBLAS_NUM_THREADS=1: the matrices are small, and threads cost more than they give. Times are processor times.
@@ -33,7 +32,6 @@ from triline.solver.window_study import (
     point_errors,
 )
 
-NEVER = 1e6
 COMPONENTS = ("X", "Y", "Z", "omega", "phi", "kappa")
 
 
@@ -98,61 +96,6 @@ def consistency(args: argparse.Namespace) -> dict[str, object]:
     }
 
 
-def _efficiency(seed: int, rough: bool, model: str, selfcal: bool) -> dict[str, object]:
-    simulation = simulate(_plan(rough, 60.0), seed)
-    poses = navigate(simulation)
-    parameters = tls(simulation.flight.camera) if selfcal else None
-    finals: dict[float, tuple[np.ndarray, np.ndarray]] = {}
-
-    def run(window_s: float, watch=None):
-        options = WindowOptions(
-            model=model, window_s=window_s, settle_s=NEVER if window_s == NEVER else 3.0, snoop=False
-        )
-        return adjust_online(simulation, poses, options, parameters, live=False, update_s=0.5, watch=watch)
-
-    online = run(0.0)
-    due = {float(o.time_s[len(o.time_s) // 2]): None for o in online.final}
-    length = online.window.length_s
-
-    def watch(now: float, window) -> None:
-        # the causal batch: nothing was ever let go, asked at the time at which the on-line answer became final
-        for time in [t for t in due if t not in finals and now - length >= t + 1.0]:
-            answer = window.live(time)
-            if answer is not None:
-                finals[time] = answer.correction[0], answer.covariance[0]
-
-    whole_batch = run(NEVER, watch)
-    errors = orientation_errors(simulation, online.final)
-    by_time = {round(t, 4): e for t, e in zip(errors.time_s.tolist(), errors.error, strict=True)}
-    corrections = {round(t, 4): c for o in online.final for t, c in zip(o.time_s.tolist(), o.correction, strict=True)}
-    causal = [by_time[round(t, 4)] + finals[t][0] - corrections[round(t, 4)] for t in finals if round(t, 4) in by_time]
-    same = [by_time[round(t, 4)] for t in finals if round(t, 4) in by_time]
-    return {
-        "same": np.sqrt(np.mean(np.square(same), axis=0)), "causal": np.sqrt(np.mean(np.square(causal), axis=0)),
-        "final": errors.rmse, "whole": orientation_errors(simulation, online.whole).rmse,
-        "batch": orientation_errors(simulation, whole_batch.final).rmse,
-        "points final": point_errors(simulation, online.final_points).rmse,
-        "points whole": point_errors(simulation, online.whole_points).rmse,
-        "points batch": point_errors(simulation, whole_batch.final_points).rmse,
-    }  # fmt: skip
-
-
-def efficiency(args: argparse.Namespace) -> dict[str, object]:
-    """RMSE over RMSE of the causal batch and of the whole batch; batches are windows that let nothing go."""
-    rows = _over_seeds(partial(_efficiency, rough=args.rough, model=args.model, selfcal=args.selfcal), args.seeds)
-    rms = {key: _rms(rows, key) for key in rows[0]}
-    return {
-        "seeds": len(rows),
-        "final / causal batch": dict(zip(COMPONENTS, rms["same"] / rms["causal"], strict=True)),
-        "after backward pass / whole batch": dict(zip(COMPONENTS, rms["whole"] / rms["batch"], strict=True)),
-        "points after backward pass / whole batch": dict(
-            zip("XYZ", rms["points whole"] / rms["points batch"], strict=True)
-        ),
-        "being on line costs: final / whole batch": dict(zip(COMPONENTS, rms["final"] / rms["batch"], strict=True)),
-        "the same for points": dict(zip("XYZ", rms["points final"] / rms["points batch"], strict=True)),
-    }
-
-
 def long(args: argparse.Namespace) -> dict[str, object]:
     """Strips without end: memory, latency and consistency over time."""
     strips = max(2, int(args.minutes * 60 / 140))
@@ -186,14 +129,14 @@ def _over_seeds(work, seeds: int) -> list[dict]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("latency", "consistency", "efficiency", "long"))
+    parser.add_argument("what", choices=("latency", "consistency", "long"))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
     parser.add_argument("--model", default="wander")
     parser.add_argument("--selfcal", action="store_true", help="with TLS-18")
     parser.add_argument("--minutes", type=float, default=20.0)
     args = parser.parse_args()
-    figures = {"latency": latency, "consistency": consistency, "efficiency": efficiency, "long": long}[args.what](args)
+    figures = {"latency": latency, "consistency": consistency, "long": long}[args.what](args)
     print(json.dumps(figures, indent=2, default=lambda v: round(float(v), 4)))
 
 

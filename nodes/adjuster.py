@@ -65,7 +65,14 @@ class Adjuster(Node):
         "observation/tie",
         "observation/progress",  # for the order of ties alone
     )
-    outputs = ("orientation/live", "orientation/final", "point/object", "adjustment/report", "event/log")
+    outputs = (
+        "orientation/live",
+        "orientation/final",
+        "orientation/whole",
+        "point/object",
+        "adjustment/report",
+        "event/log",
+    )
 
     decisions = ("adjustment/pace",)
 
@@ -125,6 +132,7 @@ class Adjuster(Node):
         self._held_strips: dict[str, Any] = {}
         self._held_ties: list[tuple[Any, str]] = []
         self._store = OrientationStore()
+        self._invalid: dict[float, str] = {}  # final orientation that is not to be relied on, and why
         self._refusals: list[Refusal] = []
         self._rejected_total = 0
         self._updates = 0
@@ -481,14 +489,19 @@ class Adjuster(Node):
                 "orientation/final", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
             )
             self._store.add_final([message.body for message in messages])
+            times = zip(orientation.time_s.tolist(), messages, strict=True)
+            self._invalid |= {t: message.body.reason for t, message in times if not message.body.valid}
             outputs += messages
         if update.whole is not None:
             for orientation in update.whole.orientation:
                 messages = out.orientations(
-                    "orientation/final", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
+                    "orientation/whole", orientation, self._reference_ns, self._stamp_ns, self._validity_at_end
                 )
                 self._store.add_whole([message.body for message in messages])
+                outputs += messages
         outputs += [out.object_point(point, self._stamp_ns) for point in update.points]
+        if update.whole is not None:
+            outputs += [out.object_point(point, self._stamp_ns) for point in update.whole.points]
         if update.report is not None:
             outputs.append(
                 out.report(
@@ -506,6 +519,11 @@ class Adjuster(Node):
                 outputs.append(self._log(": ".join(filter(None, self._light)), warning=self._light[0] != "good"))
         outputs += [self._log(text) for text in update.events]
         return outputs
+
+    def _validity_at_end(self, time_s: float) -> tuple[bool, str]:
+        """What the final orientation said of a time; a backward pass comes long after its measured poses are gone."""
+        reason = self._invalid.get(time_s)
+        return reason is None, reason or ""
 
     def _seconds(self, time_ns: int) -> float:
         return (time_ns - self._reference_ns) * 1e-9

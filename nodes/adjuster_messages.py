@@ -43,9 +43,9 @@ def orientations(
 
 
 def object_point(point: AdjustedPoint, stamp_ns: int) -> Message:
-    """An adjusted object point with the residuals of its looks."""
+    """An adjusted object point, with the residuals of its looks unless it comes from the backward pass."""
     x, y, z = (float(v) for v in point.xyz_l)
-    status = m.ObjectPoint.Status.Value("FINAL" if point.final else "LIVE")
+    status = m.ObjectPoint.Status.Value("WHOLE" if point.whole else "FINAL" if point.final else "LIVE")
     body = m.ObjectPoint(
         point=point.name, x=x, y=y, z=z, covariance=point.covariance.ravel().tolist(), rays=point.rays, role=point.role,
         status=status, checked=point.checked,
@@ -54,7 +54,7 @@ def object_point(point: AdjustedPoint, stamp_ns: int) -> Message:
                 strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, v_line=r.v_line,
                 v_sample=r.v_sample, w=r.w, rejected=r.rejected,
             )
-            for r in point.residuals
+            for r in (() if point.whole else point.residuals)
         ],
     )  # fmt: skip
     return Message("point/object", stamp_ns, body)

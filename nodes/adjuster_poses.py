@@ -191,7 +191,17 @@ class OrientationStore:
         self._live: tuple[list[int], list[Any]] = ([], [])
 
     def add_whole(self, bodies: list[Any]) -> None:
-        self._add(self._whole, bodies)
+        """Add, or put in place of those of an earlier backward pass."""
+        times, poses = self._whole
+        for body in bodies:
+            time_ns = convert.time_ns(body.timestamp)
+            i = bisect_left(times, time_ns)
+            if i < len(times) and times[i] == time_ns:
+                poses[i] = body
+            else:
+                times.insert(i, time_ns)
+                poses.insert(i, body)
+        self._add(self._whole, [])
 
     def add_final(self, bodies: list[Any]) -> None:
         self._add(self._final, bodies)

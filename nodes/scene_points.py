@@ -50,6 +50,8 @@ class PointsPart(Part):
         xyz = np.array([body.x, body.y, body.z])
         if not np.isfinite(xyz).all():
             raise ValueError(f"point {body.point!r} is not finite")
+        if body.status == body.WHOLE:  # millimetres from where it is drawn already
+            return
         bad = any(r.rejected for r in body.residuals)
         if body.point in self._given and body.status == body.FINAL:
             self._misfit[body.point] = xyz - self._given[body.point][0]

@@ -96,6 +96,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=1000, recorded=False, grace_s=3.0),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
+    Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
     Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),

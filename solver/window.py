@@ -6,9 +6,8 @@ Object points are eliminated batch by batch; what is older than the window is ma
 What is known of the slow errors beforehand makes the problem regular without any control; the window never refuses, it
 says how uncertain it is.
 
-A point that is seen again in a later strip after it has become final is a new point there: the tie to the earlier strip
-is not used. That loses information and invents none. A control point seen from two strips is weighted in both; strips
-share no unknowns but the additional parameters, so only those could take it for two surveys of the point.
+A point that is seen again in a later strip after it has become final ties both strips, on line by what the earlier ones
+know of it (`window_ties`), and after each strip by a solution of the block as a whole (`window_block`).
 """
 
 from __future__ import annotations
@@ -20,10 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .camera import LineCamera
 from .measured_trajectory import MeasuredTrajectory
+from .models.base import Design
 from .selfcalibration import SelfCalibration
 from .slow_errors import SlowErrors
-from .window_backward import LeftPoints, Step, backward
+from .window_backward import LeftPoints, Step
 from .window_batch import Batch
+from .window_block import Block
 from .window_determinability import Standing
 from .window_intake import Intake
 from .window_output import CostHistory, Orienter, adjusted_points, parameters
@@ -40,6 +41,7 @@ from .window_settle import Settler, settle
 from .window_snooping import admit, reweigh, snoop
 from .window_state import WindowState
 from .window_strip import WindowStrip, segment_length
+from .window_tie_snooping import admit_ties, snoop_ties
 from .window_watch import Watch
 
 Array = NDArray[np.floating]
@@ -59,7 +61,8 @@ MOST_RETESTED = 100
 MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
 #: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
 MOST_LEAVING = 1000
-#: Steps kept for the backward pass; of a strip that never ends the earliest part is not refined again.
+#: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
+#: refined again.
 MOST_STEPS = 600
 
 
@@ -99,6 +102,8 @@ class Window:
             m = len(self._camera_columns)
             columns = self._camera_columns[:, None].astype(np.int32)
             self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+        sigma = self_calibration.apriori_sigma if self_calibration is not None else np.empty(0)
+        self._block = Block(self.state, self.strips, self._camera_columns, sigma)
         self._intake = Intake(camera, self.strips, self.trajectory)
         self._points, self._control = self._intake.points, self._intake.control
         self._maker = BatchMaker(
@@ -142,6 +147,7 @@ class Window:
         self.strips[id] = WindowStrip(
             id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state
         )
+        self._block.begin(self.strips[id])
 
     def end_strip(self, id: str, lines: int = 0) -> None:
         """A strip is over; ``lines`` as counted."""
@@ -149,8 +155,14 @@ class Window:
             self.strips[id].end(lines)
 
     def add_control(self, name: str, xyz_l: ArrayLike, sigma_m: ArrayLike, role: str) -> None:
-        """Known coordinates (3,), before or after the point's looks; sigma infinite where a coordinate is not given."""
+        """Known coordinates (3,); sigma infinite where a coordinate is not given.
+
+        They may come before or after the point's looks, and after it has become final: then they count in the backward
+        pass, and as soon as the strips that saw it are over also for the strip that is flown.
+        """
         point = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
+        if name not in self._points:
+            self._block.add_control(name, point)
         self._intake.add_control(name, point)
 
     def add_look(self, name: str, look: Look) -> str:
@@ -165,7 +177,7 @@ class Window:
         self._serial += 1
         result = WindowUpdate()
         for strip in self.strips.values():
-            if not (strip.ended and strip.is_gone(self.state)):
+            if not strip.is_over(self.state):
                 strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
         fresh = self._take_arrived(result)
         self._replace_filtered()
@@ -184,14 +196,14 @@ class Window:
         iterations = self._solve(fresh, result)
         for strip in self.strips.values():
             strip.end(0)
-        self._let_go(np.inf, result)
+        self._let_go(np.inf, result, at_the_end=True)
         result.refused += self._intake.take_refused()
         result.report = self._report(iterations, [], result)
         return result
 
     def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
         """Batches of the points that have new looks with a measured orientation; others wait."""
-        ready: dict[int, list[str]] = {}
+        ready: dict[tuple[int, bool], list[str]] = {}
         step = segment_length(self.slow, self.options)
         again: list[Batch] = []
         for name in self._intake.ready(self._now_s):
@@ -200,21 +212,24 @@ class Window:
                 again.append(point.batch)
                 continue
             if point.looks:
-                ready.setdefault(int(min(point.time_s) // step), []).append(name)
+                ready.setdefault(self._share(name, step), []).append(name)
         known: dict[str, Array] = {}
         for batch in {id(b): b for b in again}.values():
             known |= dict(zip(batch.names, batch.points_l, strict=True))
             self._remove(batch)
             for name in batch.names:
                 self._intake.place(name, None)
-                ready.setdefault(int(min(self._points[name].time_s) // step), []).append(name)
+                ready.setdefault(self._share(name, step), []).append(name)
         fresh = []
-        for names in ready.values():
-            few = [n for n in names if len(self._points[n].looks) < 2 and n not in self._control]
+        for (_, tied), names in ready.items():
+            few = [n for n in names if len(self._points[n].looks) < 2]
+            few = [n for n in few if n not in self._control or self._points[n].spent]
             names = [n for n in names if n not in few]
             if not names:
                 continue
-            batch, _ = self._maker.make(names, [self._points[n] for n in names], known)
+            batch, _ = self._maker.make(
+                names, [self._points[n] for n in names], known, self._block.earlier if tied else None
+            )
             if batch is None:
                 continue
             for name in batch.names:
@@ -224,6 +239,7 @@ class Window:
             self.state.solve()
             for batch in fresh:
                 result.refused += admit(batch, self.state, self._points)
+                self._apart(admit_ties(batch, self.state), result)
         for batch in fresh:
             self._batches.append(batch)
             self.state.add(batch.columns, batch.information)
@@ -231,6 +247,20 @@ class Window:
         if not self._length_s and fresh:
             self._length_s = self.options.window_looks * self._look_time(fresh[0])
         return fresh
+
+    def _share(self, name: str, step_s: float) -> tuple[int, bool]:
+        """Which points go into a batch together: those of a time, and those that tie strips apart."""
+        point, earlier = self._points[name], self._block.earlier.points.get(name)
+        point.spent = earlier is not None and earlier.with_control and not point.alone
+        tied = len(point.looks) > 1 and not point.alone and self._block.earlier.enter(name, max(point.time_s))
+        return int(min(point.time_s) // step_s), tied
+
+    def _apart(self, names: list[str], result: WindowUpdate) -> None:
+        """Points that do not agree with earlier strips are points of their own."""
+        for name in names:
+            self._points[name].alone, self._points[name].spent = True, False
+        if names:
+            result.events.append(f"do not agree with earlier strips: {', '.join(names)}")
 
     def _look_time(self, batch: Batch) -> float:
         """Time between the first and the last look at a point, from view angles, height and speed."""
@@ -336,7 +366,7 @@ class Window:
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
 
-    def _let_go(self, limit_s: float, result: WindowUpdate) -> None:
+    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
         limits = {}
         for strip in self.strips.values():
@@ -349,12 +379,17 @@ class Window:
         if self.options.snoop and leaving:
             refused, rounds = snoop(leaving, self.state, self._points, self.options.critical, self._serial)
             result.refused += refused
-            if rounds:
+            failed = snoop_ties([b for b in leaving if b.ties is not None], self.state)
+            self._apart(failed, result)
+            if failed:
+                self.state.solve()
+            if rounds or failed:
                 self._orienter.forget()
         for batch in leaving:
             points = adjusted_points(batch, self.state, self._points, self._control, final=True)
             result.points += points
             self._left.append(LeftPoints.of(batch, points))
+            self._block.leave(batch, points)
         self._watch.leaving(leaving, limit_s - self._length_s)
         for batch in leaving:
             self.state.fix(batch.columns, batch.information)
@@ -372,16 +407,21 @@ class Window:
             if final is not None:
                 result.final.append(final)
                 design, noise = strip.design(final.time_s), self._orienter.noise(strip, final.time_s)
+                self._block.orientation(strip, final, design, noise)
             strip.final_to_s = to_s
-            marginal = self.state.marginalise(numbers)
-            self._watch.marginalised(marginal)
-            self._steps.append(Step(marginal, final, design, noise, self._left))
-            self._left = []
-            self._orienter.forget()
-        if self._steps and all(strip.is_gone(self.state) for strip in self.strips.values()):
-            self.state.solve()
-            result.whole = backward(self._steps, self.state)
-            self._steps = []
+            self._step(numbers, final, design, noise)
+            if strip.ended and strip.is_gone(self.state):
+                self._block.gone(strip)
+                strip.release()
+        over = min(limits.values(), default=limit_s)
+        modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in self._batches))
+        if len(modes):
+            self._step(modes)
+        if self._block.quiet:
+            result.whole = self._block.refined(self._steps, at_the_end)
+            result.events += self._block.take_events()
+            if result.whole is not None:
+                self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, result)
 
@@ -394,6 +434,20 @@ class Window:
             if rays > MOST_LEAVING:
                 return batch.oldest_s
         return np.inf
+
+    def _step(
+        self,
+        numbers: IntArray,
+        final: RefinedOrientation | None = None,
+        design: Design | None = None,
+        noise: Array | None = None,
+    ) -> None:
+        """Marginalise unknowns, and keep what leads back to them."""
+        marginal = self.state.marginalise(numbers)
+        self._watch.marginalised(marginal)
+        self._steps.append(Step(marginal, final, design, noise, self._left))
+        self._left = []
+        self._orienter.forget()
 
     def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
         """Orientation at the grid times that become final now."""
@@ -443,10 +497,15 @@ class Window:
         sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
         return replace(orientation, protection=self._watch.exposure.protection(sigma))
 
+    def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
+        """Orientation at times of a strip, none of them final, that have a measured one."""
+        return self._orienter.at(self.strips[strip], np.asarray(times, dtype=float))
+
     def strip_at(self, time_s: float) -> WindowStrip | None:
         """The strip a time belongs to, if its orientation there is not final."""
         for strip in self.strips.values():
-            if strip.final_to_s <= time_s <= strip.end_s and time_s >= strip.first_line_time_s:
+            inside = max(strip.final_to_s, strip.first_line_time_s) <= time_s <= strip.end_s
+            if inside and not strip.is_over(self.state):
                 return strip
         return None
 

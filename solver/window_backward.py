@@ -52,7 +52,7 @@ class LeftPoints:
         L = inverse_factors(self.normals)
         covariance = np.swapaxes(L, 1, 2) @ inner @ L
         return [
-            replace(point, xyz_l=xyz[i], covariance=covariance[i])
+            replace(point, xyz_l=xyz[i], covariance=covariance[i], whole=True)
             for i, point in zip(self.order, self.points, strict=True)
         ]
 
@@ -96,7 +96,7 @@ def backward(steps: list[Step], state: WindowState) -> WholeStrips:
         Q = np.block([[own @ own.T - Q12 @ T.T, Q12], [Q12.T, Q22]])
         numbers, values = np.concatenate([m.gone, m.stayed]), np.concatenate([gone, x2])
         if step.orientation is not None and step.design is not None and step.noise is not None:
-            orientation.append(_again(step.orientation, step.design, step.noise, numbers, values, Q))
+            orientation.append(again(step.orientation, step.design, step.noise, numbers, values, Q))
         for left in reversed(step.left):
             place = _places(left.columns, numbers)
             points += left.refined(values[place], Q[np.ix_(place, place)])
@@ -108,10 +108,10 @@ def _places(wanted: IntArray, numbers: IntArray) -> IntArray:
     return order[np.searchsorted(numbers, wanted, sorter=order)]
 
 
-def _again(
+def again(
     old: RefinedOrientation, design: Design, noise: Array, numbers: IntArray, values: Array, Q: Array
 ) -> RefinedOrientation:
-    """The orientation with other values and cofactors of its unknowns."""
+    """The orientation with other values and cofactors of its unknowns; ``noise`` (n, 6, 6) comes from none of them."""
     columns = np.unique(design.columns)
     columns = columns[columns >= 0].astype(np.int64)
     place = _places(columns, numbers)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .adjustment import Solution
     from .elimination import Elimination
     from .window_state import WindowState
+    from .window_ties import PointTies
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -60,12 +61,14 @@ class Batch:
     names : (p,) points
     rays : image measurements with the measured orientation
     pose_covariance : (n, 6, 6) white noise of the measured orientation, with what the model leaves out
-    columns : (u,) unknowns of the window that the rays touch, by their number; those of the camera last
+    columns : (u,) unknowns of the window that the rays touch, by their number; then those of the camera, and at the
+        end those that stand for earlier strips
     layout : the same, counted from 0
     control : weighted coordinates of the points
     weight : (n,) factor on each ray's weight; 0 = left out
     points_l : (p, 3)
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
+    ties : what earlier strips say of the points
     tested : number of the update that tested it last
     active_rays, active_control, determined : rays and control points with weight, determined object coordinates
     coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
@@ -81,6 +84,7 @@ class Batch:
     weight: Array
     points_l: Array
     provisional: bool
+    ties: PointTies | None = None
     tested: int = -1
     active_rays: int = field(init=False, default=0)
     active_control: int = field(init=False, default=0)
@@ -137,8 +141,9 @@ class Batch:
         flat = A.reshape(2 * n, u)
         # the right-hand side for theta counted from zero, the points from where they are
         lin = replace(lin, residual=lin.residual + (flat @ self.theta).reshape(n, 2).T)
-        plan = cast("Elimination", _PointsOf(self.rays.point, p))
-        normals = point_normals(lin, plan, self.control, self.origin_l)
+        tied = self.ties.rows(self.origin_l, u) if self.ties is not None else None
+        all_rows, plan = (lin, self.rays.point) if tied is None else tied.joined(lin, self.rays.point)
+        normals = point_normals(all_rows, cast("Elimination", _PointsOf(plan, p)), self.control, self.origin_l)
         a, b, c, d, e, f = normals.inverse_factor[:, self.rays.point]
         j = lin.point
         w = np.empty((n, 3, 2))
@@ -146,6 +151,8 @@ class Batch:
         w[:, 1] = (b * j[:, 0] + c * j[:, 1]).T
         w[:, 2] = (d * j[:, 0] + e * j[:, 1] + f * j[:, 2]).T
         D = np.add.reduceat(w @ A, self.first_ray[:-1], axis=0)  # (p, 3, u)
+        if tied is not None:
+            D += inverse_factors(normals) @ np.swapaxes(tied.point, 1, 2) @ tied.design
         of_points = D.reshape(3 * p, u)
         y = normals.y.T.ravel()
         matrix = flat.T @ flat - of_points.T @ of_points
@@ -156,9 +163,29 @@ class Batch:
         self.active_control = int(self.control.weight.any(axis=1).sum())
         self.determined = int(normals.rank.sum())
         rows = 2 * self.active_rays + self.control.n_observations - self.determined
+        if tied is not None:
+            matrix += np.einsum("pku,pkv->uv", tied.design, tied.design)
+            rhs += np.einsum("pku,pk->u", tied.design, tied.residual)
+            square += float(np.vdot(tied.residual, tied.residual))
+            rows += 3 * int(tied.active.sum())
         self.normals, self.information = normals, Information(matrix, rhs, square, rows)
         self.judged = None
         self._rows, self.coupling = A, D
+
+    @property
+    def n_tied(self) -> int:
+        """Number of unknowns that stand for earlier strips."""
+        return 0 if self.ties is None else len(self.ties.columns)
+
+    def equations(self, point: int) -> tuple[Array, Array, Array, Array]:
+        """Rows (2 m, u) and (2 m, 3) of a point's rays, by unknowns and point; the right-hand side (2 m,) for unknowns
+        counted from zero and the point from an origin; the origin (3,)."""
+        mine = slice(self.first_ray[point], self.first_ray[point + 1])
+        root = np.sqrt(self.weight[mine])
+        A = self._rows[mine]
+        residual = self.lin.residual[:, mine].T * root[:, None] + A @ self.theta
+        J = self.lin.point[:, :, mine].transpose(2, 0, 1) * root[:, None, None]
+        return A.reshape(-1, A.shape[2]), J.reshape(-1, 3), residual.ravel(), self.origin_l[point]
 
     def back_substitute(self, theta: Array) -> None:
         """Put the points where they belong for values (u,) of the unknowns."""

@@ -85,24 +85,28 @@ class Intake:
     def ready(self, now_s: float) -> list[str]:
         """Points with news all of whose looks have a measured orientation; they have no news any more.
 
-        Looks for which no orientation will come are refused.
+        Looks for which no orientation will come are refused, and those that waited for a partner too long.
         """
         names = list(self._arrived)
-        time_s = np.array([t for name in names for t in self.points[name].time_s])
-        covered = self._trajectory.covers(time_s)
+        points = [self.points[name] for name in names]
+        time_s = np.array([t for point in points for t in point.time_s])
+        final_s = np.array([self._strips[look.strip].final_to_s for point in points for look in point.looks])
+        alone = np.repeat([point.batch is None for point in points], [len(point.looks) for point in points])
+        past = alone.astype(bool) & (time_s < final_s)
+        covered = self._trajectory.covers(time_s) & ~past
         late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
-        good, lost = covered.tolist(), (~covered & (time_s < late_s)).tolist()
+        over, good, lost = past.tolist(), covered.tolist(), (past | (~covered & (time_s < late_s))).tolist()
         ready = []
         end = 0
-        for name in names:
-            point = self.points[name]
+        for name, point in zip(names, points, strict=True):
             first, end = end, end + len(point.looks)
             gone = [i for i in range(end - first) if lost[first + i]] if not all(good[first:end]) else []
             if len(gone) + sum(good[first:end]) == end - first:
                 ready.append(name)
                 del self._arrived[name]
             for i in gone[::-1]:
-                self._refused.append(Refusal(name, point.looks[i], "no orientation"))
+                reason = "too few looks" if over[first + i] else "no orientation"
+                self._refused.append(Refusal(name, point.looks[i], reason))
                 del point.looks[i], point.time_s[i], point.weight[i]
         return ready
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from .window_batch import Batch, join_designs, local_layout
 from .window_results import Look
 from .window_state import WindowState
 from .window_strip import WindowStrip
+
+if TYPE_CHECKING:
+    from .window_ties import EarlierStrips
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -52,6 +56,8 @@ class PointLooks:
     returned, reported : looks that were taken back once; looks whose rejection was reported
     batch : where the point is, None while it waits for a second look
     out : control coordinates that were rejected
+    alone : does not agree with what earlier strips say of it
+    spent : known coordinates have been used by an earlier strip, whether or not the point ties that strip
     """
 
     looks: list[Look] = field(default_factory=list)
@@ -61,6 +67,8 @@ class PointLooks:
     reported: set[int] = field(default_factory=set)
     batch: Batch | None = None
     out: set[int] = field(default_factory=set)
+    alone: bool = False
+    spent: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,13 +121,18 @@ class BatchMaker:
         return measured, covariance
 
     def make(
-        self, names: list[str], points: list[PointLooks], known: dict[str, Array]
+        self,
+        names: list[str],
+        points: list[PointLooks],
+        known: dict[str, Array],
+        earlier: EarlierStrips | None = None,
     ) -> tuple[Batch | None, list[str]]:
         """A batch of points, linearised where they are now, and the points that cannot be placed yet.
 
         Parameters
         ----------
         known : coordinates of points that were placed before
+        earlier : earlier strips that have seen all of the points
         """
         rays, covariance, weight, provisional = self.rays(names, points)
         ids = list(self.strips)
@@ -127,8 +140,13 @@ class BatchMaker:
         parts = [(mine, self.strips[ids[rays.strip[mine[0]]]].design(rays.time_s[mine])) for mine in groups]
         design = join_designs(parts, len(rays))
         columns, layout = local_layout(design, rays.strip, self.self_calibration, self.camera_columns, rays)
+        ties = None
+        control = self._weights(names, points, np.array([p.spent for p in points]))
+        if earlier is not None:
+            ties = earlier.ties(names, self._weights(names, points, np.zeros(len(names), dtype=bool)).weight)
+            columns = np.concatenate([columns, ties.columns])
+            control = self._weights(names, points, earlier.with_control(names))
         theta = self.state.values(columns)
-        control = self._weights(names, points)
         points_l = self._place(names, rays, weight, layout.corrections(theta), layout.displacement(theta), known)
         placed = np.isfinite(points_l)
         lost = [name for i, name in enumerate(names) if not placed[i].all()]
@@ -136,18 +154,20 @@ class BatchMaker:
             good = [i for i, n in enumerate(names) if n not in lost]
             if not good:
                 return None, lost
-            batch, _ = self.make([names[i] for i in good], [points[i] for i in good], known)
+            batch, _ = self.make([names[i] for i in good], [points[i] for i in good], known, earlier)
             return batch, lost
-        batch = Batch(list(names), rays, covariance, columns, layout, control, weight, points_l, provisional)
+        batch = Batch(list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties)
         batch.linearise(theta, reweigh=True)
         return batch, []
 
-    def _weights(self, names: list[str], points: list[PointLooks]) -> ControlWeights:
+    def _weights(self, names: list[str], points: list[PointLooks], used: NDArray[np.bool_]) -> ControlWeights:
+        """Known coordinates; those ``used`` (p,) by earlier strips take no weight again."""
         weight, xyz = np.zeros((len(names), 3)), np.zeros((len(names), 3))
         for i, name in enumerate(names):
             if name in self.control:
                 weight[i], xyz[i] = self.control[name].weight, np.nan_to_num(self.control[name].xyz_l)
                 weight[i, list(points[i].out)] = 0.0
+        weight[used] = 0.0
         return ControlWeights(weight, xyz, int((weight > 0).sum()))
 
     def _place(

@@ -130,6 +130,7 @@ class AdjustedPoint:
     xyz_l, covariance : (3,) m, (3, 3) m^2
     rays : looks that take part
     final : whether it has left the window
+    whole : whether it has the information of whole strips, from the backward pass
     residuals : of all its looks
     checked : what a gross error in one of its rays would meet: "all" of them are checked by others; "across": two
         rays, so that an error along the base goes into the height unseen; "doubtful": half of the rays are left out
@@ -143,6 +144,7 @@ class AdjustedPoint:
     final: bool
     residuals: tuple[RayResidual, ...]
     checked: str = "all"
+    whole: bool = False
 
 
 @dataclass(frozen=True)

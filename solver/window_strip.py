@@ -118,6 +118,7 @@ class WindowStrip:
         self._row_done = np.zeros(len(self._prior), dtype=bool)
         self._entered = np.zeros(self.model.n_unknowns, dtype=bool)
         self._first_use, self._last_use = self._uses(segment_length(slow, options))
+        self._over = False
         self._need = np.array([self._first_use[c[c >= 0]].max() for c in self._prior.columns])
 
     def _uses(self, step_s: float) -> tuple[Array, Array]:
@@ -156,6 +157,21 @@ class WindowStrip:
             return self.model.left_out_variance(time_s)
         return np.zeros((len(time_s), 6))
 
+    @property
+    def entered(self) -> IntArray:
+        """Numbers of the unknowns that a time has needed so far."""
+        return self.numbers[self._entered]
+
+    def apriori(self) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        """A-priori equations of these: columns (m, t) by number, -1 for none, coefficients, values, sigmas."""
+        rows = np.flatnonzero(self._row_done & np.isfinite(self._prior.sigma))
+        return self._rows(rows)
+
+    def _rows(self, rows: IntArray) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        p: PseudoObservations = self._prior
+        columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
+        return columns, p.coefficients[rows], p.value[rows], p.sigma[rows]
+
     def activate(self, to_s: float, state: WindowState) -> bool:
         """Make unknowns present that times up to this one need; whether there were any."""
         new = np.flatnonzero(~self._entered & (self._first_use <= to_s))
@@ -165,9 +181,7 @@ class WindowStrip:
         self._entered[new] = True
         rows = np.flatnonzero(~self._row_done & (self._need <= to_s))
         self._row_done[rows] = True
-        p: PseudoObservations = self._prior
-        columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
-        state.observe(columns, p.coefficients[rows], p.value[rows], p.sigma[rows])
+        state.observe(*self._rows(rows))
         return True
 
     def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:
@@ -175,6 +189,8 @@ class WindowStrip:
 
         Unknowns in use to the end of the strip leave when it has ended and is settled (limit infinite).
         """
+        if self._over:
+            return self.numbers, self.final_to_s
         present = state.places(self.numbers) >= 0
         gone = present & (self._last_use <= limit_s)
         if not np.isinf(limit_s):
@@ -184,6 +200,19 @@ class WindowStrip:
         to_s = self.end_s if np.isinf(limit_s) else float(self._last_use[gone].max())
         return self.numbers[gone], to_s
 
+    def release(self) -> None:
+        """It is over and will not come back: give up what was only needed to fly it, for flights go on for hours."""
+        self._over = True
+        none = np.empty(0)
+        self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
+        self._need = self._first_use = self._last_use = none
+        self._row_done = self._entered = np.empty(0, dtype=bool)
+        self.numbers = np.empty(0, dtype=np.int64)
+
     def is_gone(self, state: WindowState) -> bool:
         """Whether nothing of it is left in the state."""
-        return not (state.places(self.numbers) >= 0).any()
+        return self._over or not (state.places(self.numbers) >= 0).any()
+
+    def is_over(self, state: WindowState) -> bool:
+        """Whether it has been in the state and will not be again."""
+        return self._over or (self.ended and bool(self._entered.any()) and self.is_gone(state))

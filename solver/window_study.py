@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import process_time
 
 import numpy as np
@@ -35,6 +35,8 @@ Event = NavigationPose | Callable[[Window], None]
 
 #: Platform time between updates, s.
 UPDATE_S = 0.2
+#: Longer than any flight.
+NEVER_S = 1e6
 
 
 def slow_errors_of(errors: ErrorModel) -> SlowErrors:
@@ -96,8 +98,11 @@ class OnlineResult:
 
     Attributes
     ----------
-    live, final, whole : orientation, in the order of publication; the last from the backward pass
+    live, final, whole : orientation, in the order of publication; the last from the backward pass, the newest of each
+        time
+    events : what the window said
     live_points, final_points, whole_points : by name; the first answer, the last, that of the backward pass
+    final_known_s, points_known_s : when each of `final`, and each point last, became final
     update_s : processor time of each update
     window : as it was at the end
     """
@@ -108,7 +113,10 @@ class OnlineResult:
     live_points: dict[str, AdjustedPoint] = field(default_factory=dict)
     final_points: dict[str, AdjustedPoint] = field(default_factory=dict)
     whole_points: dict[str, AdjustedPoint] = field(default_factory=dict)
+    final_known_s: list[float] = field(default_factory=list)
+    points_known_s: dict[str, float] = field(default_factory=dict)
     refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
     reports: list[WindowReport] = field(default_factory=list)
     update_s: list[float] = field(default_factory=list)
     window: Window | None = None
@@ -131,13 +139,8 @@ def adjust_online(
     watch : called after every update with time and window
     update_s : platform time between updates
     """
-    options = options or WindowOptions()
-    slow, errors, flight = slow_errors_of(simulation.errors), simulation.observation_plan, simulation.flight
-    window = Window(flight.camera, slow, options, self_calibration)
-    for i, role in enumerate(simulation.points.role):
-        if role != "tie":
-            sigma = np.array(errors.control_sigma_m) if role == "control" else np.full(3, np.inf)
-            window.add_control(str(simulation.points.id[i]), simulation.surveyed_l[i], sigma, str(role))
+    slow = slow_errors_of(simulation.errors)
+    window = _window(simulation, options or WindowOptions(), self_calibration)
     events = _events(simulation, poses)
     result = OnlineResult(window=window)
     now, waiting = update_s, {False: [], True: []}
@@ -152,8 +155,50 @@ def adjust_online(
         else:
             what(window)
     _update(window, waiting, slow, now, result, update_s if live else 0.0)
-    _collect(window.finish(), result)
+    _collect(window.finish(), result, now)
     return result
+
+
+def adjust_at_once(
+    simulation: Simulation,
+    poses: Iterable[TimedPose],
+    options: WindowOptions | None = None,
+    self_calibration: SelfCalibration | None = None,
+    until_s: float = np.inf,
+) -> OnlineResult:
+    """The batch adjustment of what was known at a time: one update with all of it, nothing let go before.
+
+    Without a time, everything is made final at the end: the batch adjustment of the whole flight.
+    """
+    slow = slow_errors_of(simulation.errors)
+    options = replace(options or WindowOptions(), window_s=NEVER_S, settle_s=NEVER_S)
+    window = _window(simulation, options, self_calibration)
+    waiting: dict[bool, list[NavigationPose]] = {False: [], True: []}
+    result = OnlineResult(window=window)
+    now = 0.0
+    for time, _, what in _events(simulation, poses):
+        if time > until_s:
+            break
+        now = time
+        if isinstance(what, NavigationPose):
+            waiting[what.smoothed].append(what)
+        else:
+            what(window)
+    _update(window, waiting, slow, now, result, 0.0)
+    if until_s == np.inf:
+        _collect(window.finish(), result, now)
+    return result
+
+
+def _window(simulation: Simulation, options: WindowOptions, self_calibration: SelfCalibration | None) -> Window:
+    """A window that knows the control points."""
+    window = Window(simulation.flight.camera, slow_errors_of(simulation.errors), options, self_calibration)
+    for i, role in enumerate(simulation.points.role):
+        if role != "tie":
+            given = simulation.observation_plan.control_sigma_m
+            sigma = np.array(given) if role == "control" else np.full(3, np.inf)
+            window.add_control(str(simulation.points.id[i]), simulation.surveyed_l[i], sigma, str(role))
+    return window
 
 
 def _events(simulation: Simulation, poses: Iterable[TimedPose]) -> list[tuple[float, int, Event]]:
@@ -210,21 +255,29 @@ def _update(
     begun = process_time()
     update = window.update(now)
     result.update_s.append(process_time() - begun)
-    _collect(update, result)
+    _collect(update, result, now)
     for time in window.grid(now - live_s + 1e-6, now + 1e-6) if live_s else ():
         orientation = window.live(float(time))
         if orientation is not None:
             result.live.append(orientation)
 
 
-def _collect(update: WindowUpdate, result: OnlineResult) -> None:
+def _collect(update: WindowUpdate, result: OnlineResult, now: float) -> None:
     result.final += update.final
+    result.final_known_s += [now] * len(update.final)
     result.refused += update.refused
+    result.events += update.events
     if update.whole is not None:
+        again = {(o.strip, float(o.time_s[0])) for o in update.whole.orientation}
+        result.whole = [o for o in result.whole if (o.strip, float(o.time_s[0])) not in again]
         result.whole += update.whole.orientation
         result.whole_points |= {p.name: p for p in update.whole.points}
     for point in update.points:
-        (result.final_points if point.final else result.live_points).setdefault(point.name, point)
+        if point.final:
+            result.final_points[point.name] = point
+            result.points_known_s[point.name] = now
+        else:
+            result.live_points.setdefault(point.name, point)
     if update.report is not None:
         result.reports.append(update.report)
 

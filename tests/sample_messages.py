@@ -76,6 +76,7 @@ def body(topic: str, i: int = 0) -> Any:
         "observation/progress": m.Progress(time_ns=time_ns),
         "observation/tie": convert.tie_message(f"T{i}", [tie]),
         "orientation/live": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
+        "orientation/whole": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
         "orientation/final": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
         "point/object": point,
         "adjustment/report": report,

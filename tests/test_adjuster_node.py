@@ -76,7 +76,15 @@ def test_it_publishes_what_it_says(done, flight):
         assert np.diff(times) == pytest.approx(0.1)
         assert times[0] == pytest.approx(2.0, abs=0.11) and times[-1] > 29.8
         assert all(p.strip == "S1" and p.valid and len(p.correction) == 6 for p in poses)
-    assert {p.status for p in bodies(outputs, "point/object")} == {0, 1}
+    assert {p.status for p in bodies(outputs, "point/object")} == {0, 1, 2}
+    whole = bodies(outputs, "orientation/whole")
+    assert [p.timestamp for p in whole] == [p.timestamp for p in final]  # once: one strip, and nothing came after it
+    assert {p.point for p in bodies(outputs, "point/object") if p.status == 1} == {
+        p.point for p in bodies(outputs, "point/object") if p.status == 2
+    }
+    # what is learnt late helps what became final early: attitude and position are more certain
+    early = [np.diag(convert.pose_sample(p[20]).covariance) for p in (whole, final)]
+    assert (early[0] < early[1]).all()
     final_points = [p for p in bodies(outputs, "point/object") if p.status == 1]
     assert len({p.point for p in final_points}) == len(final_points) > 100
     assert all(len(p.residuals) >= 2 and len(p.covariance) == 9 for p in final_points)

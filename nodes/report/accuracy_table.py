@@ -10,8 +10,13 @@ _ORIENTATIONS = {
     "smoothed": "smoothed",
     "live": "on-line, at once",
     "final": "on-line, final",
+    "whole": "after the strips",
 }
-_POINTS = {"direct_georeferencing": "direct georeferencing", "final": "on-line, final"}
+_POINTS = {
+    "direct_georeferencing": "direct georeferencing",
+    "final": "on-line, final",
+    "adjusted_whole": "after the strips",
+}
 
 
 def accuracy_lines(result: dict[str, Any]) -> list[str]:

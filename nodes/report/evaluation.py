@@ -19,7 +19,7 @@ from .flight import Flight, Poses, collect, rejected_key
 Array = NDArray[np.floating]
 
 #: Rows of the orientation table, in order of processing.
-ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final")
+ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final", "whole")
 #: Points are intersected with these orientations; "" stands for the trajectory before triangulation.
 INTERSECTED = {"direct_georeferencing": "", "live": "live", "final": "final"}
 _LARGEST_GAP_S = 1.0
@@ -50,8 +50,8 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
       (omega, phi, kappa), ``nees``;
     - ``points``: ``direct_georeferencing`` (space intersection with the filtered trajectory, or the smoothed
       one where a recording holds no other), ``live`` and ``final``
-      (with these orientations), ``adjusted_live`` and ``adjusted`` (as published), against true points: ``n, rmse_m,
-      mean_m, max_m, sigma_m, nees``;
+      (with these orientations), ``adjusted_live``, ``adjusted`` and ``adjusted_whole`` (as published), against true
+      points: ``n, rmse_m, mean_m, max_m, sigma_m, nees``;
     - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
     - ``improvement``: RMSE of direct georeferencing (filtered) / final: ``points`` (3), ``orientation`` (6);
     - ``sigma0`` over the flight, ``redundancy``, ``updates``, ``rejected``;
@@ -310,7 +310,8 @@ def _difference(poses: Poses, base: Poses, start_ns: int) -> Array:
 
 def _adjusted(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
     rows = {}
-    for name, points in (("adjusted_live", flight.live_points), ("adjusted", flight.points)):
+    kinds = {"adjusted_live": flight.live_points, "adjusted": flight.points, "adjusted_whole": flight.whole_points}
+    for name, points in kinds.items():
         if points:
             values = list(points.values())
             xyz = np.array([[p.x, p.y, p.z] for p in values])

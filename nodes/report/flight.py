@@ -26,6 +26,7 @@ POSE_TOPICS = {
     "trajectory/smoothed": "smoothed",
     "orientation/live": "live",
     "orientation/final": "final",
+    "orientation/whole": "whole",
     "truth/trajectory": "truth",
 }
 
@@ -91,7 +92,8 @@ class Flight:
     start_ns : stamp of the first message that is not configuration; times in seconds count from it
     poses : by name, see POSE_TOPICS; names without messages are absent
     gnss, attitude : messages as measured, in order of arrival
-    live_points, points : first LIVE and last FINAL (or last LIVE, without one) message of each object point
+    live_points, points, whole_points : first LIVE, last FINAL (or last LIVE, without one) and last WHOLE message of
+        each object point
     ground : control and check points by id; truth_points : true coordinates by id
     reports : adjustment reports in order; rejected : the rejected observations they name, once each
     counts : messages by topic; gaps : missing sequence numbers by topic; refused : messages that hold no usable value
@@ -109,6 +111,7 @@ class Flight:
     looks: list[Look] = field(default_factory=list)
     live_points: dict[str, Any] = field(default_factory=dict)
     points: dict[str, Any] = field(default_factory=dict)
+    whole_points: dict[str, Any] = field(default_factory=dict)
     ground: dict[str, Any] = field(default_factory=dict)
     truth_points: dict[str, Array] = field(default_factory=dict)
     reports: list[tuple[int, Any]] = field(default_factory=list)
@@ -213,6 +216,9 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
             flight.looks.append(Look(body.point, i.strip, i.ccd, i.line, i.sample, i.sigma_line, i.sigma_sample))
     elif topic == "point/object":
         _finite(body, body.x, body.y, body.z)
+        if body.status == body.WHOLE:
+            flight.whole_points[body.point] = body
+            return
         if body.status == body.LIVE:
             flight.live_points.setdefault(body.point, body)
         known = flight.points.get(body.point)

@@ -18,6 +18,7 @@ _ORIENTATION = {
     "smoothed": "smoothed trajectory",
     "live": "on-line, live",
     "final": "on-line, final",
+    "whole": "after the strips (backward pass)",
 }
 _POINTS = {
     "direct_georeferencing": "direct georeferencing",
@@ -25,6 +26,7 @@ _POINTS = {
     "final": "intersected, final orientation",
     "adjusted_live": "adjusted, live",
     "adjusted": "adjusted, final",
+    "adjusted_whole": "adjusted, after the strips",
 }
 _SHOWN_REJECTED = 40
 _SHOWN_EVENTS = 60

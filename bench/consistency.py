@@ -1,0 +1,96 @@
+"""Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
+
+    python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough]
+    python bench/consistency.py drift [--minutes 120]
+
+*seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. *drift*: strips
+one after the other, each tied to the one before by its side lap; the ratio in quarters of the flight, and what is kept.
+Set OPENBLAS_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+import numpy as np
+
+from triline.solver.simulation.error_models import ErrorModel
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.window_results import WindowOptions
+from triline.solver.window_study import adjust_online, navigate, orientation_errors, point_errors
+
+ERRORS = ErrorModel(attitude_rate_hz=100.0)
+KINDS = ("live", "final", "whole", "live points", "final points", "whole points")
+
+
+def one_flight(seed: int, model: str, rough: bool) -> list[float]:
+    """Ratios by KINDS."""
+    plan = FlightPlan(
+        strip_s=40.0, stabilised=not rough, turbulence=2.0 if rough else 1.0, lead_in_s=3.0, lead_out_s=2.0
+    )
+    simulation = simulate(plan, seed, ERRORS, ObservationPlan(tie_points_per_s=5.0))
+    result = adjust_online(simulation, navigate(simulation), WindowOptions(model=model, grid_hz=5.0), update_s=0.5)
+    ratios = [orientation_errors(simulation, o).nees.mean() for o in (result.live, result.final, result.whole)]
+    points = (result.live_points, result.final_points, result.whole_points)
+    return ratios + [point_errors(simulation, p).nees.mean() for p in points]
+
+
+def seeds(args: argparse.Namespace) -> None:
+    with ProcessPoolExecutor(2) as pool:
+        work = partial(one_flight, model=args.model, rough=args.rough)
+        rows = np.array(list(pool.map(work, range(1, args.seeds + 1))))
+    band = 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
+    for name, mean, b in zip(KINDS, rows.mean(axis=0), band, strict=True):
+        print(f"{name:14} {mean:.3f} +- {b:.3f}  {'in the band' if abs(mean - 1.0) <= b else 'outside'}")
+
+
+def drift(args: argparse.Namespace) -> None:
+    strips = max(4, round(args.minutes))
+    plan = FlightPlan(strips=strips, strip_s=54.0, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0, sidelap=0.2)
+    simulation = simulate(plan, 1, ERRORS, ObservationPlan(tie_points_per_s=3.0, control=2 * strips, check=strips))
+    memory: list[float] = []
+
+    def watch(now: float, window) -> None:
+        if int(now) % 300 == 0:
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+    options = WindowOptions(grid_hz=2.0)
+    result = adjust_online(simulation, navigate(simulation), options, live=False, update_s=0.5, watch=watch)
+    print(f"{simulation.flight.covered_s[-1, 1] / 60:.0f} minutes, {strips} strips, {len(result.final_points)} points")
+    names = [s.id for s in simulation.flight.strips]
+    ms = 1e3 * np.array(result.update_s)
+    for k, part in enumerate(np.array_split(np.arange(strips), 4)):
+        mine = {names[i] for i in part}
+        ratios = [
+            orientation_errors(simulation, [o for o in run if o.strip in mine]).nees.mean()
+            for run in (result.final, result.whole)
+        ]
+        found = {n: p for n, p in result.final_points.items() if p.residuals[0].look.strip in mine}
+        ratios.append(point_errors(simulation, found).nees.mean())
+        own = ms[k * len(ms) // 4 : (k + 1) * len(ms) // 4]
+        print(
+            f"quarter {k + 1}: final {ratios[0]:.3f}  whole {ratios[1]:.3f}  points {ratios[2]:.3f}   "
+            f"update p50 {np.median(own):.1f} ms, p99 {np.percentile(own, 99):.1f} ms, longest {own.max():.0f} ms"
+        )
+    print(
+        "peak memory, MB, every five minutes (the results are kept):", np.round(memory[:: max(1, len(memory) // 12)], 0)
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("seeds", "drift"))
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--model", default="wander")
+    parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
+    parser.add_argument("--minutes", type=float, default=120.0)
+    args = parser.parse_args()
+    {"seeds": seeds, "drift": drift}[args.what](args)
+
+
+if __name__ == "__main__":
+    main()

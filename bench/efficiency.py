@@ -1,0 +1,214 @@
+"""Is the on-line answer as good as a batch adjustment? RMSE of orientation and object points against two yardsticks.
+
+    python bench/efficiency.py table [--seeds 20]          one strip: models, mounts, with and without self-calibration
+    python bench/efficiency.py block [--seeds 20] [--model wander]     six strips and two cross strips
+
+*final / causal*: what became final against a batch adjustment, from scratch, of just the data that had arrived then, at
+some times of each strip. *whole / batch*: after the backward pass, against the batch adjustment of all data. *final /
+batch*: what being on line costs. Each figure is the quotient of two RMSE over all seeds, of the same times and points;
+of X, Y, Z, omega, phi, kappa (points: X, Y, Z) the mean and the worst. Set OPENBLAS_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from triline.solver.selfcalibration import SELF_CALIBRATIONS
+from triline.solver.simulation.error_models import ErrorModel
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
+from triline.solver.window_results import AdjustedPoint, WindowOptions
+from triline.solver.window_study import (
+    OnlineResult,
+    TimedPose,
+    adjust_at_once,
+    adjust_online,
+    navigate,
+    orientation_errors,
+    point_errors,
+)
+
+#: Attitude at 100 Hz: half the work, and the window interpolates either.
+ERRORS = ErrorModel(attitude_rate_hz=100.0)
+#: Errors that shifts and drifts describe; what wanders is no case for DGR.
+CONSTANT = replace(ERRORS, wander_sigma_m=(0.0, 0.0, 0.0), wander_sigma_deg=(0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table."""
+
+    model: str
+    rough: bool = False
+    selfcal: str = "none"
+    strips: int = 1
+    cross_strips: int = 0
+    strip_s: float = 40.0
+    samples: int = 2
+    height_m: float = 1500.0
+
+    def simulate(self, seed: int) -> Simulation:
+        plan = FlightPlan(
+            height_m=self.height_m,
+            strips=self.strips,
+            cross_strips=self.cross_strips,
+            strip_s=self.strip_s,
+            stabilised=not self.rough,
+            turbulence=2.0 if self.rough else 1.0,
+            turns=False,
+            gap_s=8.0,
+            lead_in_s=3.0,
+            lead_out_s=2.0,
+        )
+        ties = ObservationPlan(tie_points_per_s=5.0, control=6 * max(1, self.strips // 3), check=20)
+        return simulate(plan, seed, CONSTANT if self.model == "dgr" else ERRORS, ties)
+
+
+def one_flight(seed: int, case: Case) -> dict[str, np.ndarray]:
+    """Sums of squares and counts of a flight, by what is compared."""
+    simulation = case.simulate(seed)
+    poses = navigate(simulation)
+    parameters = None if case.selfcal == "none" else SELF_CALIBRATIONS[case.selfcal](simulation.flight.camera)
+    options = WindowOptions(model=case.model, snoop=False, grid_hz=5.0)
+    online = adjust_online(simulation, poses, options, parameters, live=False, update_s=0.5)
+    batch = adjust_at_once(simulation, poses, options, parameters)
+    both = {name for name, p in batch.final_points.items() if name in online.whole_points and p.rays >= 3}
+
+    def points(found: dict[str, AdjustedPoint], names=both) -> np.ndarray:
+        return point_errors(simulation, {n: found[n] for n in names if n in found}).error
+
+    errors = [
+        orientation_errors(simulation, online.final), point_errors(simulation, online.final_points),
+        orientation_errors(simulation, online.whole), point_errors(simulation, online.whole_points),
+    ]  # fmt: skip
+    result = {
+        "final": orientation_errors(simulation, online.final).error,
+        "whole": orientation_errors(simulation, online.whole).error,
+        "batch": orientation_errors(simulation, batch.final).error,
+        "points final": points(online.final_points),
+        "points whole": points(online.whole_points),
+        "points batch": points(batch.final_points),
+        "nees": np.array([[e.nees.mean() for e in errors]]),
+    }
+    result |= _causal(simulation, poses, online, case, partial(adjust_at_once, simulation, poses, options, parameters))
+    return result
+
+
+def _causal(
+    simulation: Simulation,
+    poses: list[TimedPose],
+    online: OnlineResult,
+    case: Case,
+    adjust: Callable[..., OnlineResult],
+) -> dict[str, np.ndarray]:
+    """Errors of what became final at some times of each strip, and of batch adjustments of what was known then."""
+    rows: dict[str, list[np.ndarray]] = {"same": [], "causal": [], "points same": [], "points causal": []}
+    for strip in simulation.flight.strips:
+        mine = [i for i, o in enumerate(online.final) if o.strip == strip.id]
+        # not those of the very end: they become final together with all that is known of the strip
+        known = sorted({online.final_known_s[i] for i in mine})
+        for known_s in {known[k] for k in np.linspace(0.2 * len(known), len(known) - 1, case.samples).astype(int)}:
+            batch = adjust(until_s=known_s)
+            assert batch.window is not None
+            for i in (i for i in mine if online.final_known_s[i] == known_s):
+                final = online.final[i]
+                at = batch.window.orientation_at(strip.id, final.time_s)
+                rows["same"].append(orientation_errors(simulation, [final]).error)
+                rows["causal"].append(orientation_errors(simulation, [at]).error)
+            names = [n for n, t in online.points_known_s.items() if t == known_s and n in batch.live_points]
+            for key, found in (("points same", online.final_points), ("points causal", batch.live_points)):
+                rows[key].append(point_errors(simulation, {n: found[n] for n in names}, rays=1).error)
+    return {key: np.concatenate(parts) for key, parts in rows.items()}
+
+
+def run(case: Case, seeds: int) -> dict[str, object]:
+    """A row of the table."""
+    with ProcessPoolExecutor(2) as pool:
+        flights = []
+        for flight in pool.map(partial(one_flight, case=case), range(1, seeds + 1)):
+            flights.append(flight)
+            if case.strips > 1:
+                show(f"  {len(flights)} flights", _row(flights))
+    return _row(flights)
+
+
+def _row(flights: list[dict[str, np.ndarray]]) -> dict[str, object]:
+    rmse = {key: np.sqrt(np.mean(np.concatenate([f[key] for f in flights]) ** 2, axis=0)) for key in flights[0]}
+    row: dict[str, object] = {"nees": np.mean(np.concatenate([f["nees"] for f in flights]), axis=0)}
+    for name, one, two in (
+        ("final / causal", "same", "causal"),
+        ("whole / batch", "whole", "batch"),
+        ("final / batch", "final", "batch"),
+    ):
+        row[name] = rmse[one] / rmse[two]
+        row["points " + name] = rmse["points " + one] / rmse["points " + two]
+    row["batch"] = rmse["batch"], rmse["points batch"]
+    return row
+
+
+COLUMNS = tuple(
+    part + name for name in ("final / causal", "whole / batch", "final / batch") for part in ("", "points ")
+)
+
+
+def show(title: str, row: dict) -> None:
+    cells = [f"{np.mean(row[c]):6.3f} {np.max(row[c]):6.3f}" for c in COLUMNS]
+    print(f"{title:38}" + " | ".join(cells) + " | " + " ".join(f"{v:.2f}" for v in row["nees"]), flush=True)
+
+
+def header() -> None:
+    print(
+        f"{'(mean and worst component)':38}"
+        + " | ".join(f"{c.replace('points ', 'pts '):>13}"[:13] for c in COLUMNS)
+        + " | nees: final, points, whole, points"
+    )
+
+
+def table(args: argparse.Namespace) -> None:
+    header()
+    for model in ("dgr", "ppm", "lim", "wander"):
+        for rough in (False, True):
+            for selfcal in ("none", "tls12"):
+                title = f"{model}, {'rough' if rough else 'stabilised'}{', ' + selfcal if selfcal != 'none' else ''}"
+                show(title, run(Case(model, rough, selfcal), args.seeds))
+
+
+def block(args: argparse.Namespace) -> None:
+    header()
+    case = Case(
+        args.model,
+        selfcal=args.selfcal,
+        strips=args.strips,
+        cross_strips=args.cross,
+        strip_s=args.strip_s,
+        samples=args.samples,
+        height_m=1000.0,
+    )
+    row = run(case, args.seeds)
+    show(f"{args.model}, {args.strips} strips, {args.cross} cross strips", row)
+    print(json.dumps({k: np.round(v, 3).tolist() for k, v in row.items() if k != "batch"}, indent=1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("table", "block"))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--model", default="wander")
+    parser.add_argument("--selfcal", default="none")
+    parser.add_argument("--strips", type=int, default=6)
+    parser.add_argument("--cross", type=int, default=2)
+    parser.add_argument("--strip-s", type=float, default=30.0)
+    parser.add_argument("--samples", type=int, default=1, help="causal batches for each strip of a block")
+    args = parser.parse_args()
+    {"table": table, "block": block}[args.what](args)
+
+
+if __name__ == "__main__":
+    main()
