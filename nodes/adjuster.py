@@ -282,7 +282,6 @@ class Adjuster(Node):
         self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow)
         if body.ended:
             self._window.end_strip(body.id, int(body.lines))
-            self._stated.pop(body.id, None)
 
     def _begin_held(self) -> None:
         """Strips that waited for a pose begin if there is one, and get the tie points that came meanwhile."""
@@ -457,23 +456,31 @@ class Adjuster(Node):
 
     def _follow_covariance(self, time_s: float, covariance: Any) -> None:
         """Where the trajectory becomes clearly less certain in the middle of a strip, or certain again, the wander does
-        too: while GNSS is out, after the navigator has started again."""
+        too: while GNSS is out, after the navigator has started again, be that when the strip is over but not final."""
         assert self._window is not None
-        another = self._poses.started_anew()
-        for id, (first, now) in self._stated.items():
-            model = self._window.strips[id].model
-            slow = (self._window.slow if another else first).grown(covariance)
-            if not isinstance(model, Wander) or not (another or now.differs(slow)):
+        another, left_out_s = self._poses.started_anew(), -np.inf
+        for id, (first, now) in list(self._stated.items()):
+            strip = self._window.strips[id]
+            if strip.final_to_s >= strip.end_s:
+                del self._stated[id]
                 continue
+            model, slow = strip.model, (self._window.slow if another else first).grown(covariance)
+            changed = another or (time_s <= strip.end_s and now.differs(slow))
+            if not isinstance(model, Wander) or not changed:
+                continue
+            if another and self._handed_s < model.extent.start_s and first.grown(covariance) is first:
+                continue  # begun with the new filter
             used_s = max(self._handed_s, self._used_to_s, model.borders[0])
             border_s = model.restate(used_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
             if another:  # of the new filter, what the model still takes for the old one's error is no use
-                self._poses.leave_out(self._handed_s, min(border_s, model.extent.end_s))
+                left_out_s = max(left_out_s, min(border_s, model.extent.end_s, strip.end_s + NEAR_START_S))
                 first = self._window.slow
             self._stated[id] = first, slow
             if np.isfinite(border_s):
                 self._slow.add(border_s, slow)
             self.counters["wander restated"] += 1
+        if another:
+            self._poses.leave_out(self._handed_s, left_out_s)
         self._handed_s = max(self._handed_s, time_s)
 
     def _results(self, update: WindowUpdate) -> list[Message]:
