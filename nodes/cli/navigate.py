@@ -186,18 +186,17 @@ def _stretch(stretch: Navigated, gnss: GnssData, held_out: NDArray[np.bool_], of
     lay = settings.layout
     sigma = np.sqrt(np.einsum("kii->ki", stretch.best.P))
     middle = len(e) // 2
-    rms = np.sqrt(np.mean(stretch.best.sigmas(e.time_s) ** 2, axis=0))
+    of_nodes = stretch.best.sigmas(e.time_s)
+    rms, median = np.sqrt(np.mean(of_nodes**2, axis=0)), np.median(of_nodes, axis=0)
     per_h, mgal = np.degrees(1.0) * 3600.0, 1e5
     kinds = sorted({i.kind for i in stretch.forward.innovations})
     out: dict[str, Any] = {
         "start_s": float(e.time_s[0]) + offset_s,
         "end_s": float(e.time_s[-1]) + offset_s,
+        "time_offset_s": offset_s,
         "alignment": stretch.start.how,
-        "sigma_rms": {
-            "position_m": _rounded(rms[:3]),
-            "velocity_m_s": _rounded(rms[3:6]),
-            "attitude_deg": _rounded(np.degrees(rms[6:])),
-        },
+        "sigma_rms": _by_kind(rms),
+        "sigma_median": _by_kind(median),
         "gyro_bias_deg_h": _rounded(e.gyro[middle, :3] * per_h),
         "gyro_bias_deg_h_sigma": _rounded(sigma[middle, lay.gyro][:3] * per_h),
         "accel_bias_mgal": _rounded(e.accel[middle, :3] * mgal),
@@ -220,16 +219,25 @@ def _stretch(stretch: Navigated, gnss: GnssData, held_out: NDArray[np.bool_], of
     return out
 
 
+def _by_kind(sigma: NDArray[Any]) -> dict[str, list[float]]:
+    """Standard deviations (9,) by what they are of."""
+    return {
+        "position_m": _rounded(sigma[:3]),
+        "velocity_m_s": _rounded(sigma[3:6]),
+        "attitude_deg": _rounded(np.degrees(sigma[6:])),
+    }
+
+
 def _rounded(values: NDArray[Any]) -> list[float]:
     return [float(f"{v:.6g}") for v in values]
 
 
 def _summary(result: dict[str, Any], out: Path) -> None:
     for s in result["stretches"]:
-        rms = s["sigma_rms"]
+        median = s["sigma_median"]
         print(f"{s['start_s']:.1f} to {s['end_s']:.1f} s, aligned {s['alignment']}")
-        print(f"  sigma north, east, down  {_joined(rms['position_m'], 1e3, '.1f')} mm")
-        print(f"  sigma roll, pitch, heading  {_joined(rms['attitude_deg'], 1.0, '.4f')} deg")
+        print(f"  median sigma north, east, down  {_joined(median['position_m'], 1e3, '.1f')} mm")
+        print(f"  median sigma roll, pitch, heading  {_joined(median['attitude_deg'], 1.0, '.4f')} deg")
         for kind, i in s["innovations"].items():
             if i["n"]:
                 fate = ", ".join(f"{i[k]} {k}" for k in ("used", "weighted", "rejected", "restored") if i[k])
