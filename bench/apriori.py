@@ -10,7 +10,9 @@ again (restart). 1 is expected; the mean over seeds must lie within three standa
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
@@ -72,22 +74,30 @@ def normalised_squares(out: list[Message], simulation: Simulation, topic: str, e
     return np.column_stack([whole, e**2 / np.einsum("nii->ni", C)])
 
 
+def of_seed(grade: str, seed: int, case: str) -> dict[str, np.ndarray]:
+    """Mean (7,) of the normalised squares over one flight, live and final."""
+    simulation, out = fly(GRADES[grade], seed, case)
+    return {t: normalised_squares(out, simulation, f"orientation/{t}").mean(axis=0) for t in ("live", "final")}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=16)
     parser.add_argument("--cases", nargs="+", default=["flight", "outage"])
     parser.add_argument("--grades", nargs="+", default=list(GRADES))
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--quick", action="store_true", help="three seeds")
     args = parser.parse_args()
     seeds, good = 3 if args.quick else args.seeds, True
-    for case in args.cases:
-        for name in args.grades:
-            means: dict[str, list[np.ndarray]] = {"live": [], "final": []}
-            for seed in range(10, 10 + seeds):
-                simulation, out = fly(GRADES[name], seed, case)
-                for topic, of_topic in means.items():
-                    of_topic.append(normalised_squares(out, simulation, f"orientation/{topic}").mean(axis=0))
-            for topic, rows in means.items():
+    with ProcessPoolExecutor(args.processes) as pool:
+        done = {
+            (case, name): [pool.submit(of_seed, name, seed, case) for seed in range(10, 10 + seeds)]
+            for case in args.cases
+            for name in args.grades
+        }
+        for (case, name), flights in done.items():
+            for topic in ("live", "final"):
+                rows = [f.result()[topic] for f in flights]
                 mean = np.mean(rows, axis=0)
                 error = float(np.std([r[0] for r in rows], ddof=1)) / np.sqrt(seeds)
                 held = abs(mean[0] - 1.0) < 3.0 * error + 0.15

@@ -16,7 +16,7 @@ BENCHMARKS = {
     "batch job: snooping, elimination, covariances": ["adjustment_job.py"],
     "inertial navigation": ["navigation.py"],
     "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
-    "a-priori weights from the trajectory": ["apriori.py"],
+    "a-priori weights from the trajectory": ["apriori.py", "--seeds", "6"],
     "sliding window: latency of updates": ["window.py", "latency", "--selfcal"],
     "sliding window beside GTSAM and Ceres": ["window_peers.py"],
     "tie point to orientation over the bus": ["tie_latency.py"],
