@@ -83,7 +83,7 @@ def of_seed(grade: str, seed: int, case: str) -> dict[str, np.ndarray]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=16)
-    parser.add_argument("--cases", nargs="+", default=["flight", "outage"])
+    parser.add_argument("--cases", nargs="+", default=["flight", "outage", "restart"])
     parser.add_argument("--grades", nargs="+", default=list(GRADES))
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--quick", action="store_true", help="three seeds")

@@ -18,7 +18,9 @@ MUCH_LESS = 4.0
 #: Of what a pose is more uncertain by, this share of the standard deviation may wander.
 WANDERING_SHARE = 1.0
 #: Correlation time of the errors of a trajectory whose filter still learns, s: about the lag of its smoother, which
-#: says something else with every second of data that it has more. Judged over seeds by bench/apriori.py.
+#: says something else with every second of data that it has more. Judged over seeds by bench/apriori.py. Its bound:
+#: where a turn right after a strip shows the heading at once, the last seconds of smoothed poses change by more than
+#: that, and single flights are several sigma off in kappa there.
 LEARNING_TIME_S = 6.0
 
 #: No pose has less white noise than this, m and rad.
