@@ -76,6 +76,8 @@ def test_navigate_writes_trajectory_result_and_page(tmp_path, increments, capsys
     assert (sim.rms(turn) < [0.003, 0.003, 0.02]).all() and 0.3 < sim.rms(turn / late[:, 16:]).max() < 3.0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["smoothed"] and result["stretches"][0]["innovations"]["position"]["n"] == len(f.gnss)
+    median, rms = (np.array(result["stretches"][0][k]["position_m"]) for k in ("sigma_median", "sigma_rms"))
+    assert (median > 0.0).all() and (median < rms).all()  # the ends are less certain
     page = (tmp_path / "out" / "navigation.html").read_text()
     for word in ("Trajectory", "Attitude", "Standard deviations", "Innovations", "Biases", "Gaps", "data:image/png"):
         assert word in page

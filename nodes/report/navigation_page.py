@@ -53,7 +53,7 @@ def write_page(path: Path, stretches: list[Navigated], gnss: GnssData, result: d
                 f'<h2>{title}</h2><figure><img alt="{title}" src="data:image/png;base64,{data}">'
                 f"<figcaption>{note}</figcaption></figure>"
             )
-    name = escape(result["input"])
+    name, offset_s = escape(result["input"]), result["stretches"][0]["time_offset_s"]
     remarks = "".join(f"<li>{escape(note)}</li>" for note in result["notes"]) or "<li>none</li>"
     path.write_text(
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Navigation: {name}</title>\n'
@@ -61,7 +61,8 @@ def write_page(path: Path, stretches: list[Navigated], gnss: GnssData, result: d
         f"<style>{CSS}figure img {{ width: 100%; height: auto; display: block; }}</style></head>\n"
         f"<body><main><h1>Navigation: {name}</h1>\n"
         f'<p class="soft">{result["n_inertial"]} inertial samples at {result["inertial_rate_hz"]:g} Hz, '
-        f"{result['n_gnss']} fixes; {'smoothed' if result['smoothed'] else 'filtered'}.</p>\n"
+        f"{result['n_gnss']} fixes; {'smoothed' if result['smoothed'] else 'filtered'}."
+        f"{f' Times in plots count from {offset_s:.3f} s.' if offset_s else ''}</p>\n"
         f"{_tiles(result['stretches'])}<h2>Remarks</h2><ul>{remarks}</ul>\n"
         f"<h2>Gaps</h2>{_gaps(result['stretches'], gnss)}\n{''.join(sections)}\n"
         f"<h2>Figures</h2>{''.join(_figures(s) for s in result['stretches'])}\n"
@@ -154,7 +155,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _numbers(values: Sequence[float]) -> list[str]:
-    return [f"{v:.4g}" for v in values]
+    return [f"{v:.0f}" if abs(v) >= 1000.0 else f"{v:.4g}" for v in values]
 
 
 def _joined(values: Sequence[float], unit: str) -> str:

@@ -27,11 +27,12 @@ _SHOWN_SIGMAS, _SHOWN_SHARE = 5.0, 0.98
 
 def trajectory(stretches: list[Navigated], gnss: GnssData) -> Figure:
     """Plan, and height against time."""
-    fig = figure(5.2)
-    plan, height = fig.subplots(1, 2, width_ratios=(1.0, 1.15))
     scale = 6378137.0
     lat0, lon0 = float(gnss.lat[0]), float(gnss.lon[0])
     east, north = (gnss.lon - lon0) * scale * np.cos(lat0), (gnss.lat - lat0) * scale
+    wide = float(np.ptp(east)) > 1.8 * float(np.ptp(north))
+    fig = figure(5.8 if wide else 5.2)
+    plan, height = fig.subplots(2, 1) if wide else fig.subplots(1, 2, width_ratios=(1.0, 1.15))
     plan.plot(east, north, ".", color="#999", ms=4, label="GNSS antenna")
     height.plot(gnss.time_s, gnss.height_m, ".", color="#999", ms=3)
     for s in stretches:
@@ -87,7 +88,7 @@ def sigmas(stretches: list[Navigated], gnss: GnssData) -> Figure:
                     )  # fmt: skip
     for axis, unit in zip(axes, ("position, m", "velocity, m/s", "attitude, deg"), strict=True):
         axis.set_ylabel(unit)
-        axis.yaxis.set_major_locator(LogLocator(10.0, subs=(1.0,) if _decades(axis) > 2.0 else (1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_locator(LogLocator(10.0, subs=_ticks(axis), numticks=15))
         axis.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
         axis.yaxis.set_minor_formatter(NullFormatter())
     for axis in (axes[0], axes[2]):
@@ -184,9 +185,13 @@ def _times(stretch: Navigated) -> Any:
     return np.linspace(stretch.best.start_s, stretch.best.end_s, n)
 
 
-def _decades(axis: Any) -> float:
+def _ticks(axis: Any) -> tuple[float, ...]:
+    """Multiples of powers of ten at which a logarithmic axis has ticks."""
     low, high = axis.get_ylim()
-    return float(np.log10(high / low))
+    decades = float(np.log10(high / low))
+    if decades > 2.0:
+        return (1.0,)
+    return (1.0, 2.0, 5.0) if decades > 1.0 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
 
 
 def _time_axis(axes: Any, stretches: list[Navigated], gnss: GnssData) -> None:
