@@ -89,7 +89,7 @@ class Matcher(Node):
 
     def step(self, message: Message) -> Iterable[Message]:
         out: list[Message] = []
-        if message.stamp_ns >= self._told_ns + PROGRESS_NS and not find(message.topic).latched:
+        if message.stamp_ns >= self._told_ns + PROGRESS_NS and self._keeps_time(message.topic):
             # all that is older has been worked off; what has the same stamp as this message has not
             self._told_ns = message.stamp_ns
             progress = m.Progress(time_ns=message.stamp_ns - 1)
@@ -100,6 +100,11 @@ class Matcher(Node):
         except ValueError as error:
             self.problem("malformed", f"{message.topic}: {error}")
         return out
+
+    @staticmethod
+    def _keeps_time(topic: str) -> bool:
+        """Whether a message tells how far the flight is. Those of the adjuster do not: it goes by the matcher's word."""
+        return topic not in ("orientation/live", "adjustment/report") and not find(topic).latched
 
     def state(self) -> str:
         return "running" if self._matcher is not None else "waiting for configuration/camera"
