@@ -19,6 +19,8 @@ Array = NDArray[np.floating]
 LIMIT_SIGMA, LEAST_LIMIT_PX = 3.5, 0.5
 #: Matches are judged together with those of so many seconds before, and not before there are so many.
 MEMORY_S, FEWEST = 4.0, 10
+#: If a larger share of new matches is off, it is not they who are wrong.
+OUTVOTED = 0.5
 #: Robust standard deviations are never smaller than this, px.
 LEAST_SCALE_PX = 0.05
 
@@ -102,28 +104,54 @@ class SlowDisagreement:
 
     def judge(self, new: Disagreement) -> NDArray[np.bool_] | None:
         """Which views (k, views) of new points agree with the rest; None as long as there are too few to tell."""
+        if len(new):
+            self._past = _since(self._past, float(new.time_s.max()) - MEMORY_S)
         together = _joined([*self._past, new])
         if len(together) < FEWEST:
             return None
-        middle = float(np.median(together.time_s))
-        design = _design(together.time_s - middle, together.across)
+        good = self._judged(together, new)
+        if len(new) >= FEWEST and self._past and _contradicted(new, good).mean() > OUTVOTED:
+            # the orientation has jumped, as when an adjustment meets its first control: the past says nothing any more
+            alone = self._judged(new, new)
+            if _contradicted(new, alone).mean() < OUTVOTED:
+                self._past = []
+                return alone
+            good = self._judged(together, new)
+        return good
+
+    def _judged(self, all_points: Disagreement, new: Disagreement) -> NDArray[np.bool_]:
+        """Which views (k, views) of new points follow the slow part of all points, which is kept."""
+        middle = float(np.median(all_points.time_s))
+        design = _design(all_points.time_s - middle, all_points.across)
         fit, scale = np.zeros((3, self.views, 2)), np.full((self.views, 2), np.inf)
         for v in range(self.views):
             for i in range(2):
-                fit[:, v, i], scale[v, i] = _robust_fit(design, together.residual[:, v, i])
+                fit[:, v, i], scale[v, i] = _robust_fit(design, all_points.residual[:, v, i])
         left = new.residual - np.einsum("kp,pvi->kvi", _design(new.time_s - middle, new.across), fit)
         limit = np.maximum(LIMIT_SIGMA * scale, LEAST_LIMIT_PX)
-        good = np.asarray((np.abs(left) <= limit).all(axis=2))
         self._fit, self._scale, self._middle_s = fit, scale, middle
-        return good
+        return np.asarray((np.abs(left) <= limit).all(axis=2))
 
     def remember(self, accepted: Disagreement) -> None:
         """Keep points for those to come."""
         if not len(accepted):
             return
         newest = max(float(accepted.time_s.max()), *(float(d.time_s.max()) for d in self._past), -np.inf)
-        kept = _joined([*self._past, accepted])
-        self._past = [kept.select(np.flatnonzero(np.greater(kept.time_s, newest - MEMORY_S)))]
+        self._past = _since([*self._past, accepted], newest - MEMORY_S)
+
+
+def _since(parts: Sequence[Disagreement], time_s: float) -> list[Disagreement]:
+    """Points after a time."""
+    if not parts:
+        return []
+    kept = _joined(parts)
+    kept = kept.select(np.flatnonzero(np.greater(kept.time_s, time_s)))
+    return [kept] if len(kept) else []
+
+
+def _contradicted(points: Disagreement, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which points (k,) have a view that was matched and does not agree."""
+    return (~good & np.isfinite(points.residual).all(axis=2)).any(axis=1)
 
 
 def _joined(parts: Sequence[Disagreement]) -> Disagreement:
