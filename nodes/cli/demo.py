@@ -22,8 +22,10 @@ from ..processes import NodeGroup, NodeProcess
 EXAMPLE = "triline demo --headless --seconds 60 --seed 7"
 
 PLATFORM = "demo"
-#: What turns sensors into orientation, in the order in which it is stopped at the end: with image lines and without.
-ESTIMATORS, ESTIMATORS_OF_TIES = ("navigator", "matcher", "adjuster"), ("navigator", "adjuster")
+#: What turns sensors into orientation and orthoimages, in the order in which it is stopped at the end: with image lines
+#: and without.
+ESTIMATORS = ("navigator", "matcher", "adjuster", "rectifier")
+ESTIMATORS_OF_TIES = ("navigator", "adjuster")
 #: The flight with image lines: 3 x 1500 pixels, 200 times a second.
 IMAGERY = {"images": "true", "sensor": '"ads40-inner"', "height": "1690", "speed": "140", "relief": "50"}
 READY_S = 20.0
