@@ -170,7 +170,7 @@ def _accuracy(result: dict[str, Any]) -> Iterable[str]:
                 _ORIENTATION[name],
                 row["n"],
                 [row["rmse_m"], _times(row["rmse_deg"]), row.get("sigma_m"), _times(row.get("sigma_deg"))],
-                row.get("nees"),
+                None if name == "measured" else row.get("nees"),  # sensors state their noise, not their slow errors
                 name == "final",
             )
             for name, row in result["orientation"].items()
