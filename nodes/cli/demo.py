@@ -66,6 +66,7 @@ class Demo:
         self.recording = self.folder / "flight.mcap"
         self.stop = threading.Event()
         self.restarts = 0
+        self._lost: dict[str, int] = {}
         self.estimators = ESTIMATORS_OF_TIES if args.no_images else ESTIMATORS
         self.viewer_mode = self._viewer_mode()
         self._silent = args.quiet or args.json
@@ -173,6 +174,8 @@ class Demo:
             busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in self.estimators)
             if received != seen or busy:
                 seen, quiet_since = received, time.monotonic()
+        # what comes when nodes are stopped, as the navigator's last second of smoothing, is about no image line
+        self._lost = self._lost_so_far()
         for name in (*self.estimators, "viewer", "recorder"):
             if name in group.processes:
                 group.processes[name].stop(30.0)
@@ -216,11 +219,11 @@ class Demo:
         result.update(
             report=str(report), recordings=[str(path) for path in recordings], restarts=self.restarts,
             landed_early=self.stop.is_set(), viewer=self.viewer_mode, images=not self.args.no_images,
-            lost=self._lost(), waited_s=self._waited_s(),
+            lost=self._lost, waited_s=self._waited_s(),
         )  # fmt: skip
         return result
 
-    def _lost(self) -> dict[str, int]:
+    def _lost_so_far(self) -> dict[str, int]:
         """What the nodes lost on the way, by kind; the viewer may, and a late word on progress changes nothing."""
         sums: dict[str, int] = {}
         for name, status in self._overview.nodes.items():
