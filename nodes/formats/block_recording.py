@@ -151,7 +151,7 @@ def _strips_of(
     return tuple(strips)
 
 
-def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.float64] | None:
+def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating] | None:
     """(n, 6, 6) white noise of poses: their covariance without the slow errors that the project states.
 
     None where it states none, since then nobody knows what part of the covariance is white, or where nothing is left.

@@ -151,7 +151,7 @@ def _since(parts: Sequence[Disagreement], time_s: float) -> list[Disagreement]:
 
 def _contradicted(points: Disagreement, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which points (k,) have a view that was matched and does not agree."""
-    return (~good & np.isfinite(points.residual).all(axis=2)).any(axis=1)
+    return np.asarray((~good & np.isfinite(points.residual).all(axis=2)).any(axis=1))
 
 
 def _joined(parts: Sequence[Disagreement]) -> Disagreement:
