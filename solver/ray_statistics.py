@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from .adjustment import Solution
 from .covariance import Cofactors
+from .linearisation import Linearisation, Whitening
+from .network import Rays
 from .reliability import UNCONTROLLED
 
 Array = NDArray[np.floating]
@@ -50,21 +52,13 @@ def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
     the sample move it by; so ``M^-1 v`` are the residuals of line and sample in their sigmas.
     """
     rays, lin = solution.network.rays, solution.linearisation
-    g = solution.whitening.g
-    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
-    M = np.empty((len(rays), 2, 2))
-    # a later line lets the computed point move on: the residual goes against the image motion
-    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)).T
-    pitch = rays.pitch_mm.T * rays.sigma_sample_px
-    M[:, 0, 1] = g[0] * pitch[0]
-    M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
     # robust weights fade away; what hardly has any is as good as left out
     weight = np.where(solution.ray_weight > 1e-6, solution.ray_weight, 0.0)
     Qvv = cofactors.residuals(weight)
     # a ray with part of its weight: P^-1 - A Q A^T, in the units of full weight
     part = np.where((weight > 0) & (weight < 1), 1.0 / np.where(weight > 0, weight, 1.0) - 1.0, 0.0)
     Qvv = Qvv + part[:, None, None] * np.eye(2)
-    back = _inverse(M)
+    back = _in_sigmas(rays, lin, solution.whitening)
     v = np.einsum("nij,jn->ni", back, lin.residual)
     C = back @ Qvv @ np.swapaxes(back, 1, 2)
     q = np.einsum("nii->ni", C)
@@ -75,6 +69,25 @@ def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
     w = np.where(controlled, v / np.sqrt(np.where(controlled, q, 1.0)), 0.0)
     sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
     return RayStatistics(v * sigma, sigma * np.sqrt(unit), np.clip(redundancy, 0.0, 1.0), w, _joint(v, C, unit))
+
+
+def residuals_px(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
+    """Residuals (n, 2) in lines and samples, as those of `ray_statistics`."""
+    v = np.einsum("nij,jn->ni", _in_sigmas(rays, lin, whitening), lin.residual)
+    return v * np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
+
+
+def _in_sigmas(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
+    """What turns whitened residuals into line and sample in their sigmas (n, 2, 2)."""
+    g = whitening.g
+    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
+    M = np.empty((len(rays), 2, 2))
+    # a later line lets the computed point move on: the residual goes against the image motion
+    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)).T
+    pitch = rays.pitch_mm.T * rays.sigma_sample_px
+    M[:, 0, 1] = g[0] * pitch[0]
+    M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
+    return _inverse(M)
 
 
 def _inverse(M: Array) -> Array:

@@ -20,7 +20,7 @@ from .linearisation import Linearisation, Whitening, linearise, residual_covaria
 from .models.base import Design, PseudoObservations
 from .network import Rays
 from .normal_equations import ControlWeights, PointNormals, point_normals
-from .ray_statistics import RayStatistics, ray_statistics
+from .ray_statistics import RayStatistics, ray_statistics, residuals_px
 from .selfcalibration import SelfCalibration
 
 if TYPE_CHECKING:
@@ -262,6 +262,15 @@ class Batch:
             cofactors = self.cofactors(state.covariance(self.columns))
             self.judged = state.solution, cofactors, self.statistics(theta, cofactors)
         return self.judged[1], self.judged[2]
+
+    def residuals_px(self, state: WindowState) -> Array:
+        """Residuals (n, 2) of the rays in lines and samples at the present solution, as `judge` gives them."""
+        if self.judged is not None and self.judged[0] == state.solution:
+            return self.judged[2].v_px
+        theta = state.values(self.columns)
+        self.back_substitute(theta)
+        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+        return residuals_px(self.rays, lin, self.whitening)
 
     def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
         """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""

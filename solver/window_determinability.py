@@ -168,7 +168,7 @@ class Determinability:
             inner = batch.coupling @ everything[np.ix_(columns, columns)] @ np.swapaxes(batch.coupling, 1, 2) + np.eye(
                 3
             )
-            own_variance = np.einsum("pki,pkl,pli->pi", L, inner, L)
+            own_variance = np.einsum("pki,pki->pi", L, inner @ L)
             rp = to_points[known] / np.sqrt(np.maximum(own_variance[known], 1e-12)[:, :, None] * q)
             if rp.size:
                 flat = np.clip(rp.reshape(-1, len(places)), -1.0, 1.0)

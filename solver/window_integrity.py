@@ -15,6 +15,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from functools import cache
+from heapq import nlargest
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +185,9 @@ class Integrity:
         state : solved
         renew : look again at some of the observations that seem most exposed
         """
-        ranked = sorted((e for b in self._of_batch.values() for e in b.exposed), key=lambda e: -e.leverage)
+        everyone = chain.from_iterable(b.exposed for b in self._of_batch.values())
+        # of those that are renewed none can come behind so many others and still count
+        ranked = nlargest(OF_WINDOW + 1 + RENEWED, everyone, key=_leverage)
         again = ranked[:RENEWED] if renew else []
         widths = [len(e.rows) for e in again]
         G = np.zeros((len(state), 6 + sum(widths)))
@@ -196,7 +200,7 @@ class Integrity:
             e.renew(e.rows @ S[state.places(e.batch.columns), end - k : end])
         Qg = S[:, :6]
         sigma = np.sqrt(np.maximum(np.einsum("uk,uk->k", G[:, :6], Qg), 0.0))
-        ranked.sort(key=lambda e: -e.leverage)
+        ranked.sort(key=_leverage, reverse=True)
         if renew and self._of_batch:  # the one whose bound is the largest is judged anew
             loosest = max(self._of_batch.values(), key=lambda b: b.rest)
             if loosest.exposed and loosest.rest > ranked[min(OF_WINDOW, len(ranked) - 1)].leverage:
@@ -206,15 +210,17 @@ class Integrity:
         rest = max((b.rest for b in self._of_batch.values()), default=0.0)
         rest = max([rest, self._left.bound(), *(e.leverage for e in ranked[OF_WINDOW:][:1])])
         bias = self._delta * np.sqrt(rest) * sigma
-        effects = [(e, e.rows @ Qg[state.places(e.batch.columns)]) for e in ranked[:OF_WINDOW]]
-        effects += self._left.effects(Qg, state)
+        near = ranked[:OF_WINDOW]
+        on_near = [e.rows @ Qg[state.places(e.batch.columns)] for e in near]
+        observations = near + self._left.exposed
         worst: _Exposed | None = None
-        largest = float(np.linalg.norm(bias[:3]))
-        for e, h in effects:
-            effect = self._delta * np.sqrt(np.einsum("ik,ij,jk->k", h, e.inverse, h))
-            bias = np.maximum(bias, effect)
-            if float(np.linalg.norm(effect[:3])) > largest:
-                largest, worst = float(np.linalg.norm(effect[:3])), e
+        if observations:
+            h = np.concatenate([*on_near, self._left.effects(Qg, state)])
+            effect = self._delta * np.sqrt(_squares(observations, h))
+            size = np.linalg.norm(effect[:, :3], axis=1)
+            if size.max() > float(np.linalg.norm(bias[:3])):
+                worst = observations[int(np.argmax(size))]
+            bias = np.maximum(bias, effect.max(axis=0))
         if renew:
             self._left.thin(state)
             self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
@@ -231,12 +237,17 @@ class Integrity:
 
 
 class _Left:
-    """Observations that left the window: how an error in each moves the right-hand side of what stayed."""
+    """Observations that left the window: how an error in each moves the right-hand side of what stayed.
+
+    Attributes
+    ----------
+    exposed : the most exposed of them
+    """
 
     def __init__(self) -> None:
         self._numbers: IntArray = np.empty(0, dtype=np.int64)
         self._rhs = np.empty((0, 0))
-        self._exposed: list[_Exposed] = []
+        self.exposed: list[_Exposed] = []
         self._bounds: deque[tuple[float, float]] = deque()
 
     def add(self, exposed: list[_Exposed], rest: float, time_s: float, state: WindowState) -> None:
@@ -251,7 +262,7 @@ class _Left:
             rows = [place[int(n)] for n in e.batch.columns]
             self._rhs[rows, column : column + len(e.rows)] = e.rows.T
             column += len(e.rows)
-        self._exposed += exposed
+        self.exposed += exposed
         self._bounds.append((time_s, rest))
 
     def marginalise(self, marginal: Marginal) -> None:
@@ -267,32 +278,31 @@ class _Left:
             rest[order[np.searchsorted(marginal.stayed, self._numbers[stayed], sorter=order)]] = self._rhs[stayed]
             self._numbers, self._rhs = marginal.stayed.copy(), rest - moved
 
-    def effects(self, Qg: Array, state: WindowState) -> list[tuple[_Exposed, Array]]:
-        """How each moves functions of the unknowns; Qg (n, 6)."""
-        if not self._exposed:
-            return []
-        h = self._rhs.T @ Qg[state.places(self._numbers)]
-        ends = np.cumsum([len(e.rows) for e in self._exposed])
-        return [(e, h[end - len(e.rows) : end]) for e, end in zip(self._exposed, ends, strict=True)]
+    def effects(self, Qg: Array, state: WindowState) -> Array:
+        """How their rows, one below the other, move functions of the unknowns; Qg (n, 6)."""
+        if not self.exposed:
+            return np.empty((0, Qg.shape[1]))
+        return self._rhs.T @ Qg[state.places(self._numbers)]
 
     def thin(self, state: WindowState) -> None:
         """Keep the most exposed; of the others the bound."""
-        if len(self._exposed) <= 2 * OF_WINDOW:
+        if len(self.exposed) <= 2 * OF_WINDOW:
             return
         place = state.places(self._numbers)
         G = np.zeros((len(state), self._rhs.shape[1]))
         G[place] = self._rhs
         R = self._rhs.T @ state.factor.solve(G)[place]
-        ends = np.cumsum([len(e.rows) for e in self._exposed])
-        for e, end in zip(self._exposed, ends, strict=True):
-            own = slice(end - len(e.rows), end)
-            e.leverage = float(np.linalg.eigvals(e.inverse @ R[own, own]).real.max())
-        order = np.argsort([-e.leverage for e in self._exposed])
+        pair = np.stack(_rows_of(self.exposed), axis=1)
+        products = _inverses(self.exposed) @ R[pair[:, :, None], pair[:, None]]
+        leverages = np.linalg.eigvals(products).real.max(axis=1)
+        for e, leverage in zip(self.exposed, leverages.tolist(), strict=True):
+            e.leverage = leverage
+        order = np.argsort([-e.leverage for e in self.exposed])
         keep = np.sort(order[:OF_WINDOW])
-        self._bounds.append((self._bounds[-1][0], self._exposed[order[OF_WINDOW]].leverage))
-        kept = np.repeat(np.isin(np.arange(len(ends)), keep), [len(e.rows) for e in self._exposed])
+        self._bounds.append((self._bounds[-1][0], self.exposed[order[OF_WINDOW]].leverage))
+        kept = np.repeat(np.isin(np.arange(len(order)), keep), [len(e.rows) for e in self.exposed])
         columns = np.flatnonzero(kept)
-        self._rhs, self._exposed = self._rhs[:, columns], [self._exposed[i] for i in keep]
+        self._rhs, self.exposed = self._rhs[:, columns], [self.exposed[i] for i in keep]
 
     def bound(self) -> float:
         return max((value for _, value in self._bounds), default=0.0)
@@ -305,6 +315,30 @@ class _Left:
 @cache
 def _of_risk(risk: float) -> float:
     return float(norm.isf(risk / 2))
+
+
+def _leverage(e: _Exposed) -> float:
+    return e.leverage
+
+
+def _rows_of(exposed: list[_Exposed]) -> tuple[IntArray, IntArray]:
+    """First and last row (n,) of each where the rows of all stand one below the other."""
+    widths = np.array([len(e.rows) for e in exposed], dtype=np.int64)
+    ends = np.cumsum(widths)
+    return ends - widths, ends - 1
+
+
+def _inverses(exposed: list[_Exposed]) -> Array:
+    """``C^-1`` (n, 2, 2) of each; of a control coordinate it stands first, and the rest is zero."""
+    values = [(*e.inverse.ravel().tolist(), 0.0, 0.0, 0.0)[:4] for e in exposed]
+    return np.array(values).reshape(-1, 2, 2)
+
+
+def _squares(exposed: list[_Exposed], h: Array) -> Array:
+    """``h^T C^-1 h`` (n, k) of each; the rows (m, k) of all stand one below the other."""
+    first, last = _rows_of(exposed)
+    a, b, c, d = _inverses(exposed).reshape(-1, 4).T[:, :, None]
+    return a * h[first] ** 2 + (b + c) * h[first] * h[last] + d * h[last] ** 2
 
 
 def _inverse(C: Array) -> Array:

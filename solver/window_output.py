@@ -77,20 +77,22 @@ def adjusted_points(
 ) -> list[AdjustedPoint]:
     """The points of a batch that are determined, with covariance and residuals."""
     cofactors, statistics = batch.judge(state)
-    v, w, rejected = statistics.v_px.tolist(), statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
+    v_line, v_sample = statistics.v_px.T.tolist()
+    w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
+    first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
+    known = (batch.control.weight > 0).all(axis=1).tolist()
     out = []
     for i, name in enumerate(batch.names):
         if batch.normals.rank[i] < 3:
             continue
         looks = points[name].looks
-        residuals = tuple(
-            RayResidual(looks[source[r]], v[r][0], v[r][1], w[r], rejected[r])
-            for r in range(batch.first_ray[i], batch.first_ray[i + 1])
-        )
+        mine = slice(first[i], first[i + 1])
+        seen = [looks[k] for k in source[mine]]
+        residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
         role = control[name].role if name in control else "tie"
-        rays = sum(not r.rejected for r in residuals)
-        checked = _checked(rays, len(residuals), bool((batch.control.weight[i] > 0).all()))
+        rays = int(used[i])
+        checked = _checked(rays, len(residuals), known[i])
         out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals, checked))
     return out
 

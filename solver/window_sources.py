@@ -194,7 +194,7 @@ class SourceMonitor:
         use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] == 3) & (numbers >= 0))
         if not len(use):
             return None
-        _, statistics = batch.judge(state)
+        v_px = batch.residuals_px(state)
         present, of_ray = np.unique(numbers[use], return_inverse=True)
         rays, lin, g = batch.rays, batch.lin, batch.whitening.g
         rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
@@ -203,7 +203,7 @@ class SourceMonitor:
         pitch = rays.pitch_mm.T
         B[:, 0, 0, 1] = (g[0] * pitch[0])[use]
         B[:, 1, 0, 1] = (g[1] * pitch[0] + g[2] * pitch[1])[use]
-        v = np.einsum("nij,nj->ni", B[:, :, 0], statistics.v_px[use])
+        v = np.einsum("nij,nj->ni", B[:, :, 0], v_px[use])
         B[:, :, 1] = B[:, :, 0] * ((rays.time_s[use] - self._start_s) / DRIFT_S)[:, None, None]
         B = B.reshape(-1, 2, EACH)
         point = rays.point[use]

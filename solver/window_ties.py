@@ -260,6 +260,8 @@ class EarlierStrips:
 
     def leaving(self, limit_s: float, used: Iterable[IntArray]) -> IntArray:
         """Modes that no batch in the window (columns of each) touches and none will; their patches are closed."""
+        if not self.present:
+            return np.empty(0, dtype=np.int64)
         busy = {int(c) for columns in used for c in columns}
         gone = []
         for patch in self._patches:

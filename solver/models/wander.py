@@ -116,7 +116,8 @@ class Wander(CorrectionModel):
 
     def design(self, time_s: ArrayLike) -> Design:
         t = np.asarray(time_s, dtype=float)
-        k, part, _ = self._inside(t)
+        k, after = self._inside(t)
+        _, part = self._between(after, self.options.slow.wander_time_s, self._F, self._Q)
         share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
         columns = np.empty((len(t), 6, 6), dtype=np.int32)
         columns[:, 0] = np.arange(6)
@@ -127,7 +128,12 @@ class Wander(CorrectionModel):
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
-        k, _, variance = self._inside(t)
+        k, inside = self._inside(t)
+        variance = np.empty(len(t))
+        for time_s in set(self._time_s[k + 1].tolist()):
+            mine = self._time_s[k + 1] == time_s
+            F, Q = self._over_segment(time_s)
+            variance[mine] = self._between(inside[mine], time_s, F, Q)[0]
         before, after = self._sigma[k], self._sigma[k + 1]
         part = (t - self.borders[k]) / self.step_s
         size = np.where(self._another[k + 1][:, None], before**2 + after**2, (after - before) ** 2)
@@ -163,17 +169,17 @@ class Wander(CorrectionModel):
         self._observations.sigma[...] = changed.sigma
         return float(self.borders[first])
 
-    def _inside(self, t: Array) -> tuple[NDArray[np.int_], Array, Array]:
-        """Segment (n,), coefficients (n, 4) of value and slope at both its borders, variance (n,) for sigma 1."""
+    def _inside(self, t: Array) -> tuple[NDArray[np.int_], Array]:
+        """Segment (n,) of times, and the time (n,) since its first border."""
         k = np.clip(np.floor((t - self.borders[0]) / self.step_s).astype(int), 0, len(self.borders) - 2)
-        after = np.clip(t - self.borders[k], 0.0, self.step_s)
-        _, part = self._between(after, self.options.slow.wander_time_s, self._F, self._Q)
-        variance = np.empty(len(t))
-        for time_s in np.unique(self._time_s[k + 1]):
-            mine = self._time_s[k + 1] == time_s
-            F, Q, _ = second_order_gauss_markov(1.0, float(time_s), self.step_s)
-            variance[mine] = self._between(after[mine], float(time_s), F, Q)[0]
-        return k, part, variance
+        return k, np.clip(t - self.borders[k], 0.0, self.step_s)
+
+    def _over_segment(self, time_s: float) -> tuple[Array, Array]:
+        """Transition and noise (2, 2) over a segment."""
+        if time_s == self.options.slow.wander_time_s:
+            return self._F, self._Q
+        F, Q, _ = second_order_gauss_markov(1.0, time_s, self.step_s)
+        return F, Q
 
     def _between(
         self, after: Array, time_s: float, F: NDArray[np.floating], Q: NDArray[np.floating]
