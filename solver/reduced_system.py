@@ -110,6 +110,15 @@ class DenseFactor:
         """Block (m, m) of the cofactor matrix."""
         return self.inverse()[np.ix_(columns, columns)]
 
+    def few_cofactors(self, columns: NDArray[np.int64]) -> Array:
+        """Block (m, m) of the cofactor matrix for few columns, ``(L^-1 E)^T (L^-1 E)``, without all of it."""
+        if self._factor is None or self._inverse is not None:
+            return self.cofactors(columns)
+        unit = np.zeros((len(self.scale), len(columns)), order="F")
+        unit[columns, np.arange(len(columns))] = self.scale[columns]
+        Y = solve_triangular(self._factor, unit, lower=True, overwrite_b=True, check_finite=False)
+        return Y.T @ Y
+
     def variances(self) -> Array:
         """(n,) diagonal of the cofactor matrix."""
         return np.diagonal(self.inverse()).copy()

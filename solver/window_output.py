@@ -81,7 +81,7 @@ def adjusted_points(
     w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
     first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
-    known = (batch.control.weight > 0).all(axis=1).tolist()
+    known: list[bool] = np.all(batch.control.weight > 0, axis=1).tolist()
     out = []
     for i, name in enumerate(batch.names):
         if batch.normals.rank[i] < 3:

@@ -186,9 +186,7 @@ class WindowState:
         self._asked += len(place)
         if 3 * self._asked > len(self):
             return factor.cofactors(place)
-        unit = np.zeros((len(self), len(place)))
-        unit[place, np.arange(len(place))] = 1.0
-        return factor.solve(unit)[place]
+        return factor.few_cofactors(place)
 
     def marginalise(self, numbers: IntArray) -> Marginal:
         """Take unknowns out; batches that touch them must have been fixed before.

@@ -130,10 +130,10 @@ class Wander(CorrectionModel):
         t = np.asarray(time_s, dtype=float)
         k, inside = self._inside(t)
         variance = np.empty(len(t))
-        for time_s in set(self._time_s[k + 1].tolist()):
-            mine = self._time_s[k + 1] == time_s
-            F, Q = self._over_segment(time_s)
-            variance[mine] = self._between(inside[mine], time_s, F, Q)[0]
+        correlated_s = self._time_s[k + 1]
+        for each in set(correlated_s.tolist()):
+            mine = correlated_s == each
+            variance[mine] = self._between(inside[mine], each, *self._over_segment(each))[0]
         before, after = self._sigma[k], self._sigma[k + 1]
         part = (t - self.borders[k]) / self.step_s
         size = np.where(self._another[k + 1][:, None], before**2 + after**2, (after - before) ** 2)
@@ -174,7 +174,7 @@ class Wander(CorrectionModel):
         k = np.clip(np.floor((t - self.borders[0]) / self.step_s).astype(int), 0, len(self.borders) - 2)
         return k, np.clip(t - self.borders[k], 0.0, self.step_s)
 
-    def _over_segment(self, time_s: float) -> tuple[Array, Array]:
+    def _over_segment(self, time_s: float) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Transition and noise (2, 2) over a segment."""
         if time_s == self.options.slow.wander_time_s:
             return self._F, self._Q
