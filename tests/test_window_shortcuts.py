@@ -1,0 +1,66 @@
+"""What the window computes in a shorter way is what the long way gives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from triline.solver.reduced_system import DenseFactor
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.window import Window
+from triline.solver.window_integrity import _Exposed, _squares
+from triline.solver.window_study import adjust_online, navigate
+
+
+def test_cofactors_of_few_unknowns() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(60, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
+    columns = np.array([3, 38, 0, 17])
+    wanted = np.linalg.inv(A.T @ A)[np.ix_(columns, columns)]
+    factor = DenseFactor(A.T @ A)
+    few = factor.few_cofactors(columns)
+    scale = np.sqrt(np.diagonal(wanted))
+    np.testing.assert_allclose(few / scale / scale[:, None], wanted / scale / scale[:, None], atol=1e-9)
+    factor.inverse()
+    np.testing.assert_allclose(factor.few_cofactors(columns), few, rtol=1e-9, atol=1e-12 * np.abs(few).max())
+
+
+def test_cofactors_of_few_unknowns_of_a_singular_matrix() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(30, 5)) @ rng.normal(size=(5, 8))
+    factor = DenseFactor(A.T @ A)
+    columns = np.array([1, 6])
+    np.testing.assert_allclose(factor.few_cofactors(columns), factor.inverse()[np.ix_(columns, columns)])
+    assert len(factor.undetermined.eigenvalues) == 3
+
+
+def test_effects_of_rays_and_control_coordinates() -> None:
+    rng = np.random.default_rng(3)
+    widths = [2, 1, 1, 2, 2]
+    exposed, h, wanted = [], [], []
+    for k in widths:
+        root = rng.normal(size=(k, k))
+        inverse, part = root @ root.T, rng.normal(size=(k, 6))
+        exposed.append(_Exposed(None, 0, 0, 0, np.zeros((k, 3)), inverse, inverse, 0.0))  # type: ignore[arg-type]
+        h.append(part)
+        wanted.append(np.diagonal(part.T @ inverse @ part))
+    np.testing.assert_allclose(_squares(exposed, np.concatenate(h)), wanted)
+
+
+def test_residuals_without_cofactors() -> None:
+    """Of every batch of a window, at a solution for which it has not been judged."""
+    simulation = simulate(FlightPlan(strip_s=12.0), 1, observation_plan=ObservationPlan(tie_points_per_s=6.0))
+    compared = 0
+
+    def watch(_: float, window: Window) -> None:
+        nonlocal compared
+        for batch in window._batches:
+            batch.judged = None
+            alone = batch.residuals_px(window.state)
+            assert batch.judged is None
+            np.testing.assert_allclose(alone, batch.judge(window.state)[1].v_px, rtol=1e-12, atol=1e-12)
+            np.testing.assert_array_equal(batch.residuals_px(window.state), batch.judge(window.state)[1].v_px)
+            compared += 1
+
+    adjust_online(simulation, navigate(simulation), live=False, watch=watch)
+    assert compared > 20
