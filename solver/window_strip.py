@@ -22,15 +22,11 @@ IntArray = NDArray[np.int64]
 UNKNOWN_LENGTH_S = 600.0
 #: Sampling of the times at which an unknown is in use, share of a segment.
 _SAMPLING = 0.05
-#: No segment is shorter, s. Of a wander as fast as that of a filter that learns, 1.4 % is then left out instead of
-#: 0.8 %, and the window has two thirds of the unknowns; normalised errors stay in their
-#: bands (bench/apriori.py).
-SHORTEST_SEGMENT_S = 0.6
 
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
     """Longest segment, s."""
-    return options.segment_s or max(SEGMENT_SHARE * slow.wander_time_s, SHORTEST_SEGMENT_S)
+    return options.segment_s or SEGMENT_SHARE * slow.wander_time_s
 
 
 def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
