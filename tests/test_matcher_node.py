@@ -44,7 +44,8 @@ def run(tmp_path, messages, points_per_s=4.0):
         for message in messages:
             writer.write(message)
     with RecordingWriter(out) as writer:
-        summary = process(RecordingReader(flight), [Navigator(), Matcher(points_per_s=points_per_s), Adjuster()], writer.write_raw)
+        nodes = [Navigator(), Matcher(points_per_s=points_per_s), Adjuster()]
+        summary = process(RecordingReader(flight), nodes, writer.write_raw)
     reader = RecordingReader(out)
     ties = [m.body for m in reader.messages(["observation/tie"]) if "-M" in m.body.point]
     told = [m.body.message for m in reader.messages(["event/log"]) if m.body.name == "matcher"]

@@ -246,7 +246,7 @@ def test_lanes_of_a_small_budget_give_ties_too():
     settings = {"sensor": "ads40-small", "pixels": 3200, "images": True, "seconds": 8.0, "height": 400.0, "seed": 4}
     flight = (wide := simulated_flight(settings)).simulation.flight
     images = [wide.imager.render(0, ccd, 0, flight.strips[0].lines) for ccd in range(3)]
-    ties, matcher, told = matched(flight, images, options=MatchingOptions(budget_mb=46.0, points_per_s=12.0))
+    ties, matcher, told = matched(flight, images, options=MatchingOptions(budget_mb=46.0, points_per_s=24.0))
     assert matcher.store is not None and matcher.store.nbytes <= 46e6 and 0.6 < matcher.store.cover < 0.9
     assert any("lanes" in text for text in told)
     error, _ = errors(flight, ties)
