@@ -80,6 +80,8 @@ def fly(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     matched = [message for message in ties if "-M" in message.body.point]
     others = [message for message in messages if not message.topic.startswith("sensor/lines/")]
     rng = np.random.default_rng(settings["seed"])
+    # control is the same in both: targets as they were measured
+    others += [message for message in ties if "-M" not in message.body.point and message.source == Matcher.name]
     _, reference, _ = _processed([*others, *simulated_ties(flight, matched, rng)], [Navigator(), Adjuster()], folder)
     accuracy = {
         name: {
@@ -228,6 +230,8 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
     for key, name in (("rms_m", "position"), ("rms_deg", "attitude"), ("points_m", "points")):
         both = [np.array([r["accuracy"][kind][key] for r in rows]) for kind in ("matched", "simulated")]
         known = np.isfinite(both).all(axis=(0, 2))  # a flight without good targets has no points to compare
+        if not known.any():
+            continue
         ratio = np.sqrt((both[0][known] ** 2).sum(axis=0) / (both[1][known] ** 2).sum(axis=0))
         out.append(f"  matched over simulated, {name:<9}" + " ".join(f"{v:6.2f}" for v in ratio))
     return out
