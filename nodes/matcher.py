@@ -103,7 +103,7 @@ class Matcher(Node):
 
     @staticmethod
     def _keeps_time(topic: str) -> bool:
-        """Whether a message tells how far the flight is. Those of the adjuster do not: it goes by the matcher's word."""
+        """Whether a message tells how far the flight is; not those of the adjuster, which goes by the matcher."""
         return topic not in ("orientation/live", "adjustment/report") and not find(topic).latched
 
     def state(self) -> str:
