@@ -338,7 +338,8 @@ def _squares(exposed: list[_Exposed], h: Array) -> Array:
     """``h^T C^-1 h`` (n, k) of each; the rows (m, k) of all stand one below the other."""
     first, last = _rows_of(exposed)
     a, b, c, d = _inverses(exposed).reshape(-1, 4).T[:, :, None]
-    return a * h[first] ** 2 + (b + c) * h[first] * h[last] + d * h[last] ** 2
+    squares = a * h[first] ** 2 + (b + c) * h[first] * h[last] + d * h[last] ** 2
+    return np.maximum(squares, 0.0)  # rounding
 
 
 def _inverse(C: Array) -> Array:

@@ -85,7 +85,7 @@ def test_a_lens_that_looks_forward_looks_forward():
 def test_unknown_preset_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"ads40.*aster-vnir"):
         preset("ads80")
-    assert len(PRESETS) == 8
+    assert len(PRESETS) == 9
 
 
 def test_line_from_parameters_is_straight_and_inclined():
