@@ -162,6 +162,8 @@ class Demo:
 
     def _land(self, group: NodeGroup, overview: Any, show: Callable[[], None]) -> None:
         """Let the nodes work off what they have, then stop them along the flow, the recorder last."""
+        # what comes late after the last image line, as the navigator's last second of smoothing, is about none of them
+        late = self._lost_so_far(("late",))
         until = time.monotonic() + DRAIN_S
         quiet_since = time.monotonic()
         seen = -1
@@ -174,8 +176,7 @@ class Demo:
             busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in self.estimators)
             if received != seen or busy:
                 seen, quiet_since = received, time.monotonic()
-        # what comes when nodes are stopped, as the navigator's last second of smoothing, is about no image line
-        self._lost = self._lost_so_far()
+        self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         for name in (*self.estimators, "viewer", "recorder"):
             if name in group.processes:
                 group.processes[name].stop(30.0)
@@ -223,12 +224,12 @@ class Demo:
         )  # fmt: skip
         return result
 
-    def _lost_so_far(self) -> dict[str, int]:
+    def _lost_so_far(self, kinds: tuple[str, ...]) -> dict[str, int]:
         """What the nodes lost on the way, by kind; the viewer may, and a late word on progress changes nothing."""
         sums: dict[str, int] = {}
         for name, status in self._overview.nodes.items():
             for topic in status.topics if name != "viewer" else ():
-                for kind in ("gaps", "late", "malformed", "dropped"):
+                for kind in kinds:
                     if getattr(topic, kind) and (topic.topic, kind) != ("observation/progress", "late"):
                         sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
         return sums
