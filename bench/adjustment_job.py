@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from triline.solver.batch import Event, Job, Phase, run
-from triline.solver.network import Control, Measurements, Network, build_network
+from triline.solver.adjustment.batch import Event, Job, Phase, run
+from triline.solver.adjustment.network import Control, Measurements, Network, build_network
 from triline.solver.simulation.testfield_study import choose_control
 from triline.solver.simulation.testfields import TESTFIELDS
 

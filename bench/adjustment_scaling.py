@@ -32,9 +32,9 @@ def run(case: tuple) -> dict:
     """Simulate and adjust one network; in a process of its own."""
     import numpy as np
 
-    from triline.solver.adjustment import pose_problem, solve
+    from triline.solver.adjustment.adjustment import pose_problem, solve
+    from triline.solver.adjustment.covariance import cofactors
     from triline.solver.camera import three_line_camera
-    from triline.solver.covariance import cofactors
     from triline.solver.models.dgr import DgrOptions
     from triline.solver.models.lim import LimOptions
     from triline.solver.models.ppm import PpmOptions

@@ -20,8 +20,8 @@ import numpy as np
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window_results import WindowOptions
-from triline.solver.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.window.results import WindowOptions
 
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
 KINDS = ("live", "final", "whole", "live points", "final points", "whole points")

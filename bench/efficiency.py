@@ -24,8 +24,7 @@ from triline.solver.selfcalibration import SELF_CALIBRATIONS
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
-from triline.solver.window_results import AdjustedPoint, WindowOptions
-from triline.solver.window_study import (
+from triline.solver.simulation.window_study import (
     OnlineResult,
     TimedPose,
     adjust_at_once,
@@ -34,6 +33,7 @@ from triline.solver.window_study import (
     orientation_errors,
     point_errors,
 )
+from triline.solver.window.results import AdjustedPoint, WindowOptions
 
 #: Attitude at 100 Hz: half the work, and the window interpolates either.
 ERRORS = ErrorModel(attitude_rate_hz=100.0)

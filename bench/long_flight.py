@@ -24,7 +24,7 @@ from triline.nodes.config import build
 from triline.nodes.recording import RecordingReader, RecordingWriter
 from triline.nodes.runner import process
 from triline.schemas.envelope import RawMessage
-from triline.solver.window import Window
+from triline.solver.window.window import Window
 
 #: The flight is warm after so long, s.
 WARM_S = 1800.0

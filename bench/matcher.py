@@ -27,9 +27,9 @@ from triline.nodes.navigator import Navigator
 from triline.nodes.node import Message
 from triline.nodes.recording import RecordingReader
 from triline.nodes.runner import StepDriver
-from triline.solver.line_store import LineRing
 from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.line_scan import LineScan, view_of
+from triline.solver.matching.line_store import LineRing
 from triline.solver.matching.search import Ground, Image, find
 
 RECORDING = Path("out/bench/full_rate.mcap")

@@ -15,15 +15,15 @@ import time
 
 import numpy as np
 
-from triline.solver.alignment import align
-from triline.solver.filter_pass import run_filter
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_data import MEMS, TACTICAL
-from triline.solver.inertial_navigator import InertialNavigator
-from triline.solver.navigation import NavigationSettings
-from triline.solver.navigation_trajectory import NavigationTrajectory
+from triline.solver.navigation.alignment import align
+from triline.solver.navigation.carried import NavigationTrajectory
+from triline.solver.navigation.error_state import NavigationSettings
+from triline.solver.navigation.filter_pass import run_filter
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL
+from triline.solver.navigation.inertial_navigator import InertialNavigator
+from triline.solver.navigation.smoother import smooth
 from triline.solver.simulation.inertial import gnss_fixes, survey_flight, with_errors
-from triline.solver.smoother import smooth
 
 ARM = (0.5, 0.1, -1.2)
 #: forward RMS after 120 s must not exceed: north, east, down in mm; roll, pitch, heading in deg

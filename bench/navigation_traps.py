@@ -19,9 +19,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from triline.solver.inertial_checks import check
-from triline.solver.inertial_data import MEMS, TACTICAL, GnssData, InertialData
-from triline.solver.navigation import NavigationSettings
+from triline.solver.navigation.error_state import NavigationSettings
+from triline.solver.navigation.inertial_checks import check
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL, GnssData, InertialData
 from triline.solver.simulation.inertial import gnss_fixes, survey_flight, with_errors
 
 #: How often each verdict fell, and wrong findings.

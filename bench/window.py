@@ -21,8 +21,7 @@ from triline.nodes.collection import RareCollections
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window_results import WindowOptions
-from triline.solver.window_study import (
+from triline.solver.simulation.window_study import (
     UPDATE_S,
     adjust_online,
     direct_points,
@@ -31,6 +30,7 @@ from triline.solver.window_study import (
     orientation_errors,
     point_errors,
 )
+from triline.solver.window.results import WindowOptions
 
 COMPONENTS = ("X", "Y", "Z", "omega", "phi", "kappa")
 

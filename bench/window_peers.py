@@ -27,9 +27,9 @@ from triline.nodes.collection import RareCollections
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window import Window
-from triline.solver.window_results import WindowOptions
-from triline.solver.window_study import adjust_online, navigate
+from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.results import WindowOptions
+from triline.solver.window.window import Window
 
 WINDOW_S = 40.0
 #: Rays a second that fill the window with so many, as a share: a point stays from its last look to the end of the

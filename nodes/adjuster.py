@@ -10,8 +10,8 @@ import numpy as np
 from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
 from ..solver.slow_errors import SlowErrors
-from ..solver.window import AHEAD_S, Window
-from ..solver.window_results import TAKEN_BACK, Look, Refusal, WindowOptions, WindowUpdate
+from ..solver.window.results import TAKEN_BACK, Look, Refusal, WindowOptions, WindowUpdate
+from ..solver.window.window import AHEAD_S, Window
 from . import adjuster_messages as out
 from . import convert
 from .adjuster_pace import Governor, Pace, Pacing, pace_message

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..solver.rotation import matrix_from_angles, quaternion_from_matrix
-from ..solver.window_results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal, WindowReport
+from ..solver.window.results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal, WindowReport
 from . import convert
 from .node import Message
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..schemas import messages as m
-from ..solver.window_thinning import Candidate, Thinning
+from ..solver.window.thinning import Candidate, Thinning
 from . import convert
 
 #: Factor on the time and the number of rays between updates, and share of the tie points kept, by level.

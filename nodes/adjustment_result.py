@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..solver.adjustment import Solution
-from ..solver.batch import BatchResult, Job
-from ..solver.block import Block
-from ..solver.layout import CorrectionSet
-from ..solver.network import Control
-from ..solver.reliability import reliability
+from ..solver.adjustment.adjustment import Solution
+from ..solver.adjustment.batch import BatchResult, Job
+from ..solver.adjustment.block import Block
+from ..solver.adjustment.layout import CorrectionSet
+from ..solver.adjustment.network import Control
+from ..solver.adjustment.reliability import reliability
+from ..solver.adjustment.snooping import control_tests
+from ..solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest_correlations
 from ..solver.selfcalibration import SelfCalibration
-from ..solver.snooping import control_tests
-from ..solver.statistics import PointAccuracy, mean_sigma, strongest_correlations
 
 Array = NDArray[np.floating]
 

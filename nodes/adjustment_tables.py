@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..solver.adjustment import Solution
-from ..solver.layout import CorrectionSet
-from ..solver.reliability import reliability
+from ..solver.adjustment.adjustment import Solution
+from ..solver.adjustment.layout import CorrectionSet
+from ..solver.adjustment.reliability import reliability
 from ..solver.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
 from .adjustment_result import Adjustment, set_name
 

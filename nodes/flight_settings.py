@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..solver.camera import LineCamera
-from ..solver.inertial_data import MEMS, TACTICAL
+from ..solver.navigation.inertial_data import MEMS, TACTICAL
 from ..solver.sensors import preset, with_pixels
 from ..solver.simulation.error_models import ErrorModel
 from ..solver.simulation.flight import FlightPlan

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ..solver.inertial_data import InertialGrade
-from ..solver.inertial_navigator import InertialNavigator
-from ..solver.kinematic import KinematicFilter, KinematicOptions
-from ..solver.navigation import NavigationSettings
-from ..solver.navigation_trajectory import CameraMount
-from ..solver.online_poses import OnlineOptions
+from ..solver.navigation.carried import CameraMount
+from ..solver.navigation.error_state import NavigationSettings
+from ..solver.navigation.inertial_data import InertialGrade
+from ..solver.navigation.inertial_navigator import InertialNavigator
+from ..solver.navigation.kinematic import KinematicFilter, KinematicOptions
+from ..solver.navigation.online_poses import OnlineOptions
 from . import convert
 
 #: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.

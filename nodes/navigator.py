@@ -10,9 +10,9 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..solver.frames import LocalFrame
-from ..solver.inertial_navigator import InertialNavigator
-from ..solver.kinematic import KinematicFilter
-from ..solver.navigation_pose import NavigationPose
+from ..solver.navigation.inertial_navigator import InertialNavigator
+from ..solver.navigation.kinematic import KinematicFilter
+from ..solver.navigation.pose import NavigationPose
 from ..solver.rotation import R_ENU_NED
 from . import convert
 from .navigation_engines import inertial_engine, kinematic_engine, stated_noise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from triline.solver.adjustment import Solution
+from triline.solver.adjustment.adjustment import Solution
 from triline.solver.camera import three_line_camera
 from triline.solver.models import ModelOptions
 from triline.solver.simulation.network import SimulatedNetwork, regular_block

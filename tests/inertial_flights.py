@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 
 from triline.solver import earth
-from triline.solver.inertial_data import MEMS, TACTICAL, GnssData, InertialData, InertialGrade
-from triline.solver.navigation import NavigationSettings
-from triline.solver.navigation_trajectory import NavigationTrajectory
+from triline.solver.navigation.carried import NavigationTrajectory
+from triline.solver.navigation.error_state import NavigationSettings
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL, GnssData, InertialData, InertialGrade
 from triline.solver.simulation.inertial import TrueMotion, gnss_fixes, survey_flight, with_errors
 
 ARM = (0.5, 0.1, -1.2)

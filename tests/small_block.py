@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from triline.solver.block import Apriori, Block, GroundPoints, ImagePoints
+from triline.solver.adjustment.block import Apriori, Block, GroundPoints, ImagePoints
+from triline.solver.adjustment.network import Strip
 from triline.solver.collinearity import project
 from triline.solver.frames import LocalFrame
-from triline.solver.network import Strip
 from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.sensors import preset
 from triline.solver.trajectory import Trajectory

@@ -10,16 +10,16 @@ from adjustment_networks import CAMERA, dense_design, simulate
 from scipy import stats
 from scipy.optimize import least_squares
 
-from triline.solver.adjustment import AdjustmentOptions, State, adjust, pose_problem, solve
+from triline.solver.adjustment.adjustment import AdjustmentOptions, State, adjust, pose_problem, solve
+from triline.solver.adjustment.covariance import cofactors, point_cofactors, point_unknown_cofactors
+from triline.solver.adjustment.linearisation import linearise
+from triline.solver.adjustment.network import Control
+from triline.solver.adjustment.refined_orientation import correction_cofactors, corrections_at, find_set
+from triline.solver.adjustment.robust import danish, huber, igg3
 from triline.solver.collinearity import project
-from triline.solver.covariance import cofactors, point_cofactors, point_unknown_cofactors
-from triline.solver.linearisation import linearise
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
-from triline.solver.network import Control
-from triline.solver.refined_orientation import correction_cofactors, corrections_at, find_set
-from triline.solver.robust import danish, huber, igg3
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.network import Noise
 
@@ -339,7 +339,7 @@ def test_no_information_is_an_answer_not_an_error():
 @pytest.mark.skipif(not BLOCKS.exists(), reason=f"no data in {BLOCKS}")
 def test_block_of_an_independent_program():
     from triline.nodes.formats.block_folder import read_block
-    from triline.solver.block import network_from_block
+    from triline.solver.adjustment.block import network_from_block
 
     block = read_block(BLOCKS / "dgr")
     expected = json.loads((BLOCKS / "dgr" / "expected.json").read_text())

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from triline.solver import earth
-from triline.solver.alignment import AlignmentError, AttitudePrior, align, static_attitude
-from triline.solver.inertial_data import MEMS, TACTICAL
-from triline.solver.post_processing import navigate
+from triline.solver.navigation.alignment import AlignmentError, AttitudePrior, align, static_attitude
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL
+from triline.solver.navigation.post_processing import navigate
 from triline.solver.rotation import matrix_from_navigation, navigation_from_matrix
 
 

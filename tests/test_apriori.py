@@ -12,7 +12,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.navigator import Navigator
 from triline.nodes.simulator import Simulator
 from triline.solver.accuracy import angle_difference
-from triline.solver.inertial_data import MEMS, TACTICAL
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.inertial_sensors import InertialPlan

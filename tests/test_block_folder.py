@@ -12,7 +12,7 @@ from small_block import FILES, REAL, simulated_block, write_files
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_writer import write_block
-from triline.solver.block import network_from_block
+from triline.solver.adjustment.block import network_from_block
 from triline.solver.rotation import angles_from_matrix, matrix_from_quaternion
 
 

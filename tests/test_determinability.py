@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triline.solver.determinability import Criterion, Evidence, Limits, examine, group_of
+from triline.solver.adjustment.determinability import Criterion, Evidence, Limits, examine, group_of
 
 
 def evidence(**changes):

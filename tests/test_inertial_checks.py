@@ -7,9 +7,9 @@ import inertial_flights as sim
 import numpy as np
 import pytest
 
-from triline.solver.inertial_checks import check
-from triline.solver.inertial_cleaning import clean_gnss, clean_inertial, gap_findings, outage_findings
-from triline.solver.inertial_data import InertialData
+from triline.solver.navigation.inertial_checks import check
+from triline.solver.navigation.inertial_cleaning import clean_gnss, clean_inertial, gap_findings, outage_findings
+from triline.solver.navigation.inertial_data import InertialData
 
 FLU = np.diag([1.0, -1.0, -1.0])
 RFU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

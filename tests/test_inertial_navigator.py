@@ -7,12 +7,12 @@ import inertial_flights as sim
 import numpy as np
 import pytest
 
-from triline.solver.alignment import AttitudePrior
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_navigator import InertialNavigator
-from triline.solver.navigation_trajectory import CameraMount
-from triline.solver.online_poses import OnlineOptions
-from triline.solver.post_processing import navigate
+from triline.solver.navigation.alignment import AttitudePrior
+from triline.solver.navigation.carried import CameraMount
+from triline.solver.navigation.inertial_navigator import InertialNavigator
+from triline.solver.navigation.online_poses import OnlineOptions
+from triline.solver.navigation.post_processing import navigate
 from triline.solver.rotation import R_BC_NOMINAL, angles_from_matrix
 
 FRAME = LocalFrame(47.55, 9.17, 0.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from triline.solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from triline.solver.kinematic import KinematicFilter
-from triline.solver.kinematic_model import N_STATES, KinematicOptions, quintic, transition
+from triline.solver.navigation.kinematic import KinematicFilter
+from triline.solver.navigation.kinematic_model import N_STATES, KinematicOptions, quintic, transition
 from triline.solver.rotation import (
     angles_from_matrix,
     matrix_from_angles,
@@ -16,7 +16,7 @@ from triline.solver.rotation import (
 )
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import simulate
-from triline.solver.window_study import measured_errors, navigate, slow_errors_of
+from triline.solver.simulation.window_study import measured_errors, navigate, slow_errors_of
 
 FRAME = LocalFrame(47.0, 8.0, 400.0)
 LEVER = np.array([0.5, -0.2, -1.2])

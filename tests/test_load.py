@@ -13,23 +13,23 @@ from triline.nodes.adjuster_pace import LEVELS, Governor, Pacing, pace_message
 from triline.nodes.bus import Bus
 from triline.nodes.recording import RecordingReader
 from triline.schemas import codec
-from triline.solver.window_thinning import Candidate, Thinning
+from triline.solver.window.thinning import Candidate, Thinning
 
 #: An adjuster on a slow machine: every update of the window takes so much longer per new batch and in any case.
 SLOW = """
 import sys, time
-from triline.solver import window_batch
-from triline.solver.window import Window
+from triline.solver.window import batch
+from triline.solver.window.window import Window
 plain = Window.update
-seen = window_batch.Batch.linearise
+seen = batch.Batch.linearise
 def update(self, now_s):
     time.sleep(0.02)
     return plain(self, now_s)
 def linearise(self, theta, reweigh):
     time.sleep(0.004 * len(self.rays) if self._slow() else 0.0)
     return seen(self, theta, reweigh)
-window_batch.Batch._slow = lambda self: 18.0 < self.newest_s < 24.0
-window_batch.Batch.linearise = linearise
+batch.Batch._slow = lambda self: 18.0 < self.newest_s < 24.0
+batch.Batch.linearise = linearise
 Window.update = update
 from triline.nodes.cli import main
 sys.exit(main())

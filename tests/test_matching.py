@@ -9,10 +9,10 @@ import pytest
 from triline.nodes.cli import main
 from triline.nodes.flight_settings import simulated_flight
 from triline.nodes.recording import RecordingReader
-from triline.solver.line_store import LineRing, LineStore
 from triline.solver.matching.least_squares import match_patches
 from triline.solver.matching.line_quality import IS_DARK, IS_FROZEN, IS_SATURATED, judge_lines
 from triline.solver.matching.line_scan import LineScan, view_of
+from triline.solver.matching.line_store import LineRing, LineStore
 from triline.solver.matching.tie_matcher import MatchingOptions, TieMatcher
 from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.simulation.imagery import ImagingPlan, LineImager

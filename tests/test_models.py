@@ -5,12 +5,12 @@ import pytest
 from adjustment_networks import simulate
 
 import triline.solver.models as models
-from triline.solver.adjustment import adjust
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.refined_orientation import corrections_at
 from triline.solver.models import MODELS, Extent
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.lim import LimOptions, fewest_rays, merge_fixes
 from triline.solver.models.ppm import PpmOptions
-from triline.solver.refined_orientation import corrections_at
 
 EXTENT = Extent("strip S1", 100.0, 160.0)
 OPTIONS = [

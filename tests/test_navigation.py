@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 from triline.solver import earth
-from triline.solver.alignment import align
-from triline.solver.filter_pass import node_times, rates_at, run_filter
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_data import TACTICAL, GnssData, InertialGrade
-from triline.solver.navigation import ErrorStateFilter, Estimate, NavigationSettings, Start, bias_variances
-from triline.solver.navigation_trajectory import (
+from triline.solver.navigation.alignment import align
+from triline.solver.navigation.carried import (
     CameraMount,
     NavigationStates,
     NavigationTrajectory,
@@ -20,11 +17,20 @@ from triline.solver.navigation_trajectory import (
     camera_poses,
     navigation_jacobian,
 )
-from triline.solver.observations import AntennaPosition, AntennaVelocity, Heading, ZeroVelocity
-from triline.solver.post_processing import NavigationError, headings, held_out_misses, navigate, zero_velocities
+from triline.solver.navigation.error_state import ErrorStateFilter, Estimate, NavigationSettings, Start, bias_variances
+from triline.solver.navigation.filter_pass import node_times, rates_at, run_filter
+from triline.solver.navigation.inertial_data import TACTICAL, GnssData, InertialGrade
+from triline.solver.navigation.observations import AntennaPosition, AntennaVelocity, Heading, ZeroVelocity
+from triline.solver.navigation.post_processing import (
+    NavigationError,
+    headings,
+    held_out_misses,
+    navigate,
+    zero_velocities,
+)
+from triline.solver.navigation.smoother import smooth
+from triline.solver.navigation.strapdown import State, rotation_matrix
 from triline.solver.rotation import R_BC_NOMINAL, angles_from_matrix
-from triline.solver.smoother import smooth
-from triline.solver.strapdown import State, rotation_matrix
 
 SEEDS = (1, 2, 3)
 
@@ -219,7 +225,7 @@ def test_filter_and_smoother_agree_with_a_batch_adjustment():
     start = align(f.inertial, f.gnss, steady, patience_s=1e9)
     wide = Start(start.estimate, np.diag([100.0] * 3 + [4.0] * 3 + [0.05**2] * 3 + bias_variances(steady).tolist()))
     s = smooth(run_filter(f.inertial, f.gnss, wide, steady))
-    from triline.solver.alignment_window import curve, fit_window, noise_root
+    from triline.solver.navigation.alignment_window import curve, fit_window, noise_root
 
     inside = f.gnss[f.gnss.time_s < f.inertial.time_s[-1]]
     c = curve(f.inertial.corrected(), inside, start.estimate.time_s)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_cleaning import clean_gnss, clean_inertial
-from triline.solver.inertial_data import GnssData, InertialData, InertialGrade
-from triline.solver.navigation import NavigationSettings
-from triline.solver.post_processing import NavigationError, held_out_misses, navigate
+from triline.solver.navigation.error_state import NavigationSettings
+from triline.solver.navigation.inertial_cleaning import clean_gnss, clean_inertial
+from triline.solver.navigation.inertial_data import GnssData, InertialData, InertialGrade
+from triline.solver.navigation.post_processing import NavigationError, held_out_misses, navigate
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam (with the KITTI drive in its wheel) is not installed")
 

@@ -20,8 +20,8 @@ from triline.nodes.simulator import Simulator
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.solver.accuracy import angle_difference
-from triline.solver.inertial_data import MEMS, TACTICAL
-from triline.solver.inertial_navigator import InertialNavigator
+from triline.solver.navigation.inertial_data import MEMS, TACTICAL
+from triline.solver.navigation.inertial_navigator import InertialNavigator
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.inertial_sensors import InertialPlan

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from adjustment_networks import simulate
 
+from triline.solver.adjustment.network import Control, Measurements, build_network, neighbourhood_order
+from triline.solver.adjustment.robust import danish, huber, igg3
 from triline.solver.camera import Lens, LineCamera, straight_line
 from triline.solver.intersection import intersect_rays
 from triline.solver.models.dgr import DgrOptions
-from triline.solver.network import Control, Measurements, build_network, neighbourhood_order
-from triline.solver.robust import danish, huber, igg3
 from triline.solver.simulation.network import Noise, draw_unknowns
 
 
@@ -144,7 +144,7 @@ def test_intersection_of_rays():
 
 def test_network_without_errors_fits_exactly():
     """Simulation and adjustment agree on every convention: no noise, no residuals."""
-    from triline.solver.adjustment import adjust
+    from triline.solver.adjustment.adjustment import adjust
 
     exact = DgrOptions((1e-9,) * 3, (1e-9,) * 3, (1e-9,) * 3)
     simulated = simulate(4, exact, points=30, noise=Noise(image_px=1e-6, control_m=(1e-7,) * 3, jitter_deg=0.3))

@@ -4,8 +4,8 @@ import inertial_flights as sim
 import numpy as np
 
 from triline.solver.frames import LocalFrame
-from triline.solver.inertial_navigator import InertialNavigator
-from triline.solver.online_alignment import GnssWatch
+from triline.solver.navigation.inertial_navigator import InertialNavigator
+from triline.solver.navigation.online_alignment import GnssWatch
 
 FRAME = LocalFrame(47.5, 9.2, 0.0)
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from triline.nodes.flight_settings import simulated_flight
-from triline.solver.window_results import WindowOptions
-from triline.solver.window_study import adjust_online, navigate, orientation_errors
+from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors
+from triline.solver.window.results import WindowOptions
 
 MOTION = Path(__file__).parents[1].parent / "shared/data/avirisng/ang20170323t202244_eph_att"
 pytestmark = pytest.mark.skipif(

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from adjustment_networks import CAMERA, simulate
 
-import triline.solver.normal_matrix as normal_matrix
-from triline.solver.adjustment import adjust, pose_problem
-from triline.solver.covariance import cofactors
+from triline.solver.adjustment import normal_matrix
+from triline.solver.adjustment.adjustment import adjust, pose_problem
+from triline.solver.adjustment.covariance import cofactors
+from triline.solver.adjustment.reduced_system import BandedFactor, DenseFactor
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
-from triline.solver.reduced_system import BandedFactor, DenseFactor
 from triline.solver.selfcalibration import tls
 
 LONG = {"points": 400, "strips": 1, "cross": 0, "length_m": 60000.0}

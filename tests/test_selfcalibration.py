@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from adjustment_networks import CAMERA, simulate
 
-from triline.solver.adjustment import adjust
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.covariance import point_cofactors
 from triline.solver.camera import Lens, LineCamera, straight_line
-from triline.solver.covariance import point_cofactors
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.selfcalibration import SELF_CALIBRATIONS, lens, prism, tls
 from triline.solver.simulation.network import disturb_camera
@@ -142,7 +142,7 @@ def test_lenses_that_look_separately_have_correction_sets_of_their_own():
 @pytest.mark.skipif(not BLOCKS.exists(), reason=f"no data in {BLOCKS}")
 def test_block_with_camera_errors():
     from triline.nodes.formats.block_folder import read_block
-    from triline.solver.block import network_from_block
+    from triline.solver.adjustment.block import network_from_block
 
     block = read_block(BLOCKS / "selfcal")
     truth = json.loads((BLOCKS / "selfcal" / "truth.json").read_text())

@@ -19,7 +19,7 @@ from triline.nodes.recording import RecordingReader
 from triline.nodes.simulator import Simulator, run
 from triline.schemas import topics
 from triline.solver.collinearity import project
-from triline.solver.inertial_data import TACTICAL
+from triline.solver.navigation.inertial_data import TACTICAL
 from triline.solver.rotation import matrix_from_angles
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan

@@ -7,7 +7,7 @@ import pytest
 
 from triline.solver.collinearity import project
 from triline.solver.frames import R_lc_from_navigation
-from triline.solver.inertial_data import TACTICAL
+from triline.solver.navigation.inertial_data import TACTICAL
 from triline.solver.rotation import angles_from_matrix, matrix_from_angles, navigation_from_matrix
 from triline.solver.sensors import preset
 from triline.solver.simulation.error_models import ErrorModel, antenna_position, draw_slow_errors

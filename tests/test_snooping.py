@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triline.solver.adjustment import adjust, solve
-from triline.solver.batch import Job, run
-from triline.solver.covariance import cofactors
+from triline.solver.adjustment.adjustment import adjust, solve
+from triline.solver.adjustment.batch import Job, run
+from triline.solver.adjustment.covariance import cofactors
+from triline.solver.adjustment.network import Control, Measurements, build_network
+from triline.solver.adjustment.point_consensus import consensus
+from triline.solver.adjustment.ray_statistics import ray_statistics
+from triline.solver.adjustment.reliability import CRITICAL_W
+from triline.solver.adjustment.robust import danish, huber, igg3
+from triline.solver.adjustment.snooping import control_tests, joint_limit, snoop
 from triline.solver.models.dgr import DgrOptions
-from triline.solver.network import Control, Measurements, build_network
-from triline.solver.point_consensus import consensus
-from triline.solver.ray_statistics import ray_statistics
-from triline.solver.reliability import CRITICAL_W
-from triline.solver.robust import danish, huber, igg3
 from triline.solver.selfcalibration import tls
 from triline.solver.sensors import preset
 from triline.solver.simulation.network import Noise, parallel_and_cross, scatter_points, simulate_network
-from triline.solver.snooping import control_tests, joint_limit, snoop
 
 CAMERA = preset("ads40")
 MODEL = DgrOptions((0.1, 0.1, 0.2), (0.005, 0.005, 0.008), (0.005, 0.005, 0.008))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from triline.solver.reliability import noncentrality, normalised_residuals, reliability
-from triline.solver.statistics import (
+from triline.solver.adjustment.reliability import noncentrality, normalised_residuals, reliability
+from triline.solver.adjustment.statistics import (
     correlations,
     fisher_limit,
     fisher_value,

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triline.solver.adjustment import adjust
-from triline.solver.batch import Job, run
-from triline.solver.covariance import cofactors, point_cofactors
-from triline.solver.direct_georeferencing import georeference
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.batch import Job, run
+from triline.solver.adjustment.covariance import cofactors, point_cofactors
+from triline.solver.adjustment.direct_georeferencing import georeference
+from triline.solver.adjustment.statistics import global_test
+from triline.solver.adjustment.variance_components import GROUPS, estimate_components, group_sums
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.ppm import PpmOptions
 from triline.solver.selfcalibration import tls
 from triline.solver.sensors import preset
 from triline.solver.simulation.network import Noise, parallel_and_cross, scatter_points, simulate_network
-from triline.solver.statistics import global_test
-from triline.solver.variance_components import GROUPS, estimate_components, group_sums
 
 CAMERA = preset("ads40")
 MODEL = DgrOptions((0.1, 0.1, 0.2), (0.005, 0.005, 0.008), (0.005, 0.005, 0.008))

@@ -6,17 +6,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from triline.solver import earth
-from triline.solver.inertial_data import InertialData, cut
-from triline.solver.navigation_trajectory import gravitation
-from triline.solver.rotation import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    quaternion_from_vector,
-    quaternion_multiply,
-    skew,
-    vector_from_quaternion,
-)
-from triline.solver.strapdown import (
+from triline.solver.navigation.carried import gravitation
+from triline.solver.navigation.inertial_data import InertialData, cut
+from triline.solver.navigation.strapdown import (
     Block,
     State,
     gravitation_e,
@@ -27,6 +19,14 @@ from triline.solver.strapdown import (
     rotation_matrix,
     running_product,
     transition,
+)
+from triline.solver.rotation import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_vector,
+    quaternion_multiply,
+    skew,
+    vector_from_quaternion,
 )
 
 ZERO = np.zeros(3)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from triline.solver.batch import Job, NotAdjustableError, run
+from triline.solver.adjustment.batch import Job, NotAdjustableError, run
+from triline.solver.adjustment.network import Measurements, build_network
+from triline.solver.adjustment.network_weakness import describe, undetermined, word
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
-from triline.solver.network import Measurements, build_network
-from triline.solver.network_weakness import describe, undetermined, word
 from triline.solver.selfcalibration import tls
 from triline.solver.sensors import preset
 from triline.solver.simulation.network import parallel_and_cross, scatter_points, simulate_network

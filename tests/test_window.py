@@ -7,17 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triline.solver.adjustment import adjust
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.network import Control, Measurements, Strip, build_network
 from triline.solver.models.base import ModelOptions
-from triline.solver.network import Control, Measurements, Strip, build_network
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.trajectory import Trajectory
-from triline.solver.window import Window
-from triline.solver.window_results import Look, WindowOptions
-from triline.solver.window_study import (
+from triline.solver.simulation.window_study import (
     adjust_online,
     direct_points,
     measured_errors,
@@ -26,6 +23,9 @@ from triline.solver.window_study import (
     point_errors,
     slow_errors_of,
 )
+from triline.solver.trajectory import Trajectory
+from triline.solver.window.results import Look, WindowOptions
+from triline.solver.window.window import Window
 
 PLAN = FlightPlan(strip_s=30.0, lead_in_s=3.0, lead_out_s=2.0)
 TIES = ObservationPlan(tie_points_per_s=5.0, check=10)

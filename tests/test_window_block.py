@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triline.solver import window_archive
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window_results import WindowOptions
-from triline.solver.window_study import (
+from triline.solver.simulation.window_study import (
     adjust_at_once,
     adjust_online,
     navigate,
     orientation_errors,
     point_errors,
 )
+from triline.solver.window import archive
+from triline.solver.window.results import WindowOptions
 
 #: Two strips side by side, and one across them.
 PLAN = FlightPlan(
@@ -83,7 +83,7 @@ def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one
     poses = navigate(one)
     block = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("triline.solver.window_block.MOST_OF_STRIP", 10)
+        patch.setattr("triline.solver.window.block.MOST_OF_STRIP", 10)
         chain = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
     assert any("refined alone" in text for text in chain.events)
     difference, sigma = far_apart(block.whole, chain.whole)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from triline.solver import window as module
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window_entry import SUSPECTED, _Equations, entry_weight
-from triline.solver.window_study import adjust_online, navigate
+from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window import window as module
+from triline.solver.window.entry import SUSPECTED, _Equations, entry_weight
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from triline.solver.reduced_system import DenseFactor
+from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window import Window
-from triline.solver.window_integrity import _Exposed, _squares
-from triline.solver.window_study import adjust_online, navigate
+from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.integrity import _Exposed, _squares
+from triline.solver.window.window import Window
 
 
 def test_cofactors_of_few_unknowns() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triline.solver.window_batch import Information
-from triline.solver.window_state import WindowState
+from triline.solver.window.batch import Information
+from triline.solver.window.state import WindowState
 
 
 def random_information(rng, n, rows):

@@ -12,13 +12,13 @@ from triline.solver.selfcalibration import tls
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.window import Window
-from triline.solver.window_integrity import Exposure, _inverse, _largest_ratio
-from triline.solver.window_light import FAILED, GOOD, WEAK, Situation, light
-from triline.solver.window_results import TAKEN_BACK, Look, WindowOptions
-from triline.solver.window_settle import _consensus, _subsets
-from triline.solver.window_sources import BiasedSource
-from triline.solver.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.window.integrity import Exposure, _inverse, _largest_ratio
+from triline.solver.window.light import FAILED, GOOD, WEAK, Situation, light
+from triline.solver.window.results import TAKEN_BACK, Look, WindowOptions
+from triline.solver.window.settle import _consensus, _subsets
+from triline.solver.window.sources import BiasedSource
+from triline.solver.window.window import Window
 
 PLAN = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
 SENSORS = ErrorModel(attitude_rate_hz=100.0)

@@ -108,7 +108,7 @@ def write_problem(path: Path, problem, whitening) -> None:
 def compare(name: str, peer: Path | None, folder: Path, repeat: int) -> dict:
     import numpy as np
 
-    from triline.solver.adjustment import pose_problem, solve
+    from triline.solver.adjustment.adjustment import pose_problem, solve
     from triline.solver.camera import three_line_camera
     from triline.solver.models.dgr import DgrOptions
     from triline.solver.models.lim import LimOptions

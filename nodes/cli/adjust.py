@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from ...solver.adjustment import Iteration
-from ...solver.batch import Event, Job, NotAdjustableError, Phase
-from ...solver.batch import run as run_job
-from ...solver.block import Block, network_from_block
-from ...solver.determinability import Limits, Removal
+from ...solver.adjustment.adjustment import Iteration
+from ...solver.adjustment.batch import Event, Job, NotAdjustableError, Phase
+from ...solver.adjustment.batch import run as run_job
+from ...solver.adjustment.block import Block, network_from_block
+from ...solver.adjustment.determinability import Limits, Removal
+from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
+from ...solver.adjustment.snooping import Round
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
-from ...solver.robust import WEIGHT_FUNCTIONS
 from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
-from ...solver.snooping import Round
 from ..adjustment_result import Adjustment, result_of, worst_strip
 from ..adjustment_summary import summary_lines
 from ..adjustment_tables import write_tables

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.inertial_data import GnssData, InertialData
-from ...solver.observations import Observation
-from ...solver.post_processing import (
+from ...solver.navigation.inertial_data import GnssData, InertialData
+from ...solver.navigation.observations import Observation
+from ...solver.navigation.post_processing import (
     Navigated,
     NavigationError,
     headings,

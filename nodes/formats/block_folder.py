@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.adjustment.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.adjustment.network import ROLES, Strip
 from ...solver.camera import LineCamera
 from ...solver.frames import CrsError, LocalFrame
-from ...solver.network import ROLES, Strip
 from ...solver.rotation import matrix_from_angles, quaternion_from_matrix
 from ...solver.trajectory import Trajectory
 from ..errors import UserError

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas.topics import rank
-from ...solver.block import Block
+from ...solver.adjustment.block import Block
+from ...solver.adjustment.network import Strip
 from ...solver.models.dgr import DgrOptions
-from ...solver.network import Strip
 from ...solver.rotation import angles_from_matrix, matrix_from_quaternion
 from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
 from ..node import Message

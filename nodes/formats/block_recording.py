@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
-from ...solver.block import Apriori, Block, GroundPoints, ImagePoints
-from ...solver.network import Strip
+from ...solver.adjustment.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.adjustment.network import Strip
 from ...solver.slow_errors import SlowErrors
 from ...solver.trajectory import Trajectory
 from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.block import Block
-from ...solver.network import Strip
+from ...solver.adjustment.block import Block
+from ...solver.adjustment.network import Strip
 from ...solver.rotation import angles_from_matrix, matrix_from_quaternion
 from .camera_json import write_camera
 from .table import write_table

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.inertial_cleaning import Finding
-from ...solver.inertial_data import TACTICAL, GnssData, InertialGrade
+from ...solver.navigation.inertial_cleaning import Finding
+from ...solver.navigation.inertial_data import TACTICAL, GnssData, InertialGrade
 from ...solver.rotation import R_ENU_NED
 from .. import convert
 from ..errors import UserError

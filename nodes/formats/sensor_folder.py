@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.alignment import AttitudePrior
-from ...solver.inertial_cleaning import Finding, clean_gnss, clean_inertial
-from ...solver.inertial_data import MEMS, GnssData, InertialData, InertialGrade
-from ...solver.navigation import NavigationSettings
-from ...solver.navigation_trajectory import CameraMount
+from ...solver.navigation.alignment import AttitudePrior
+from ...solver.navigation.carried import CameraMount
+from ...solver.navigation.error_state import NavigationSettings
+from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
+from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, InertialGrade
 from ...solver.rotation import R_BC_NOMINAL, matrix_from_navigation
 from ..errors import UserError
 from .keys import Keys, read_toml

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas.topics import rank
-from ...solver.block import Apriori
-from ...solver.inertial_cleaning import Finding, clean_gnss, clean_inertial
-from ...solver.inertial_data import InertialData
+from ...solver.adjustment.block import Apriori
+from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
+from ...solver.navigation.inertial_data import InertialData
 from ...solver.rotation import R_ENU_NED
 from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
-from ...solver.block import Apriori
+from ...solver.adjustment.block import Apriori
 from ...solver.earth import ecef_from_geodetic
 from ...solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
 from ...solver.gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps

@@ -11,8 +11,8 @@ from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ...solver.inertial_data import GnssData
-from ...solver.post_processing import Navigated
+from ...solver.navigation.inertial_data import GnssData
+from ...solver.navigation.post_processing import Navigated
 from . import navigation_plots as plots
 from .page_style import CSS
 from .style import styled

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from ...solver.inertial_data import GnssData
-from ...solver.navigation import Innovation
-from ...solver.post_processing import Navigated
+from ...solver.navigation.error_state import Innovation
+from ...solver.navigation.inertial_data import GnssData
+from ...solver.navigation.post_processing import Navigated
 from .style import figure
 
 _MOST_POINTS = 4000

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line_store import LineStore
 from .line_quality import GOOD, REASONS, judge_lines
+from .line_store import LineStore
 from .options import MatchingOptions
 
 #: Events of a strip that are told.

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line_store import LANE, LineRing
 from .interest_points import interest_point
+from .line_store import LANE, LineRing
 from .options import MatchingOptions, Place
 
 Array = NDArray[np.floating]

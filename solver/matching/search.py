@@ -8,10 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line_store import LineRing
 from .correlation import best_place, correlate
 from .least_squares import PatchMatch, match_patches
 from .line_scan import LineScan
+from .line_store import LineRing
 from .patches import Windows, interpolate_stack
 
 Array = NDArray[np.floating]

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..camera import LineCamera
-from ..line_store import LineRing, Stretch
 from ..rotation import angles_from_matrix, matrix_from_angles
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
+from .line_store import LineRing, Stretch
 from .target_image import RING, Centre, candidates, fit
 
 Array = NDArray[np.floating]

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import LineCamera
-from ..line_store import LineStore
 from .chips import CHIP_HALF, ChipStore
 from .consistency import Disagreement
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
 from .line_scan import LineScan, view_of
+from .line_store import LineStore
 from .looks import Looked, LookMatcher
 from .options import MatchedRay, MatchedTie, MatchingOptions, Place
 from .places import PlaceChooser

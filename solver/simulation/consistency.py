@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from ..adjustment import adjust
-from ..covariance import cofactors
+from ..adjustment.adjustment import adjust
+from ..adjustment.covariance import cofactors
+from ..adjustment.statistics import global_test
+from ..adjustment.variance_components import group_sums
 from ..models.base import ModelOptions
 from ..models.dgr import DgrOptions
 from ..models.lim import LimOptions
 from ..models.ppm import PpmOptions
 from ..selfcalibration import tls
 from ..sensors import preset
-from ..statistics import global_test
-from ..variance_components import group_sums
 from .network import regular_block
 
 Array = NDArray[np.floating]

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..adjustment.network import Strip
 from ..camera import LineCamera
 from ..frames import LocalFrame, R_lc_from_navigation
-from ..network import Strip
 from ..rotation import quaternion_from_matrix
 from ..sensors import preset
 from ..trajectory import Trajectory

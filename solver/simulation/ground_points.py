@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..network import Strip
+from ..adjustment.network import Strip
 from ..rotation import matrix_from_angles
 from .flight import Flight, view_tangents
 

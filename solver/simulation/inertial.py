@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
 from .. import earth
-from ..inertial_data import GnssData, InertialData, InertialGrade
+from ..navigation.inertial_data import GnssData, InertialData, InertialGrade
 from ..rotation import (
     matrix_from_navigation,
     matrix_from_quaternion,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inertial_data import InertialGrade
+from ..navigation.inertial_data import InertialGrade
 from ..rotation import R_ENU_NED
 from .error_models import Three, antenna_position
 from .flight import Flight

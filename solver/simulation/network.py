@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..adjustment.network import Control, Measurements, Network, Strip, build_network
 from ..camera import CcdLine, LineCamera
 from ..collinearity import collinearity
 from ..models.base import CorrectionModel, Extent, ModelOptions
-from ..network import Control, Measurements, Network, Strip, build_network
 from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
 from ..selfcalibration import SelfCalibration
 from ..trajectory import Trajectory

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..adjustment.network import Strip
 from ..camera import LineCamera
 from ..collinearity import project
-from ..network import Strip
 from ..rotation import matrix_from_angles
 from ..trajectory import Trajectory
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
+from ..adjustment.network import Strip
 from ..camera import LineCamera, three_line_camera
 from ..frames import LocalFrame, R_lc_from_navigation
-from ..network import Strip
 from ..rotation import matrix_from_angles, quaternion_from_matrix
 from ..trajectory import Trajectory
 from .error_models import ErrorModel, ErrorRealisation

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..adjustment.network import Control, Measurements, Strip, build_network
 from ..camera import LineCamera
 from ..collinearity import collinearity
 from ..models.base import Extent, ModelOptions
-from ..network import Control, Measurements, Strip, build_network
 from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
 from ..selfcalibration import SelfCalibration
 from ..sensors import lens_rotation

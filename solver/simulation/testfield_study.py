@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch import Job, run
-from ..network import Control
-from ..statistics import planimetric
+from ..adjustment.batch import Job, run
+from ..adjustment.network import Control
+from ..adjustment.statistics import planimetric
 from .testfields import Configuration, Testfield
 
 Array = NDArray[np.floating]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch import Job
+from ..adjustment.batch import Job
 from ..camera import LineCamera
 from ..models.base import ModelOptions
 from ..models.dgr import DgrOptions

@@ -1,0 +1,114 @@
+"""Direct georeferencing of a network: space intersection with the measured orientation, the baseline of reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..models.base import ModelOptions
+from .adjustment import Problem, State, pose_problem
+from .linearisation import linearise, pitch_covariance, refresh_weights, whiten
+from .network import Network
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Georeferenced:
+    """Object points without adjustment; p points.
+
+    Attributes
+    ----------
+    xyz_l : (p, 3) metres; NaN where the rays do not decide a point
+    image_sigma_m : (p, 3) theoretical, from the image measurements alone [K 5.1]
+    sigma_m : (p, 3) theoretical, from image measurements and the a-priori sigmas of the trajectory
+    """
+
+    xyz_l: Array
+    image_sigma_m: Array
+    sigma_m: Array
+
+
+def georeference(network: Network, model: ModelOptions, ray_weight: Array | None = None) -> Georeferenced:
+    """Weighted multi-ray forward intersection of all points.
+
+    Errors of the trajectory act as the correction functions of the model with their a-priori sigmas: in common on all
+    looks of a strip at a point.
+
+    Parameters
+    ----------
+    network, model : as for the adjustment
+    ray_weight : (n,) factors on the weights; 0 leaves a ray out
+    """
+    problem = pose_problem(network, model)
+    state = State(np.zeros(problem.layout.n_unknowns), network.approximate_l)
+    weight = np.ones(len(network.rays)) if ray_weight is None else ray_weight
+    p = network.rays.point
+    count = network.n_points
+    rays, whitening = network.rays, whiten(pitch_covariance(network.rays))
+    lin, inverse, known = None, np.empty((count, 3, 3)), np.zeros(count, dtype=bool)
+    for _ in range(4):
+        lin = linearise(rays, problem.layout, whitening, state.theta, state.points_l)
+        whitening, lin = refresh_weights(rays, whitening, lin)
+        lin = lin.reweighted(weight)
+        J = np.moveaxis(lin.point, 2, 0)  # (n, 2, 3)
+        normal = _per_point(np.einsum("nij,nik->njk", J, J), p, count)
+        right = _per_point(np.einsum("nij,in->nj", J, lin.residual), p, count)
+        inverse, known = _inverse(normal)
+        state = State(state.theta, state.points_l + np.einsum("pij,pj->pi", inverse, right))
+    assert lin is not None
+    image = np.einsum("pii->pi", inverse)
+    total = image + _through_trajectory(problem, lin.orientation, np.moveaxis(lin.point, 2, 0), inverse)
+    xyz = np.where(known[:, None], state.points_l, np.nan)
+    return Georeferenced(xyz, _root(image, known), _root(total, known))
+
+
+def _root(variance: Array, known: NDArray[np.bool_]) -> Array:
+    return np.where(known[:, None], np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
+def _per_point(values: Array, point: NDArray[np.int64], count: int) -> Array:
+    total = np.zeros((count, *values.shape[1:]))
+    np.add.at(total, point, values)
+    return total
+
+
+def _inverse(normal: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Inverses (p, 3, 3), zero where singular, and which are not."""
+    scale = np.einsum("pii->p", normal)
+    known = np.linalg.eigvalsh(normal)[:, 0] > 1e-10 * scale
+    result = np.zeros_like(normal)
+    result[known] = np.linalg.inv(normal[known])
+    return result, known
+
+
+def _through_trajectory(problem: Problem, d_orientation: Array, J: Array, inverse: Array) -> Array:
+    """Variances (p, 3) that a-priori errors of the correction functions bring into the points."""
+    layout, point = problem.layout, problem.network.rays.point
+    # what an orientation error of a ray does to its point, (n, 3, 6)
+    effect = inverse[point] @ np.einsum("nij,ikn->njk", J, d_orientation)
+    rows, columns, values = [], [], []
+    for t, (node, component) in enumerate(zip(layout.node, layout.component, strict=True)):
+        present = np.flatnonzero(layout.columns[t] >= 0)
+        for axis in range(3):
+            rows.append(3 * point[present] + axis)
+            columns.append(layout.columns[t, present])
+            values.append(effect[present, axis, component] * layout.coefficients[node, present])
+    shape = (3 * problem.network.n_points, layout.n_unknowns)
+    M = csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    B = problem.prior.matrix
+    if np.diff(B.indptr).max(initial=0) <= 1:
+        information = np.asarray(B.multiply(B).sum(axis=0)).ravel()
+        variance = np.divide(1.0, information, out=np.zeros_like(information), where=information > 0)
+        spread = np.asarray(M.multiply(M) @ variance).ravel()
+    else:  # continuity binds the unknowns of a set, never those of two
+        spread = np.zeros(shape[0])
+        by_column, normal = M.tocsc(), problem.prior.normal.tocsc()
+        for item in layout.sets:
+            own = csr_array(by_column[:, item.columns])
+            covariance = np.linalg.pinv(normal[item.columns, item.columns].toarray(), hermitian=True)
+            spread += np.asarray(own.multiply(own @ covariance).sum(axis=1)).ravel()
+    return spread.reshape(-1, 3)

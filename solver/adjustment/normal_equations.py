@@ -1,0 +1,292 @@
+"""Normal equations with the object points eliminated (Schur complement), and the way back to the points.
+
+With whitened equations ``r = J x + Jp p + v`` and ``V = Jp^T Jp + P_control = L L^T`` per point, the reduced system is
+``S = J^T J + P_prior - D^T D``, ``b = J^T r + .. - D^T y`` with ``D = L^-1 Jp^T J``, ``y = L^-1 (Jp^T r + ..)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..models.base import PseudoObservations
+from .elimination import Cell, Cluster, Elimination
+from .layout import Layout
+from .linearisation import Linearisation
+from .network import Control
+from .normal_matrix import NormalMatrix
+
+Array = NDArray[np.floating]
+
+#: A pivot of a point's 3x3 matrix below this share of its diagonal counts as zero: that direction is not determined.
+POINT_PIVOT = 1e-10
+#: Rays for which products are formed at a time.
+BATCH = 16384
+#: Rays that clusters are joined up to while their rays are worked on.
+SHARED = 6144
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Whitened a-priori equations ``value = matrix @ theta`` and their normal matrix; without those of no weight."""
+
+    matrix: csr_array
+    value: Array
+    normal: csr_array
+
+    @property
+    def n_observations(self) -> int:
+        return len(self.value)
+
+    def residual(self, theta: Array) -> Array:
+        """Whitened residuals (m,)."""
+        return self.value - self.matrix @ theta
+
+
+def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
+    """Sparse matrix and right-hand side of the pseudo-observations that carry weight."""
+    keep = np.flatnonzero(np.isfinite(prior.sigma))
+    weight = 1.0 / prior.sigma[keep]
+    columns, coefficients = prior.columns[keep], prior.coefficients[keep] * weight[:, None]
+    row, term = np.nonzero(columns >= 0)
+    entries = (coefficients[row, term], (row, columns[row, term]))
+    matrix = csr_array(entries, shape=(len(keep), n_unknowns))
+    return Prior(matrix, prior.value[keep] * weight, csr_array(matrix.T @ matrix))
+
+
+@dataclass(frozen=True)
+class ControlWeights:
+    """Weights (p, 3) and target coordinates (p, 3) of all points; weight 0 where nothing is given."""
+
+    weight: Array
+    xyz_l: Array
+    n_observations: int
+
+    def residual(self, points_l: Array) -> Array:
+        """Whitened (p, 3): given minus estimated."""
+        return np.sqrt(self.weight) * (self.xyz_l - points_l)
+
+
+def weigh_control(control: Control, n_points: int) -> ControlWeights:
+    """Spread control over all points; a point given twice gets the weighted mean."""
+    weight, moment = np.zeros((n_points, 3)), np.zeros((n_points, 3))
+    given = np.isfinite(control.sigma_m)
+    w = np.where(given, 1.0 / np.where(given, control.sigma_m, 1.0) ** 2, 0.0)
+    np.add.at(weight, control.point, w)
+    np.add.at(moment, control.point, w * np.where(given, control.xyz_l, 0.0))
+    return ControlWeights(weight, moment / np.where(weight > 0, weight, 1.0), int((weight > 0).sum()))
+
+
+@dataclass(frozen=True)
+class PointNormals:
+    """Per point: inverse Cholesky factor ``L^-1`` and ``y``.
+
+    Attributes
+    ----------
+    inverse_factor : (6, p) lower triangle 00, 10, 11, 20, 21, 22; rows of undetermined directions are zero
+    y : (3, p)
+    rank : (p,) number of determined directions
+    """
+
+    inverse_factor: Array
+    y: Array
+    rank: NDArray[np.int64]
+
+    def back(self, t: Array) -> Array:
+        """``L^-T t`` for (3, p)."""
+        a, b, c, d, e, f = self.inverse_factor
+        return np.stack([a * t[0] + b * t[1] + d * t[2], c * t[1] + e * t[2], f * t[2]])
+
+    def covariance(self) -> Array:
+        """``(L L^T)^-1`` as (p, 3, 3): what the points would have with known orientation."""
+        a, b, c, d, e, f = self.inverse_factor
+        zero = np.zeros_like(a)
+        rows = np.stack([np.stack([a, zero, zero]), np.stack([b, c, zero]), np.stack([d, e, f])])
+        return np.einsum("kin,kjn->nij", rows, rows)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The reduced system ``matrix @ d_theta = rhs`` and what leads back to the points."""
+
+    matrix: NormalMatrix
+    rhs: Array
+    points: PointNormals
+
+
+def point_normals(
+    lin: Linearisation, elimination: Elimination, control: ControlWeights, points_l: Array, damping: float = 0.0
+) -> PointNormals:
+    """Normal matrices of all points, factorised."""
+    p, index = elimination.n_points, elimination.point
+    j, r = lin.point, lin.residual
+
+    def total(values: Array) -> Array:
+        return np.bincount(index, values, p).astype(float, copy=False)
+
+    pairs = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
+    v = [total(j[0, a] * j[0, b] + j[1, a] * j[1, b]) for a, b in pairs]
+    g = np.stack([total(j[0, a] * r[0] + j[1, a] * r[1]) for a in range(3)])
+    g += (control.weight * (control.xyz_l - points_l)).T
+    for axis, diagonal in enumerate((0, 2, 5)):
+        v[diagonal] = (v[diagonal] + control.weight[:, axis]) * (1.0 + damping)
+
+    def pivot(value: Array, whole: Array) -> tuple[Array, NDArray[np.bool_]]:
+        good = value > POINT_PIVOT * whole
+        return np.where(good, 1.0 / np.sqrt(np.where(good, value, 1.0)), 0.0), good
+
+    a, good_a = pivot(v[0], v[0])
+    l10, l20 = v[1] * a, v[3] * a
+    c, good_c = pivot(v[2] - l10 * l10, v[2])
+    l21 = (v[4] - l20 * l10) * c
+    f, good_f = pivot(v[5] - l20 * l20 - l21 * l21, v[5])
+    b = -l10 * a * c
+    e = -l21 * c * f
+    d = -(l20 * a + l21 * b) * f
+    y = np.stack([a * g[0], b * g[0] + c * g[1], d * g[0] + e * g[1] + f * g[2]])
+    rank = good_a.astype(np.int64) + good_c + good_f
+    return PointNormals(np.stack([a, b, c, d, e, f]), y, rank)
+
+
+def reduce_normals(
+    lin: Linearisation,
+    layout: Layout,
+    elimination: Elimination,
+    prior: Prior,
+    control: ControlWeights,
+    theta: Array,
+    points_l: Array,
+    damping: float = 0.0,
+) -> Reduced:
+    """Reduced normal equations at a linearisation.
+
+    ``damping`` multiplies all diagonals by ``1 + damping`` (Levenberg-Marquardt).
+    """
+    matrix = elimination.new_matrix()
+    matrix.add_sparse(prior.normal)
+    rhs = prior.matrix.T @ prior.residual(theta)
+    add_cells(matrix, rhs, lin, layout, elimination)
+    if damping:
+        matrix.damp(damping)
+    matrix.keep_scale()
+    points = point_normals(lin, elimination, control, points_l, damping)
+    for cluster, D in couplings(lin, layout, elimination, points):
+        rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
+        block = D.T @ D
+        matrix.add(cluster.columns, np.negative(block, out=block))
+    return Reduced(matrix, rhs, points)
+
+
+def add_cells(matrix: NormalMatrix, rhs: Array, lin: Linearisation, layout: Layout, elimination: Elimination) -> None:
+    """Add ``J^T J`` to a matrix and ``J^T r`` to its right-hand side (n_unknowns,), one dense product per cell."""
+    batch: list[Cell] = []
+    held = 0
+    for cell in elimination.cells:
+        batch.append(cell)
+        held += cell.high - cell.low
+        if held >= BATCH:
+            _add_batch(matrix, rhs, lin, layout, elimination, batch)
+            batch, held = [], 0
+    if batch:
+        _add_batch(matrix, rhs, lin, layout, elimination, batch)
+
+
+def _add_batch(
+    matrix: NormalMatrix,
+    rhs: Array,
+    lin: Linearisation,
+    layout: Layout,
+    elimination: Elimination,
+    batch: list[Cell],
+) -> None:
+    low = batch[0].low
+    rays = elimination.by_cell[low : batch[-1].high]
+    orientation = lin.orientation.take(rays, axis=2)
+    coefficients = layout.coefficients.take(rays, axis=1)
+    T, slots = len(layout.node), lin.camera.shape[1]
+    J = np.empty((2, T + slots + 1, len(rays)))
+    for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
+        np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
+    J[:, T:-1] = lin.camera.take(rays, axis=2)
+    J[:, -1] = lin.residual.take(rays, axis=1)
+    for cell in batch:
+        x, y = J[:, :, cell.low - low : cell.high - low]
+        block = x @ x.T + y @ y.T
+        used = np.flatnonzero(cell.columns >= 0)
+        columns = cell.columns[used]
+        rhs[columns] += block[used, -1]
+        matrix.add(columns, block[np.ix_(used, used)] if len(used) < T + slots else block[:-1, :-1])
+
+
+def couplings(
+    lin: Linearisation, layout: Layout, elimination: Elimination, points: PointNormals
+) -> Iterator[tuple[Cluster, Array]]:
+    """Clusters with their ``D`` (3 points, U), rows axis by axis."""
+    clusters = elimination.clusters
+    first = 0
+    while first < len(clusters):  # neighbouring clusters share the work on single rays
+        last = first + 1
+        while last < len(clusters) and clusters[last].rays.stop - clusters[first].rays.start <= SHARED:
+            last += 1
+        rays = slice(clusters[first].rays.start, clusters[last - 1].rays.stop)
+        terms = _coupling_terms(lin, layout, points, elimination.point, rays)
+        for cluster in clusters[first:last]:
+            own = terms[:, :, cluster.rays.start - rays.start : cluster.rays.stop - rays.start]
+            yield cluster, _coupling(own, cluster)
+        first = last
+
+
+def _coupling_terms(
+    lin: Linearisation, layout: Layout, points: PointNormals, point: NDArray[np.int64], rays: slice
+) -> Array:
+    """``L^-1 Jp^T J`` of rays: (3, q, n) by the terms they have."""
+    T, slots = len(layout.node), lin.camera.shape[1]
+    a, b, c, d, e, f = points.inverse_factor.take(point[rays], axis=1)
+    j0, j1, j2 = lin.point[:, 0, rays], lin.point[:, 1, rays], lin.point[:, 2, rays]
+    orientation, camera = lin.orientation[:, :, rays], lin.camera[:, :, rays]
+    coefficients = layout.coefficients[:, rays]
+    terms = np.empty((3, T + slots, len(a)))
+    for k, w in enumerate((a * j0, b * j0 + c * j1, d * j0 + e * j1 + f * j2)):
+        eo = w[0] * orientation[0]
+        eo += w[1] * orientation[1]
+        for t, (node, component) in enumerate(zip(layout.node, layout.component, strict=True)):
+            np.multiply(coefficients[node], eo[component], out=terms[k, t])
+        if slots:
+            np.multiply(w[0], camera[0], out=terms[k, T:])
+            terms[k, T:] += w[1] * camera[1]
+    return terms
+
+
+def _coupling(terms: Array, cluster: Cluster) -> Array:
+    width = len(cluster.columns) + 1
+    place = cluster.place.ravel()
+    D = np.empty((3, cluster.n_points * width))
+    for k in range(3):
+        D[k] = np.bincount(place, terms[k].ravel(), cluster.n_points * width)
+    return D.reshape(3 * cluster.n_points, width)[:, :-1]
+
+
+def change_of_rays(lin: Linearisation, layout: Layout, d_theta: Array) -> Array:
+    """``J d_theta`` (2, n): what a change of the reduced unknowns does to the computed coordinates, whitened."""
+    d_eo = layout.corrections(d_theta)
+    change = np.einsum("ckn,kn->cn", lin.orientation, d_eo)
+    if layout.camera is not None:
+        of_slot = np.append(d_theta[layout.n_model :], 0.0)[layout.camera.columns].T
+        change += np.einsum("csn,sn->cn", lin.camera, of_slot[:, layout.camera.pattern])
+    return change
+
+
+def back_substitute(
+    lin: Linearisation, layout: Layout, elimination: Elimination, points: PointNormals, d_theta: Array
+) -> Array:
+    """Change of the object points (p, 3) that goes with a change of the reduced unknowns."""
+    change = change_of_rays(lin, layout, d_theta)
+    p, index = elimination.n_points, elimination.point
+    t = [np.bincount(index, lin.point[0, a] * change[0] + lin.point[1, a] * change[1], p) for a in range(3)]
+    a, b, c, d, e, f = points.inverse_factor
+    rest = points.y - np.stack([a * t[0], b * t[0] + c * t[1], d * t[0] + e * t[1] + f * t[2]])
+    return points.back(rest).T

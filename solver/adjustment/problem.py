@@ -1,0 +1,180 @@
+"""An adjustment as a problem with a state and a solution: what stays, what moves, what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.base import ModelOptions
+from ..selfcalibration import SelfCalibration
+from .elimination import Elimination, plan_elimination
+from .layout import Layout, build_layout
+from .linearisation import Linearisation, Whitening
+from .network import Network
+from .normal_equations import ControlWeights, PointNormals, Prior, weigh_control, whiten_prior
+from .reduced_system import Factor
+from .robust import WeightFunction
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """How to iterate.
+
+    Attributes
+    ----------
+    weights : "motion" carries line and sample sigma through the image motion, "pitch" uses the pixel pitch alone
+    max_iterations : of Gauss-Newton, including rejected steps
+    tolerance : converged when a step lowers the cost by less than this share of it
+    robust : weight function of the normalised residual; None for least squares
+    """
+
+    weights: str = "motion"
+    max_iterations: int = 30
+    tolerance: float = 1e-12
+    robust: WeightFunction | None = None
+
+    def __post_init__(self) -> None:
+        if self.weights not in ("motion", "pitch"):
+            raise ValueError(f"weights are 'motion' or 'pitch', not {self.weights!r}")
+
+
+#: Iterations as they usually are.
+USUAL = AdjustmentOptions()
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step, for progress lines: cost before it, cost after it, damping, whether it was taken."""
+
+    number: int
+    cost_before: float
+    cost: float
+    damping: float
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that stays the same while iterating.
+
+    Attributes
+    ----------
+    network, model, self_calibration : what is adjusted, and how
+    layout, elimination, prior, control : made from these
+    earlier : solutions of models run before; their corrections are in the orientation of the network's rays
+    """
+
+    network: Network
+    model: ModelOptions
+    self_calibration: SelfCalibration | None
+    layout: Layout
+    elimination: Elimination
+    prior: Prior
+    control: ControlWeights
+    earlier: tuple[Solution, ...] = ()
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all unknowns: ``theta`` (n_unknowns,) of the reduced system, ``points_l`` (p, 3)."""
+
+    theta: Array
+    points_l: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of an adjustment. Arrays of rays and points are in the network's order.
+
+    Attributes
+    ----------
+    problem : network, layout, priors
+    state : adjusted values
+    whitening : weights used, from the image motion; without `ray_weight`
+    ray_weight : (n,) factors on the rays' weights: 0 for excluded ones, between for robust estimation
+    linearisation : whitened observation equations at the solution, of all rays, without `ray_weight`
+    points : factorised point matrices at the solution
+    factor : factorised reduced system
+    cost : sum of squared whitened residuals of rays, control and a-priori observations
+    n_observations, n_unknowns : of those that carry weight / are determined
+    iterations : number of steps taken
+    converged : whether the tolerance was reached
+    history : all steps
+    """
+
+    problem: Problem
+    state: State
+    whitening: Whitening
+    ray_weight: Array
+    linearisation: Linearisation
+    points: PointNormals
+    factor: Factor
+    cost: float
+    n_observations: int
+    n_unknowns: int
+    iterations: int
+    converged: bool
+    history: tuple[Iteration, ...]
+
+    @property
+    def redundancy(self) -> int:
+        return self.n_observations - self.n_unknowns
+
+    @property
+    def sigma0(self) -> float:
+        """``sqrt(v^T P v / (n - u))`` [K 4.54]; NaN without redundancy."""
+        return float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else float("nan")
+
+    @property
+    def network(self) -> Network:
+        return self.problem.network
+
+    @property
+    def layout(self) -> Layout:
+        return self.problem.layout
+
+    @property
+    def camera_parameters(self) -> Array:
+        """(n_camera,) estimated additional parameters."""
+        return self.state.theta[self.layout.n_model :]
+
+
+def pose_problem(network: Network, model: ModelOptions, self_calibration: SelfCalibration | None = None) -> Problem:
+    """Unknowns, priors and elimination plan of a network."""
+    layout = build_layout(network, model, self_calibration)
+    prior = whiten_prior(layout.prior, layout.n_unknowns)
+    return Problem(
+        network,
+        model,
+        self_calibration,
+        layout,
+        plan_elimination(layout, prior.normal, network.rays.point, network.first_ray),
+        prior,
+        weigh_control(network.control, network.n_points),
+    )
+
+
+def start_state(problem: Problem, points_l: Array | None = None) -> State:
+    """No corrections, and points (p, 3), or those where the measured rays meet."""
+    points = problem.network.approximate_l if points_l is None else points_l
+    return State(np.zeros(problem.layout.n_unknowns), points)
+
+
+def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
+    """The problem of another model on the orientation that a solution refined [K 4.2.3]."""
+    old = solution.problem
+    correction = old.layout.corrections(solution.state.theta)
+    rays = old.network.rays
+    refined = old.network.with_orientation(rays.position_l + correction[:3].T, rays.angles + correction[3:].T)
+    return replace(pose_problem(refined, model, old.self_calibration), earlier=(*old.earlier, solution))
+
+
+def cost_of(problem: Problem, state: State, lin: Linearisation) -> float:
+    """Sum of squared whitened residuals of rays, control and a-priori observations."""
+    prior = problem.prior.residual(state.theta)
+    control = problem.control.residual(state.points_l)
+    return float(np.vdot(lin.residual, lin.residual) + prior @ prior + np.vdot(control, control))

@@ -1,0 +1,288 @@
+"""Navigation of a recording: check the data, align, filter, smooth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import earth
+from .alignment import AlignmentError, AttitudePrior, align
+from .carried import NavigationTrajectory
+from .error_state import Innovation, NavigationSettings, Start, sensor_covariance
+from .filter_pass import FilterPass, run_filter
+from .inertial_checks import check
+from .inertial_cleaning import Finding, gap_findings, outage_findings
+from .inertial_data import GnssData, InertialData, InertialGrade
+from .observations import Heading, Observation, ZeroVelocity
+from .smoother import smooth
+
+Array = NDArray[np.floating]
+
+
+class NavigationError(ValueError):
+    """The data cannot be navigated; the finding says why."""
+
+    def __init__(self, finding: Finding):
+        super().__init__(finding.text)
+        self.finding = finding
+
+
+@dataclass(frozen=True)
+class Navigated:
+    """One stretch of a recording, navigated.
+
+    Attributes
+    ----------
+    start : alignment
+    forward : filter pass
+    filtered : trajectory of the filter
+    smoothed : trajectory of the smoother, None if not asked for
+    findings : remarks on the data
+    """
+
+    start: Start
+    forward: FilterPass
+    filtered: NavigationTrajectory
+    smoothed: NavigationTrajectory | None
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def best(self) -> NavigationTrajectory:
+        return self.filtered if self.smoothed is None else self.smoothed
+
+
+def navigate(
+    inertial: InertialData,
+    gnss: GnssData,
+    settings: NavigationSettings,
+    *,
+    prior: AttitudePrior | None = None,
+    smoothing: bool = True,
+    increments: bool = False,
+    held_out: NDArray[np.bool_] | None = None,
+    aids: list[tuple[float, Observation]] | None = None,
+    checks: bool = True,
+    tune: bool = True,
+) -> list[Navigated]:
+    """Navigate a recording.
+
+    Parameters
+    ----------
+    inertial, gnss : cleaned data (see `inertial_checks`)
+    settings : sensors and treatment
+    prior : attitude at the first inertial sample, where known
+    smoothing : whether to smooth after filtering
+    increments : whether the inertial data came as increments, for the checks
+    held_out : (m,) fixes that are compared with the result but not used
+    aids : further observations (see `zero_velocities`, `headings`)
+    checks : whether to look for wrong units, axes and time scales first
+    tune : whether biases may be taken to change faster than the grade says, where innovations ask for it
+
+    Returns
+    -------
+    stretches : one, or more where gaps in the inertial data are longer than the settings allow
+
+    Raises
+    ------
+    NavigationError : wrong units, axes or time scales, or no alignment
+    """
+    common: list[Finding] = []
+    if checks:
+        common = check(inertial, gnss, settings, increments=increments)
+        for finding in (f for f in common if f.fatal):
+            raise NavigationError(finding)
+    withheld = np.zeros(len(gnss), dtype=bool) if held_out is None else held_out
+    out: list[Navigated] = []
+    failed: list[Finding] = []
+    for i, stretch in enumerate(_stretches(inertial, settings.longest_gap_s)):
+        used = gnss[~withheld]
+        try:
+            start = align(stretch, used, settings, prior=prior if i == 0 else None)
+        except AlignmentError as error:
+            failed.append(Finding("alignment", "alignment", str(error), True))
+            continue
+        forward = run_filter(stretch, gnss, start, settings, held_out=withheld, aids=aids)
+        tuned: list[Finding] = []
+        if tune and _disagrees(forward):
+
+            def again(grade: InertialGrade, start: Start = start, stretch: InertialData = stretch) -> FilterPass:
+                changed = replace(settings, grade=grade)
+                return run_filter(stretch, gnss, restart(start, changed), changed, held_out=withheld, aids=aids)
+
+            forward, tuned = _tuned(forward, again)
+        smoothed = NavigationTrajectory.smoothed(forward, smooth(forward)) if smoothing else None
+        findings = [*common, *gap_findings(stretch), *tuned]
+        findings += outage_findings(gnss, start.estimate.time_s, float(stretch.time_s[-1]))
+        findings += [Finding("alignment", "alignment", note, False) for note in start.notes]
+        findings += innovation_findings(forward.innovations)
+        out.append(Navigated(start, forward, NavigationTrajectory.filtered(forward), smoothed, findings))
+        common = []
+    if not out:
+        raise NavigationError(failed[0])
+    for f in failed:
+        out[0].findings.append(Finding(f.code, f.subject, f"a stretch was left out: {f.text}", False))
+    return out
+
+
+#: Changes of the biases that are tried where innovations are too large: correlation time (s), factor on the sigmas.
+_FASTER = ((600.0, 1.0), (60.0, 1.0), (60.0, 3.0), (60.0, 10.0), (60.0, 30.0))
+_TUNE_ABOVE = 1.3
+_LARGEST_NIS = 25.0  # beyond this an innovation says nothing about inertial noise
+
+
+def _disagrees(forward: FilterPass) -> bool:
+    """Whether innovations are too large as a whole, outliers cut down."""
+    of_gnss = [i for i in forward.innovations if i.kind in ("position", "velocity") and i.status != "held out"]
+    if len(of_gnss) < 30:
+        return False
+    mean = sum(min(i.nis, _LARGEST_NIS) for i in of_gnss) / sum(len(i.value) for i in of_gnss)
+    return mean > _TUNE_ABOVE or any(i.status == "restored" for i in of_gnss)
+
+
+def _minus_log_likelihood(forward: FilterPass) -> float:
+    return sum(
+        0.5 * min(i.nis, _LARGEST_NIS) + float(np.log(i.sigma).sum())
+        for i in forward.innovations
+        if i.kind in ("position", "velocity") and i.status != "held out"
+    )
+
+
+def _tuned(forward: FilterPass, again: Callable[[InertialGrade], FilterPass]) -> tuple[FilterPass, list[Finding]]:
+    """The filter pass with the bias model that makes the innovations most likely."""
+    given = forward.settings.grade
+    best, cost = forward, _minus_log_likelihood(forward)
+    for time_s, factor in _FASTER:
+        faster = min(time_s, given.bias_time_s)
+        if faster == given.bias_time_s and factor == 1.0:
+            continue
+        trial = again(
+            replace(given, bias_time_s=faster, gyro_bias=given.gyro_bias * factor, accel_bias=given.accel_bias * factor)
+        )
+        trial_cost = _minus_log_likelihood(trial)
+        if trial_cost < cost - 10.0:
+            best, cost = trial, trial_cost
+    if best is forward:
+        return forward, []
+    g = best.settings.grade
+    text = f"inertial errors change faster than the grade says: biases taken as {_biases(g)} (given: {_biases(given)})"
+    return best, [Finding("tuned", "imu.noise", text, False)]
+
+
+def _biases(g: InertialGrade) -> str:
+    return f"{np.degrees(g.gyro_bias) * 3600:.3g} deg/h and {g.accel_bias * 1e5:.3g} mGal over {g.bias_time_s:.0f} s"
+
+
+def restart(start: Start, settings: NavigationSettings) -> Start:
+    """The same start for another grade of the inertial sensor."""
+    P = start.P.copy()
+    P[9:, 9:] = sensor_covariance(settings, start.estimate.state.r_e)
+    return Start(start.estimate, P, start.how, start.notes)
+
+
+def _stretches(inertial: InertialData, longest_gap_s: float) -> list[InertialData]:
+    hole = inertial.time_s[1:] - inertial.dt_s[1:] - inertial.time_s[:-1]
+    cuts = np.flatnonzero(hole > longest_gap_s) + 1
+    parts = np.split(np.arange(len(inertial)), cuts)
+    return [inertial[p[0] : p[-1] + 1] for p in parts if len(p) > 1]
+
+
+def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
+    """What the innovations say about the sigmas of the observations, and about outliers."""
+    findings = []
+    for kind in sorted({i.kind for i in innovations}):
+        of_kind = [i for i in innovations if i.kind == kind]
+        nis = np.array([i.nis / len(i.value) for i in of_kind])
+        of_gnss = kind in ("position", "velocity")
+        subject, source = ("gnss.sigma", f"gnss.{kind}") if of_gnss else (kind, kind)
+        if len(nis) >= 30:
+            middle = float(np.median(nis)) / 0.79  # median of chi-square of 3 degrees of freedom over 3
+            if middle > 4.0 or middle < 0.1:
+                text = f"{kind} innovations are {np.sqrt(middle):.2g} times what their sigmas say: scale these by that"
+                findings.append(Finding("sigma scale", subject, text, False))
+        rejected = sum(i.status == "rejected" for i in of_kind)
+        if rejected:
+            text = f"{rejected} of {len(of_kind)} {kind} observations rejected as outliers"
+            findings.append(Finding("outliers", source, text, False))
+        restored = [i.time_s for i in of_kind if i.status == "restored"]
+        if restored:
+            times = ", ".join(f"{t:.1f}" for t in restored[:5])
+            text = f"filter and {kind} disagreed for long, filter restored at {times} s"
+            findings.append(Finding("restored", source, text, False))
+    return findings
+
+
+def zero_velocities(inertial: InertialData, gnss: GnssData, sigma_m_s: float = 0.01) -> list[tuple[float, Observation]]:
+    """Zero-velocity observations, one a second, where neither inertial nor GNSS data show a motion."""
+    start = float(inertial.time_s[0] - inertial.dt_s[0])
+    second = np.floor(inertial.time_s - start).astype(int)
+    n = second[-1]
+    if n < 3 or len(gnss) < 2:
+        return []
+
+    def spread(x: Array) -> Array:
+        rate = x / inertial.dt_s[:, None]
+        count = np.maximum(np.bincount(second), 1)
+        mean = np.stack([np.bincount(second, r) / count for r in rate.T], axis=1)
+        square = np.stack([np.bincount(second, r * r) / count for r in rate.T], axis=1)
+        return np.sqrt(np.maximum(square - mean**2, 0.0)).max(axis=1)[:n]
+
+    quiet = (spread(inertial.dtheta) < 0.02) & (spread(inertial.dv) < 0.5)
+    r = gnss.position_e
+    step = np.linalg.norm(np.diff(r, axis=0), axis=1)
+    limit = 0.1 * np.diff(gnss.time_s) + 4.0 * gnss.sigma_ned_m.max(axis=1)[1:]
+    rests = step < limit
+    k = np.searchsorted(gnss.time_s, start + np.arange(n) + 0.5)
+    inside = (k > 0) & (k < len(gnss))
+    k = np.clip(k, 1, len(gnss) - 1)
+    out: list[tuple[float, Observation]] = []
+    for i in np.flatnonzero(quiet & inside & rests[k - 1]):
+        if 0 < i < n - 1 and quiet[i - 1] and quiet[i + 1]:
+            out.append((start + i + 0.5, ZeroVelocity(sigma_m_s)))
+    return out
+
+
+def headings(time_s: Array, heading: Array, sigma: Array, step_s: float = 1.0) -> list[tuple[float, Observation]]:
+    """Heading observations (radians), thinned to one in ``step_s``."""
+    keep, last = [], -np.inf
+    for i, t in enumerate(time_s):
+        if t >= last + step_s - 1e-6:
+            keep.append(i)
+            last = t
+    return [(float(time_s[i]), Heading(float(heading[i]), float(sigma[i]))) for i in keep]
+
+
+def innovation_statistics(innovations: list[Innovation], kind: str) -> dict[str, float]:
+    """Number, mean normalised square per degree of freedom, and counts by fate, of one kind of observation."""
+    of_kind = [i for i in innovations if i.kind == kind and i.status != "held out"]
+    if not of_kind:
+        return {"n": 0}
+    nis = np.array([i.nis / len(i.value) for i in of_kind if i.status != "rejected"])
+    out: dict[str, float] = {
+        "n": len(of_kind),
+        "nis_per_degree_of_freedom": round(float(nis.mean()), 4) if len(nis) else 0.0,
+    }
+    for status in ("used", "weighted", "rejected", "restored"):
+        out[status] = sum(i.status == status for i in of_kind)
+    return out
+
+
+def held_out_misses(
+    trajectory: NavigationTrajectory, gnss: GnssData, settings: NavigationSettings, held_out: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Fixes that were not used, less the antenna of a trajectory, north-east-down, and the standard deviations of that.
+
+    Returns
+    -------
+    miss, sigma : (k, 3) metres, for the fixes inside the trajectory
+    """
+    fixes = gnss[held_out & (gnss.time_s >= trajectory.start_s) & (gnss.time_s <= trajectory.end_s)]
+    states = trajectory.at(fixes.time_s)
+    arm = states.R_eb @ np.asarray(settings.lever_arm_b)
+    R_ne = np.swapaxes(earth.R_en(fixes.lat, fixes.lon), -1, -2)
+    miss = np.einsum("mij,mj->mi", R_ne, fixes.position_e - states.r_e - arm)
+    P = trajectory.covariance(fixes.time_s)[:, :3, :3]
+    own = np.einsum("mij,mjk,mik->mi", R_ne, P, R_ne)
+    return miss, np.sqrt(own + fixes.sigma_ned_m**2)

@@ -1,0 +1,5 @@
+"""The sliding-window adjustment; start at ``window.py``.
+
+``batch.py`` takes points with their rays to equations, ``state.py`` holds the unknowns, ``block.py`` and ``archive.py``
+join strips, ``backward.py`` refines what left early, ``watch.py`` and its parts judge how far the result holds.
+"""

@@ -1,0 +1,401 @@
+"""What the strips of a block have said so far, kept after they have left the window.
+
+The window lets go of unknowns by marginalisation, one strip at a time. So that a later strip can still tell an earlier
+one something, the information of every batch that became final is kept here a second time, before marginalisation: one
+dense block of normal equations for every pair of strips that points tie together, and for every object point its
+coordinates given the unknowns its rays touched (`LeftPoints`). A point that is seen again in a later strip thus ties
+both, and its earlier looks are never counted twice. Solving the whole gives every line and every point the information
+of the block: it is the backward pass of `backward` for several strips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment.normal_equations import PointNormals
+from ..adjustment.reduced_system import DenseFactor
+from ..models.base import Design
+from .backward import LeftPoints, again
+from .batch import Batch, inverse_factors
+from .points import ControlPoint
+from .results import AdjustedPoint, RefinedOrientation, WholeStrips
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about a
+#: second of one core and 300 MB.
+MOST_UNKNOWNS = 4200
+#: A strip with more unknowns is no part of a block.
+MOST_OF_STRIP = 1500
+#: Object points kept; beyond that those of the oldest strip are forgotten.
+MOST_POINTS = 30000
+
+
+@dataclass
+class KeptPoint:
+    """A point that became final.
+
+    Attributes
+    ----------
+    left, place : where its coordinates come from, given the unknowns
+    strips : where it was seen
+    time_s : about when, in the last of them
+    with_control : whether known coordinates are in it
+    """
+
+    left: LeftPoints
+    place: int
+    strips: frozenset[str]
+    time_s: float
+    with_control: bool
+
+    @property
+    def root(self) -> tuple[Array, Array, Array]:
+        """``L^T`` (3, 3), ``D`` (3, u), ``y`` (3,) of ``L^T (p - origin) + D theta = y + noise(1)``."""
+        L_inv = inverse_factors(self.left.normals)[self.place]
+        return np.linalg.inv(L_inv).T, self.left.coupling[self.place], self.left.normals.y[:, self.place]
+
+
+@dataclass
+class KeptStrip:
+    """A strip: numbers of its unknowns, a-priori equations, orientation that became final."""
+
+    id: str
+    numbers: IntArray
+    prior: tuple[NDArray[np.int32], Array, Array, Array] | None = None
+    entered: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    orientation: list[tuple[RefinedOrientation, Design, Array]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class BlockSolution:
+    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), ascending."""
+
+    numbers: IntArray
+    values: Array
+    cofactors: Array
+
+    def places(self, numbers: IntArray) -> IntArray:
+        return np.searchsorted(self.numbers, numbers)
+
+    def of(self, numbers: IntArray) -> tuple[Array, Array]:
+        """Values and cofactors of some."""
+        at = self.places(numbers)
+        return self.values[at], self.cofactors[np.ix_(at, at)]
+
+
+class Archive:
+    """The strips of a block that are over or being flown; see the module.
+
+    Parameters
+    ----------
+    camera_columns : (m,) numbers of the additional parameters, which all strips share
+    camera_sigma : (m,) a priori
+
+    Attributes
+    ----------
+    strips, points : by name, oldest first
+    changed : whether there is news since the last solution
+    """
+
+    def __init__(self, camera_columns: IntArray, camera_sigma: Array):
+        self.strips: dict[str, KeptStrip] = {}
+        self.points: dict[str, KeptPoint] = {}
+        self.changed = False
+        self._camera, self._camera_sigma = camera_columns, camera_sigma
+        self._group = np.full(256, -1, dtype=np.int64)
+        self._first: dict[int, int] = {}
+        self._blocks: dict[tuple[int, int], Array] = {}
+        self._rhs: dict[int, Array] = {}
+        self._groups: dict[str, int] = {}
+        self._begin("", camera_columns)
+
+    def _begin(self, id: str, numbers: IntArray) -> None:
+        group = len(self._first)
+        self._groups[id] = group
+        self._first[group] = int(numbers[0]) if len(numbers) else 0
+        if len(numbers):
+            top = int(numbers[-1]) + 1
+            if top > len(self._group):
+                self._group = np.concatenate([self._group, np.full(top, -1, dtype=np.int64)])
+            self._group[numbers] = group
+
+    def begin_strip(self, id: str, numbers: IntArray) -> None:
+        """A strip begins, whose unknowns have these numbers (consecutive)."""
+        self.strips[id] = KeptStrip(id, numbers)
+        self._begin(id, numbers)
+
+    def holds(self, columns: IntArray) -> bool:
+        """Whether all these unknowns are kept."""
+        return bool((columns < len(self._group)).all() and (self._group[columns] >= 0).all())
+
+    # -- what becomes final --------------------------------------------------------------------------------------------
+
+    def add(self, columns: IntArray, matrix: Array, rhs: Array) -> None:
+        """Add information (u, u), (u,) about unknowns (u,); without effect if some are kept no more."""
+        if not self.holds(columns):
+            return
+        self.changed = True
+        groups = self._group[columns]
+        parts = [(int(g), np.flatnonzero(groups == g)) for g in np.unique(groups)]
+        for i, (g, mine) in enumerate(parts):
+            row = columns[mine] - self._first[g]
+            self._right(g, int(row.max()) + 1)[row] += rhs[mine]
+            for h, others in parts[i:]:
+                column = columns[others] - self._first[h]
+                block = self._block(g, h, int(row.max()) + 1, int(column.max()) + 1)
+                block[np.ix_(row, column)] += matrix[np.ix_(mine, others)]
+
+    def _block(self, g: int, h: int, rows: int, columns: int) -> Array:
+        """The block of two groups, made large enough."""
+        old = self._blocks.get((g, h), np.zeros((0, 0)))
+        if old.shape[0] < rows or old.shape[1] < columns:
+            size = [max(old.shape[k], wanted + wanted // 4) for k, wanted in enumerate((rows, columns))]
+            new = np.zeros((max(size), max(size)) if g == h else size)
+            new[: old.shape[0], : old.shape[1]] = old
+            self._blocks[g, h] = old = new
+        return old
+
+    def _right(self, g: int, size: int) -> Array:
+        old = self._rhs.get(g, np.zeros(0))
+        if len(old) < size:
+            old = self._rhs[g] = np.concatenate([old, np.zeros(size + size // 4 - len(old))])
+        return old
+
+    def leave(self, batch: Batch, published: Sequence[AdjustedPoint]) -> None:
+        """A batch became final.
+
+        Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
+        and of the earlier strip's coordinates, with all unknowns of that strip instead of what stood for it on line.
+
+        Parameters
+        ----------
+        published : its points, those of full rank
+        """
+        if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
+            return
+        if batch.ties is None:
+            self.add(batch.columns, batch.information.matrix, batch.information.rhs)
+            left = LeftPoints.of(batch, published)
+            time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
+            control = [bool(w.any()) for w in batch.control.weight]
+            for i, point in zip(left.order.tolist(), left.points, strict=True):
+                seen = frozenset(r.look.strip for r in point.residuals)
+                self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), control[i]))
+            return
+        by_name = {p.name: p for p in published}
+        for i, name in enumerate(batch.names):
+            self._tie(batch, i, by_name.get(name))
+
+    def _keep(self, name: str, kept: KeptPoint) -> None:
+        """Put a point in place of what is known of it, as the newest."""
+        self.points.pop(name, None)
+        self.points[name] = kept
+
+    def _tie(self, batch: Batch, i: int, published: AdjustedPoint | None) -> None:
+        """A point of a batch that ties strips."""
+        assert batch.ties is not None
+        name, own = batch.names[i], batch.columns[: len(batch.columns) - batch.n_tied]
+        A, J, residual, origin = batch.equations(i)
+        old = self.points.get(name)
+        if old is None or not self.holds(old.left.columns) or not batch.ties.active[i]:
+            old = None
+        columns = own if old is None else np.union1d(own, old.left.columns)
+        rows, points, values = [_spread(A[:, : len(own)], own, columns)], [J], [residual]
+        control = not (old is not None and old.with_control) and bool(batch.ties.control[i].any())
+        if old is not None:
+            L, D, y = old.root
+            rows.append(_spread(D, old.left.columns, columns))
+            points.append(L)
+            values.append(y - L @ (origin - old.left.origin_l[old.place]))
+        if control:
+            root = np.sqrt(batch.ties.control[i])
+            rows.append(np.zeros((3, len(columns))))
+            points.append(np.diag(root))
+            values.append(root * (batch.control.xyz_l[i] - origin))
+        A, J, residual = np.concatenate(rows), np.concatenate(points), np.concatenate(values)
+        normal = J.T @ J
+        if published is None or np.linalg.cond(normal) > 1e12:
+            return
+        left, matrix, rhs = _eliminated(A, J, residual, normal, columns, origin, published)
+        self.add(columns, matrix, rhs)
+        seen = frozenset(r.look.strip for r in published.residuals)
+        if old is not None:
+            seen |= old.strips
+            before = old.left.points[list(old.left.order).index(old.place)]
+            merged = replace(published, rays=published.rays + before.rays,
+                             residuals=before.residuals + published.residuals)  # fmt: skip
+            left = replace(left, points=(merged,))
+        time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
+        self._keep(name, KeptPoint(left, 0, seen, time_s, control or (old is not None and old.with_control)))
+
+    def add_control(self, name: str, control: ControlPoint) -> bool:
+        """Known coordinates of a point that is final; whether they count."""
+        kept, weight = self.points.get(name), control.weight
+        if kept is None or kept.with_control or not weight.any() or not self.holds(kept.left.columns):
+            return False
+        L, D, y = kept.root
+        origin = kept.left.origin_l[kept.place]
+        root, u = np.sqrt(weight), len(kept.left.columns)
+        A, J = np.concatenate([D, np.zeros((3, u))]), np.concatenate([L, np.diag(root)])
+        residual = np.concatenate([y, root * (np.nan_to_num(control.xyz_l) - origin)])
+        point = kept.left.points[list(kept.left.order).index(kept.place)]
+        left, matrix, rhs = _eliminated(
+            A, J, residual, J.T @ J, kept.left.columns, origin, replace(point, role=control.role)
+        )
+        # the looks themselves are in already: they leave nothing but L^T p + D theta = y, which p takes up
+        self.add(kept.left.columns, matrix, rhs)
+        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, True)
+        return True
+
+    # -- solution ------------------------------------------------------------------------------------------------------
+
+    @property
+    def n_unknowns(self) -> int:
+        return len(self._camera) + sum(len(s.entered) for s in self.strips.values())
+
+    def solve(self) -> BlockSolution:
+        """Values and cofactors of all unknowns from all that is kept."""
+        numbers = np.concatenate([self._camera, *(s.entered for s in self.strips.values())])
+        order = np.argsort(numbers)
+        numbers = numbers[order]
+        n = len(numbers)
+        N, rhs = np.zeros((n, n)), np.zeros(n)
+        m = len(self._camera)
+        at = np.searchsorted(numbers, self._camera)
+        N[at, at] += 1.0 / self._camera_sigma[:m] ** 2
+        names = ["", *self.strips]
+        places = {self._groups[id]: self._present(id, numbers) for id in names}
+        for (g, h), block in self._blocks.items():
+            if g in places and h in places:
+                place_g, row = self._inside(places[g], block.shape[0])
+                place_h, column = self._inside(places[h], block.shape[1])
+                part = block[np.ix_(row, column)]
+                N[np.ix_(place_g, place_h)] += part
+                if g != h:
+                    N[np.ix_(place_h, place_g)] += part.T
+        for g, values in self._rhs.items():
+            if g in places:
+                place, row = self._inside(places[g], len(values))
+                rhs[place] += values[row]
+        for strip in self.strips.values():
+            _add_prior(N, rhs, numbers, strip)
+        factor = DenseFactor(N)
+        self.changed = False
+        return BlockSolution(numbers, factor.solve(rhs), factor.inverse())
+
+    def _present(self, id: str, numbers: IntArray) -> tuple[IntArray, IntArray]:
+        """Places of a group's unknowns in the solution and in its blocks."""
+        mine = self._camera if not id else np.sort(self.strips[id].entered)
+        return np.searchsorted(numbers, mine), mine - self._first[self._groups[id]]
+
+    @staticmethod
+    def _inside(place: tuple[IntArray, IntArray], size: int) -> tuple[IntArray, IntArray]:
+        keep = place[1] < size
+        return place[0][keep], place[1][keep]
+
+    def whole(self, solution: BlockSolution, strips: Iterable[str]) -> WholeStrips:
+        """Orientation and points of strips with the information of the block; a point goes with its last strip."""
+        wanted = set(strips)
+        orientation = []
+        for strip in self.strips.values():
+            if strip.id in wanted:
+                for old, design, noise in strip.orientation:
+                    orientation.append(again(old, design, noise, solution.numbers, solution.values, solution.cofactors))
+        groups: dict[int, tuple[LeftPoints, set[str]]] = {}
+        for name, kept in self.points.items():
+            if kept.strips & wanted:
+                groups.setdefault(id(kept.left), (kept.left, set()))[1].add(name)
+        points = []
+        for left, names in groups.values():
+            points += [p for p in left.refined(*solution.of(left.columns)) if p.name in names]
+        return WholeStrips(orientation, points)
+
+    # -- bounds --------------------------------------------------------------------------------------------------------
+
+    def too_long(self, id: str) -> bool:
+        """Whether a strip has too many unknowns for a block."""
+        return id in self.strips and len(self.strips[id].entered) > MOST_OF_STRIP
+
+    def oldest_beyond(self) -> str | None:
+        """The strip that must be closed so that the block keeps its bounds, None if it keeps them."""
+        if len(self.strips) < 2 or (self.n_unknowns <= MOST_UNKNOWNS and len(self.points) <= MOST_POINTS):
+            return None
+        return next(iter(self.strips))
+
+    def drop(self, id: str) -> None:
+        """Forget a strip as if it had never been tied to others."""
+        group = self._groups.pop(id)
+        strip = self.strips.pop(id)
+        self._group[strip.numbers] = -1
+        self._blocks = {k: v for k, v in self._blocks.items() if group not in k}
+        self._rhs.pop(group, None)
+        self.points = {name: p for name, p in self.points.items() if id not in p.strips}
+
+    def close(self, id: str) -> None:
+        """Let a strip's unknowns go; what they say of the others stays (Schur complement)."""
+        strip, g = self.strips[id], self._groups[id]
+        numbers = np.sort(strip.entered)
+        n = len(numbers)
+        local = numbers - self._first[g]
+        keep = local < len(self._block(g, g, 1, 1))
+        N, rhs = np.zeros((n, n)), np.zeros(n)
+        N[np.ix_(keep, keep)] = self._blocks[g, g][np.ix_(local[keep], local[keep])]
+        right = self._right(g, int(local[-1]) + 1)
+        rhs += right[local]
+        _add_prior(N, rhs, numbers, strip)
+        others = {}
+        for (a, b), block in self._blocks.items():
+            if (a == g) != (b == g):
+                cross = block if a == g else block.T
+                whole = np.zeros((n, cross.shape[1]))
+                inside = local < len(cross)
+                whole[inside] = cross[local[inside]]
+                others[b if a == g else a] = whole
+        factor = DenseFactor(N)
+        groups = sorted(others)
+        for i, h in enumerate(groups):
+            through = factor.solve(others[h]).T
+            size = through.shape[0]
+            self._right(h, size)[:size] -= through @ rhs
+            for k in groups[i:]:
+                block = self._block(h, k, size, others[k].shape[1])
+                block[:size, : others[k].shape[1]] -= through @ others[k]
+        self.drop(id)
+        self.changed = True
+
+
+def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:
+    """Rows (m, u) over other, sorted columns that contain theirs."""
+    result = np.zeros((len(part), len(wanted)))
+    result[:, np.searchsorted(wanted, columns)] = part
+    return result
+
+
+def _eliminated(
+    A: Array, J: Array, residual: Array, normal: Array, columns: IntArray, origin: Array, point: AdjustedPoint
+) -> tuple[LeftPoints, Array, Array]:
+    """A point with rows ``A theta + J (p - origin) = residual``: what is left of it, and its information."""
+    L_inv = np.linalg.inv(np.linalg.cholesky(normal))
+    D, y = L_inv @ (J.T @ A), L_inv @ (J.T @ residual)
+    lower = L_inv[np.tril_indices(3)]
+    normals = PointNormals(lower[:, None], y[:, None], np.array([3]))
+    left = LeftPoints(columns, origin[None], normals, D[None], np.zeros(1, dtype=np.int64), (point,))
+    return left, A.T @ A - D.T @ D, A.T @ residual - D.T @ y
+
+
+def _add_prior(N: Array, rhs: Array, numbers: IntArray, strip: KeptStrip) -> None:
+    """Add a strip's a-priori equations to normal equations of sorted unknowns."""
+    if strip.prior is None:
+        return
+    columns, coefficients, value, sigma = strip.prior
+    weighted, right = coefficients / sigma[:, None], value / sigma
+    place = np.where(columns >= 0, np.searchsorted(numbers, columns), 0)
+    weighted = np.where(columns >= 0, weighted, 0.0)
+    np.add.at(N, (place[:, :, None], place[:, None, :]), weighted[:, :, None] * weighted[:, None, :])
+    np.add.at(rhs, place, weighted * right[:, None])

@@ -1,0 +1,153 @@
+"""What arrives at the window: looks and control, judged, and held until they can be used."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from ..camera import LineCamera
+from ..measured_trajectory import MeasuredTrajectory
+from .batch import Batch
+from .points import ControlPoint, PointLooks
+from .results import Look, Refusal
+from .strip import WindowStrip
+
+#: Time after which a look whose orientation has not come is given up, s.
+PATIENCE_S = 2.0
+
+
+class Intake:
+    """The points of the window by name, and which of them have news or wait.
+
+    Attributes
+    ----------
+    points : all points that are not final
+    control : known coordinates by point
+    """
+
+    def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
+        self.points: dict[str, PointLooks] = {}
+        self.control: dict[str, ControlPoint] = {}
+        self._camera, self._strips, self._trajectory = camera, strips, trajectory
+        self._arrived: dict[str, None] = {}
+        self._waiting: dict[str, None] = {}
+        self._done: deque[tuple[float, str, str]] = deque()
+        self._is_done: set[tuple[str, str]] = set()
+        self._refused: list[Refusal] = []
+
+    def add_control(self, name: str, point: ControlPoint) -> None:
+        self.control[name] = point
+        if name in self.points:
+            self._arrived[name] = None
+
+    def add_look(self, name: str, look: Look) -> str:
+        """Take a look, or say why not."""
+        reason = self._judge(look) or self._judge_time(name, look)
+        if reason:
+            self._refused.append(Refusal(name, look, reason))
+            return reason
+        point = self.points.setdefault(name, PointLooks())
+        point.looks.append(look)
+        point.time_s.append(float(self._strips[look.strip].time_of(look.line)))
+        point.weight.append(1.0)
+        self._arrived[name] = None
+        if point.batch is None:
+            self._waiting[name] = None
+        return ""
+
+    def _judge(self, look: Look) -> str:
+        values = (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px)
+        if not np.isfinite(values).all():
+            return "value is not finite"
+        if min(values[2:]) <= 0:
+            return "sigma is not positive"
+        if look.ccd not in self._camera.line_index:
+            return "unknown ccd"
+        if look.strip not in self._strips:
+            return "unknown strip"
+        if not self._camera.lines[self._camera.line_index[look.ccd]].contains(look.sample):
+            return "beyond the ccd line"
+        if not self._strips[look.strip].contains(look.line):
+            return "outside strip"
+        return ""
+
+    def _judge_time(self, name: str, look: Look) -> str:
+        strip = self._strips[look.strip]
+        if float(strip.time_of(look.line)) < strip.final_to_s:
+            return "too late"
+        if (name, look.strip) in self._is_done:
+            return "point is final"
+        if name in self.points and look in self.points[name].looks:
+            return "duplicate"
+        return ""
+
+    def ready(self, now_s: float) -> list[str]:
+        """Points with news all of whose looks have a measured orientation; they have no news any more.
+
+        Looks for which no orientation will come are refused, and those that waited for a partner too long.
+        """
+        names = list(self._arrived)
+        points = [self.points[name] for name in names]
+        time_s = np.array([t for point in points for t in point.time_s])
+        final_s = np.array([self._strips[look.strip].final_to_s for point in points for look in point.looks])
+        alone = np.repeat([point.batch is None for point in points], [len(point.looks) for point in points])
+        past = alone.astype(bool) & (time_s < final_s)
+        covered = self._trajectory.covers(time_s) & ~past
+        late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
+        over, good, lost = past.tolist(), covered.tolist(), (past | (~covered & (time_s < late_s))).tolist()
+        ready = []
+        end = 0
+        for name, point in zip(names, points, strict=True):
+            first, end = end, end + len(point.looks)
+            gone = [i for i in range(end - first) if lost[first + i]] if not all(good[first:end]) else []
+            if len(gone) + sum(good[first:end]) == end - first:
+                ready.append(name)
+                del self._arrived[name]
+            for i in gone[::-1]:
+                reason = "too few looks" if over[first + i] else "no orientation"
+                self._refused.append(Refusal(name, point.looks[i], reason))
+                del point.looks[i], point.time_s[i], point.weight[i]
+        return ready
+
+    def place(self, name: str, batch: Batch | None) -> None:
+        """A point is in a batch now, or in none."""
+        self.points[name].batch = batch
+        if batch is None:
+            self._waiting[name] = None
+        else:
+            self._waiting.pop(name, None)
+
+    def finish(self, batch: Batch) -> None:
+        """The points of a batch are final."""
+        for name in batch.names:
+            strips = {look.strip for look in self.points[name].looks}
+            del self.points[name]
+            self._arrived.pop(name, None)
+            for strip in strips:
+                self._done.append((batch.newest_s, name, strip))
+                self._is_done.add((name, strip))
+
+    def forget(self, limit_s: float, done_before_s: float) -> list[Refusal]:
+        """Give up single looks older than the limit, and forget which points became final long ago."""
+        refused = []
+        for name in list(self._waiting):
+            point = self.points[name]
+            if not point.time_s or max(point.time_s) <= limit_s:
+                refused += [Refusal(name, look, "too few looks") for look in point.looks]
+                del self.points[name], self._waiting[name]
+                self._arrived.pop(name, None)
+        while self._done and self._done[0][0] < done_before_s:
+            _, name, strip = self._done.popleft()
+            self._is_done.discard((name, strip))
+        return refused
+
+    @property
+    def oldest_waiting_s(self) -> float:
+        """Time of the oldest look that waits."""
+        return min((min(self.points[n].time_s, default=np.inf) for n in self._waiting), default=np.inf)
+
+    def take_refused(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        refused, self._refused = self._refused, []
+        return refused

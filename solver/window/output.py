@@ -1,0 +1,161 @@
+"""What the window says: orientation and points with covariance, sigma0 over its length, parameters."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..measured_trajectory import MeasuredTrajectory
+from ..models.base import COMPONENTS
+from ..selfcalibration import SelfCalibration
+from .batch import Batch
+from .determinability import ESTIMATED, NOT_YET, Standing
+from .points import ControlPoint, PointLooks
+from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation
+from .state import WindowState
+from .strip import WindowStrip
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Times worked on at once.
+CHUNK = 64
+#: Sigma of a strip's parameter, in units of the a-priori one, from which the observations know it better.
+BETTER = 0.7
+
+
+class Orienter:
+    """Refined orientation at any time; keeps the cofactors of the unknowns asked for last."""
+
+    def __init__(self, state: WindowState, trajectory: MeasuredTrajectory):
+        self._state, self._trajectory = state, trajectory
+        self._columns: IntArray = np.empty(0, dtype=np.int64)
+        self._cofactors: Array | None = None
+
+    def forget(self) -> None:
+        """The state has changed."""
+        self._cofactors = None
+
+    def at(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
+        """Orientation at times (n,) that have a measured one."""
+        parts = [self._chunk(strip, times[i : i + CHUNK]) for i in range(0, len(times), CHUNK)]
+        correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
+        measured = self._trajectory.at(times)
+        angles = measured.poses.angles + correction[:, 3:]
+        angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        covariance = covariance + measured.covariance
+        return RefinedOrientation(
+            strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
+        )
+
+    def noise(self, strip: WindowStrip, times: Array) -> Array:
+        """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
+        return self._trajectory.at(times).covariance + strip.left_out_variance(times)[:, :, None] * np.eye(6)
+
+    def _chunk(self, strip: WindowStrip, times: Array) -> tuple[Array, Array]:
+        """Corrections (n, 6) and their covariance, with what the model leaves out."""
+        design = strip.design(times)
+        columns = np.unique(design.columns)
+        columns = columns[columns >= 0].astype(np.int64)
+        if self._cofactors is None or not np.array_equal(columns, self._columns):
+            self._cofactors, self._columns = self._state.covariance(columns), columns
+        local = np.where(design.columns >= 0, np.searchsorted(columns, design.columns), len(columns))
+        A = np.zeros((len(times), 6, len(columns) + 1))
+        row = np.arange(len(times))[:, None, None]
+        A[row, np.arange(6), local] += design.coefficients[:, :, None]
+        A = A[:, :, :-1]
+        covariance = A @ self._cofactors @ np.swapaxes(A, 1, 2)
+        covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
+        return A @ self._state.values(columns), covariance
+
+
+def adjusted_points(
+    batch: Batch, state: WindowState, points: Mapping[str, PointLooks], control: Mapping[str, ControlPoint], final: bool
+) -> list[AdjustedPoint]:
+    """The points of a batch that are determined, with covariance and residuals."""
+    cofactors, statistics = batch.judge(state)
+    v_line, v_sample = statistics.v_px.T.tolist()
+    w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
+    source = batch.rays.source.tolist()
+    first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
+    known: list[bool] = np.all(batch.control.weight > 0, axis=1).tolist()
+    out = []
+    for i, name in enumerate(batch.names):
+        if batch.normals.rank[i] < 3:
+            continue
+        looks = points[name].looks
+        mine = slice(first[i], first[i + 1])
+        seen = [looks[k] for k in source[mine]]
+        residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
+        role = control[name].role if name in control else "tie"
+        rays = int(used[i])
+        checked = _checked(rays, len(residuals), known[i])
+        out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals, checked))
+    return out
+
+
+def _checked(rays: int, looks: int, known: bool) -> str:
+    """See `AdjustedPoint`."""
+    if 2 * rays <= looks and looks > 2:
+        return "doubtful"
+    return "all" if rays > 2 or known else "across"
+
+
+class CostHistory:
+    """Weighted squares and redundancy so far, over time: what has been gained over the last while."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, float, int]] = deque()
+
+    def over(self, now_s: float, length_s: float, cost: float, redundancy: int) -> tuple[float, int]:
+        """sigma0 (NaN without redundancy) and redundancy of what came in the last ``length_s``."""
+        self._past.append((now_s, cost, redundancy))
+        while len(self._past) > 2 and self._past[1][0] <= now_s - length_s:
+            self._past.popleft()
+        then, old_cost, old_redundancy = self._past[0]
+        if now_s - then < length_s:
+            old_cost, old_redundancy = 0.0, 0
+        gained = redundancy - old_redundancy
+        if gained <= 0:
+            return float("nan"), 0
+        return float(np.sqrt(max(cost - old_cost, 0.0) / gained)), gained
+
+
+def parameters(
+    state: WindowState,
+    strip_globals: ArrayLike,
+    apriori: Array,
+    self_calibration: SelfCalibration | None,
+    camera_columns: IntArray,
+    standing: Sequence[Standing] = (),
+) -> tuple[Parameter, ...]:
+    """Offset, shift and drift of a strip (numbers (9,), or none; a-priori sigmas (9,)) and the additional parameters.
+
+    Those of the strip are in the state from the start, with what is known of them beforehand: "estimated" says that the
+    observations know them better.
+    """
+    names: list[tuple[str, str, int]] = []
+    if len(np.asarray(strip_globals)):
+        kinds = [f"d{c}" for c in COMPONENTS] + [f"{c} drift" for c in COMPONENTS[3:]]
+        names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, np.asarray(strip_globals).tolist(), strict=True))
+    if self_calibration is not None:
+        for name, number in zip(self_calibration.unknown_names, camera_columns.tolist(), strict=True):
+            names.append((name, "mm" if name[:2] in ("dc", "xp", "yp", "dx", "dy") else "", number))
+    numbers = np.array([number for _, _, number in names], dtype=np.int64)
+    if not len(numbers) or (state.places(numbers) < 0).any():
+        return ()
+    sigma = np.sqrt(np.diagonal(state.covariance(numbers)))
+    values = state.values(numbers)
+    of_strip = len(names) - len(camera_columns)
+    result = []
+    for i, ((name, unit, _), v, s) in enumerate(zip(names, values, sigma, strict=True)):
+        known = Standing(ESTIMATED, "")
+        if i >= of_strip and standing:
+            known = standing[i - of_strip]
+        elif i < of_strip and s > BETTER * apriori[i]:
+            known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
+        result.append(Parameter(name, unit, float(v), float(s), known.status, known.reason))
+    return tuple(result)

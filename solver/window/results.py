@@ -1,0 +1,213 @@
+"""What the window takes and gives: settings, looks, refined orientation, points, reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment.reliability import CRITICAL_W
+from ..models import MODELS
+
+if TYPE_CHECKING:
+    from .watch import Watched
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """Settings of the sliding window.
+
+    Attributes
+    ----------
+    model : trajectory model: "wander" (see `models.wander`), "dgr", "ppm", "lim"
+    segment_s : longest segment (distance of fixes for "lim"); 0 = a fifteenth of the correlation time
+    window_s : length; 0 = `window_looks` times the time between the first and the last look at a point
+    window_looks : see there
+    grid_hz : rate of the published orientation
+    settle_s : so long after the end of a strip late tie points are waited for; then the strip is final
+    critical : of Baarda's |w|
+    snoop : whether observations are tested at all
+    determine : whether an additional parameter enters only when the network can see it; else all are estimated
+    retest : batches tested again per update, besides new ones
+    """
+
+    model: str = "wander"
+    segment_s: float = 0.0
+    window_s: float = 0.0
+    window_looks: float = 1.5
+    grid_hz: float = 20.0
+    settle_s: float = 3.0
+    critical: float = CRITICAL_W
+    snoop: bool = True
+    determine: bool = True
+    retest: int = 4
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f"unknown trajectory model {self.model!r}; known: {', '.join(MODELS)}")
+        for name in ("segment_s", "window_s", "settle_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
+        for name in ("window_looks", "grid_hz", "critical"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: wanted more than 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image measurement of a point: strip and CCD line by name, line and sample in pixels with their sigmas.
+
+    ``source`` is who measured it; the same measurement from two is one.
+    """
+
+    strip: str
+    ccd: str
+    line: float
+    sample: float
+    sigma_line_px: float
+    sigma_sample_px: float
+    source: str = field(default="", compare=False)
+
+
+#: Reason of a "refusal" that is the opposite: what was refused before is used again.
+TAKEN_BACK = "taken back"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A measurement that was not used, and why (or that is `TAKEN_BACK`); ``w`` is 0 where no test decided."""
+
+    point: str
+    look: Look
+    reason: str
+    w: float = 0.0
+
+
+@dataclass(frozen=True)
+class RefinedOrientation:
+    """Refined exterior orientation at n times.
+
+    Attributes
+    ----------
+    strip : whose model it comes from
+    time_s : (n,)
+    position_l, angles : (n, 3) m; omega, phi, kappa in rad
+    covariance : (n, 6, 6) of correction and measurement noise together
+    correction : (n, 6) added to the measured orientation
+    protection : (n, 6) protection levels, see `integrity`; None where they are not known
+    """
+
+    strip: str
+    time_s: Array
+    position_l: Array
+    angles: Array
+    covariance: Array
+    correction: Array
+    protection: Array | None = None
+
+
+class RayResidual(NamedTuple):
+    """Residual of one look, measured minus computed, px; ``w`` is the larger normalised one."""
+
+    look: Look
+    v_line: float
+    v_sample: float
+    w: float
+    rejected: bool
+
+
+@dataclass(frozen=True)
+class AdjustedPoint:
+    """An object point as it came out.
+
+    Attributes
+    ----------
+    name, role : role is tie, control, planimetric, height or check
+    xyz_l, covariance : (3,) m, (3, 3) m^2
+    rays : looks that take part
+    final : whether it has left the window
+    whole : whether it has the information of whole strips, from the backward pass
+    residuals : of all its looks
+    checked : what a gross error in one of its rays would meet: "all" of them are checked by others; "across": two
+        rays, so that an error along the base goes into the height unseen; "doubtful": half of the rays are left out
+    """
+
+    name: str
+    role: str
+    xyz_l: Array
+    covariance: Array
+    rays: int
+    final: bool
+    residuals: tuple[RayResidual, ...]
+    checked: str = "all"
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the present strip or of the camera; status "estimated" or "not yet determined", and why."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    status: str = "estimated"
+    reason: str = ""
+
+    @property
+    def t(self) -> float:
+        return self.value / self.sigma if self.sigma > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class WindowReport:
+    """Figures of one update; sigma0 is 1 a priori.
+
+    Attributes
+    ----------
+    sigma0, redundancy : over about the length of the window; NaN without redundancy
+    sigma0_total, redundancy_total : since the start
+    observations, unknowns : in the window, what was marginalised counting as one observation an unknown
+    start_s, end_s : orientation before the start is final; newest ray
+    watched : light, protection levels and sources that drift
+    """
+
+    sigma0: float
+    redundancy: int
+    sigma0_total: float
+    redundancy_total: int
+    observations: int
+    unknowns: int
+    iterations: int
+    start_s: float
+    end_s: float
+    rays: int
+    points: int
+    control: int
+    strip: str
+    parameters: tuple[Parameter, ...]
+    watched: Watched
+
+
+@dataclass(frozen=True)
+class WholeStrips:
+    """Orientation and points with the information of whole strips, from the backward pass after their end."""
+
+    orientation: list[RefinedOrientation]
+    points: list[AdjustedPoint]
+
+
+@dataclass
+class WindowUpdate:
+    """What one update gave; ``whole`` when strips have ended."""
+
+    report: WindowReport | None = None
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    whole: WholeStrips | None = None

@@ -1,0 +1,226 @@
+"""The unknowns of the window and what is known of them: information that is added, taken back and marginalised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from ..adjustment.reduced_system import DenseFactor
+from .batch import Information
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Weight of what is held, which makes its cofactors nothing.
+HELD = 1e30
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=float)
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """What was known of unknowns when they left: ``R11 x1 + R12 x2 = d1 + noise(1)`` with those that stayed, x2.
+
+    Attributes
+    ----------
+    gone, stayed : numbers of the unknowns
+    R11, R12, d1 : upper triangular (m, m), (m, k), (m,)
+    """
+
+    gone: IntArray
+    stayed: IntArray
+    R11: Array
+    R12: Array
+    d1: Array
+
+
+class WindowState:
+    """Unknowns, each with a number for life, and their normal equations in two parts.
+
+    The *live* part is the sum of the batches that can still be linearised again or lose a ray. The *fixed* part holds
+    a-priori knowledge and what was marginalised; it never changes its linearisation. When unknowns leave, the fixed
+    part is brought to square-root form (Cholesky, those that leave first): the lower right block of the factor is what
+    stays. It is positive definite by construction.
+
+    Attributes
+    ----------
+    numbers : (n,) unknowns present, in the order of the matrices
+    theta : (n,) values
+    square : cost of everything so far at theta = 0 of the present unknowns
+    redundancy : observations so far less unknowns so far
+    solution : number of solutions computed so far
+    """
+
+    def __init__(self) -> None:
+        self.numbers: IntArray = np.empty(0, dtype=np.int64)
+        self.theta: Array = np.empty(0)
+        self._next = 0
+        self._place = np.full(256, -1, dtype=np.int64)
+        self._fixed, self._live = np.zeros((0, 0)), np.zeros((0, 0))
+        self._fixed_rhs, self._live_rhs = np.empty(0), np.empty(0)
+        self.square = 0.0
+        self.redundancy = 0
+        self._factor: DenseFactor | None = None
+        self._asked = 0
+        self.solution = 0
+        self._held: IntArray = np.empty(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def new_numbers(self, n: int) -> IntArray:
+        """Numbers for n unknowns that may become present later."""
+        numbers = np.arange(self._next, self._next + n)
+        self._next += n
+        if self._next > len(self._place):
+            self._place = np.concatenate([self._place, np.full(self._next, -1, dtype=np.int64)])
+        return numbers
+
+    def places(self, numbers: ArrayLike) -> IntArray:
+        """Places in the matrices; -1 for unknowns that are not present."""
+        return self._place[np.asarray(numbers, dtype=np.int64)]
+
+    def values(self, numbers: ArrayLike) -> Array:
+        """Values of unknowns; 0 for those that are not present."""
+        place = self.places(numbers)
+        return np.where(place >= 0, np.append(self.theta, 0.0)[place], 0.0)
+
+    def enter(self, numbers: IntArray) -> None:
+        """Make unknowns present; until observed they have no information."""
+        n = len(self.numbers)
+        self._place[numbers] = n + np.arange(len(numbers))
+        self.numbers = np.concatenate([self.numbers, numbers])
+        m = len(numbers)
+        self.theta = np.concatenate([self.theta, np.zeros(m)])
+        self._fixed, self._live = (np.pad(a, ((0, m), (0, m))) for a in (self._fixed, self._live))
+        self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m)) for a in (self._fixed_rhs, self._live_rhs))
+        self.redundancy -= m
+        self._factor = None
+
+    def observe(self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array) -> None:
+        """Add a-priori observations (m, t) of present unknowns; column -1 is none, infinite sigma no weight."""
+        keep = np.isfinite(sigma)
+        columns, weight = columns[keep], 1.0 / sigma[keep]
+        rows = np.zeros((len(columns), len(self) + 1))
+        place = np.where(columns >= 0, self.places(np.maximum(columns, 0)), -1)
+        np.add.at(rows, (np.arange(len(rows))[:, None], place), coefficients[keep] * weight[:, None])
+        rows, rhs = rows[:, :-1], value[keep] * weight
+        self._fixed += rows.T @ rows
+        self._fixed_rhs += rows.T @ rhs
+        self.square += float(rhs @ rhs)
+        self.redundancy += len(rows)
+        self._factor = None
+
+    def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
+        """Add a batch's information to the live part, or take it back (``sign = -1``)."""
+        place = self.places(columns)
+        self._live[np.ix_(place, place)] += sign * information.matrix
+        self._live_rhs[place] += sign * information.rhs
+        self.square += sign * information.square
+        self.redundancy += sign * information.rows
+        self._factor = None
+
+    def exchange(self, columns: IntArray, old: Information, new: Information) -> None:
+        """Put a batch's new information in the live part in place of what it said before."""
+        place = self.places(columns)
+        self._live[np.ix_(place, place)] += new.matrix - old.matrix
+        self._live_rhs[place] += new.rhs - old.rhs
+        self.square += new.square - old.square
+        self.redundancy += new.rows - old.rows
+        self._factor = None
+
+    def fix(self, columns: IntArray, information: Information) -> None:
+        """Move a batch's information from the live to the fixed part."""
+        place = self.places(columns)
+        block = np.ix_(place, place)
+        self._live[block] -= information.matrix
+        self._fixed[block] += information.matrix
+        self._live_rhs[place] -= information.rhs
+        self._fixed_rhs[place] += information.rhs
+
+    def normal(self) -> tuple[Array, Array]:
+        """Normal equations (n, n), (n,) of all information."""
+        return self._fixed + self._live, self._fixed_rhs + self._live_rhs
+
+    def hold(self, numbers: IntArray) -> None:
+        """Hold these unknowns at zero from now on, and no others; what is known of them is kept."""
+        self._held = np.asarray(numbers, dtype=np.int64)
+        self._factor = None
+
+    def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
+        """Factor and values (n,) with other unknowns held at zero."""
+        matrix, rhs = self.normal()
+        _hold(matrix, self.places(held))
+        factor = DenseFactor(matrix)
+        rhs[self.places(held)] = 0.0
+        return factor, factor.solve(rhs)
+
+    @property
+    def factor(self) -> DenseFactor:
+        if self._factor is None:
+            matrix = self._fixed + self._live
+            if len(self._held):
+                _hold(matrix, self.places(self._held))
+            self._factor = DenseFactor(matrix)
+            self._asked = 0
+        return self._factor
+
+    def solve(self) -> None:
+        """Values from all information."""
+        rhs = self._fixed_rhs + self._live_rhs
+        if len(self._held):
+            rhs[self.places(self._held)] = 0.0
+        self.theta = self.factor.solve(rhs)
+        self.solution += 1
+
+    def cost(self) -> float:
+        """Weighted squares of everything so far, at the present solution."""
+        return max(self.square - float((self._fixed_rhs + self._live_rhs) @ self.theta), 0.0)
+
+    def covariance(self, numbers: IntArray) -> Array:
+        """Cofactors (m, m) of present unknowns."""
+        place, factor = self.places(numbers), self.factor
+        # the whole inverse costs as much as the columns of a third of it
+        self._asked += len(place)
+        if 3 * self._asked > len(self):
+            return factor.cofactors(place)
+        return factor.few_cofactors(place)
+
+    def marginalise(self, numbers: IntArray) -> Marginal:
+        """Take unknowns out; batches that touch them must have been fixed before.
+
+        Raises
+        ------
+        ValueError : an unknown about which nothing is known, not even beforehand
+        """
+        gone = self.places(numbers)
+        stay = np.setdiff1d(np.arange(len(self)), gone)
+        own = self._fixed[np.ix_(gone, gone)]
+        diagonal = np.diagonal(own)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        R11, failed = _potrf(own * scale[:, None] * scale, lower=0, clean=1)
+        if failed:
+            raise ValueError(f"unknown {int(self.numbers[gone[failed - 1]])} is undetermined and cannot leave")
+        R11 /= scale
+        R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
+        d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
+        marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
+        inside = np.ix_(stay, stay)
+        self._fixed = self._fixed[inside] - R12.T @ R12
+        self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
+        self._live, self._live_rhs = self._live[inside], self._live_rhs[stay]
+        self.square -= float(d @ d)
+        self._place[self.numbers[gone]] = -1
+        self.numbers, self.theta = self.numbers[stay], self.theta[stay]
+        self._place[self.numbers] = np.arange(len(stay))
+        self._factor = None
+        return marginal
+
+
+def _hold(matrix: Array, places: IntArray) -> None:
+    """Cut unknowns off from the others, so that they are zero and certain."""
+    matrix[places, :] = 0.0
+    matrix[:, places] = 0.0
+    matrix[places, places] = HELD

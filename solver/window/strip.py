@@ -1,0 +1,218 @@
+"""A strip in the window: its time scale and its trajectory model, whose unknowns come and go with time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..models import MODELS
+from ..models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations
+from ..models.dgr import DgrOptions
+from ..models.lim import LimOptions
+from ..models.ppm import PpmOptions
+from ..models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
+from ..slow_errors import SlowErrors
+from .results import WindowOptions
+from .state import WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
+UNKNOWN_LENGTH_S = 600.0
+#: Sampling of the times at which an unknown is in use, share of a segment.
+_SAMPLING = 0.05
+
+
+def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
+    """Longest segment, s."""
+    return options.segment_s or SEGMENT_SHARE * slow.wander_time_s
+
+
+def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
+    """Settings of the model that `options` names, with a-priori sigmas from the slow errors.
+
+    Offset and wander together bound each piecewise coefficient; "wander" alone states them as the processes they are.
+
+    Raises
+    ------
+    ValueError : an unknown model
+    """
+    step = segment_length(slow, options)
+    pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
+
+    def triple(values: Array) -> tuple[float, float, float]:
+        a, b, c = np.maximum(values, NOTHING).tolist()
+        return (a, b, c)
+
+    position = triple(slow.position_sigma)
+    attitude = triple(np.degrees(slow.attitude_sigma))
+    if options.model == "wander":
+        return WanderOptions(slow, step)
+    if options.model == "dgr":
+        offset, shift, drift = np.array(slow.offset_m), np.degrees(slow.shift), np.degrees(slow.drift)
+        return DgrOptions(triple(offset), triple(shift), triple(drift))
+    if options.model == "lim":
+        return LimOptions(max(pieces + 1, 4), False, position, attitude)
+    if options.model == "ppm":
+        # slopes change at borders by what the white noise that drives the wander gathers over a segment
+        b = 2.146 / slow.wander_time_s
+        slope = b * step
+        jump = float(np.sqrt(4.0 * b**3 * step / 3.0))
+        wander_m = np.array(slow.wander_m)
+        wander_deg = np.degrees(slow.wander)
+        return PpmOptions(
+            segments=pieces,
+            offset_sigma_m=position,
+            shift_sigma_deg=attitude,
+            first_sigma_m=triple(slope * wander_m),
+            first_sigma_deg=triple(slope * wander_deg + np.degrees(slow.drift) / pieces),
+            second_sigma_m=triple(jump * step * wander_m),
+            second_sigma_deg=triple(jump * step * wander_deg),
+            continuity_sigma_m=triple(jump * wander_m),
+            continuity_sigma_deg=triple(jump * wander_deg),
+        )
+    raise ValueError(f"unknown trajectory model {options.model!r}; known: {', '.join(MODELS)}")
+
+
+class WindowStrip:
+    """A strip whose model grows with time.
+
+    The model is built for the planned length; unknowns become present in the window's state when a time needs them,
+    with those a-priori observations that speak of present unknowns only, and leave it when no later time needs them.
+
+    Attributes
+    ----------
+    id : name
+    first_line_time_s, line_rate_hz : image line u is taken at first_line_time_s + u / line_rate_hz
+    lines : number of lines, 0 = not known
+    model : its correction functions
+    slow : its slow errors, as known beforehand
+    ended : whether the last line has been taken
+    final_to_s : orientation up to here is final
+    """
+
+    def __init__(
+        self,
+        id: str,
+        first_line_time_s: float,
+        line_rate_hz: float,
+        lines: int,
+        slow: SlowErrors,
+        options: WindowOptions,
+        state: WindowState,
+    ):
+        self.id = id
+        self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
+        self.lines = lines
+        self.slow = slow
+        self.ended = False
+        self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
+        self.final_to_s = first_line_time_s
+        length = lines / line_rate_hz if lines else UNKNOWN_LENGTH_S
+        self.model: CorrectionModel = model_options(slow, options, length).build(
+            Extent(f"strip {id}", first_line_time_s, first_line_time_s + length)
+        )
+        self.numbers = state.new_numbers(self.model.n_unknowns)
+        self._prior = self.model.pseudo_observations()
+        self._row_done = np.zeros(len(self._prior), dtype=bool)
+        self._entered = np.zeros(self.model.n_unknowns, dtype=bool)
+        self._first_use, self._last_use = self._uses(segment_length(slow, options))
+        self._over = False
+        self._need = np.array([self._first_use[c[c >= 0]].max() for c in self._prior.columns])
+
+    def _uses(self, step_s: float) -> tuple[Array, Array]:
+        """Times (n_unknowns,) before and after which an unknown takes no part; up to one sample on the safe side."""
+        extent = self.model.extent
+        t = np.linspace(extent.start_s, extent.end_s, int((extent.end_s - extent.start_s) / (_SAMPLING * step_s)) + 2)
+        columns = self.model.design(t).columns.reshape(len(t), -1)
+        first = np.full(self.model.n_unknowns + 1, np.inf)
+        last = np.full(self.model.n_unknowns + 1, -np.inf)
+        np.minimum.at(first, columns, t[:, None])
+        np.maximum.at(last, columns, t[:, None])
+        sample = t[1] - t[0]
+        return first[:-1] - sample, np.minimum(last[:-1] + sample, extent.end_s)
+
+    def time_of(self, line: ArrayLike) -> Array:
+        return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz
+
+    def contains(self, line: float) -> bool:
+        return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
+
+    def end(self, lines: int) -> None:
+        """The strip is over."""
+        self.ended = True
+        if lines:
+            self.lines = lines
+            self.end_s = float(self.time_of(lines))
+
+    def design(self, time_s: ArrayLike) -> Design:
+        """Design with the unknowns' numbers in the window."""
+        d = self.model.design(time_s)
+        return Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
+
+    def left_out_variance(self, time_s: Array) -> Array:
+        """(n, 6) what the model cannot follow; 0 for models that do not say."""
+        if isinstance(self.model, Wander):
+            return self.model.left_out_variance(time_s)
+        return np.zeros((len(time_s), 6))
+
+    @property
+    def entered(self) -> IntArray:
+        """Numbers of the unknowns that a time has needed so far."""
+        return self.numbers[self._entered]
+
+    def apriori(self) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        """A-priori equations of these: columns (m, t) by number, -1 for none, coefficients, values, sigmas."""
+        rows = np.flatnonzero(self._row_done & np.isfinite(self._prior.sigma))
+        return self._rows(rows)
+
+    def _rows(self, rows: IntArray) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        p: PseudoObservations = self._prior
+        columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
+        return columns, p.coefficients[rows], p.value[rows], p.sigma[rows]
+
+    def activate(self, to_s: float, state: WindowState) -> bool:
+        """Make unknowns present that times up to this one need; whether there were any."""
+        new = np.flatnonzero(~self._entered & (self._first_use <= to_s))
+        if not len(new):
+            return False
+        state.enter(self.numbers[new])
+        self._entered[new] = True
+        rows = np.flatnonzero(~self._row_done & (self._need <= to_s))
+        self._row_done[rows] = True
+        state.observe(*self._rows(rows))
+        return True
+
+    def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:
+        """Unknowns that no time after the limit needs, and the time up to which the orientation becomes final.
+
+        Unknowns in use to the end of the strip leave when it has ended and is settled (limit infinite).
+        """
+        if self._over:
+            return self.numbers, self.final_to_s
+        present = state.places(self.numbers) >= 0
+        gone = present & (self._last_use <= limit_s)
+        if not np.isinf(limit_s):
+            gone &= self._last_use < self.model.extent.end_s - 1e-6
+        if not gone.any():
+            return np.empty(0, dtype=np.int64), self.final_to_s
+        to_s = self.end_s if np.isinf(limit_s) else float(self._last_use[gone].max())
+        return self.numbers[gone], to_s
+
+    def release(self) -> None:
+        """It is over and will not come back: give up what was only needed to fly it, for flights go on for hours."""
+        self._over = True
+        none = np.empty(0)
+        self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
+        self._need = self._first_use = self._last_use = none
+        self._row_done = self._entered = np.empty(0, dtype=bool)
+        self.numbers = np.empty(0, dtype=np.int64)
+
+    def is_gone(self, state: WindowState) -> bool:
+        """Whether nothing of it is left in the state."""
+        return self._over or not (state.places(self.numbers) >= 0).any()
+
+    def is_over(self, state: WindowState) -> bool:
+        """Whether it has been in the state and will not be again."""
+        return self._over or (self.ended and bool(self._entered.any()) and self.is_gone(state))

@@ -1,0 +1,89 @@
+"""Whether a point seen again agrees with what earlier strips say of it; ties that fail are dropped, the looks stay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ..adjustment.normal_equations import ControlWeights
+from .batch import Batch, inverse_factors
+from .state import WindowState
+
+Array = NDArray[np.floating]
+
+#: Probability that a good tie fails, at the door and in the window.
+AT_THE_DOOR, INSIDE = 1e-5, 1e-3
+#: Ties of one batch that are dropped before it is solved again: those that fail by this share of the worst, at least.
+TOGETHER = 0.5
+
+
+def admit_ties(batch: Batch, state: WindowState) -> list[str]:
+    """Drop the ties of a batch that is not in the state which contradict its rays; names of their points.
+
+    The place where the new rays meet, with the orientation as known, is compared with that of the earlier strips.
+    """
+    ties = batch.ties
+    if ties is None or not ties.active.any():
+        return []
+    theta, Q = state.values(batch.columns), state.covariance(batch.columns)
+    fails = np.zeros(batch.n_points, dtype=bool)
+    m = len(ties.columns)
+    for i in np.flatnonzero(ties.active):
+        A, J, residual, origin = batch.equations(int(i))
+        N = J.T @ J
+        if np.linalg.cond(N) > 1e12:
+            continue
+        spread = np.linalg.inv(N)
+        G = -spread @ J.T @ A
+        G[:, -m:] -= ties.modes[i]
+        off = origin + spread @ (J.T @ residual) - ties.xyz_l[i] + G @ theta
+        C = spread + np.linalg.inv(ties.root[i].T @ ties.root[i]) + G @ Q @ G.T
+        fails[i] = off @ np.linalg.solve(C, off) > chi2.isf(AT_THE_DOOR, 3)
+    return _drop(batch, fails)
+
+
+def snoop_ties(batches: Sequence[Batch], state: WindowState) -> list[str]:
+    """Drop ties of batches in the state that fail; names of their points. The state has to be solved again if any."""
+    limit = float(chi2.isf(INSIDE, 3))
+    values = [_joint(b, state) for b in batches]
+    worst = max((float(v.max(initial=0.0)) for v in values), default=0.0)
+    names = []
+    for batch, value in zip(batches, values, strict=True):
+        fails = value > max(limit, TOGETHER * worst)
+        if fails.any():
+            state.add(batch.columns, batch.information, -1)
+            names += _drop(batch, fails)
+            state.add(batch.columns, batch.information)
+    return names
+
+
+def _joint(batch: Batch, state: WindowState) -> Array:
+    """What the cost loses without each tie (p,); 0 for points without."""
+    if batch.ties is None or not batch.ties.active.any():
+        return np.zeros(batch.n_points)
+    theta = state.values(batch.columns)
+    batch.back_substitute(theta)
+    rows = batch.ties.rows(batch.origin_l, len(batch.columns))
+    through = rows.point @ np.swapaxes(inverse_factors(batch.normals), 1, 2)
+    design = rows.design - through @ batch.coupling
+    C = design @ state.covariance(batch.columns) @ np.swapaxes(design, 1, 2) + through @ np.swapaxes(through, 1, 2)
+    v = rows.residual - rows.design @ theta - np.einsum("pij,pj->pi", rows.point, batch.points_l - batch.origin_l)
+    left = np.eye(3) - C
+    value = np.einsum("pi,pij,pj->p", v, np.linalg.pinv(left, rcond=1e-6, hermitian=True), v)
+    return np.where(rows.active & (batch.normals.rank == 3), value, 0.0)
+
+
+def _drop(batch: Batch, fails: NDArray[np.bool_]) -> list[str]:
+    """Take the weight from ties; known coordinates that they stood for count themselves."""
+    assert batch.ties is not None
+    if not fails.any():
+        return []
+    batch.ties = replace(batch.ties, active=batch.ties.active & ~fails)
+    weight = np.where(fails[:, None], batch.ties.control, batch.control.weight)
+    batch.control = ControlWeights(weight, batch.control.xyz_l, int((weight > 0).sum()))
+    batch.eliminate()
+    return [batch.names[i] for i in np.flatnonzero(fails)]

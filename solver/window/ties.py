@@ -1,0 +1,302 @@
+"""What the strips flown so far say of points that a later strip sees again.
+
+Solving the block anew with every tie point is no on-line computation, so a later strip meets the earlier ones in short
+form. The points of some seconds of an earlier strip, a *patch*, share the errors of its orientation. The main
+directions of these joint errors, with the variance they have after the solution of the block, become a few unknowns of
+the window (their *modes*), ``p_i = p^_i + B_i s + e_i``; they enter when a point of the patch is seen again, with their
+correlation with the modes and additional parameters that are present, and are marginalised when the window has passed.
+What is left, ``e_i``, counts as independent from point to point. That costs about 1 % in RMSE of what becomes final
+against an adjustment with all the equations, and nothing after the backward pass (``bench/efficiency.py block``).
+
+Nothing is counted twice: what the later strip learnt about a patch is not handed back to it here, but when the block is
+solved again with all the equations (`archive`); a patch that has left is closed for the rest of the strip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment.linearisation import Linearisation
+from .archive import Archive, BlockSolution, KeptPoint
+from .batch import inverse_factors
+from .points import ControlPoint
+from .state import WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+#: Length of a patch along the strip, s.
+PATCH_S = 10.0
+#: Points from which the modes of a patch are made.
+SAMPLED = 60
+#: Modes whose variance is below this share of what the patch's points can tell about them are left out; modes at most.
+NEGLIGIBLE, MOST_MODES = 0.05, 32
+#: Modes in the window at most; while there are as many, points of further patches do not tie.
+MOST_PRESENT = 240
+#: Variance of a mode given those present, at least: of what all but follows from them.
+FLOOR = 1e-6
+
+
+@dataclass
+class Patch:
+    """Points of some seconds of a strip.
+
+    Attributes
+    ----------
+    strip : which
+    modes : its rows in the joint covariance of all modes
+    numbers : of its unknowns in the window, empty while they are not present
+    used_s : newest ray that touched it
+    closed : whether it has left
+    """
+
+    strip: str
+    modes: slice
+    numbers: IntArray
+    used_s: float = -np.inf
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class EarlierPoint:
+    """``p = xyz_l + modes @ s + e``, and ``root`` (3, 3) with ``root^T root`` the weight of e."""
+
+    patch: int
+    xyz_l: Array
+    modes: Array
+    root: Array
+    with_control: bool
+
+
+@dataclass(frozen=True)
+class TieRows:
+    """Whitened equations of p points: ``design @ theta + point @ (xyz - origin) = residual``; three a point."""
+
+    design: Array
+    point: Array
+    residual: Array
+    active: Bools
+
+    def joined(self, lin: Linearisation, point: IntArray) -> tuple[Linearisation, IntArray]:
+        """With the observations of rays, as two more rays a point."""
+        p = len(self.point)
+        first, second = self.point[:, :2].transpose(1, 2, 0), np.zeros((2, 3, p))
+        second[0] = self.point[:, 2].T
+        rest = np.stack([self.residual[:, 2], np.zeros(p)])
+        both = replace(
+            lin,
+            residual=np.concatenate([lin.residual, self.residual[:, :2].T, rest], axis=1),
+            point=np.concatenate([lin.point, first, second], axis=2),
+        )
+        return both, np.concatenate([point, np.tile(np.arange(p), 2)])
+
+
+@dataclass
+class PointTies:
+    """What earlier strips say of the p points of a batch.
+
+    Attributes
+    ----------
+    columns : (m,) unknowns of the window that stand for earlier strips, the last ones of the batch
+    xyz_l, modes, root : (p, 3), (p, 3, m), (p, 3, 3) see `EarlierPoint`
+    control : (p, 3) weights of known coordinates, whether or not an earlier strip has used them
+    active : (p,) False where the tie failed its test
+    """
+
+    columns: IntArray
+    xyz_l: Array
+    modes: Array
+    root: Array
+    control: Array
+    active: Bools
+
+    def rows(self, origin_l: Array, n_unknowns: int) -> TieRows:
+        """Equations of all points, zero where they are not active."""
+        root = np.where(self.active[:, None, None], self.root, 0.0)
+        design = np.zeros((len(root), 3, n_unknowns))
+        design[:, :, n_unknowns - len(self.columns) :] = -root @ self.modes
+        return TieRows(design, root, np.einsum("pij,pj->pi", root, self.xyz_l - origin_l), self.active)
+
+
+class EarlierStrips:
+    """Points of the block as it was solved last, and which of their modes are in the window.
+
+    Attributes
+    ----------
+    points : by name
+    full : how often a point could not tie for want of room
+    """
+
+    def __init__(self, state: WindowState, camera_columns: IntArray) -> None:
+        self.points: dict[str, EarlierPoint] = {}
+        self.full = 0
+        self._state, self._camera = state, camera_columns
+        self._patches: list[Patch] = []
+        self._covariance = np.empty((0, 0))
+        self._camera_values = np.zeros(len(camera_columns))
+
+    @property
+    def present(self) -> bool:
+        """Whether modes are in the window."""
+        return any(len(p.numbers) for p in self._patches)
+
+    def learn(self, archive: Archive, solution: BlockSolution) -> None:
+        """Take the points of a solution of the block in place of those known so far."""
+        members: dict[tuple[str, int], list[tuple[str, KeptPoint]]] = {}
+        for name, kept in archive.points.items():
+            strip = max(kept.strips, key=list(archive.strips).index)
+            part = int(kept.time_s // PATCH_S) if len(archive.strips[strip].entered) > 4 * MOST_MODES else 0
+            members.setdefault((strip, part), []).append((name, kept))
+        self.points, self._patches = {}, []
+        functionals: list[Array] = []
+        first = 0
+        for (strip, _), kept in members.items():
+            found, M = _patch(kept, solution)
+            functionals.append(M)
+            for (name, k), (xyz, B, root) in zip(kept, found, strict=True):
+                self.points[name] = EarlierPoint(len(self._patches), xyz, B, root, k.with_control)
+            self._patches.append(Patch(strip, slice(first, first + len(M)), np.empty(0, dtype=np.int64)))
+            first += len(M)
+        camera = np.zeros((len(self._camera), len(solution.numbers)))
+        camera[np.arange(len(camera)), solution.places(self._camera)] = 1.0
+        M = np.concatenate([*functionals, camera])
+        self._covariance = M @ solution.cofactors @ M.T
+        self._camera_values = solution.of(self._camera)[0]
+
+    # -- in the window -------------------------------------------------------------------------------------------------
+
+    def enter(self, name: str, time_s: float) -> bool:
+        """Make the modes of a point's patch present; False where it cannot tie.
+
+        Parameters
+        ----------
+        time_s : newest ray that will touch it
+        """
+        point = self.points.get(name)
+        if point is None:
+            return False
+        patch = self._patches[point.patch]
+        if patch.closed:
+            return False
+        if not len(patch.numbers):
+            here = [p for p in self._patches if len(p.numbers)]
+            m = patch.modes.stop - patch.modes.start
+            if sum(len(p.numbers) for p in here) + m > MOST_PRESENT:
+                self.full += 1
+                return False
+            patch.numbers = self._state.new_numbers(m)
+            self._state.enter(patch.numbers)
+            self._observe(patch, here)
+        patch.used_s = max(patch.used_s, time_s)
+        return True
+
+    def _observe(self, patch: Patch, here: Sequence[Patch]) -> None:
+        """What is known of modes that enter, given those present and the additional parameters."""
+        S = self._covariance
+        given = np.concatenate(
+            [np.arange(len(S))[p.modes] for p in here] + [len(S) - len(self._camera) + np.arange(len(self._camera))]
+        )
+        own = np.arange(len(S))[patch.modes]
+        numbers = np.concatenate([*(p.numbers for p in here), self._camera])
+        scale = np.sqrt(np.maximum(S[given, given], 1e-300))
+        known = S[np.ix_(given, given)] / scale[:, None] / scale + FLOOR * np.eye(len(given))
+        K = np.linalg.solve(known, S[np.ix_(given, own)] / scale[:, None]).T / scale
+        V = S[np.ix_(own, own)] - K @ S[np.ix_(given, own)]
+        root = np.linalg.inv(np.linalg.cholesky(V + FLOOR * np.eye(len(own))))
+        rows = np.concatenate([root, -root @ K], axis=1)
+        value = -root @ K[:, len(given) - len(self._camera) :] @ self._camera_values
+        columns = np.tile(np.concatenate([patch.numbers, numbers]), (len(own), 1))
+        self._state.observe(columns.astype(np.int32), rows, value, np.ones(len(own)))
+
+    def ties(self, names: Sequence[str], control: Array) -> PointTies:
+        """Of points whose patches are present; ``control`` (p, 3) are the weights of their known coordinates."""
+        points = [self.points[name] for name in names]
+        columns, starts = [], {}
+        for patch in sorted({p.patch for p in points}):
+            starts[patch] = sum(len(c) for c in columns)
+            columns.append(self._patches[patch].numbers)
+        numbers = np.concatenate(columns)
+        modes = np.zeros((len(points), 3, len(numbers)))
+        for i, p in enumerate(points):
+            modes[i, :, starts[p.patch] : starts[p.patch] + p.modes.shape[1]] = p.modes
+        return PointTies(
+            numbers, np.array([p.xyz_l for p in points]), modes, np.array([p.root for p in points]), control,
+            np.ones(len(points), dtype=bool),
+        )  # fmt: skip
+
+    def with_control(self, names: Sequence[str]) -> Bools:
+        """Which points have known coordinates in them already."""
+        return np.array([self.points[n].with_control for n in names])
+
+    def add_control(self, name: str, control: ControlPoint) -> bool:
+        """Known coordinates of a point of an earlier strip that came late; whether they count in the window now."""
+        point, weight = self.points.get(name), control.weight
+        if point is None or point.with_control or not weight.any() or not self.enter(name, -np.inf):
+            return False
+        axes = np.flatnonzero(weight > 0)
+        spread = np.linalg.inv(point.root.T @ point.root)
+        noise = spread[np.ix_(axes, axes)] + np.diag(1.0 / weight[axes])
+        root = np.linalg.inv(np.linalg.cholesky(noise))
+        numbers = self._patches[point.patch].numbers
+        off = np.nan_to_num(control.xyz_l)[axes] - point.xyz_l[axes]
+        columns = np.tile(numbers, (len(axes), 1)).astype(np.int32)
+        self._state.observe(columns, root @ point.modes[axes], root @ off, np.ones(len(axes)))
+        own = point.root.T @ point.root
+        N = own + np.diag(weight)
+        target = own @ point.xyz_l + weight * np.nan_to_num(control.xyz_l)
+        self.points[name] = EarlierPoint(
+            point.patch,
+            np.linalg.solve(N, target),
+            np.linalg.solve(N, own @ point.modes),
+            np.linalg.cholesky(N).T,
+            True,
+        )
+        return True
+
+    def leaving(self, limit_s: float, used: Iterable[IntArray]) -> IntArray:
+        """Modes that no batch in the window (columns of each) touches and none will; their patches are closed."""
+        if not self.present:
+            return np.empty(0, dtype=np.int64)
+        busy = {int(c) for columns in used for c in columns}
+        gone = []
+        for patch in self._patches:
+            if len(patch.numbers) and patch.used_s <= limit_s and int(patch.numbers[0]) not in busy:
+                gone.append(patch.numbers)
+                patch.numbers, patch.closed = np.empty(0, dtype=np.int64), True
+        return np.concatenate(gone) if gone else np.empty(0, dtype=np.int64)
+
+
+def _patch(
+    kept: Sequence[tuple[str, KeptPoint]], solution: BlockSolution
+) -> tuple[list[tuple[Array, Array, Array]], Array]:
+    """Points of a patch as (place, modes, root of the weight of the rest), and the modes as functions (r, n) of all
+    unknowns."""
+    xyz, own, rows = [], [], []
+    columns = np.unique(np.concatenate([k.left.columns for _, k in kept]))
+    theta, Q = solution.of(columns)
+    for _, k in kept:
+        L = inverse_factors(k.left.normals)[k.place].T
+        D = np.zeros((3, len(columns)))
+        D[:, np.searchsorted(columns, k.left.columns)] = k.left.coupling[k.place]
+        xyz.append(k.left.origin_l[k.place] + L @ (k.left.normals.y[:, k.place] - D @ theta))
+        own.append(L @ L.T)
+        rows.append(-L @ D)
+    P, noise = np.array(rows), np.array(own)
+    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), SAMPLED)).astype(int))
+    weight = 1.0 / np.sqrt(np.einsum("pii->pi", noise[chosen])).reshape(-1, 1)
+    sample = P[chosen].reshape(-1, len(columns)) * weight
+    values, vectors = np.linalg.eigh(sample @ Q @ sample.T)
+    r = min(int((values * len(kept) / len(chosen) > NEGLIGIBLE).sum()), MOST_MODES)
+    r = max(r, 1)
+    M = (vectors[:, -r:] / np.sqrt(np.maximum(values[-r:], 1e-300))).T @ sample
+    B = P @ (Q @ M.T)
+    rest = P @ Q @ np.swapaxes(P, 1, 2) + noise - B @ np.swapaxes(B, 1, 2)
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(rest)), 1, 2)
+    whole = np.zeros((r, len(solution.numbers)))
+    whole[:, solution.places(columns)] = M
+    return list(zip(xyz, B, root, strict=True)), whole

@@ -1,0 +1,219 @@
+"""What watches over the window besides data snooping: integrity, sources that drift, determinability, the light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment.determinability import Limits
+from ..camera import LineCamera
+from ..selfcalibration import SelfCalibration
+from .batch import Batch, Information
+from .determinability import Determinability, Standing, ranks
+from .integrity import Exposure, Integrity
+from .light import Situation, light
+from .points import PointLooks
+from .settle import refused_control
+from .sources import BiasedSource, Group, SourceMonitor
+from .state import Marginal, WindowState
+from .strip import WindowStrip
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Level of the tests of parameters on line; they are made again and again.
+ALPHA = 0.01
+#: Steps of the determinability test in one update before the first sweep is over, and updates between two later on.
+STEPS, STEP_EVERY = 2, 2
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The findings of one update.
+
+    Attributes
+    ----------
+    light, reason : see `light`
+    exposure : at the newest time, None without tie points
+    time_s : of that
+    sources : those that drift
+    standing : of the additional parameters
+    events : for the operator
+    sigma, protection : (6,) of the newest orientation, m and rad
+    """
+
+    light: str
+    reason: str
+    exposure: Exposure | None
+    time_s: float
+    sources: tuple[BiasedSource, ...]
+    standing: tuple[Standing, ...]
+    events: tuple[str, ...]
+    sigma: Array
+    protection: Array
+
+    @property
+    def names(self) -> frozenset[Group]:
+        """The sources that drift."""
+        return frozenset((s.source, s.ccd) for s in self.sources)
+
+
+@dataclass(frozen=True)
+class _Count:
+    """Of a batch, as long as its information is this: points of which nothing is left, control coordinates (3,) in use,
+    control points of which nothing is left."""
+
+    information: Information
+    refused: int
+    has_control: bool
+    control: Array
+    control_refused: int
+
+
+class Watch:
+    """Runs once an update; what costs much is spread over updates.
+
+    Parameters
+    ----------
+    determine : whether additional parameters enter only when they are determined
+    """
+
+    def __init__(
+        self,
+        camera: LineCamera,
+        critical: float,
+        points: dict[str, PointLooks],
+        self_calibration: SelfCalibration | None,
+        camera_columns: IntArray,
+        state: WindowState,
+        determine: bool,
+    ) -> None:
+        self._integrity = Integrity(critical)
+        self._sources = SourceMonitor()
+        self._points, self._state = points, state
+        self._ccds = [line.id for line in camera.lines]
+        self._pitch = float(np.median(np.linalg.norm(np.diff(camera.lines[0].xy_mm[:2], axis=0), axis=1)))
+        self._focal = float(camera.focal_length_mm[0])
+        self._determinability: Determinability | None = None
+        if self_calibration is not None and determine:
+            nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id
+            order = ranks(self_calibration, nadir)
+            self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
+            self._determinability.hold(state)
+        self._count = 0
+        self._counts: dict[int, _Count] = {}
+        self.exposure: Exposure | None = None
+
+    @property
+    def most_exposed(self) -> Batch | None:
+        """The batch to be tested before all others, if it is in the window."""
+        return self._integrity.most_exposed
+
+    def drop(self, batch: Batch) -> None:
+        """A batch is taken apart."""
+        self._integrity.drop(batch)
+
+    def leaving(self, batches: list[Batch], before_s: float) -> None:
+        """Batches leave the window; what left before a time is forgotten."""
+        self._integrity.note(batches)
+        self._integrity.leave(batches, self._state, before_s)
+        self._sources.leave(batches, self._state, self._groups)
+
+    def marginalised(self, marginal: Marginal) -> None:
+        """Unknowns have left the window."""
+        self._integrity.marginalised(marginal)
+        self._sources.marginalised(marginal)
+
+    def exposure_at(self, strip: WindowStrip, time_s: float, renew: bool = False) -> Exposure | None:
+        """Exposure of the orientation at a time of a strip; None if its unknowns are not there."""
+        design = strip.design([time_s])
+        numbers = np.unique(design.columns)
+        numbers = numbers[numbers >= 0].astype(np.int64)
+        if not len(numbers) or (self._state.places(numbers) < 0).any():
+            return None
+        A = np.zeros((6, len(numbers) + 1))
+        local = np.where(design.columns[0] >= 0, np.searchsorted(numbers, design.columns[0]), len(numbers))
+        A[np.arange(6), local] += design.coefficients[0][:, None]
+        return self._integrity.at(numbers, A[:, :-1], self._state, renew)
+
+    def look(
+        self,
+        now_s: float,
+        length_s: float,
+        strip: WindowStrip | None,
+        batches: list[Batch],
+        changed: list[Batch],
+        sigma0: float,
+        redundancy: int,
+        total: tuple[float, int],
+        apriori_m: Array,
+    ) -> Watched:
+        """Findings of an update.
+
+        Parameters
+        ----------
+        strip : the newest one, None if all are over
+        batches, changed : of the window; those judged in this update
+        sigma0, redundancy, total : over the window, since the start
+        apriori_m : (3,) sigma of the position beforehand
+        """
+        self._count += 1
+        self._integrity.note(changed)
+        time_s = -np.inf
+        self.exposure = None
+        if strip is not None and batches:
+            time_s = min(now_s, strip.end_s)
+            self.exposure = self.exposure_at(strip, time_s, renew=True)
+        self._sources.update(now_s, batches, self._state, self._groups)
+        events: list[str] = []
+        d = self._determinability
+        if d is not None:
+            for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
+                events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
+        self._counts = {id(b): self._count_of(b) for b in batches}
+        points = sum(b.n_points for b in batches)
+        refused = sum(c.refused for c in self._counts.values())
+        known = [c for c in self._counts.values() if c.has_control]
+        control = sum((c.control for c in known), np.zeros(3))
+        control_refused = sum(c.control_refused for c in known)
+        since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
+        colour, reason = light(
+            Situation(
+                strip is not None, length_s, since_s, sigma0, redundancy, points, refused, control_refused, control,
+                apriori_m, self.exposure, self._sources.biased,
+            )
+        )  # fmt: skip
+        standing = tuple(d.standing()) if d is not None else ()
+        sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
+        protection = sigma if self.exposure is None else self.exposure.protection(sigma)
+        return Watched(
+            colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events), sigma, protection
+        )
+
+    def _count_of(self, batch: Batch) -> _Count:
+        """Anew only if the batch has changed."""
+        count = self._counts.get(id(batch))
+        if count is not None and count.information is batch.information:
+            return count
+        kept = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points) > 0
+        control = ((batch.control.weight > 0) & kept[:, None]).sum(axis=0)
+        refused = batch.n_points - int(kept.sum())
+        return _Count(batch.information, refused, bool(batch.active_control), control, refused_control(batch))
+
+    def _groups(self, batch: Batch) -> list[Group]:
+        """Source and CCD line of each ray."""
+        rays = batch.rays
+        looks = [self._points[name].looks for name in batch.names]
+        return [
+            (looks[p][s].source, self._ccds[c])
+            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
+        ]
+
+    def _gsd(self, batches: list[Batch]) -> float:
+        if not batches:
+            return 1.0
+        rays = batches[-1].rays
+        height = np.abs(rays.position_l[:, 2] - batches[-1].points_l[rays.point, 2])
+        return float(np.median(height)) * self._pitch / self._focal
