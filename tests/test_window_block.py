@@ -18,7 +18,7 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
-from triline.solver.window import archive
+from triline.solver.window import archive as window_archive
 from triline.solver.window.results import WindowOptions
 
 #: Two strips side by side, and one across them.
