@@ -140,6 +140,30 @@ def test_the_effect_of_an_undetected_error_is_what_the_adjustment_makes_of_it(fl
     np.testing.assert_allclose(seen["said"], seen["is"], atol=1e-6 * scale)
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_has_been_rejected_exposes_nothing_any_more(flight):
+    simulation, poses = flight
+    named = {}
+
+    def watch(now, window):
+        if named or now < 30.0:
+            return
+        integrity = window._watch._integrity
+        numbers = window.strips["S1"].numbers[:6]
+        control = [e for b in integrity._of_batch.values() for e in b.exposed if e.ray < 0]
+        if not control:
+            return
+        for e in control:
+            e.leverage, e.rows = 1e6, 100.0 * e.rows
+        named["before"] = integrity.at(numbers, np.eye(6), window.state).control
+        for e in control:
+            e.batch.control.weight[e.point, e.axis] = 0.0
+        named["after"] = integrity.at(numbers, np.eye(6), window.state).control
+
+    adjust_online(simulation, poses, live=False, watch=watch)
+    assert named == {"before": True, "after": False}
+
+
 def _spread(state, columns, values):
     full = np.zeros(len(state))
     full[state.places(columns)] = values

@@ -86,6 +86,12 @@ class _Exposed:
     inverse: Array
     leverage: float
 
+    @property
+    def counts(self) -> bool:
+        """Whether it has not been rejected since."""
+        weight = self.batch.weight[self.ray] if self.ray >= 0 else self.batch.control.weight[self.point, self.axis]
+        return bool(weight > 0)
+
     def renew(self, R: Array) -> None:
         """Figures for other cofactors (k, k) of its prediction."""
         C = self.own - R
@@ -130,7 +136,7 @@ class Integrity:
         for batch in batches:
             known = self._of_batch.pop(id(batch), None)
             if known is not None:
-                self._left.add(known.exposed, known.rest, batch.newest_s, state)
+                self._left.add([e for e in known.exposed if e.counts], known.rest, batch.newest_s, state)
         self._left.forget(before_s)
 
     def marginalised(self, marginal: Marginal) -> None:
@@ -210,7 +216,7 @@ class Integrity:
         rest = max((b.rest for b in self._of_batch.values()), default=0.0)
         rest = max([rest, self._left.bound(), *(e.leverage for e in ranked[OF_WINDOW:][:1])])
         bias = self._delta * np.sqrt(rest) * sigma
-        near = ranked[:OF_WINDOW]
+        near = [e for e in ranked[:OF_WINDOW] if e.counts]
         on_near = [e.rows @ Qg[state.places(e.batch.columns)] for e in near]
         observations = near + self._left.exposed
         worst: _Exposed | None = None
