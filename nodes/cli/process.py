@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -130,8 +131,10 @@ def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
         counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
         lines.append(f"  left out: {counted}" + (f"; the last: {summary.last_problem}" if summary.last_problem else ""))
     for name, counters in summary.counters.items():
-        if counters:
-            counted = ", ".join(f"{n} {kind}" for kind, n in counters.items())
+        if any(counters.values()):
+            by_number = sorted(((n, kind) for kind, n in counters.items() if n), key=lambda c: (-c[0], c[1]))
+            counted = ", ".join(f"{n} {kind}" for n, kind in by_number)
             last = summary.problems.get(name)
-            lines.append(f"  {name}: {counted}" + (f"; the last: {last}" if last else ""))
+            text = f"{name}: {counted}" + (f"; the last: {last}" if last else "")
+            lines += textwrap.wrap(text, 116, initial_indent="  ", subsequent_indent="    ", break_long_words=False)
     return lines
