@@ -179,9 +179,11 @@ class Sequencer(Generic[T]):
     high rate, or that the table grants grace) must also have been silent for ``grace_s`` (or that grace) of waiting
     time, so that a machine that hesitates does not change the order. A topic on which something is said only now and
     then (control, strips) or in bursts holds nothing up while its publisher is heard on other topics: a session
-    delivers in the order in which it was published. What arrives after its place has passed leaves at once, and is
-    called late. Observations may be stamped ahead (when they are to be used), so they do not tell how far platform time
-    is, unless nobody else does or a steady stream has died.
+    delivers in the order in which it was published, and the stamps of a source never go back from one of its topics to
+    the next. A topic without allowed lateness holds nothing up while nobody speaks on it: before it was heard, and
+    after its grace. What arrives after its place has passed leaves at once, and is called late. Observations may be
+    stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or a
+    steady stream has died.
 
     Parameters
     ----------
@@ -200,7 +202,7 @@ class Sequencer(Generic[T]):
         self._time_ns: int | None = None  # the same without observations
         self._released: Key | None = None
         self._streams: dict[tuple[str, str], _Watermark] = {}
-        self._sources: dict[str, int] = {}  # newest stamp of each, without observations
+        self._sources: dict[str, tuple[int, tuple[int, str, str]]] = {}  # newest stamp of each, and its place
         self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
         self._started_s: float | None = None
 
@@ -227,12 +229,11 @@ class Sequencer(Generic[T]):
             self._unheard.pop(row.name, None)
             place = (topics.rank(topic), topic, envelope.source)
             lateness, grace_s = self._patience(row)
-            on_events = row.in_bursts or (row.rate_hz == 0 and row.family is not Family.OBSERVATION)
-            stream = _Watermark(place, lateness, grace_s, on_events, stamp, now_s)
+            stream = _Watermark(place, lateness, grace_s, row.in_bursts or row.rate_hz == 0, stamp, now_s)
             self._streams[topic, envelope.source] = stream
         stream.latest_ns = max(stream.latest_ns, stamp)
-        if topics.find(topic).family is not Family.OBSERVATION:  # those may be stamped ahead
-            self._sources[envelope.source] = max(self._sources.get(envelope.source, stamp), stamp)
+        said = stamp, (topics.rank(topic), topic, envelope.source)
+        self._sources[envelope.source] = max(self._sources.get(envelope.source, said), said)
         stream.heard_s = now_s
         key = order_key(topic, envelope)
         if self._released is not None and key < self._released:
@@ -269,19 +270,25 @@ class Sequencer(Generic[T]):
         stamp, rank, topic, source = key[:4]
         newest_ns, time_ns = self._newest_ns, self.newest_ns
         assert newest_ns is not None and time_ns is not None and self._started_s is not None
+        place = (rank, topic, source)
         for stream in self._streams.values():
-            if stream.place == (rank, topic, source):
+            if stream.place == place:
                 continue
-            bound = self._sources.get(stream.place[2], stream.latest_ns) if stream.on_events else stream.latest_ns
-            if not now_s - stream.heard_s < stream.grace_s:
-                bound = max(bound, (newest_ns if stream.grace_s else time_ns) - stream.lateness_ns)
-            if bound < stamp or (bound == stamp and stream.place < (rank, topic, source)):
+            silent = not now_s - stream.heard_s < stream.grace_s
+            if silent and not stream.lateness_ns:
+                continue
+            bound = stream.latest_ns, stream.place
+            if stream.on_events:
+                bound = max(bound, self._sources[stream.place[2]])
+            if silent:
+                bound = max(bound, ((newest_ns if stream.grace_s else time_ns) - stream.lateness_ns, stream.place))
+            if bound < (stamp, place):
                 return False
         for row in self._unheard.values():
             lateness, grace_s = self._patience(row)
             if now_s - self._started_s < min(grace_s, self._grace_s):
                 return False
-            if (newest_ns if grace_s else time_ns) - lateness <= stamp:
+            if lateness and (newest_ns if grace_s else time_ns) - lateness <= stamp:
                 return False
         return True
 

@@ -44,7 +44,9 @@ class Topic:
     family : who makes it
     rate_hz : typical rate, 0 = on events
     queue : policy of the bounded queue in front of a subscriber
-    allowed_lateness_ms : platform time within which a message may arrive after its turn without changing a result
+    allowed_lateness_ms : platform time within which a message may arrive after its turn without changing a result;
+        0 = its publisher stamps it ahead of time, or has said something before it that makes others wait: as long as
+        nobody speaks on it, it holds nothing up
     recorded : whether the recorder keeps it
     latched : whether all that was sent so far is handed to whoever joins later
     grace_s : waiting time for which whoever needs its order waits for it when it falls silent, s; 0 = by its rate alone
@@ -89,11 +91,13 @@ TOPICS: tuple[Topic, ...] = (
     Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST),
     Topic("trajectory/filtered", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
     Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100, in_bursts=True),
-    Topic("observation/control", m.GroundPoint, _O, 0, latched=True),
-    Topic("observation/verdict", m.Verdict, _O, 0),
+    # known before the flight, or stamped half a second ahead
+    Topic("observation/control", m.GroundPoint, _O, 0, allowed_lateness_ms=0, latched=True),
+    Topic("observation/verdict", m.Verdict, _O, 0, allowed_lateness_ms=0),
     Topic("observation/tie", m.TiePoint, _O, 50),
     Topic("observation/target", m.TargetLook, _O, 0),
-    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=1000, recorded=False, grace_s=3.0),
+    # whoever makes ties late speaks here before the first of them
+    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=0, recorded=False, grace_s=3.0),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=200),

@@ -76,6 +76,39 @@ def test_live_and_process_give_the_same_messages(rig, tmp_path):
     assert payloads(again, "orientation/final") == payloads(processed, "orientation/final")
 
 
+def test_nobody_is_waited_for_who_is_not_there(rig, tmp_path):
+    """A tie point is worked in as soon as a pose after it has come, with no matcher that could have others.
+
+    Platform time stands still until the answer is there; what is told again meanwhile keeps the node from taking the
+    silence for the end.
+    """
+    navigated = tmp_path / "navigated.mcap"
+    assert triline("process", simulated_flight(), "-o", navigated, "--nodes", "navigator").returncode == 0
+    wanted = (
+        "configuration/project", "configuration/camera", "configuration/strip", "observation/control",
+        "observation/tie", "trajectory/filtered", "trajectory/smoothed",
+    )  # fmt: skip
+    messages = list(RecordingReader(navigated).sorted_messages(wanted))
+    times = sorted(message.stamp_ns for message in messages if message.topic == "observation/tie")
+    asked = times[:: max(len(times) // 6, 1)]
+    rig.start("node", "adjuster", "--set", "update_rays=1", "--set", 'pace="normal"')
+    answered: set[int] = set()
+    with Bus(port=rig.port) as bus:
+        bus.prepare(wanted)
+        bus.subscribe("adjustment/report", lambda raw: answered.add(raw.envelope.stamp_ns))
+        wait_for(lambda: "adjuster" in bus.alive(), 20, "the adjuster")
+        for message in messages:
+            while asked and message.stamp_ns > asked[0] + 120_000_000:  # 100 ms until smoothed poses were heard
+
+                def told(stamp_ns: int = asked[0]) -> bool:
+                    bus.publish(messages[0])
+                    return stamp_ns in answered
+
+                wait_for(told, 20, f"the answer to the tie point of {asked.pop(0)}")
+            bus.publish(message)
+    assert not asked
+
+
 class Chain(Node):
     """An order-dependent node: its output is a running product over all inputs."""
 

@@ -151,6 +151,61 @@ def test_reports_of_a_busy_adjuster_come_in_order_and_rare_ones_hold_nothing_up(
     assert max(w for (_, e), w in waited.items() if e.stamp_ns < begin + 2900 * MS) < 1600  # no longer than for live
 
 
+ADJUSTER = (
+    "configuration/strip", "trajectory/filtered", "trajectory/smoothed", "observation/control", "observation/verdict",
+    "observation/tie", "observation/progress",
+)  # fmt: skip
+
+
+def held(messages, inputs):
+    """Platform time, ms, for which each message is held that leaves; waiting time goes with it."""
+    sequencer: Sequencer = Sequencer(inputs)
+    waited, late = {}, []
+    for topic, envelope in messages:
+        now = envelope.stamp_ns / 1e9
+        late += filter(None, [sequencer.push(topic, envelope, (topic, envelope), now)])
+        for left in sequencer.pop(now):
+            waited[left] = (envelope.stamp_ns - left[1].stamp_ns) / MS
+    assert not late
+    return waited
+
+
+def stream(topic, source, times_ms):
+    return [(topic, Envelope(t * MS, source, i)) for i, t in enumerate(times_ms)]
+
+
+def test_who_is_not_there_holds_nothing_up():
+    """Without matcher, without verdicts and with control that was sent long ago a tie waits for the next pose alone."""
+    ground = stream("configuration/strip", "s", [0]) + stream("observation/control", "s", [0])
+    poses, ties = (
+        stream("trajectory/filtered", "n", range(1, 6000, 5)),
+        stream("observation/tie", "s", range(3, 6000, 7)),
+    )
+    smoothed = stream("trajectory/smoothed", "n", [1] * 5)
+    waited = held(sorted([*ground, *poses, *smoothed, *ties], key=lambda m: order_key(*m)), ADJUSTER)
+    later = [w for (topic, e), w in waited.items() if topic == "observation/tie" and e.stamp_ns > 1000 * MS]
+    assert len(later) > 700 and max(later) <= 5
+    later = [w for (topic, e), w in waited.items() if topic == "trajectory/filtered" and e.stamp_ns > 1000 * MS]
+    assert len(later) > 900 and max(later) <= 7
+
+
+def test_a_matcher_is_waited_for_while_it_speaks_and_for_its_grace():
+    """It is a second behind, its words are stamped 0.8 s ahead, its first tie comes after them; it dies at 2 s."""
+    poses = [(m[1].stamp_ns / MS, m) for m in stream("trajectory/filtered", "n", range(0, 9000, 5))]
+    words = [(m[1].stamp_ns / MS + 200, m) for m in stream("observation/progress", "m", range(800, 1800, 40))]
+    ties = [(m[1].stamp_ns / MS + 200, m) for m in stream("observation/tie", "m", range(1220, 1800, 40))]
+    sequencer: Sequencer = Sequencer(("trajectory/filtered", "observation/tie", "observation/progress"))
+    out, late = [], []
+    for at, (topic, envelope) in sorted([*poses, *words, *ties], key=lambda m: (m[0], order_key(*m[1]))):
+        late += filter(None, [sequencer.push(topic, envelope, (at, topic, envelope), at / 1e3)])
+        out += [(at, topic, envelope) for _, topic, envelope in sequencer.pop(at / 1e3)]
+    assert {topic for _, topic, _ in late} <= {"observation/progress"}  # of the time before it was heard
+    assert sum(topic == "observation/tie" for _, topic, _ in out) == len(ties)
+    of_poses = [(at, at - e.stamp_ns / MS) for at, topic, e in out if topic == "trajectory/filtered"]
+    assert max(w for at, w in of_poses if at > 5100) <= 50  # it tells nothing any more: 50 ms for its ties
+    assert max(w for at, w in of_poses) > 2900
+
+
 def test_equal_stamps_leave_by_their_place_in_the_topic_table():
     names = ("observation/tie", "trajectory/filtered", "sensor/gnss", "configuration/strip")
     messages = [(name, Envelope(10**9, "x", 0)) for name in names]
