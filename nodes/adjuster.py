@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -21,7 +22,9 @@ from .node import Message, Node
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
-PACES = ("load", "normal")
+PACES = ("load", "normal", "throughput")
+#: Platform time between updates at the pace for throughput, s.
+THROUGHPUT_S = 2.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -44,7 +47,9 @@ class Adjuster(Node):
     update_s : platform time between updates
     update_rays : waiting image points after which an update does not wait for its time
     pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
-        the flight was recorded; "normal", everything at its time, however long it takes
+        the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
+        of long flights: an update every 2 s with what came till then, from smoothed poses alone where there are any,
+        and the live orientation with the update
     self_calibration : set of additional parameters, or "none"
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
@@ -108,8 +113,10 @@ class Adjuster(Node):
             model=model, segment_s=segment_s or 0.0, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
             settle_s=settle_s, snoop=snoop,
         )  # fmt: skip
-        self._update_ns = round(update_s * convert.SECOND_NS)
-        self._update_rays, self._by_load = update_rays, pace == "load"
+        self._early = pace != "throughput"  # whether answers are wanted early
+        self._update_ns = round((update_s if self._early else max(update_s, THROUGHPUT_S)) * convert.SECOND_NS)
+        self._update_rays = update_rays if self._early else sys.maxsize
+        self._by_load = pace == "load"
         self._rays_waiting = 0
         self._pacing, self._governor = Pacing(), Governor()
         self._self_calibration = self_calibration
@@ -120,7 +127,7 @@ class Adjuster(Node):
         self._reference_ns = 0
         self._next_update_ns: int | None = None
         self._stamp_ns = 0
-        self._strips = StripDesk(apriori == "trajectory", self.counters)
+        self._strips = StripDesk(apriori == "trajectory", self.counters, smoothed_only=not self._early)
         self._poses = self._strips.poses
         self._teller = Teller(self.name, self.counters, self._poses)
         self._next_live = -np.inf
@@ -150,9 +157,13 @@ class Adjuster(Node):
     def finish(self) -> Iterable[Message]:
         if self._window is None:
             return ()
-        self._hand_over_poses()
-        self._take_ties()
-        return self._results(self._window.finish())
+        outputs: list[Message] = []
+        if self._early:
+            self._hand_over_poses()
+            self._take_ties()
+        else:  # what the smoother still held reaches further than the last update
+            outputs += self._update(self._stamp_ns)
+        return outputs + self._results(self._window.finish())
 
     def state(self) -> str:
         if self._window is not None:
@@ -321,6 +332,8 @@ class Adjuster(Node):
             self._begin_held()
         if not (smoothed and self._poses.filtered_seen):
             self._newest_pose_s = time_s
+        if not self._early:
+            return []
         # without a filter (an imported trajectory) the smoothed poses lead
         if smoothed and self._poses.filtered_seen:
             return []
@@ -350,6 +363,17 @@ class Adjuster(Node):
         self._teller.store.add_live([message.body for message in outputs])
         return outputs
 
+    def _live_since(self) -> list[Message]:
+        """Live orientation on the grid up to the newest pose that the window has, since the last one."""
+        assert self._window is not None
+        begin_s, end_s = self._next_live, self._window.trajectory.end_s
+        outputs = []
+        for orientation in self._window.live_between(begin_s, end_s):
+            outputs += self._teller.live(orientation, self._stamp_ns)
+        self._next_live = max(begin_s, end_s)
+        self._teller.store.add_live([message.body for message in outputs])
+        return outputs
+
     def _update_if_due(self, stamp_ns: int) -> list[Message]:
         if self._window is None:
             return []
@@ -366,9 +390,13 @@ class Adjuster(Node):
         assert self._window is not None
         self._rays_waiting = 0
         self._hand_over_poses()
-        self._strips.use_to(self._seconds(now_ns))
+        now_s = self._seconds(now_ns)
+        if not self._early and np.isfinite(self._window.trajectory.end_s):  # its length counts from the newest pose
+            now_s = min(now_s, self._window.trajectory.end_s)
+        self._strips.use_to(now_s)
         self._take_ties()
-        return self._results(self._window.update(self._seconds(now_ns)))
+        outputs = self._results(self._window.update(now_s))
+        return outputs if self._early else outputs + self._live_since()
 
     @property
     def _interval_ns(self) -> int:

@@ -23,6 +23,7 @@ class StripDesk:
     ----------
     by_poses : weights of slow errors may be larger than what is known beforehand, where the poses say so
     counters : of the node
+    smoothed_only : filtered poses say how good the trajectory is, but are not handed over where there are smoothed ones
 
     Attributes
     ----------
@@ -31,10 +32,10 @@ class StripDesk:
     poses : measured poses since the last hand-over
     """
 
-    def __init__(self, by_poses: bool, counters: Counter[str]) -> None:
+    def __init__(self, by_poses: bool, counters: Counter[str], smoothed_only: bool = False) -> None:
         self._by_poses, self._counters = by_poses, counters
         self.bodies: dict[str, Any] = {}
-        self.poses = PoseBuffer(known_only=by_poses)
+        self.poses = PoseBuffer(known_only=by_poses, smoothed_only=smoothed_only)
         self.held_ties: list[tuple[Any, str]] = []
         self._held: dict[str, Any] = {}
         self._slow = SlowHistory()
@@ -107,7 +108,7 @@ class StripDesk:
             if another and self._handed_s < model.extent.start_s and first.grown(covariance) is first:
                 continue  # begun with the new filter
             used_s = max(self._handed_s, self._used_to_s, model.borders[0])
-            border_s = model.restate(used_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
+            border_s = strip.restate(used_s, slow, another)
             if another:  # of the new filter, what the model still takes for the old one's error is no use
                 left_out_s = max(left_out_s, min(border_s, model.extent.end_s, strip.end_s + NEAR_START_S))
                 first = window.slow
