@@ -56,11 +56,11 @@ def run(args: argparse.Namespace) -> int:
             progress("processing", args.quiet or args.json) as told,
         ):
             RareCollections()
-            summary = process(reader, nodes, writer.write_raw, told)
+            summary = process(reader, nodes, writer.write_raw, told, apart=True)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
         if not summary.outputs:
-            raise UserError(f"{args.recording}: nothing came out: {_waiting(summary, nodes)}")
+            raise UserError(f"{args.recording}: nothing came out: {_waiting(summary)}")
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
@@ -106,10 +106,10 @@ def _held(reader: RecordingReader) -> str:
     return f"it holds {', '.join(held)}"
 
 
-def _waiting(summary: ProcessSummary, nodes: list[Node]) -> str:
+def _waiting(summary: ProcessSummary) -> str:
     """What the nodes that ran say of themselves."""
-    ran = [node for node in nodes if node.name in summary.nodes]
-    return "; ".join(f"{n.name} {n.state()}" + (f" ({n.last_problem})" if n.last_problem else "") for n in ran)
+    said = ((name, summary.states[name], summary.problems.get(name)) for name in summary.nodes)
+    return "; ".join(f"{name} {state}" + (f" ({problem})" if problem else "") for name, state, problem in said)
 
 
 def _platform(reader: RecordingReader) -> str:
