@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from ..solver.models.wander import Wander
 from ..solver.selfcalibration import SELF_CALIBRATIONS
-from ..solver.slow_errors import SlowErrors
-from ..solver.window.results import TAKEN_BACK, Look, Refusal, WindowOptions, WindowUpdate
-from ..solver.window.window import AHEAD_S, Window
+from ..solver.window.results import Look, Refusal, WindowOptions, WindowUpdate
+from ..solver.window.window import Window
 from . import adjuster_messages as out
 from . import convert
+from .adjuster_control import GroundPoints
 from .adjuster_pace import Governor, Pace, Pacing, pace_message
-from .adjuster_poses import OrientationStore, PoseBuffer, SlowHistory
+from .adjuster_results import Teller
+from .adjuster_strips import StripDesk
 from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
-PACES = ("load", "normal")
-#: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
-NEAR_START_S = 1.0
+PACES = ("load", "normal", "throughput")
+#: Platform time between updates at the pace for throughput, s.
+THROUGHPUT_S = 2.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -46,7 +47,9 @@ class Adjuster(Node):
     update_s : platform time between updates
     update_rays : waiting image points after which an update does not wait for its time
     pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
-        the flight was recorded; "normal", everything at its time, however long it takes
+        the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
+        of long flights: an update every 2 s with what came till then, from smoothed poses alone where there are any,
+        and the live orientation with the update
     self_calibration : set of additional parameters, or "none"
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
@@ -110,35 +113,23 @@ class Adjuster(Node):
             model=model, segment_s=segment_s or 0.0, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
             settle_s=settle_s, snoop=snoop,
         )  # fmt: skip
-        self._update_ns = round(update_s * convert.SECOND_NS)
-        self._update_rays, self._by_load = update_rays, pace == "load"
+        self._early = pace != "throughput"  # whether answers are wanted early
+        self._update_ns = round((update_s if self._early else max(update_s, THROUGHPUT_S)) * convert.SECOND_NS)
+        self._update_rays = update_rays if self._early else sys.maxsize
+        self._by_load = pace == "load"
         self._rays_waiting = 0
         self._pacing, self._governor = Pacing(), Governor()
         self._self_calibration = self_calibration
         self._window: Window | None = None
         self._project: Any = None
         self._camera: Any = None
-        self._strips: dict[str, Any] = {}
-        self._control: dict[str, Any] = {}
-        self._refused: set[str] = set()  # ground points whose coordinates do not count
+        self._control = GroundPoints()
         self._reference_ns = 0
         self._next_update_ns: int | None = None
         self._stamp_ns = 0
-        self._by_poses = apriori == "trajectory"
-        self._poses = PoseBuffer(known_only=self._by_poses)
-        self._slow = SlowHistory()
-        self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
-        self._handed_s = self._used_to_s = -np.inf
-        self._held_strips: dict[str, Any] = {}
-        self._held_ties: list[tuple[Any, str]] = []
-        self._store = OrientationStore()
-        self._invalid: dict[float, str] = {}  # final orientation that is not to be relied on, and why
-        self._refusals: list[Refusal] = []
-        self._rejected_total = 0
-        self._updates = 0
-        self._sources: frozenset[tuple[str, str]] = frozenset()
-        self._returned_total = 0
-        self._light = ("good", "no strip is flown")
+        self._strips = StripDesk(apriori == "trajectory", self.counters, smoothed_only=not self._early)
+        self._poses = self._strips.poses
+        self._teller = Teller(self.name, self.counters, self._poses)
         self._next_live = -np.inf
         self._newest_pose_s: float | None = None
 
@@ -166,9 +157,13 @@ class Adjuster(Node):
     def finish(self) -> Iterable[Message]:
         if self._window is None:
             return ()
-        self._hand_over_poses()
-        self._take_ties()
-        return self._results(self._window.finish())
+        outputs: list[Message] = []
+        if self._early:
+            self._hand_over_poses()
+            self._take_ties()
+        else:  # what the smoother still held reaches further than the last update
+            outputs += self._update(self._stamp_ns)
+        return outputs + self._results(self._window.finish())
 
     def state(self) -> str:
         if self._window is not None:
@@ -178,7 +173,7 @@ class Adjuster(Node):
         return "waiting for " + ", ".join(f"configuration/{n}" for n in missing)
 
     def light(self) -> tuple[str, str]:
-        return self._light if self._window is not None else ("", "")
+        return self._teller.light if self._window is not None else ("", "")
 
     def query(self, name: str, parameters: dict[str, str]) -> Message | None:
         """Refined orientation at a time: ``query/orientation?t=..``, seconds (or nanoseconds) since the Unix epoch.
@@ -196,7 +191,7 @@ class Adjuster(Node):
         if not np.isfinite(t):
             return None
         time_ns = int(parameters["t"]) if parameters["t"].isdigit() and t > 1e15 else round(t * convert.SECOND_NS)
-        body = self._store.at(time_ns)
+        body = self._teller.store.at(time_ns)
         return None if body is None else Message("query/orientation", self._stamp_ns, body)
 
     # -- input ---------------------------------------------------------------------------------------------------------
@@ -211,7 +206,7 @@ class Adjuster(Node):
             if self._by_load:
                 self._pacing.announce(body)
         elif topic == "observation/control":
-            self._ground_point(body)
+            self._control.take(body, self._window)
         elif topic == "observation/verdict":
             return self._verdict(body)
         elif topic == "observation/progress":
@@ -240,26 +235,21 @@ class Adjuster(Node):
         camera = convert.camera_from(self._camera)
         parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
         self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
-        self._slow = SlowHistory()
-        self._slow.add(-np.inf, self._window.slow)
-        self._stated.clear()
-        self._handed_s = self._used_to_s = -np.inf
-        self._poses.clear()
-        self._held_strips.clear()
-        self._held_ties.clear()
-        for strip in self._strips.values():
+        self._strips.begin_window(self._window)
+        self._teller.reference_ns = self._reference_ns
+        for strip in self._strips.bodies.values():
             self._begin(strip)
-        for point in self._control.values():
-            self._ground_point(point)
+        for point in self._control.bodies.values():
+            self._control.take(point, self._window)
         return [self._log("configuration changed: the window starts again", warning=True)] if again else []
 
     def _strip(self, body: Any) -> list[Message]:
         if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
             raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
-        known = self._strips.get(body.id)
+        known = self._strips.bodies.get(body.id)
         if known is not None and known.ended and body.ended:
             return []
-        self._strips[body.id] = body
+        self._strips.bodies[body.id] = body
         if self._window is None:
             return []
         self._begin(body)
@@ -267,58 +257,19 @@ class Adjuster(Node):
 
     def _begin(self, body: Any) -> None:
         assert self._window is not None
-        first_s = self._seconds(body.first_line_time_ns)
-        self._held_strips.pop(body.id, None)
-        slow = self._window.slow
-        if self._by_poses and body.id not in self._window.strips:
-            covariance = self._poses.covariance_after(first_s - NEAR_START_S)
-            if covariance is not None:
-                slow = slow.widened(covariance, self._poses.learning)
-            elif not body.ended:
-                self._held_strips[body.id] = body
-                return
-            self._slow.add(first_s, slow)
-            self._stated[body.id] = slow, slow
-        self._window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow)
-        if body.ended:
-            self._window.end_strip(body.id, int(body.lines))
+        self._strips.begin(body, self._seconds(body.first_line_time_ns), self._window)
 
     def _begin_held(self) -> None:
         """Strips that waited for a pose begin if there is one, and get the tie points that came meanwhile."""
-        for strip in list(self._held_strips.values()):
+        for strip in self._strips.held():
             self._begin(strip)
-        if not self._held_strips:
-            ties, self._held_ties = self._held_ties, []
+        if not self._strips.any_held:
+            ties, self._strips.held_ties = self._strips.held_ties, []
             for body, source in ties:
                 self._tie(body, source)
 
-    def _ground_point(self, body: Any) -> None:
-        if not body.point:
-            raise ValueError("ground point without a name")
-        xyz = np.array([body.x, body.y, body.z])
-        role = convert.role_of(body)
-        covariance = np.array(body.covariance) if body.covariance else np.zeros(9)
-        if not np.isfinite(xyz).all() or covariance.shape != (9,) or not np.isfinite(covariance).all():
-            raise ValueError(f"ground point {body.point!r} is not finite or its covariance has not 9 values")
-        variance = covariance[::4]
-        given = {"control": (0, 1, 2), "planimetric": (0, 1), "height": (2,)}.get(role, ())
-        sigma = np.full(3, np.inf)
-        for axis in given:
-            if not variance[axis] > 0:
-                raise ValueError(f"ground point {body.point!r}: variance {variance[axis]}, wanted more than 0")
-            sigma[axis] = np.sqrt(variance[axis])
-        self._control[body.point] = body
-        if body.point in self._refused:
-            sigma, role = np.full(3, np.inf), "check"
-        if self._window is not None:
-            self._window.add_control(body.point, xyz, sigma, role)
-
     def _verdict(self, body: Any) -> list[Message]:
-        """A surveyor says whether the coordinates of a point count."""
-        if body.point not in self._control:
-            raise ValueError(f"verdict on {body.point!r}, which is no ground point")
-        (self._refused.discard if body.accepted else self._refused.add)(body.point)
-        self._ground_point(self._control[body.point])
+        self._control.judge(body, self._window)
         verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
         return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
 
@@ -343,8 +294,8 @@ class Adjuster(Node):
         """Of the tie points that wait because of the load, take those that tell most."""
         if not self._pacing.waiting:
             return
-        rates = {id: s.line_rate_hz for id, s in self._strips.items()}
-        starts = {id: s.first_line_time_ns for id, s in self._strips.items()}
+        rates = {id: s.line_rate_hz for id, s in self._strips.bodies.items()}
+        starts = {id: s.first_line_time_ns for id, s in self._strips.bodies.items()}
         pixels = {line.id: len(line.x_mm) for line in self._camera.lines}
         before = self._pacing.left_out_total
         for body, source in self._pacing.take_waiting(rates, starts, pixels):
@@ -354,8 +305,8 @@ class Adjuster(Node):
 
     def _tie(self, body: Any, source: str) -> None:
         assert self._window is not None
-        if self._held_strips and any(image.strip in self._held_strips for image in body.images):
-            self._held_ties.append((body, source))
+        if self._strips.is_held(body):
+            self._strips.held_ties.append((body, source))
             return
         sigma = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX
         for image in body.images:
@@ -366,7 +317,7 @@ class Adjuster(Node):
             if body.point:
                 self._window.add_look(body.point, look)
             else:
-                self._refusals.append(Refusal("", look, "point without a name"))
+                self._teller.refusals.append(Refusal("", look, "point without a name"))
 
     def _pose(self, body: Any, smoothed: bool) -> list[Message]:
         if self._window is None:
@@ -377,10 +328,12 @@ class Adjuster(Node):
             raise ValueError("pose without covariance")
         time_s = self._seconds(sample.time_ns)
         self._poses.add(time_s, sample, smoothed, body.reason)
-        if self._held_strips:
+        if self._strips.any_held:
             self._begin_held()
         if not (smoothed and self._poses.filtered_seen):
             self._newest_pose_s = time_s
+        if not self._early:
+            return []
         # without a filter (an imported trajectory) the smoothed poses lead
         if smoothed and self._poses.filtered_seen:
             return []
@@ -406,10 +359,19 @@ class Adjuster(Node):
         for t in due:
             orientation = self._window.live(float(t))
             if orientation is not None:
-                outputs += out.orientations(
-                    "orientation/live", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
-                )
-        self._store.add_live([message.body for message in outputs])
+                outputs += self._teller.live(orientation, self._stamp_ns)
+        self._teller.store.add_live([message.body for message in outputs])
+        return outputs
+
+    def _live_since(self) -> list[Message]:
+        """Live orientation on the grid up to the newest pose that the window has, since the last one."""
+        assert self._window is not None
+        begin_s, end_s = self._next_live, self._window.trajectory.end_s
+        outputs = []
+        for orientation in self._window.live_between(begin_s, end_s):
+            outputs += self._teller.live(orientation, self._stamp_ns)
+        self._next_live = max(begin_s, end_s)
+        self._teller.store.add_live([message.body for message in outputs])
         return outputs
 
     def _update_if_due(self, stamp_ns: int) -> list[Message]:
@@ -428,9 +390,13 @@ class Adjuster(Node):
         assert self._window is not None
         self._rays_waiting = 0
         self._hand_over_poses()
-        self._used_to_s = self._seconds(now_ns) + AHEAD_S
+        now_s = self._seconds(now_ns)
+        if not self._early and np.isfinite(self._window.trajectory.end_s):  # its length counts from the newest pose
+            now_s = min(now_s, self._window.trajectory.end_s)
+        self._strips.use_to(now_s)
         self._take_ties()
-        return self._results(self._window.update(self._seconds(now_ns)))
+        outputs = self._results(self._window.update(now_s))
+        return outputs if self._early else outputs + self._live_since()
 
     @property
     def _interval_ns(self) -> int:
@@ -447,90 +413,13 @@ class Adjuster(Node):
 
     def _hand_over_poses(self) -> None:
         assert self._window is not None
-        if self._stated and self._poses.leading is not None:
-            self._follow_covariance(*self._poses.leading)
-        for poses in self._poses.take(self._slow):
-            late = self._window.trajectory.add(*poses)
-            if late:
-                self.problem("pose out of order", f"{late} poses came twice or too late")
-
-    def _follow_covariance(self, time_s: float, covariance: Any) -> None:
-        """Where the trajectory becomes clearly less certain in the middle of a strip, or certain again, the wander does
-        too: while GNSS is out, after the navigator has started again, be that when the strip is over but not final."""
-        assert self._window is not None
-        another, left_out_s = self._poses.started_anew(), -np.inf
-        for id, (first, now) in list(self._stated.items()):
-            strip = self._window.strips[id]
-            if strip.final_to_s >= strip.end_s:
-                del self._stated[id]
-                continue
-            model, slow = strip.model, (self._window.slow if another else first).grown(covariance)
-            changed = another or (time_s <= strip.end_s and now.differs(slow))
-            if not isinstance(model, Wander) or not changed:
-                continue
-            if another and self._handed_s < model.extent.start_s and first.grown(covariance) is first:
-                continue  # begun with the new filter
-            used_s = max(self._handed_s, self._used_to_s, model.borders[0])
-            border_s = model.restate(used_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
-            if another:  # of the new filter, what the model still takes for the old one's error is no use
-                left_out_s = max(left_out_s, min(border_s, model.extent.end_s, strip.end_s + NEAR_START_S))
-                first = self._window.slow
-            self._stated[id] = first, slow
-            if np.isfinite(border_s):
-                self._slow.add(border_s, slow)
-            self.counters["wander restated"] += 1
-        if another:
-            self._poses.leave_out(self._handed_s, left_out_s)
-        self._handed_s = max(self._handed_s, time_s)
+        late = self._strips.hand_over(self._window)
+        if late:
+            self.problem("pose out of order", f"{late} poses came twice or too late")
 
     def _results(self, update: WindowUpdate) -> list[Message]:
-        for refusal in update.refused:
-            self.counters["observations rejected" if refusal.reason == "snooping" else refusal.reason] += 1
-        refusals, self._refusals = self._refusals + update.refused, []
-        back = sum(r.reason == TAKEN_BACK for r in refusals)
-        self._returned_total += back
-        self._rejected_total += len(refusals) - back
-        outputs: list[Message] = []
-        for orientation in update.final:
-            messages = out.orientations(
-                "orientation/final", orientation, self._reference_ns, self._stamp_ns, self._poses.validity
-            )
-            self._store.add_final([message.body for message in messages])
-            times = zip(orientation.time_s.tolist(), messages, strict=True)
-            self._invalid |= {t: message.body.reason for t, message in times if not message.body.valid}
-            outputs += messages
-        if update.whole is not None:
-            for orientation in update.whole.orientation:
-                messages = out.orientations(
-                    "orientation/whole", orientation, self._reference_ns, self._stamp_ns, self._validity_at_end
-                )
-                self._store.add_whole([message.body for message in messages])
-                outputs += messages
-        outputs += [out.object_point(point, self._stamp_ns) for point in update.points]
-        if update.whole is not None:
-            outputs += [out.object_point(point, self._stamp_ns) for point in update.whole.points]
-        if update.report is not None:
-            outputs.append(
-                out.report(
-                    update.report, refusals, self._rejected_total, self._returned_total, self._updates,
-                    self._reference_ns, self._stamp_ns,
-                )
-            )  # fmt: skip
-            pace, body = self._pacing.pace, outputs[-1].body
-            body.update_interval_s = self._interval_ns / convert.SECOND_NS
-            body.kept_share, body.left_out_total = pace.kept, self._pacing.left_out_total
-            self._updates += 1
-            watched, before = update.report.watched, (self._light[0], self._sources)
-            self._light, self._sources = (watched.light, watched.reason), watched.names
-            if before != (self._light[0], self._sources):
-                outputs.append(self._log(": ".join(filter(None, self._light)), warning=self._light[0] != "good"))
-        outputs += [self._log(text) for text in update.events]
-        return outputs
-
-    def _validity_at_end(self, time_s: float) -> tuple[bool, str]:
-        """What the final orientation said of a time; a backward pass comes long after its measured poses are gone."""
-        reason = self._invalid.get(time_s)
-        return reason is None, reason or ""
+        pacing = self._pacing
+        return self._teller.results(update, self._stamp_ns, pacing.pace, pacing.left_out_total, self._interval_ns)
 
     def _seconds(self, time_ns: int) -> float:
         return (time_ns - self._reference_ns) * 1e-9

@@ -18,6 +18,8 @@ Poses = tuple[list[float], Array, Array, Array, bool]
 
 #: Of so long, s, each measured pose's validity is remembered, longer than any window; of earlier ones the stretches.
 REMEMBERED_S = 300.0
+#: Smoothed poses may come so much later than filtered ones, s.
+PATIENCE_S = 30.0
 #: So many older ones may be kept, until they are forgotten together.
 MOST_OLD = 1024
 #: Times this near are the same, s.
@@ -66,10 +68,11 @@ class PoseBuffer:
     Parameters
     ----------
     known_only : leave out poses that say that they do not know the attitude
+    smoothed_only : hand over smoothed poses alone, unless there are none for `PATIENCE_S`
     """
 
-    def __init__(self, known_only: bool = False) -> None:
-        self._known_only = known_only
+    def __init__(self, known_only: bool = False, smoothed_only: bool = False) -> None:
+        self._known_only, self._smoothed_only = known_only, smoothed_only
         self._latest: dict[bool, tuple[float, Array]] = {}
         self._attitude_lost = False
         self._left_out = (0.0, 0.0)
@@ -139,6 +142,8 @@ class PoseBuffer:
         """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
         begin_s, end_s = self._left_out
         for smoothed in (False, True):
+            if not smoothed and self._smoothed_only and self._smoothed_follow():
+                continue
             waiting = [w for w in self._waiting[smoothed] if not begin_s < w[0] < end_s]
             self._waiting[smoothed] = []
             if waiting:
@@ -150,6 +155,14 @@ class PoseBuffer:
                     slow.without([time for time, _ in waiting], np.array([s.covariance for s in samples])),
                     smoothed,
                 )
+
+    def _smoothed_follow(self) -> bool:
+        """Whether smoothed poses have come, or may still; filtered ones are then not kept."""
+        waiting = self._waiting[False]
+        if self._seen[True][0]:
+            waiting.clear()
+            return True
+        return not waiting or waiting[-1][0] - waiting[0][0] < PATIENCE_S
 
     def validity(self, time_s: float) -> tuple[bool, str]:
         """Whether the measured poses between which the one at a time was interpolated are valid, and why not.

@@ -18,7 +18,7 @@ from . import convert
 LARGEST_RATE_SIGMA, LARGEST_FORCE_SIGMA = 1.0, 50.0
 
 
-def kinematic_engine(project: Any) -> KinematicFilter:
+def kinematic_engine(project: Any, filtered_s: float = 0.0) -> KinematicFilter:
     """The engine for attitude and GNSS input."""
     slow = convert.slow_errors_of(project)
     options = KinematicOptions(
@@ -28,6 +28,7 @@ def kinematic_engine(project: Any) -> KinematicFilter:
         wander_sigma_m=np.array(slow.wander_m),
         wander_time_s=slow.wander_time_s,
         attitude_sigma=slow.attitude_sigma,
+        filtered_s=filtered_s,
     )
     return KinematicFilter(convert.local_frame(project), options)
 

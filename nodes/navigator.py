@@ -28,14 +28,21 @@ class Navigator(Node):
     Attitude and GNSS go through the kinematic filter. With the first raw inertial sample the inertial filter takes
     over; measured attitudes are then counted and left aside. Poses carry the stamp of the message that made them
     possible; the time they are valid for stands in the body.
+
+    Parameters
+    ----------
+    filtered_s : least distance of filtered poses, s; 0 = all of them, which those who want them at once need
     """
 
     name = "navigator"
     inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss")
     outputs = ("trajectory/filtered", "trajectory/smoothed", "event/log")
 
-    def __init__(self) -> None:
+    def __init__(self, *, filtered_s: float = 0.0) -> None:
         super().__init__()
+        if not 0.0 <= filtered_s <= 1.0:
+            raise ValueError(f"filtered_s is {filtered_s:g}, wanted 0 to 1 s")
+        self._filtered_s = filtered_s
         self._engine: KinematicFilter | InertialNavigator | None = None
         self._configuration: Any = None
         self._reference_ns = 0
@@ -80,7 +87,7 @@ class Navigator(Node):
         if content == self._project:
             return ()
         try:
-            self._engine = kinematic_engine(message.body)
+            self._engine = kinematic_engine(message.body, self._filtered_s)
             self._configuration = message.body
         except ValueError as error:
             self.problem("bad configuration", f"{message.topic}: {error}")
@@ -111,7 +118,8 @@ class Navigator(Node):
         if not 0 < body.interval_ns <= convert.SECOND_NS:
             raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
         if not isinstance(self._engine, InertialNavigator):
-            self._engine, self._seen = inertial_engine(self._configuration, body), Counter()
+            self._engine = inertial_engine(self._configuration, body, filtered_s=self._filtered_s)
+            self._seen = Counter()
             wrong = stated_noise(body)[2]
             if wrong:
                 self.problem("inertial noise", f"sensor/imu: {wrong}")

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from ..schemas.topics import Family
 from .node import Message, Node
 from .ordering import Key, StreamCheck, order_key
 from .recording import RecordingReader
+from .runner_apart import BATCH, UNDER_WAY, Apart, Item, raw_of
 
 
 class StepDriver:
@@ -96,6 +96,7 @@ class ProcessSummary:
     dropped : messages that were not usable, by kind
     counters : per node, what it counted
     problems : per node, its last problem
+    states : per node, what it said of itself at the end
     first_ns, last_ns : platform time covered
     """
 
@@ -107,6 +108,7 @@ class ProcessSummary:
     last_problem: str = ""
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
+    states: dict[str, str] = field(default_factory=dict)
     first_ns: int = 0
     last_ns: int = 0
 
@@ -164,8 +166,9 @@ def process(
     nodes: Sequence[Node],
     write: Callable[[RawMessage], None],
     progress: Callable[[float], None] | None = None,
+    apart: bool = False,
 ) -> ProcessSummary:
-    """Run nodes over a recording, in one thread, as fast as it goes.
+    """Run nodes over a recording, as fast as it goes.
 
     Parameters
     ----------
@@ -173,6 +176,7 @@ def process(
     nodes : the nodes; those with nothing to work on stay out
     write : takes inputs and outputs, in the order of `order_key`; receive time = stamp
     progress : told the fraction that is done, now and then
+    apart : the last node may run in a process of its own, if no other needs its outputs; what comes out is the same
     """
     summary = ProcessSummary()
     held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
@@ -181,57 +185,191 @@ def process(
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
     drivers = [StepDriver(node) for node in running]
-    listeners: dict[str, list[StepDriver]] = {}
-
-    def listening(topic: str) -> list[StepDriver]:
-        if topic not in listeners:
-            listeners[topic] = [
-                d for d in drivers if any(topics.find(n).matches(topic) for n in (*d.node.inputs, *d.node.decisions))
-            ]
-        return listeners[topic]
-
-    pending: list[tuple[Key, Message, RawMessage]] = []
-
-    def queue(outputs: list[Message]) -> None:
-        for output in outputs:
-            envelope = Envelope(output.stamp_ns, output.source, output.sequence)
-            raw = RawMessage(output.topic, envelope, codec.encode(output.body), output.stamp_ns)
-            heapq.heappush(pending, (order_key(output.topic, envelope), output, raw))
-            summary.outputs[output.topic] += 1
-
-    def hand_on(message: Message | None, raw: RawMessage) -> None:
-        write(raw)
-        if message is not None:
-            for driver in listening(raw.topic):
-                queue(driver.step(message))
-
-    def hand_on_pending(until: Key | None) -> None:
-        while pending and (until is None or pending[0][0] < until):
-            _, message, raw = heapq.heappop(pending)
-            hand_on(message, raw)
-
-    for key, message, raw in _inputs(reader, made, listening, summary, progress):
-        hand_on_pending(key)
-        hand_on(message, raw)
-    hand_on_pending(None)
-    for driver in drivers:
-        queue(driver.finish())
-        hand_on_pending(None)
-    for node in running:
-        summary.counters[node.name] = dict(sorted(node.counters.items()))
-        if node.last_problem:
-            summary.problems[node.name] = node.last_problem
+    if apart and Apart.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
+        line: _Line = _LineApart(reader, drivers, write, summary)
+    else:
+        line = _Line(drivers, write, summary)
+    try:
+        for number, message, raw in _inputs(reader, made, line.is_heard, summary, progress):
+            line.take(number, message, raw)
+        line.finish()
+    finally:
+        line.close()
     return summary
+
+
+def _feeds(node: Node, others: Sequence[Node]) -> bool:
+    """Whether others need what a node puts out."""
+    return any(topics.find(i).matches(o) for other in others for i in other.inputs for o in node.outputs)
+
+
+class _Line:
+    """Nodes one after the other: hands inputs and outputs on in order, and has them written.
+
+    Parameters
+    ----------
+    drivers : of the nodes, those that make another's input before it
+    write : takes what is handed on
+    summary : where outputs and what nodes say are counted
+    """
+
+    def __init__(
+        self, drivers: Sequence[StepDriver], write: Callable[[RawMessage], None], summary: ProcessSummary
+    ) -> None:
+        self._drivers, self._write, self._summary = drivers, write, summary
+        self._listeners: dict[str, list[StepDriver]] = {}
+        self._pending: list[tuple[Key, Message, RawMessage]] = []
+
+    def is_heard(self, topic: str) -> bool:
+        """Whether a node listens to a topic."""
+        return bool(self._listening(topic))
+
+    def take(self, number: int, message: Message | None, raw: RawMessage) -> None:
+        """The next input, and its number in the recording; decoded if a node listens."""
+        self._hand_on_pending(order_key(raw.topic, raw.envelope))
+        self._hand_on(message, raw, number)
+
+    def finish(self) -> None:
+        """There are no more inputs."""
+        self._hand_on_pending(None)
+        for driver in self._drivers:
+            self._queue(driver.finish())
+            self._hand_on_pending(None)
+            node = driver.node
+            self._conclude(node.name, node.counters, node.last_problem, node.state())
+
+    def close(self) -> None:
+        """Give back what the nodes needed."""
+
+    def _conclude(self, name: str, counters: Counter[str], problem: str, state: str) -> None:
+        self._summary.counters[name] = dict(sorted(counters.items()))
+        self._summary.states[name] = state
+        if problem:
+            self._summary.problems[name] = problem
+
+    def _listening(self, topic: str) -> list[StepDriver]:
+        if topic not in self._listeners:
+            self._listeners[topic] = [d for d in self._drivers if _listens(d.node, topic)]
+        return self._listeners[topic]
+
+    def _queue(self, outputs: list[Message]) -> None:
+        for output in outputs:
+            raw = raw_of(output)
+            heapq.heappush(self._pending, (order_key(output.topic, raw.envelope), output, raw))
+            self._summary.outputs[output.topic] += 1
+
+    def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
+        self._write(raw)
+        if message is not None:
+            for driver in self._listening(raw.topic):
+                self._queue(driver.step(message))
+
+    def _hand_on_pending(self, until: Key | None) -> None:
+        while self._pending and (until is None or self._pending[0][0] < until):
+            _, message, raw = heapq.heappop(self._pending)
+            self._hand_on(message, raw)
+
+
+class _LineApart(_Line):
+    """The same with the last node in a process of its own: what is handed on waits for its answer to be written."""
+
+    def __init__(
+        self,
+        reader: RecordingReader,
+        drivers: Sequence[StepDriver],
+        write: Callable[[RawMessage], None],
+        summary: ProcessSummary,
+    ) -> None:
+        super().__init__(drivers[:-1], write, summary)
+        self._last = drivers[-1].node
+        self._heard_apart: dict[str, bool] = {}
+        self._apart = Apart(reader, drivers[-1])
+        self._batch: list[RawMessage] = []
+        self._items: list[Item] = []
+        self._waiting: deque[list[RawMessage]] = deque()
+        self._answered: list[tuple[Key, RawMessage]] = []
+
+    def is_heard(self, topic: str) -> bool:
+        return super().is_heard(topic) or self._is_heard_apart(topic)
+
+    def finish(self) -> None:
+        self._hand_on_pending(None)
+        self._write_up_to()
+        super().finish()
+        self._write_up_to()
+        end = self._apart.finish()
+        self._count(end.outputs)
+        for raw in sorted(end.outputs, key=lambda raw: order_key(raw.topic, raw.envelope)):
+            self._write(raw)
+        self._conclude(self._last.name, end.counters, end.problem, end.state)
+
+    def close(self) -> None:
+        self._apart.close()
+
+    def _is_heard_apart(self, topic: str) -> bool:
+        if topic not in self._heard_apart:
+            self._heard_apart[topic] = _listens(self._last, topic)
+        return self._heard_apart[topic]
+
+    def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
+        if self._is_heard_apart(raw.topic):
+            self._items.append((len(self._batch), raw if number is None else number))
+        self._batch.append(raw)
+        if message is not None:
+            for driver in self._listening(raw.topic):
+                self._queue(driver.step(message))
+        if len(self._batch) >= BATCH:
+            self._send()
+            while self._apart.under_way > UNDER_WAY or self._apart.ready():
+                self._write_answered()
+
+    def _send(self) -> None:
+        self._apart.send(self._items)
+        self._waiting.append(self._batch)
+        self._batch, self._items = [], []
+
+    def _write_up_to(self) -> None:
+        """Write all that was handed on so far, and what came of it."""
+        self._send()
+        while self._waiting:
+            self._write_answered()
+        self._write_before(None)
+
+    def _write_answered(self) -> None:
+        """Write the oldest batch, with what the node answered to it."""
+        batch, answer = self._waiting.popleft(), iter(self._apart.answer())
+        place, outputs = next(answer, (-1, []))
+        for i, raw in enumerate(batch):
+            if self._answered:
+                self._write_before(order_key(raw.topic, raw.envelope))
+            self._write(raw)
+            if i == place:
+                self._count(outputs)
+                for output in outputs:
+                    heapq.heappush(self._answered, (order_key(output.topic, output.envelope), output))
+                place, outputs = next(answer, (-1, []))
+
+    def _write_before(self, until: Key | None) -> None:
+        while self._answered and (until is None or self._answered[0][0] < until):
+            self._write(heapq.heappop(self._answered)[1])
+
+    def _count(self, outputs: list[RawMessage]) -> None:
+        for raw in outputs:
+            self._summary.outputs[raw.topic] += 1
+
+
+def _listens(node: Node, topic: str) -> bool:
+    return any(topics.find(name).matches(topic) for name in (*node.inputs, *node.decisions))
 
 
 def _inputs(
     reader: RecordingReader,
     made: set[str],
-    listening: Callable[[str], list[Any]],
+    is_heard: Callable[[str], bool],
     summary: ProcessSummary,
     progress: Callable[[float], None] | None,
-) -> Iterator[tuple[Key, Message | None, RawMessage]]:
-    """The usable inputs of a recording in order; decoded where a node listens."""
+) -> Iterator[tuple[int, Message | None, RawMessage]]:
+    """The usable inputs of a recording in order, with their numbers; decoded where a node listens."""
     numbers = []
     for number in reader.select():
         channel = reader.channels[int(reader.index.channel[number])]
@@ -262,7 +400,7 @@ def _inputs(
         raw = reader.raw(int(number))
         raw = raw._replace(receive_ns=raw.envelope.stamp_ns)
         message = None
-        if listening(raw.topic):
+        if is_heard(raw.topic):
             try:
                 body = codec.decode(raw.topic, raw.data)
             except ValueError as error:
@@ -273,4 +411,4 @@ def _inputs(
         if progress is not None and time.monotonic() - told > 0.2:
             told = time.monotonic()
             progress(done / len(ordered))
-        yield order_key(raw.topic, raw.envelope), message, raw
+        yield int(number), message, raw

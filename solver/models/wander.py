@@ -36,6 +36,7 @@ from .base import (
 )
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int_]
 
 #: A-priori sigma in place of zero, share of a metre or radian: an error that is said not to exist.
 NOTHING = 1e-7
@@ -43,6 +44,8 @@ NOTHING = 1e-7
 NO_SLOW_ERRORS = SlowErrors()
 #: Length of a segment as a share of the correlation time: what is left out is then below 1 % of the wander.
 SEGMENT_SHARE = 1.0 / 15.0
+#: Numbers of shortest segments that a longer one may have.
+LENGTHS = (2, 3, 4, 5)
 #: Columns of offset, shift and drift before those of the borders.
 GLOBALS = 9
 
@@ -55,11 +58,15 @@ class WanderOptions(ModelOptions):
     ----------
     slow : a-priori sigmas of offset, shift, drift and wander
     segment_s : longest time between borders; 0 = `SEGMENT_SHARE` of the correlation time
+    left_out_m, left_out : segments may be longer, whole numbers of these, where interpolation then leaves out no more
+        than so much of the wander, m and rad
     """
 
     name: ClassVar[str] = "wander"
     slow: SlowErrors = NO_SLOW_ERRORS
     segment_s: float = 0.0
+    left_out_m: float = 0.0
+    left_out: float = 0.0
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
@@ -89,6 +96,7 @@ class Wander(CorrectionModel):
     Attributes
     ----------
     borders : (segments + 1,) times, seconds; equally far apart, the last one at the end of the extent or beyond
+    used : places of the borders in use, the first and the last one among them; the unknowns of others appear nowhere
     """
 
     def __init__(self, extent: Extent, options: WanderOptions):
@@ -111,40 +119,46 @@ class Wander(CorrectionModel):
         self._sigma = np.tile(np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING), (segments + 1, 1))
         self._time_s = np.full(segments + 1, slow.wander_time_s)
         self._another = np.zeros(segments + 1, dtype=bool)
-        self._F, self._Q, self._P0 = second_order_gauss_markov(1.0, slow.wander_time_s, self.step_s)
+        self.used = self._spaced(0, self._sigma[0], slow.wander_time_s)
         self._observations = self._stated()
 
     def design(self, time_s: ArrayLike) -> Design:
         t = np.asarray(time_s, dtype=float)
-        k, after = self._inside(t)
-        _, part = self._between(after, self.options.slow.wander_time_s, self._F, self._Q)
+        begin, end, after = self._inside(t)
+        part = np.empty((len(t), 4))
+        for length in _different(end - begin):
+            mine = end - begin == length
+            part[mine] = self._between(after[mine], self.options.slow.wander_time_s, int(length))[1]
         share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
         columns = np.empty((len(t), 6, 6), dtype=np.int32)
         columns[:, 0] = np.arange(6)
         columns[:, 1] = [-1, -1, -1, 6, 7, 8]
-        columns[:, 2:] = (GLOBALS + 12 * k)[:, None, None] + np.arange(24).reshape(4, 6)
+        columns[:, 2:4] = (GLOBALS + 12 * begin)[:, None, None] + np.arange(12).reshape(2, 6)
+        columns[:, 4:] = (GLOBALS + 12 * end)[:, None, None] + np.arange(12).reshape(2, 6)
         return Design(columns, np.column_stack([np.ones_like(t), share, part]))
 
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
-        k, inside = self._inside(t)
+        begin, end, inside = self._inside(t)
         variance = np.empty(len(t))
-        correlated_s = self._time_s[k + 1]
+        correlated_s, lengths = self._time_s[end], end - begin
         for each in set(correlated_s.tolist()):
-            mine = correlated_s == each
-            variance[mine] = self._between(inside[mine], each, *self._over_segment(each))[0]
-        before, after = self._sigma[k], self._sigma[k + 1]
-        part = (t - self.borders[k]) / self.step_s
-        size = np.where(self._another[k + 1][:, None], before**2 + after**2, (after - before) ** 2)
+            for length in _different(lengths):
+                mine = (correlated_s == each) & (lengths == length)
+                if mine.any():
+                    variance[mine] = self._between(inside[mine], each, int(length))[0]
+        before, after = self._sigma[begin], self._sigma[end]
+        part = (t - self.borders[begin]) / (self.step_s * lengths)
+        size = np.where(self._another[end][:, None], before**2 + after**2, (after - before) ** 2)
         jump = np.clip(part * (1.0 - part), 0.0, 0.25)[:, None] * size  # it can be anywhere between
         return variance[:, None] * np.maximum(before, after) ** 2 + jump
 
     def restate(self, from_s: float, sigma: ArrayLike, time_s: float, another: bool = False) -> float:
         """Another wander from a border on, the second one after a time, so that the segment there and its borders stay.
 
-        The arrays that `pseudo_observations` gave change for the segments concerned; who has used them already for
-        times up to ``from_s`` sees no difference.
+        The arrays that `pseudo_observations` gave change for the segments concerned, and so may the borders in use; who
+        has used them already for times up to ``from_s`` sees no difference.
 
         Parameters
         ----------
@@ -157,36 +171,47 @@ class Wander(CorrectionModel):
         -------
         border_s : from here on it holds; infinite if the strip ends before
         """
-        first = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1)) + 2
-        first = max(first, 0)
-        if first >= len(self.borders):
+        place = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1))
+        stays = int(np.searchsorted(self.used, place, side="right"))  # of those in use, the last that stays as it is
+        if stays >= len(self.used) - 1:
             return np.inf
-        self._sigma[first:] = np.maximum(np.asarray(sigma, dtype=float), NOTHING)
+        sigma = np.maximum(np.asarray(sigma, dtype=float), NOTHING)
+        kept = self.used[: stays + 1] if place >= -1 else self.used[:0]
+        after = self._spaced(int(kept[-1]) if len(kept) else 0, sigma, time_s)
+        self.used = np.concatenate([kept, after[1:] if len(kept) else after])
+        first = int(self.used[len(kept)])
+        self._sigma[first:] = sigma
         self._time_s[first:] = time_s
         self._another[first] = another
         changed = self._stated()
+        self._observations.columns[...] = changed.columns
         self._observations.coefficients[...] = changed.coefficients
         self._observations.sigma[...] = changed.sigma
         return float(self.borders[first])
 
-    def _inside(self, t: Array) -> tuple[NDArray[np.int_], Array]:
-        """Segment (n,) of times, and the time (n,) since its first border."""
-        k = np.clip(np.floor((t - self.borders[0]) / self.step_s).astype(int), 0, len(self.borders) - 2)
-        return k, np.clip(t - self.borders[k], 0.0, self.step_s)
+    def _spaced(self, first: int, sigma: Array, time_s: float) -> IntArray:
+        """Borders in use from one to the last, as far apart as a wander (6,) allows."""
+        o, last = self.options, len(self.borders) - 1
+        length = 1
+        for longer in LENGTHS if o.left_out_m > 0.0 or o.left_out > 0.0 else ():
+            out = np.sqrt(self._between(np.array([0.5 * longer * self.step_s]), time_s, longer)[0][0])
+            if out * sigma[:3].max() <= o.left_out_m and out * sigma[3:].max() <= o.left_out:
+                length = longer
+        return np.append(np.arange(first, last, length), last)
 
-    def _over_segment(self, time_s: float) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Transition and noise (2, 2) over a segment."""
-        if time_s == self.options.slow.wander_time_s:
-            return self._F, self._Q
-        F, Q, _ = second_order_gauss_markov(1.0, time_s, self.step_s)
-        return F, Q
+    def _inside(self, t: Array) -> tuple[IntArray, IntArray, Array]:
+        """Places (n,) of the borders in use around times, and the time (n,) since the first of both."""
+        place = np.floor((t - self.borders[0]) / self.step_s)
+        k = np.clip(np.searchsorted(self.used, place, side="right") - 1, 0, len(self.used) - 2)
+        begin, end = self.used[k], self.used[k + 1]
+        return begin, end, np.clip(t - self.borders[begin], 0.0, self.step_s * (end - begin))
 
-    def _between(
-        self, after: Array, time_s: float, F: NDArray[np.floating], Q: NDArray[np.floating]
-    ) -> tuple[Array, Array]:
+    def _between(self, after: Array, time_s: float, length: int) -> tuple[Array, Array]:
         """Variance (n,) of what is left out for sigma 1, and coefficients (n, 4), at times after a border."""
+        step_s = self.step_s * length
+        F, Q, _ = second_order_gauss_markov(1.0, time_s, step_s)
         F0, Q0, _ = second_order_gauss_markov(1.0, time_s, after)
-        F1, _, _ = second_order_gauss_markov(1.0, time_s, self.step_s - after)
+        F1, _, _ = second_order_gauss_markov(1.0, time_s, step_s - after)
         back = Q0 @ np.swapaxes(F1, 1, 2)
         right = back @ np.linalg.inv(Q)
         left = F0 - right @ F
@@ -211,23 +236,31 @@ class Wander(CorrectionModel):
     def _transitions(self) -> PseudoObservations:
         """Two whitened observations ``G (z_k+1 - F D z_k) = 0`` of every component and segment, ``G Q G^T = I``.
 
-        ``D`` makes an error that grows larger. Where sigma falls, the value at the next border is a new one.
+        ``D`` makes an error that grows larger. Where sigma falls, the value at the next border is a new one. There are
+        as many rows as if all borders were in use; those that end at others carry no weight.
         """
         n = len(self.borders) - 1
-        coefficients = np.zeros((n, 6, 2, 4))
-        for time_s in np.unique(self._time_s[1:]):
-            mine = self._time_s[1:] == time_s
-            F, Q, P0 = second_order_gauss_markov(1.0, float(time_s), self.step_s)
+        coefficients, sigma = np.zeros((n, 6, 2, 4)), np.full((n, 6), np.inf)
+        before = np.arange(n)
+        begin, end = self.used[:-1], self.used[1:]
+        before[end - 1] = begin
+        sigma[end - 1] = self._sigma[end]
+        for time_s, length in {*zip(self._time_s[end].tolist(), (end - begin).tolist(), strict=True)}:
+            chosen = (self._time_s[end] == time_s) & (end - begin == length)
+            a, b = begin[chosen], end[chosen]
+            F, Q, P0 = second_order_gauss_markov(1.0, time_s, self.step_s * length)
             G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
-            ratio = self._sigma[1:][mine] / self._sigma[:-1][mine]  # (m, 6)
-            rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[:-1][mine]])
+            ratio = self._sigma[b] / self._sigma[a]  # (m, 6)
+            rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[a]])
             D = np.zeros((*ratio.shape, 2, 2))
             D[..., 0, 0], D[..., 1, 1] = ratio, ratio * rate[:, None]
-            falls = ((ratio < 1.0 - 1e-9) | self._another[1:][mine][:, None])[..., None, None]
-            coefficients[mine, :, :, :2] = np.where(falls, 0.0, -G @ F @ D)
-            coefficients[mine, :, :, 2:] = np.where(falls, new, G)
+            falls = ((ratio < 1.0 - 1e-9) | self._another[b][:, None])[..., None, None]
+            coefficients[b - 1, :, :, :2] = np.where(falls, 0.0, -G @ F @ D)
+            coefficients[b - 1, :, :, 2:] = np.where(falls, new, G)
         segment, component, row = (a.ravel() for a in np.indices((n, 6, 2)))
-        columns = GLOBALS + 12 * segment[:, None] + component[:, None] + np.array([0, 6, 12, 18])
+        from_column = GLOBALS + 12 * before[segment] + component
+        to_column = GLOBALS + 12 * (segment + 1) + component
+        columns = np.stack([from_column, from_column + 6, to_column, to_column + 6], axis=1)
         labels = tuple(
             f"wander of {COMPONENTS[c]} over segment {k + 1} of {self.extent.name}"
             for k, c in zip(segment, component, strict=True)
@@ -236,7 +269,7 @@ class Wander(CorrectionModel):
             columns.astype(np.int32),
             coefficients[segment, component, row],
             np.zeros(len(row)),
-            self._sigma[segment + 1, component],
+            sigma[segment, component],
             labels,
         )
 
@@ -256,3 +289,8 @@ class Wander(CorrectionModel):
             borders.append(one)
         result["borders"] = borders
         return result
+
+
+def _different(values: IntArray) -> list[int]:
+    """The different ones among whole numbers, in order."""
+    return sorted(set(values.tolist()))

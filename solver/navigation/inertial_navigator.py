@@ -235,7 +235,8 @@ class InertialNavigator:
         if self._chain is None or not self._insert(time_s, fix) or self._chain is None:
             return []
         poses = self._filtered()
-        self._pose_due = not poses  # if no sample has come since the last pose, the next one brings the fix out
+        # if no sample has come since the last pose, the next one brings the fix out
+        self._pose_due = not poses and not self.options.filtered_s
         return poses
 
     def _insert(self, time_s: float, fix: GnssData) -> bool:
@@ -311,6 +312,8 @@ class InertialNavigator:
     def _filtered(self) -> list[NavigationPose]:
         """Pose at the end of the inertial data."""
         assert self._chain is not None
+        if self._chain.end_s < self._published + self.options.filtered_s - 1e-6:
+            return []
         time_s, state, P = self._chain.tip()
         if time_s <= self._published:
             return []

@@ -74,7 +74,7 @@ class KinematicFilter:
         self._last_fix_s = -np.inf
         self._gap_from_s = self._bridged_at_s = -np.inf
         self._refused = 0
-        self._smoothed_to = -np.inf
+        self._smoothed_to = self._next_filtered_s = -np.inf
         self._transitions: dict[int, tuple[Array, Array]] = {}
         self._ahead_cov = np.zeros((len(_AHEAD_S), 3, 3))
         self._ahead_white_m = np.zeros(len(_AHEAD_S))  # without the slow errors
@@ -85,7 +85,8 @@ class KinematicFilter:
     def add_attitude(self, time_s: float, rpy: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]:
         """One attitude sample: roll, pitch, heading (3,) in radians with covariance (3, 3).
 
-        Returns the filtered pose at its time (none before the first fix) and smoothed poses that fell due.
+        Returns the filtered pose at its time (none before the first fix, or if one has just been) and smoothed poses
+        that fell due.
         """
         rpy = np.asarray(rpy, dtype=float)
         last = self._attitude.last_s
@@ -107,7 +108,9 @@ class KinematicFilter:
             return poses
         while time_s - self._epochs[-1].time_s > COAST_STEP_S:
             poses += self._coast(self._epochs[-1].time_s + COAST_STEP_S)
-        poses.append(self._filtered(time_s, rpy))
+        if time_s >= self._next_filtered_s:
+            self._next_filtered_s = time_s + self.options.filtered_s - 1e-6
+            poses.append(self._filtered(time_s, rpy))
         return poses
 
     def add_gnss(self, time_s: float, antenna_l: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]:

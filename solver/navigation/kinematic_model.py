@@ -37,6 +37,7 @@ class KinematicOptions:
     gate, hard_gate : normalised innovation squared of a position above which a fix is weighted down, or refused
     patience : so many refused fixes in a row mean that the filter is wrong; it starts again
     attitude_gap_s : a longer step between attitude samples is a gap
+    filtered_s : least distance of filtered poses; 0 = one at each attitude sample
     """
 
     lever_arm_b: Array = field(default_factory=lambda: np.zeros(3))
@@ -55,6 +56,7 @@ class KinematicOptions:
     hard_gate: float = 150.0
     patience: int = 5
     attitude_gap_s: float = 0.1
+    filtered_s: float = 0.0
 
 
 def transition(dt: float, options: KinematicOptions) -> tuple[Array, Array]:

@@ -23,6 +23,7 @@ class OnlineOptions:
     Attributes
     ----------
     pose_step_s : distance of poses
+    filtered_s : least distance of filtered poses; 0 = all
     lag_s : smoothed poses come so much later
     smooth_every_s : how often they come
     rewind_s : how late a fix may be
@@ -34,6 +35,7 @@ class OnlineOptions:
     """
 
     pose_step_s: float = 0.02
+    filtered_s: float = 0.0
     lag_s: float = 5.0
     smooth_every_s: float = 1.0
     rewind_s: float = 2.0

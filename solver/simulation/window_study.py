@@ -130,6 +130,7 @@ def adjust_online(
     live: bool = True,
     watch: Callable[[float, Window], None] | None = None,
     update_s: float = UPDATE_S,
+    so_far: Callable[[float, OnlineResult], None] | None = None,
 ) -> OnlineResult:
     """Fly a simulation through the window as an on-line system would.
 
@@ -138,6 +139,7 @@ def adjust_online(
     live : whether the live orientation is asked for on the grid
     watch : called after every update with time and window
     update_s : platform time between updates
+    so_far : called after every update with time and what has come out so far
     """
     slow = slow_errors_of(simulation.errors)
     window = _window(simulation, options or WindowOptions(), self_calibration)
@@ -149,6 +151,8 @@ def adjust_online(
             _update(window, waiting, slow, now, result, update_s if live else 0.0)
             if watch is not None:
                 watch(now, window)
+            if so_far is not None:
+                so_far(now, result)
             now = round(now + update_s, 9)
         if isinstance(what, NavigationPose):
             waiting[what.smoothed].append(what)

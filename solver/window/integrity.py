@@ -255,6 +255,7 @@ class _Left:
         self._rhs = np.empty((0, 0))
         self.exposed: list[_Exposed] = []
         self._bounds: deque[tuple[float, float]] = deque()
+        self._newest_s = -np.inf
 
     def add(self, exposed: list[_Exposed], rest: float, time_s: float, state: WindowState) -> None:
         """Observations that leave, and the largest lambda of the others of their batch."""
@@ -270,6 +271,7 @@ class _Left:
             column += len(e.rows)
         self.exposed += exposed
         self._bounds.append((time_s, rest))
+        self._newest_s = max(self._newest_s, time_s)
 
     def marginalise(self, marginal: Marginal) -> None:
         """Eliminate unknowns from the right-hand sides."""
@@ -305,7 +307,7 @@ class _Left:
             e.leverage = leverage
         order = np.argsort([-e.leverage for e in self.exposed])
         keep = np.sort(order[:OF_WINDOW])
-        self._bounds.append((self._bounds[-1][0], self.exposed[order[OF_WINDOW]].leverage))
+        self._bounds.append((self._newest_s, self.exposed[order[OF_WINDOW]].leverage))
         kept = np.repeat(np.isin(np.arange(len(order)), keep), [len(e.rows) for e in self.exposed])
         columns = np.flatnonzero(kept)
         self._rhs, self.exposed = self._rhs[:, columns], [self.exposed[i] for i in keep]

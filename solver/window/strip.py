@@ -11,7 +11,7 @@ from ..models.dgr import DgrOptions
 from ..models.lim import LimOptions
 from ..models.ppm import PpmOptions
 from ..models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
-from ..slow_errors import SlowErrors
+from ..slow_errors import LEARNING_TIME_S, SlowErrors
 from .results import WindowOptions
 from .state import WindowState
 
@@ -22,6 +22,9 @@ IntArray = NDArray[np.int64]
 UNKNOWN_LENGTH_S = 600.0
 #: Sampling of the times at which an unknown is in use, share of a segment.
 _SAMPLING = 0.05
+#: Of a wander that is fast because the filter learns, so much may be left out between borders, m and rad: small against
+#: the noise of an image coordinate on the ground and in the air. There are half as many unknowns and less.
+LEFT_OUT_M, LEFT_OUT = 0.03, 1e-5
 
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
@@ -48,7 +51,9 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
     position = triple(slow.position_sigma)
     attitude = triple(np.degrees(slow.attitude_sigma))
     if options.model == "wander":
-        return WanderOptions(slow, step)
+        if slow.wander_time_s > LEARNING_TIME_S or options.segment_s:
+            return WanderOptions(slow, step)
+        return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
         offset, shift, drift = np.array(slow.offset_m), np.degrees(slow.shift), np.degrees(slow.drift)
         return DgrOptions(triple(offset), triple(shift), triple(drift))
@@ -117,9 +122,21 @@ class WindowStrip:
         self._prior = self.model.pseudo_observations()
         self._row_done = np.zeros(len(self._prior), dtype=bool)
         self._entered = np.zeros(self.model.n_unknowns, dtype=bool)
-        self._first_use, self._last_use = self._uses(segment_length(slow, options))
+        self._step_s = segment_length(slow, options)
         self._over = False
-        self._need = np.array([self._first_use[c[c >= 0]].max() for c in self._prior.columns])
+        self._look_up_uses()
+
+    def restate(self, from_s: float, slow: SlowErrors, another: bool = False) -> float:
+        """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""
+        assert isinstance(self.model, Wander)
+        border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
+        if np.isfinite(border_s):
+            self._look_up_uses()
+        return border_s
+
+    def _look_up_uses(self) -> None:
+        self._first_use, self._last_use = self._uses(self._step_s)
+        self._need = self._first_use[self._prior.columns].max(axis=1, initial=-np.inf, where=self._prior.columns >= 0)
 
     def _uses(self, step_s: float) -> tuple[Array, Array]:
         """Times (n_unknowns,) before and after which an unknown takes no part; up to one sample on the safe side."""

@@ -497,6 +497,23 @@ class Window:
         sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
         return replace(orientation, protection=self._watch.exposure.protection(sigma))
 
+    def live_between(self, from_s: float, to_s: float) -> list[RefinedOrientation]:
+        """Live orientation at the grid times from one (or where it is not final yet) to another, by strip."""
+        found = []
+        for strip in self.strips.values():
+            first_s = max(from_s, strip.final_to_s, strip.first_line_time_s)
+            last_s = min(to_s, strip.end_s)
+            if first_s >= last_s or strip.is_over(self.state):
+                continue
+            times = self.grid(first_s, last_s)
+            times = times[self.trajectory.covers(times)] if len(times) else times
+            if len(times):
+                if strip.activate(float(times[-1]), self.state):
+                    self.state.solve()
+                    self._orienter.forget()
+                found.append(self._protected(strip, self._orienter.at(strip, times)))
+        return found
+
     def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
         """Orientation at times of a strip, none of them final, that have a measured one."""
         return self._orienter.at(self.strips[strip], np.asarray(times, dtype=float))

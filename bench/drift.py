@@ -1,0 +1,116 @@
+"""Does what the window says of itself stay true over hours? Mean normalised error squared (1 expected) as time goes on.
+
+    python bench/drift.py [--minutes 120] [--seed 1]
+
+Strips one after the other, each tied to the one before by its side lap, with ground control now and then. A row each
+ten minutes, as soon as they are flown, of the strips that became final in them: the ratio of final and whole
+orientation and of points, time of updates and memory (the results are kept). At the end the ratio of the second half of
+the strips over the first, with the scatter of strips: without drift it is 1. Set OPENBLAS_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+
+import numpy as np
+
+from triline.solver.simulation.error_models import ErrorModel
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
+from triline.solver.simulation.window_study import (
+    OnlineResult,
+    adjust_online,
+    navigate,
+    orientation_errors,
+    point_errors,
+)
+from triline.solver.window.results import WindowOptions
+
+#: Between two rows, s, and strips of so many seconds with gaps between them.
+ROW_S = 600.0
+STRIP_S, GAP_S = 54.0, 6.0
+KINDS = ("final", "whole", "points")
+
+
+def resident_mb() -> float:
+    """Resident memory."""
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
+
+
+class Ratios:
+    """Of the strips that are over, told in rows."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._ends = {s.id: s.first_line_time_s + s.lines / s.line_rate_hz for s in simulation.flight.strips}
+        self.of_strip: dict[str, list[float]] = {}
+        self._due_s, self._updates = ROW_S, 0
+        self._begun = time.monotonic()
+
+    def look(self, now_s: float, result: OnlineResult) -> None:
+        """A row, if its time has come; strips count half a minute after their end."""
+        if now_s < self._due_s:
+            return
+        self._due_s += ROW_S
+        over = [id for id, end_s in self._ends.items() if end_s + 30.0 < now_s and id not in self.of_strip]
+        rows = self._count(over, result)
+        ms = 1e3 * np.array(result.update_s[self._updates :])
+        self._updates = len(result.update_s)
+        each = "  ".join(f"{kind} {ratio:.3f}" for kind, ratio in zip(KINDS, np.mean(rows, axis=0), strict=True))
+        print(
+            f"to {now_s / 60:4.0f} min, {len(over):2d} strips: {each}   update p50 {np.median(ms):5.1f} ms, p99 "
+            f"{np.percentile(ms, 99):5.1f} ms   {resident_mb():5.0f} MB   {time.monotonic() - self._begun:5.0f} s",
+            flush=True,
+        )
+
+    def _count(self, strips: list[str], result: OnlineResult) -> np.ndarray:
+        points: dict[str, dict] = {id: {} for id in strips}
+        for name, point in result.final_points.items():
+            if point.residuals and point.residuals[0].look.strip in points:
+                points[point.residuals[0].look.strip][name] = point
+        for id in strips:
+            ratios = [
+                orientation_errors(self._simulation, [o for o in run if o.strip == id]).nees.mean()
+                for run in (result.final, result.whole)
+            ]
+            self.of_strip[id] = [*map(float, ratios), float(point_errors(self._simulation, points[id]).nees.mean())]
+        return np.array([self.of_strip[id] for id in strips])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=120.0)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    strips = max(4, round(60.0 * args.minutes / (STRIP_S + GAP_S)))
+    plan = FlightPlan(
+        strips=strips, strip_s=STRIP_S, turns=False, gap_s=GAP_S, lead_in_s=3.0, lead_out_s=2.0, sidelap=0.2
+    )
+    errors = ErrorModel(attitude_rate_hz=100.0)
+    seen = ObservationPlan(tie_points_per_s=3.0, control=2 * strips, check=strips)
+    simulation = simulate(plan, args.seed, errors, seen)
+    print(f"{simulation.flight.covered_s[-1, 1] / 60:.0f} minutes, {strips} strips", flush=True)
+    ratios = Ratios(simulation)
+    adjust_online(
+        simulation, navigate(simulation), WindowOptions(grid_hz=2.0), live=False, update_s=0.5, so_far=ratios.look
+    )
+    rows = np.array(list(ratios.of_strip.values()))
+    first, last = rows[: len(rows) // 2], rows[len(rows) // 2 :]
+    result: dict[str, object] = {"minutes": args.minutes, "strips judged": len(rows)}
+    for i, kind in enumerate(KINDS):
+        drift = last[:, i].mean() / first[:, i].mean()
+        scatter = np.hypot(*(1.96 * h[:, i].std(ddof=1) / h[:, i].mean() / np.sqrt(len(h)) for h in (first, last)))
+        error = 1.96 * rows[:, i].std(ddof=1) / np.sqrt(len(rows))
+        result[kind] = {
+            "ratio": round(float(rows[:, i].mean()), 3), "+-": round(float(error), 3),
+            "second half over first": round(float(drift), 3), "drift +-": round(float(scatter), 3),
+        }  # fmt: skip
+    print(json.dumps(result, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
