@@ -1,9 +1,11 @@
 """Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
 
-    python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough]
+    python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough] [--camera 0.03]
     python bench/consistency.py drift [--minutes 120]
 
-*seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. *drift*: strips
+*seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. With *camera*,
+the true camera has TLS-12 parameters drawn from that share of their usual a-priori sigmas, and they are estimated;
+without wander (*--constant*) the errors are those that "dgr" describes. *drift*: strips
 one after the other, each tied to the one before by its side lap; the ratio in quarters of the flight, and what is kept.
 Set OPENBLAS_NUM_THREADS=1.
 """
@@ -13,10 +15,13 @@ from __future__ import annotations
 import argparse
 import resource
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from triline.solver.selfcalibration import tls
+from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
@@ -24,16 +29,23 @@ from triline.solver.simulation.window_study import adjust_online, navigate, orie
 from triline.solver.window.results import WindowOptions
 
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
+CONSTANT = replace(ERRORS, wander_sigma_m=(0.0, 0.0, 0.0), wander_sigma_deg=(0.0, 0.0, 0.0))
 KINDS = ("live", "final", "whole", "live points", "final points", "whole points")
 
 
-def one_flight(seed: int, model: str, rough: bool) -> list[float]:
+def one_flight(seed: int, model: str, rough: bool, camera: float, constant: bool) -> list[float]:
     """Ratios by KINDS."""
     plan = FlightPlan(
         strip_s=40.0, stabilised=not rough, turbulence=2.0 if rough else 1.0, lead_in_s=3.0, lead_out_s=2.0
     )
-    simulation = simulate(plan, seed, ERRORS, ObservationPlan(tie_points_per_s=5.0))
-    result = adjust_online(simulation, navigate(simulation), WindowOptions(model=model, grid_hz=5.0), update_s=0.5)
+    errors, ties = CONSTANT if constant else ERRORS, ObservationPlan(tie_points_per_s=5.0)
+    stated = tls(plan.camera, 12).scaled(camera) if camera else None
+    if stated is not None:
+        simulation = simulate_with_camera_errors(plan, seed, stated, errors, ties)
+    else:
+        simulation = simulate(plan, seed, errors, ties)
+    options = WindowOptions(model=model, grid_hz=5.0)
+    result = adjust_online(simulation, navigate(simulation), options, stated, update_s=0.5)
     ratios = [orientation_errors(simulation, o).nees.mean() for o in (result.live, result.final, result.whole)]
     points = (result.live_points, result.final_points, result.whole_points)
     return ratios + [point_errors(simulation, p).nees.mean() for p in points]
@@ -41,7 +53,7 @@ def one_flight(seed: int, model: str, rough: bool) -> list[float]:
 
 def seeds(args: argparse.Namespace) -> None:
     with ProcessPoolExecutor(2) as pool:
-        work = partial(one_flight, model=args.model, rough=args.rough)
+        work = partial(one_flight, model=args.model, rough=args.rough, camera=args.camera, constant=args.constant)
         rows = np.array(list(pool.map(work, range(1, args.seeds + 1))))
     band = 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
     for name, mean, b in zip(KINDS, rows.mean(axis=0), band, strict=True):
@@ -87,6 +99,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--model", default="wander")
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
+    parser.add_argument("--camera", type=float, default=0.0, help="share of the a-priori sigmas of TLS-12")
+    parser.add_argument("--constant", action="store_true", help="no wander")
     parser.add_argument("--minutes", type=float, default=120.0)
     args = parser.parse_args()
     {"seeds": seeds, "drift": drift}[args.what](args)
