@@ -1,11 +1,14 @@
 """Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
 
     python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough] [--camera 0.03]
+    python bench/consistency.py control [--seeds 100]
     python bench/consistency.py drift [--minutes 120]
 
 *seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. With *camera*,
 the true camera has TLS-12 parameters drawn from that share of their usual a-priori sigmas, and they are estimated;
-without wander (*--constant*) the errors are those that "dgr" describes. *drift*: strips
+without wander (*--constant*) the errors are those that "dgr" describes. *control*: one coordinate of a control point is
+wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level (0.1 % allowed), and beyond 3.29
+sigma. *drift*: strips
 one after the other, each tied to the one before by its side lap; the ratio in quarters of the flight, and what is kept.
 Set OPENBLAS_NUM_THREADS=1.
 """
@@ -19,6 +22,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.stats import norm
 
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
@@ -60,6 +64,41 @@ def seeds(args: argparse.Namespace) -> None:
         print(f"{name:14} {mean:.3f} +- {b:.3f}  {'in the band' if abs(mean - 1.0) <= b else 'outside'}")
 
 
+def one_wrong_control(seed: int) -> dict[str, tuple[int, int, int]]:
+    """Components of orientation: beyond the protection level, beyond 3.29 sigma, all."""
+    plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, seed, ERRORS, ObservationPlan(tie_points_per_s=5.0))
+    rng = np.random.default_rng(seed)
+    surveyed = simulation.surveyed_l.copy()
+    point = rng.choice(np.flatnonzero(simulation.points.role == "control"))
+    sigma = np.array(simulation.observation_plan.control_sigma_m)
+    axis = rng.integers(3)
+    surveyed[point, axis] += rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 12.0) * sigma[axis]
+    spoilt = replace(simulation, surveyed_l=surveyed)
+    result = adjust_online(spoilt, navigate(simulation), WindowOptions(grid_hz=2.0), update_s=0.5)
+    counts = {}
+    for name, run in (("live", result.live), ("final", result.final)):
+        told = [o for o in run if o.protection is not None]
+        errors = orientation_errors(simulation, told)
+        level = np.concatenate([o.protection for o in told if o.protection is not None])
+        beyond = np.abs(errors.error) > level
+        far = np.abs(errors.error) > norm.isf(0.5e-3) * np.sqrt(np.einsum("nii->ni", errors.covariance))
+        counts[name] = int(beyond.sum()), int(far.sum()), beyond.size
+    return counts
+
+
+def control(args: argparse.Namespace) -> None:
+    with ProcessPoolExecutor(2) as pool:
+        flights = list(pool.map(one_wrong_control, range(1, args.seeds + 1)))
+    for name in ("live", "final"):
+        beyond, far, n = np.sum([f[name] for f in flights], axis=0)
+        of_flights = sum(f[name][0] > 0 for f in flights)
+        print(
+            f"{name:6} beyond the protection level {100 * beyond / n:.3f} % of {n} ({of_flights} of {len(flights)} "
+            f"flights); beyond 3.29 sigma {100 * far / n:.2f} %"
+        )
+
+
 def drift(args: argparse.Namespace) -> None:
     strips = max(4, round(args.minutes))
     plan = FlightPlan(strips=strips, strip_s=54.0, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0, sidelap=0.2)
@@ -95,7 +134,7 @@ def drift(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("seeds", "drift"))
+    parser.add_argument("what", choices=("seeds", "control", "drift"))
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--model", default="wander")
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
@@ -103,7 +142,7 @@ def main() -> None:
     parser.add_argument("--constant", action="store_true", help="no wander")
     parser.add_argument("--minutes", type=float, default=120.0)
     args = parser.parse_args()
-    {"seeds": seeds, "drift": drift}[args.what](args)
+    {"seeds": seeds, "control": control, "drift": drift}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from functools import partial
 
 import numpy as np
 
-from triline.solver.camera import preset
 from triline.solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
+from triline.solver.sensors import preset
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
