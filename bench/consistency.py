@@ -1,9 +1,14 @@
 """Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
 
-    python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough]
+    python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough] [--camera 0.03]
+    python bench/consistency.py control [--seeds 100]
     python bench/consistency.py drift [--minutes 120]
 
-*seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. *drift*: strips
+*seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. With *camera*,
+the true camera has TLS-12 parameters drawn from that share of their usual a-priori sigmas, and they are estimated;
+without wander (*--constant*) the errors are those that "dgr" describes. *control*: one coordinate of a control point is
+wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level (0.1 % allowed), and beyond 3.29
+sigma. *drift*: strips
 one after the other, each tied to the one before by its side lap; the ratio in quarters of the flight, and what is kept.
 Set OPENBLAS_NUM_THREADS=1.
 """
@@ -13,10 +18,14 @@ from __future__ import annotations
 import argparse
 import resource
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.stats import norm
 
+from triline.solver.selfcalibration import tls
+from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
@@ -24,16 +33,23 @@ from triline.solver.simulation.window_study import adjust_online, navigate, orie
 from triline.solver.window.results import WindowOptions
 
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
+CONSTANT = replace(ERRORS, wander_sigma_m=(0.0, 0.0, 0.0), wander_sigma_deg=(0.0, 0.0, 0.0))
 KINDS = ("live", "final", "whole", "live points", "final points", "whole points")
 
 
-def one_flight(seed: int, model: str, rough: bool) -> list[float]:
+def one_flight(seed: int, model: str, rough: bool, camera: float, constant: bool) -> list[float]:
     """Ratios by KINDS."""
     plan = FlightPlan(
         strip_s=40.0, stabilised=not rough, turbulence=2.0 if rough else 1.0, lead_in_s=3.0, lead_out_s=2.0
     )
-    simulation = simulate(plan, seed, ERRORS, ObservationPlan(tie_points_per_s=5.0))
-    result = adjust_online(simulation, navigate(simulation), WindowOptions(model=model, grid_hz=5.0), update_s=0.5)
+    errors, ties = CONSTANT if constant else ERRORS, ObservationPlan(tie_points_per_s=5.0)
+    stated = tls(plan.camera, 12).scaled(camera) if camera else None
+    if stated is not None:
+        simulation = simulate_with_camera_errors(plan, seed, stated, errors, ties)
+    else:
+        simulation = simulate(plan, seed, errors, ties)
+    options = WindowOptions(model=model, grid_hz=5.0)
+    result = adjust_online(simulation, navigate(simulation), options, stated, update_s=0.5)
     ratios = [orientation_errors(simulation, o).nees.mean() for o in (result.live, result.final, result.whole)]
     points = (result.live_points, result.final_points, result.whole_points)
     return ratios + [point_errors(simulation, p).nees.mean() for p in points]
@@ -41,11 +57,46 @@ def one_flight(seed: int, model: str, rough: bool) -> list[float]:
 
 def seeds(args: argparse.Namespace) -> None:
     with ProcessPoolExecutor(2) as pool:
-        work = partial(one_flight, model=args.model, rough=args.rough)
+        work = partial(one_flight, model=args.model, rough=args.rough, camera=args.camera, constant=args.constant)
         rows = np.array(list(pool.map(work, range(1, args.seeds + 1))))
     band = 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
     for name, mean, b in zip(KINDS, rows.mean(axis=0), band, strict=True):
         print(f"{name:14} {mean:.3f} +- {b:.3f}  {'in the band' if abs(mean - 1.0) <= b else 'outside'}")
+
+
+def one_wrong_control(seed: int) -> dict[str, tuple[int, int, int]]:
+    """Components of orientation: beyond the protection level, beyond 3.29 sigma, all."""
+    plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, seed, ERRORS, ObservationPlan(tie_points_per_s=5.0))
+    rng = np.random.default_rng(seed)
+    surveyed = simulation.surveyed_l.copy()
+    point = rng.choice(np.flatnonzero(simulation.points.role == "control"))
+    sigma = np.array(simulation.observation_plan.control_sigma_m)
+    axis = rng.integers(3)
+    surveyed[point, axis] += rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 12.0) * sigma[axis]
+    spoilt = replace(simulation, surveyed_l=surveyed)
+    result = adjust_online(spoilt, navigate(simulation), WindowOptions(grid_hz=2.0), update_s=0.5)
+    counts = {}
+    for name, run in (("live", result.live), ("final", result.final)):
+        told = [o for o in run if o.protection is not None]
+        errors = orientation_errors(simulation, told)
+        level = np.concatenate([o.protection for o in told if o.protection is not None])
+        beyond = np.abs(errors.error) > level
+        far = np.abs(errors.error) > norm.isf(0.5e-3) * np.sqrt(np.einsum("nii->ni", errors.covariance))
+        counts[name] = int(beyond.sum()), int(far.sum()), beyond.size
+    return counts
+
+
+def control(args: argparse.Namespace) -> None:
+    with ProcessPoolExecutor(2) as pool:
+        flights = list(pool.map(one_wrong_control, range(1, args.seeds + 1)))
+    for name in ("live", "final"):
+        beyond, far, n = np.sum([f[name] for f in flights], axis=0)
+        of_flights = sum(f[name][0] > 0 for f in flights)
+        print(
+            f"{name:6} beyond the protection level {100 * beyond / n:.3f} % of {n} ({of_flights} of {len(flights)} "
+            f"flights); beyond 3.29 sigma {100 * far / n:.2f} %"
+        )
 
 
 def drift(args: argparse.Namespace) -> None:
@@ -83,13 +134,15 @@ def drift(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("seeds", "drift"))
+    parser.add_argument("what", choices=("seeds", "control", "drift"))
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--model", default="wander")
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
+    parser.add_argument("--camera", type=float, default=0.0, help="share of the a-priori sigmas of TLS-12")
+    parser.add_argument("--constant", action="store_true", help="no wander")
     parser.add_argument("--minutes", type=float, default=120.0)
     args = parser.parse_args()
-    {"seeds": seeds, "drift": drift}[args.what](args)
+    {"seeds": seeds, "control": control, "drift": drift}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -127,6 +127,17 @@ class SelfCalibration:
             values[of_kind if of_kind else [self._place(name)]] = value
         return replace(self, sigma=values)
 
+    def scaled(self, share: float) -> SelfCalibration:
+        """The set with all a-priori sigmas times a factor.
+
+        Raises
+        ------
+        ValueError : a factor that is not positive
+        """
+        if not share > 0:
+            raise ValueError(f"factor of the a-priori sigmas must be positive, got {share}")
+        return replace(self, sigma=share * self.sigma)
+
     def free(self) -> SelfCalibration:
         """The set with a-priori sigmas so large that they carry no weight."""
         return replace(self, sigma=self.sigma * FREE)

@@ -149,6 +149,10 @@ class CorrectionModel(ABC):
         """Corrections (n, 6) at times (n,), metres and radians."""
         return self.design(time_s).evaluate(theta)
 
+    def left_out_variance(self, time_s: ArrayLike) -> Array:
+        """Variance (n, 6) of what the model cannot follow at times (n,), m^2 and rad^2; 0 where it does not know."""
+        return np.zeros((np.size(time_s), 6))
+
 
 class ModelOptions(ABC):
     """Settings of a model; builds one `CorrectionModel` per correction set.

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..slow_errors import SlowErrors
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -17,8 +18,20 @@ from .base import (
     ModelOptions,
     PseudoObservations,
     direct_observations,
+    join_observations,
     three,
 )
+from .process import (
+    BEFORE,
+    constant_names,
+    constants_stated,
+    describe_constants,
+    given_before,
+    left_between_values,
+    wander_sigma,
+    with_constants,
+)
+from .wander import GLOBALS
 
 Array = NDArray[np.floating]
 
@@ -35,6 +48,7 @@ class LimOptions(ModelOptions):
     fixes : per correction set, 4 at least; fewer remain where too few rays lie between two of them
     merge : whether fixes are merged at all
     offset_sigma_m, shift_sigma_deg : of the zero observations of every fix
+    slow : the slow errors, where they are known as a process (see `process`): instead of zero observations
     """
 
     name: ClassVar[str] = "lim"
@@ -42,6 +56,7 @@ class LimOptions(ModelOptions):
     merge: bool = True
     offset_sigma_m: tuple[float, float, float] = (0.2, 0.2, 0.2)
     shift_sigma_deg: tuple[float, float, float] = (0.01, 0.01, 0.02)
+    slow: SlowErrors | None = None
 
     def __post_init__(self) -> None:
         if self.fixes < FEWEST_FIXES:
@@ -63,7 +78,8 @@ class LimOptions(ModelOptions):
 class LagrangeInterpolation(CorrectionModel):
     """Six corrections at each fix; at a time the cubic through the two fixes before and the two after.
 
-    Column ``6 f + c``: component c of fix f.
+    Column ``6 f + c``: component c of fix f; where the slow errors are known as a process, after nine columns of
+    offset, shift and drift of the strip.
 
     Attributes
     ----------
@@ -81,12 +97,22 @@ class LagrangeInterpolation(CorrectionModel):
         gone = options.fixes - len(self.fixes)
         if gone:
             self.notes = (f"{extent.name}: {gone} of {options.fixes} fixes merged, too few rays between them",)
-        self.unknown_names = tuple(
+        names = [
             f"{component} at fix {f + 1} of {extent.name}" for f in range(len(self.fixes)) for component in COMPONENTS
-        )
+        ]
+        self.unknown_names = (*(constant_names(extent) if options.slow else ()), *names)
 
     def design(self, time_s: ArrayLike) -> Design:
         t = np.asarray(time_s, dtype=float)
+        around, coefficients = self._between(t)
+        columns = (6 * around[:, :, None] + np.arange(6)).astype(np.int32)
+        if self.options.slow is not None:
+            share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
+            columns, coefficients = with_constants(columns, coefficients, share)
+        return Design(columns, coefficients)
+
+    def _between(self, t: Array) -> tuple[NDArray[np.int64], Array]:
+        """The four fixes (n, 4) of times, and their factors (n, 4)."""
         first = np.clip(np.searchsorted(self.fixes, t, side="right") - 2, 0, len(self.fixes) - 4)
         around = first[:, None] + np.arange(4)
         at = self.fixes[around]
@@ -95,15 +121,48 @@ class LagrangeInterpolation(CorrectionModel):
             for m in range(4):
                 if m != j:
                     coefficients[:, j] *= (t - at[:, m]) / (at[:, j] - at[:, m])
-        columns = 6 * around[:, :, None] + np.arange(6)
-        return Design(columns.astype(np.int32), coefficients)
+        return around, coefficients
+
+    def left_out_variance(self, time_s: ArrayLike) -> Array:
+        t = np.asarray(time_s, dtype=float)
+        if self.options.slow is None:
+            return super().left_out_variance(t)
+        around, coefficients = self._between(t)
+        left = left_between_values(self.options.slow.wander_time_s, t, self.fixes[around], coefficients)
+        return left[:, None] * wander_sigma(self.options.slow) ** 2
 
     def pseudo_observations(self) -> PseudoObservations:
+        if self.options.slow is not None:
+            return join_observations(
+                [constants_stated(self.extent, self.options.slow), self._values(self.options.slow)]
+            )
         of_fix = np.concatenate([self.options.offset_sigma_m, np.radians(self.options.shift_sigma_deg)])
         return direct_observations(np.tile(of_fix, len(self.fixes)), self.unknown_names)
 
+    def _values(self, slow: SlowErrors) -> PseudoObservations:
+        """Every value observed as what those before it say of it, with the variance of what is new."""
+        weights, variance = given_before(slow.wander_time_s, self.fixes)
+        fix, component = (a.ravel() for a in np.indices((len(self.fixes), 6)))
+        back = np.arange(-BEFORE, 1)
+        columns = GLOBALS + 6 * (fix[:, None] + back) + component[:, None]
+        columns = np.where(fix[:, None] + back >= 0, columns, -1)
+        coefficients = np.column_stack([-weights, np.ones(len(weights))])[fix]
+        return PseudoObservations(
+            columns.astype(np.int32),
+            coefficients,
+            np.zeros(len(fix)),
+            wander_sigma(slow)[component] * np.sqrt(variance[fix]),
+            tuple(
+                f"wander of {COMPONENTS[c]} at fix {f + 1} of {self.extent.name}"
+                for f, c in zip(fix, component, strict=True)
+            ),
+        )
+
     def describe(self, theta: ArrayLike, sigma: ArrayLike) -> dict[str, object]:
-        value, spread = np.reshape(theta, (-1, 6)), np.reshape(sigma, (-1, 6))
+        theta, sigma = np.asarray(theta, dtype=float), np.asarray(sigma, dtype=float)
+        result = describe_constants(theta, sigma) if self.options.slow is not None else {}
+        first = GLOBALS if self.options.slow is not None else 0
+        value, spread = np.reshape(theta[first:], (-1, 6)), np.reshape(sigma[first:], (-1, 6))
         fixes = [
             {
                 "time_s": float(t),
@@ -114,7 +173,7 @@ class LagrangeInterpolation(CorrectionModel):
             }
             for t, v, s in zip(self.fixes, value, spread, strict=True)
         ]
-        return {"fixes": fixes}
+        return result | {"fixes": fixes}
 
 
 def fewest_rays(fixes: int, self_calibration: bool) -> int:

@@ -20,6 +20,7 @@ STREAMS = (
     "texture",
     "illumination",
     "sensor noise",
+    "camera",
 )
 
 

@@ -1,11 +1,14 @@
-"""Determinability on line: an additional parameter enters the state when the network can see it.
+"""Determinability on line: which additional parameters the network can see by now.
 
-All parameters gather information all along; those that are not determined are *held* at zero, which conditions the
-solution and loses nothing, so that they can be let in at any time with everything that was ever said about them. The
-stepwise test of the batch adjustment (`determinability.examine`) runs on the normal equations of the window, one
+All parameters are in the state from the start with what is known of them beforehand, and gather information all along.
+What the network cannot see yet stays near zero by its a-priori sigma, and what that sigma leaves open is in the
+covariance of all results; a parameter held at zero until a test lets it in would leave that out, and good rays would be
+refused for the camera's fault (bench/consistency.py camera).
+
+The stepwise test of the batch adjustment (`determinability.examine`) runs on the normal equations of the window, one
 parameter an update, from the full set downwards, again and again. Before its four criteria stands one that a window
 needs: what the observations say must be more than what was said beforehand. Two sweeps have to agree before a
-parameter comes or goes.
+parameter counts as determined or no longer.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ SAMPLED = 4
 
 @dataclass(frozen=True)
 class Standing:
-    """Whether a parameter is in the state, and why (not)."""
+    """Whether a parameter is determined, and why (not)."""
 
     status: str
     reason: str
@@ -55,7 +58,7 @@ class Determinability:
 
     Attributes
     ----------
-    inside : (m,) which are in the state
+    inside : (m,) which are determined
     reasons : (m) why (not)
     swept : whether a first sweep is over
     """
@@ -78,10 +81,6 @@ class Determinability:
         self._found = [""] * m
         self._votes = np.zeros(m, dtype=np.int64)
         self.swept = False
-
-    def hold(self, state: WindowState) -> None:
-        """Hold what is not inside."""
-        state.hold(self.numbers[~self.inside])
 
     def standing(self) -> list[Standing]:
         return [
@@ -112,9 +111,9 @@ class Determinability:
             for name, why in verdict.kept.items():
                 self._found[self.names.index(name)] = why
             self._votes[open_[np.abs(evidence.t) > CLEAR]] += 1
-        return self._conclude(state)
+        return self._conclude()
 
-    def _conclude(self, state: WindowState) -> list[str]:
+    def _conclude(self) -> list[str]:
         """A sweep is over: parameters that two of them agree about come or go."""
         differs = self._open != self.inside
         self._votes = np.where(differs, self._votes + 1, 0)
@@ -122,7 +121,7 @@ class Determinability:
         events = []
         for i in np.flatnonzero(change):
             self.inside[i] = self._open[i]
-            what = "is determined and enters" if self.inside[i] else f"leaves: {self._found[i]}"
+            what = "is determined" if self.inside[i] else f"is not determined any more: {self._found[i]}"
             events.append(f"parameter {self.names[i]} {what}")
         for i in range(len(self.names)):
             self.reasons[i] = self._found[i]
@@ -132,9 +131,6 @@ class Determinability:
         self.swept = True
         self._open[:] = True
         self._found = [""] * len(self.names)
-        if change.any():
-            self.hold(state)
-            state.solve()
         return events
 
     def _gather(

@@ -2,11 +2,13 @@
 
 Baarda's reliability theory: an observation hides a gross error up to its marginal detectable error; the most that such
 an error moves a function ``g`` of the unknowns is ``delta_0 sqrt(h^T C^-1 h)`` with ``h = A_r Q g``, where ``A_r`` are
-the rows of the observation with the points eliminated and ``C`` the cofactors of its residuals. The protection level
-is that of the worst observation, plus k sigma. By Cauchy and Schwarz no function moves by more than ``delta_0
-sqrt(lambda)`` of its sigmas, ``lambda`` the largest eigenvalue of ``C^-1 A_r Q A_r^T``. So the few observations of
-largest lambda are looked at exactly, and the bound stands for all others, those that have left the window included:
-their lambda can only have become smaller. One error is thought of at a time, in an image ray or a control coordinate.
+the rows of the observation with the points eliminated and ``C`` the cofactors of its residuals. A larger error is
+noticed more surely but not always, and where the network checks an observation badly it moves the result by far more:
+the protection level is exceeded, with any one error, no more often than the stated risk (`protection`). By Cauchy and
+Schwarz no function moves by more than ``delta_0 sqrt(lambda)`` of its sigmas, ``lambda`` the largest eigenvalue of
+``C^-1 A_r Q A_r^T``. So the few observations of largest lambda are looked at exactly, and the bound stands for all
+others, those that have left the window included: their lambda can only have become smaller. One error is thought of at
+a time, in an image ray or a control coordinate.
 """
 
 from __future__ import annotations
@@ -14,17 +16,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from functools import cache
 from heapq import nlargest
 from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.stats import norm
 
-from ..adjustment.reliability import noncentrality
+from ..adjustment.reliability import CRITICAL_W, noncentrality
 from .batch import Batch, inverse_factors
+from .protection import protection_factor
 from .state import Marginal, WindowState
 
 Array = NDArray[np.floating]
@@ -52,6 +53,7 @@ class Exposure:
     observation : the one that X, Y and Z are most exposed to, in words
     control : whether that is a control coordinate
     detectable_m : its marginal detectable error if it is one, else 0
+    critical : of the test that ought to notice
     """
 
     bias: Array
@@ -59,10 +61,12 @@ class Exposure:
     observation: str
     control: bool
     detectable_m: float
+    critical: float = CRITICAL_W
 
     def protection(self, sigma: Array, risk: float = RISK) -> Array:
         """Protection levels (n, 6) where the orientation has standard deviations (n, 6)."""
-        return (_of_risk(risk) + self.bias / np.maximum(self.sigma, 1e-300)) * sigma
+        outer = self.bias / (noncentrality(self.critical) * np.maximum(self.sigma, 1e-300))
+        return protection_factor(outer, risk, self.critical) * sigma
 
 
 @dataclass
@@ -117,7 +121,7 @@ class Integrity:
     """
 
     def __init__(self, critical: float) -> None:
-        self._delta = noncentrality(critical)
+        self._critical, self._delta = critical, noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
         self._left = _Left()
         self.most_exposed: Batch | None = None
@@ -230,7 +234,7 @@ class Integrity:
         if renew:
             self._left.thin(state)
             self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
-        return Exposure(bias, sigma, *self._name(worst))
+        return Exposure(bias, sigma, *self._name(worst), self._critical)
 
     def _name(self, e: _Exposed | None) -> tuple[str, bool, float]:
         if e is None:
@@ -318,11 +322,6 @@ class _Left:
     def forget(self, before_s: float) -> None:
         while self._bounds and self._bounds[0][0] < before_s:
             self._bounds.popleft()
-
-
-@cache
-def _of_risk(risk: float) -> float:
-    return float(norm.isf(risk / 2))
 
 
 def _leverage(e: _Exposed) -> float:

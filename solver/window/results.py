@@ -31,7 +31,7 @@ class WindowOptions:
     settle_s : so long after the end of a strip late tie points are waited for; then the strip is final
     critical : of Baarda's |w|
     snoop : whether observations are tested at all
-    determine : whether an additional parameter enters only when the network can see it; else all are estimated
+    determine : whether it is tested which additional parameters the network can see by now; else all are estimated
     retest : batches tested again per update, besides new ones
     """
 

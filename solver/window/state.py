@@ -65,7 +65,6 @@ class WindowState:
         self._factor: DenseFactor | None = None
         self._asked = 0
         self.solution = 0
-        self._held: IntArray = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -144,11 +143,6 @@ class WindowState:
         """Normal equations (n, n), (n,) of all information."""
         return self._fixed + self._live, self._fixed_rhs + self._live_rhs
 
-    def hold(self, numbers: IntArray) -> None:
-        """Hold these unknowns at zero from now on, and no others; what is known of them is kept."""
-        self._held = np.asarray(numbers, dtype=np.int64)
-        self._factor = None
-
     def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
         """Factor and values (n,) with other unknowns held at zero."""
         matrix, rhs = self.normal()
@@ -160,18 +154,13 @@ class WindowState:
     @property
     def factor(self) -> DenseFactor:
         if self._factor is None:
-            matrix = self._fixed + self._live
-            if len(self._held):
-                _hold(matrix, self.places(self._held))
-            self._factor = DenseFactor(matrix)
+            self._factor = DenseFactor(self._fixed + self._live)
             self._asked = 0
         return self._factor
 
     def solve(self) -> None:
         """Values from all information."""
         rhs = self._fixed_rhs + self._live_rhs
-        if len(self._held):
-            rhs[self.places(self._held)] = 0.0
         self.theta = self.factor.solve(rhs)
         self.solution += 1
 

@@ -35,7 +35,7 @@ def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
 def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
     """Settings of the model that `options` names, with a-priori sigmas from the slow errors.
 
-    Offset and wander together bound each piecewise coefficient; "wander" alone states them as the processes they are.
+    All but "dgr", which has no place for it, state the wander as the process it is.
 
     Raises
     ------
@@ -43,41 +43,23 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
     """
     step = segment_length(slow, options)
     pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
-
-    def triple(values: Array) -> tuple[float, float, float]:
-        a, b, c = np.maximum(values, NOTHING).tolist()
-        return (a, b, c)
-
-    position = triple(slow.position_sigma)
-    attitude = triple(np.degrees(slow.attitude_sigma))
     if options.model == "wander":
         if slow.wander_time_s > LEARNING_TIME_S or options.segment_s:
             return WanderOptions(slow, step)
         return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
-        offset, shift, drift = np.array(slow.offset_m), np.degrees(slow.shift), np.degrees(slow.drift)
-        return DgrOptions(triple(offset), triple(shift), triple(drift))
+        offset, shift, drift = (_triple(v) for v in (slow.offset_m, np.degrees(slow.shift), np.degrees(slow.drift)))
+        return DgrOptions(offset, shift, drift)
     if options.model == "lim":
-        return LimOptions(max(pieces + 1, 4), False, position, attitude)
+        return LimOptions(max(pieces + 1, 4), False, slow=slow)
     if options.model == "ppm":
-        # slopes change at borders by what the white noise that drives the wander gathers over a segment
-        b = 2.146 / slow.wander_time_s
-        slope = b * step
-        jump = float(np.sqrt(4.0 * b**3 * step / 3.0))
-        wander_m = np.array(slow.wander_m)
-        wander_deg = np.degrees(slow.wander)
-        return PpmOptions(
-            segments=pieces,
-            offset_sigma_m=position,
-            shift_sigma_deg=attitude,
-            first_sigma_m=triple(slope * wander_m),
-            first_sigma_deg=triple(slope * wander_deg + np.degrees(slow.drift) / pieces),
-            second_sigma_m=triple(jump * step * wander_m),
-            second_sigma_deg=triple(jump * step * wander_deg),
-            continuity_sigma_m=triple(jump * wander_m),
-            continuity_sigma_deg=triple(jump * wander_deg),
-        )
+        return PpmOptions(segments=pieces, slow=slow)
     raise ValueError(f"unknown trajectory model {options.model!r}; known: {', '.join(MODELS)}")
+
+
+def _triple(values: ArrayLike) -> tuple[float, float, float]:
+    a, b, c = np.maximum(values, NOTHING).tolist()
+    return (a, b, c)
 
 
 class WindowStrip:
@@ -170,9 +152,7 @@ class WindowStrip:
 
     def left_out_variance(self, time_s: Array) -> Array:
         """(n, 6) what the model cannot follow; 0 for models that do not say."""
-        if isinstance(self.model, Wander):
-            return self.model.left_out_variance(time_s)
-        return np.zeros((len(time_s), 6))
+        return self.model.left_out_variance(time_s)
 
     @property
     def entered(self) -> IntArray:

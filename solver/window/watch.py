@@ -77,7 +77,7 @@ class Watch:
 
     Parameters
     ----------
-    determine : whether additional parameters enter only when they are determined
+    determine : whether it is tested which additional parameters are determined
     """
 
     def __init__(
@@ -101,7 +101,6 @@ class Watch:
             nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id
             order = ranks(self_calibration, nadir)
             self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
-            self._determinability.hold(state)
         self._count = 0
         self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None

@@ -567,11 +567,10 @@ class Window:
 
     def parameters(self, strip: WindowStrip, standing: tuple[Standing, ...] = ()) -> tuple[Parameter, ...]:
         """Offset, shift and drift of a strip where its model has them, and the additional parameters."""
-        with_globals = self.options.model in ("wander", "dgr")
         slow = strip.slow
         return parameters(
             self.state,
-            strip.numbers[:9] if with_globals else (),
+            strip.numbers[:9],
             np.concatenate([slow.offset_m, slow.shift, slow.drift]),
             self._self_calibration,
             self._camera_columns,
