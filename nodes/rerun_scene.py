@@ -21,9 +21,10 @@ APPLICATION = "triline"
 TIMELINE = "flight_time"
 _FLUSH_S = 5.0
 _BACKGROUND = [18, 20, 26]  # the colours of the scene are made for a dark ground, whatever the theme
+_NAME = [240, 243, 248]  # of labels, whose ground goes with the theme: grey or nearly black
 _FIELD_OF_VIEW = np.radians(55.0)  # of the viewer, vertical
 _ALWAYS = rrb.TimeRangeBoundary.infinite()  # plots show the whole flight, not what is near the time cursor
-_ASPECT = 1.35  # of the 3D view, about
+_ASPECT, _WIDE_ASPECT = 1.35, 2.0  # of the 3D view, about; wide above curves
 _MARGIN = 1.06
 _MAP_POINTS = 300.0  # height and width of the map, about
 
@@ -34,6 +35,7 @@ class RerunCanvas:
     def __init__(self, stream: rr.RecordingStream, process: ViewerProcess | None = None) -> None:
         self.stream = stream
         self.process = process
+        self._named: set[str] = set()
         stream.log("flight", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def at(self, time_s: float) -> None:
@@ -43,9 +45,8 @@ class RerunCanvas:
         self, entity: str, xyz: Array, colors: Sequence[Color], radius: float, labels: Sequence[str] | None = None
     ) -> None:
         kind = rr.Points3D if xyz.shape[1] == 3 else rr.Points2D
-        size = rr.Radius.ui_points(radius)
-        shown = labels is not None
-        self.stream.log(entity, kind(xyz, colors=list(colors), radii=size, labels=labels, show_labels=shown))
+        self.stream.log(entity, kind(xyz, colors=list(colors), radii=rr.Radius.ui_points(radius)))
+        self._names(entity, xyz, labels)
 
     def lines(
         self, entity: str, strips: Sequence[Array], colors: Sequence[Color], radius: float,
@@ -53,9 +54,21 @@ class RerunCanvas:
     ) -> None:  # fmt: skip
         kind = rr.LineStrips3D if not len(strips) or strips[0].shape[1] == 3 else rr.LineStrips2D
         size = rr.Radius.ui_points(radius)
-        self.stream.log(
-            entity, kind(list(strips), colors=list(colors), radii=size, labels=labels, show_labels=labels is not None)
-        )
+        self.stream.log(entity, kind(list(strips), colors=list(colors), radii=size))
+        self._names(entity, np.array([strip.mean(axis=0) for strip in strips]), labels)
+
+    def _names(self, entity: str, places: Array, labels: Sequence[str] | None) -> None:
+        """Labels at places; as an entity of their own, in a colour that can be read on any ground."""
+        if labels is None and entity not in self._named:
+            return
+        self._named.add(entity)
+        if not labels:
+            self.stream.log(f"{entity}/names", rr.Clear(recursive=False))
+            return
+        kind = rr.Points3D if places.shape[1] == 3 else rr.Points2D
+        radius = rr.Radius.ui_points(0.0)
+        names = kind(places, colors=[_NAME], radii=radius, labels=list(labels), show_labels=True)
+        self.stream.log(f"{entity}/names", names)
 
     def arrows(
         self, entity: str, origins: Array, vectors: Array, colors: Sequence[Color], radius: float,
@@ -253,11 +266,12 @@ def viewpoint(layout: Layout) -> tuple[Array, Array]:
     up = np.cross(backward, across)
     target = (layout.corners.min(axis=0) + layout.corners.max(axis=0)) / 2
     half = np.tan(_FIELD_OF_VIEW / 2)
+    aspect = _WIDE_ASPECT if layout.lines else _ASPECT
     distance = 1.0
     for _ in range(5):  # nearest distance, then move the target so that the picture is centred, and again
         offset = layout.corners - target
         depth = offset @ backward
-        reach = np.maximum(np.abs(offset @ across) / (half * _ASPECT), np.abs(offset @ up) / half)
+        reach = np.maximum(np.abs(offset @ across) / (half * aspect), np.abs(offset @ up) / half)
         distance = _MARGIN * float((depth + reach).max())
         x = (offset @ across) / (distance - depth)
         y = (offset @ up) / (distance - depth)

@@ -174,7 +174,7 @@ class Scene:
         """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
         s = self.state
         has = s.has_truth, s.has_mosaic, s.has_lines
-        key = (tuple(s.extent), s.camera is not None, has, tuple(s.units), s.frame is not None)
+        key = (tuple(s.extent), s.camera is not None, has, tuple(s.units), s.frame is not None, s.bar_px)
         if key == self._laid_out or not s.extent:
             return
         self._laid_out = key
@@ -191,7 +191,7 @@ class Scene:
             grid_m=s.grid_m,
             corners=corners,
             along=along,
-            ccds={ccd: f"Residuals {ccd}: samples to the right, lines up, bar = 1 px" for ccd in s.ccds},
+            ccds={ccd: f"Residuals {ccd}: samples to the right, lines up, bar = {s.bar_px:g} px" for ccd in s.ccds},
             image_size=s.image_size,
             units=tuple(s.units),
             truth=s.has_truth,
@@ -212,6 +212,8 @@ class Scene:
             f"Residuals x {s.residual_scale:g}: thin arrows are those of single rays laid on the ground, in the "
             "colour of their CCD line; they fade when the point is final. Thick arrows at control and check points "
             "are adjusted minus given coordinates.\n\n"
+            "Image lines, newest on top: dots of one colour in the three views are the looks at one tie point; red are "
+            "control points, blue check points, magenta targets that are held (with the reason) and rejected rays.\n\n"
             "Outlines on the ground: the part of the strip in the *live* window; the *marginal* part before it is "
             "final and kept as a prior on what follows; the *whole* strip has been through the backward pass.\n\n"
             "Protection level: with a risk of 0.001 the orientation is not further off, even if one gross error that "

@@ -10,12 +10,13 @@ import numpy as np
 from .canvas import Canvas
 from .node import Message
 from .scene_parts import CCD_COLORS, REJECTED, Part, faded
-from .scene_state import SceneState
+from .scene_state import SceneState, round_number
 
 _NEWEST = 1500  # rays a view shows
 _PERIOD_S = 1.0  # all of them are drawn again
 _LENGTH_S = 60.0  # of a strip whose end is not known
-_PIXEL = 0.05  # of the view's width is one pixel of residual
+_BAR = 0.05  # of the view's width is the scale bar,
+_TELLING, _BAR_RMS = 60, 3.0  # which is 1 px, or less: about so many times the residuals, once there are so many
 _SETTLED = 0.5  # of the colour is left of the residuals of final points
 _GREY = (110, 110, 120, 255)
 
@@ -29,7 +30,9 @@ class ImagePart(Part):
         self._strip = ""
         self._changed: set[str] = set()
         self._drawn_s = 0.0
-        self._framed: tuple[str, int] | None = None
+        self._framed: tuple[str, int, float] | None = None
+        self._sized = False
+        self._squares: list[float] = []
 
     def take(self, message: Message) -> None:
         if message.topic != "point/object":
@@ -42,10 +45,21 @@ class ImagePart(Part):
                 self._changed = set(self._rays)
             rays = self._rays.get(r.ccd)
             if rays is not None:
+                self._size(r)
                 rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected, settled
                 if len(rays) > _NEWEST:
                     rays.popitem(last=False)
                 self._changed.add(r.ccd)
+
+    def _size(self, residual: Any) -> None:
+        """Decide how long the scale bar is, by the first residuals."""
+        if self._sized or residual.rejected:
+            return
+        self._squares.append(residual.v_line**2 + residual.v_sample**2)
+        if len(self._squares) >= _TELLING:
+            self._sized = True
+            self.state.bar_px = min(round_number(_BAR_RMS * float(np.sqrt(np.mean(self._squares)))), 1.0)
+            self._squares.clear()
 
     def draw(self, canvas: Canvas) -> None:
         strip = self.state.strips.get(self._strip)
@@ -59,14 +73,15 @@ class ImagePart(Part):
         while newest > lines:
             lines *= 2
         along = height / lines
-        scale = _PIXEL * width
+        bar = _BAR * width
+        scale = bar / self.state.bar_px
         for ccd in sorted(self._changed):
             rows = np.array([row for row in self._rays[ccd].values()], dtype=float).reshape(-1, 6)
             origin = np.column_stack([rows[:, 1], height - rows[:, 0] * along])
             vector = scale * np.column_stack([rows[:, 3], -rows[:, 2]])
             bad = rows[:, 4] > 0
             length = np.linalg.norm(vector, axis=1)
-            longest = 2 * scale  # a rejected ray may be far off; its arrow shows where to
+            longest = 2 * bar  # a rejected ray may be far off; its arrow shows where to
             vector[bad] *= np.minimum(1.0, longest / np.maximum(length[bad], 1e-9))[:, None]
             color = CCD_COLORS[self.state.ccds.index(ccd) % len(CCD_COLORS)]
             shades = [faded(color, _SETTLED) if settled else color for settled in rows[:, 5] > 0]
@@ -74,14 +89,15 @@ class ImagePart(Part):
                 own = [REJECTED if bad[i] else shades[i] for i in np.flatnonzero(chosen)]
                 canvas.arrows(f"image/{ccd}/{name}", origin[chosen], vector[chosen], own, 0.9)
         self._changed.clear()
-        if self._framed != (self._strip, round(lines)):
-            self._framed = self._strip, round(lines)
-            self._frame(canvas, width, height, scale)
+        framed = self._strip, round(lines), self.state.bar_px
+        if self._framed != framed:
+            self._framed = framed
+            self._frame(canvas, width, height, bar)
 
-    def _frame(self, canvas: Canvas, width: float, height: float, scale: float) -> None:
+    def _frame(self, canvas: Canvas, width: float, height: float, length: float) -> None:
         """Outline of the strip and a scale bar."""
         for ccd in self.state.ccds:
             box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
             canvas.lines(f"image/{ccd}/frame", [box], [_GREY], 0.7)
-            bar = np.array([[-0.015 * width - scale, 0.9 * height]])
-            canvas.arrows(f"image/{ccd}/scale", bar, np.array([[scale, 0.0]]), [(255, 255, 255, 255)], 1.2)
+            bar = np.array([[-0.015 * width - length, 0.9 * height]])
+            canvas.arrows(f"image/{ccd}/scale", bar, np.array([[length, 0.0]]), [(255, 255, 255, 255)], 1.2)

@@ -69,6 +69,7 @@ class SceneState:
     project, camera, frame, strips : configuration, as far as it has come; strip : id of the newest strip
     origin : (3,) subtracted from local coordinates for display; decided by the first pose
     extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
+    bar_px : residual that is drawn as long as the scale bar
     measured : the trajectory others are compared with, "filtered" or "smoothed"
     trajectory, truth : the newest poses of both
     units : units of the parameters that have come
@@ -91,6 +92,7 @@ class SceneState:
         self.has_truth = False
         self.has_mosaic = False
         self.has_lines = False
+        self.bar_px = 1.0
         self.newest: PoseSample | None = None
         self.speed_m_s = 70.0
         self._control: list[Array] = []
@@ -213,8 +215,8 @@ class SceneState:
 
     @property
     def residual_scale(self) -> float:
-        """Of residuals in object space: a pixel becomes a 25th of the flying height."""
-        return round_number(self.height_m / 25 / self.gsd_m)
+        """Of residuals in object space: the scale bar of image space becomes a 25th of the flying height."""
+        return round_number(self.height_m / 25 / (self.bar_px * self.gsd_m))
 
     @property
     def lines_reduced(self) -> int:

@@ -18,7 +18,8 @@ Array = NDArray[np.floating]
 _STEP_NS = int(0.4 * SECOND_NS)
 _PERIOD_S = 0.4
 _LIGHTS: dict[str, Color] = {"good": (70, 220, 120, 255), "weak": (255, 190, 40, 255), "failed": (255, 60, 60, 255)}
-_WRAP = 64  # characters of a reason
+_WRAP = 84  # characters of a reason
+_ASIDE = 0.18  # of the swath's width: names stand so far beside it, on the viewer's side
 
 
 class WindowPart(Part):
@@ -93,12 +94,20 @@ class WindowPart(Part):
             ("marginal", gone, WHOLE if over else FINAL, "whole strip" if over else "marginal"),
             ("live", live, LIVE, f"live window, {_seconds(live):.0f} s"),
         ):
+            entity = f"flight/window/{name}"
             if len(rows) > 1:
-                canvas.lines(f"flight/window/{name}", [self._outline(rows)], [color], 1.6, [label])
+                canvas.lines(entity, [self._outline(rows)], [color], 1.6)
+                canvas.points(f"{entity}/name", self._beside(rows)[None], [color], 0.5, [label])
             else:
-                canvas.lines(f"flight/window/{name}", [], [], 1.6)
+                canvas.lines(entity, [], [], 1.6)
+                canvas.points(f"{entity}/name", np.empty((0, 3)), [], 0.5, [])
         fence = [np.array([row[2], row[1], row[3]]) for row in (live[:1] if len(live) > 1 and gone else [])]
         canvas.lines("flight/window/border", [self.state.display(f) for f in fence], [LIVE] * len(fence), 0.8)
+
+    def _beside(self, rows: list[tuple[int, Array, Array, Array]]) -> Array:
+        """Where a name stands: to the right of the middle of a swath."""
+        _, _, left, right = rows[len(rows) // 2]
+        return self.state.display(right + _ASIDE * (right - left))
 
     def _outline(self, rows: list[tuple[int, Array, Array, Array]]) -> Array:
         left, right = np.array([r[2] for r in rows]), np.array([r[3] for r in rows])

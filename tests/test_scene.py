@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from itertools import pairwise
 
@@ -96,7 +97,7 @@ def test_residuals_in_object_space_have_the_stated_scale(notes, messages):
     np.testing.assert_allclose(misfits[0], scale * np.array([p.x - g.x, p.y - g.y, p.z - g.z]), rtol=1e-9)
 
 
-def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages):
+def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages, bar_px=1.0):
     final = [m.body for m in messages if m.topic == "point/object" and m.body.status == 1]
     for line in preset("ads40").lines:
         rays = [r for p in final for r in p.residuals if r.ccd == line.id]
@@ -105,10 +106,26 @@ def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages):
         kept = sorted((r.sample, r.v_sample, r.v_line) for r in rays if not r.rejected)
         order = np.argsort(origins[:, 0])
         np.testing.assert_allclose(origins[order, 0], [s for s, _, _ in kept])
-        np.testing.assert_allclose(vectors[order] / bar, [[x, -y] for _, x, y in kept], rtol=1e-9)
+        np.testing.assert_allclose(vectors[order] / bar * bar_px, [[x, -y] for _, x, y in kept], rtol=1e-9)
         bad = notes.drawn[f"image/{line.id}/rejected"]
         assert len(bad[0]) == sum(r.rejected for r in rays)
         assert not len(bad[1]) or np.linalg.norm(bad[1], axis=1).max() <= 2.001 * bar
+
+
+def test_small_residuals_get_a_smaller_bar(messages):
+    small = []
+    for m in messages:
+        body = type(m.body)()
+        body.CopyFrom(m.body)
+        if m.topic == "point/object":
+            for r in body.residuals:
+                r.v_line, r.v_sample = 0.1 * r.v_line, 0.1 * r.v_sample
+        small.append(Message(m.topic, m.stamp_ns, body, m.source, m.sequence))
+    canvas = Notebook()
+    show(small, canvas)
+    titles = canvas.layouts[-1].ccds.values()
+    assert {re.sub(".* bar = ", "", title) for title in titles} == {"0.1 px"}
+    test_residuals_in_image_space_have_the_size_of_the_bar(canvas, small, bar_px=0.1)
 
 
 def test_curves_hold_what_the_messages_say(notes, messages):

@@ -10,7 +10,9 @@ from typing import Any
 STUDIES: dict[str, tuple[str, str]] = {
     "testfields": ("study_testfields", "the testfields of the dissertation, simulated: published accuracy beside ours"),
     "online": ("study_online", "the demo flight with many seeds through the on-line nodes, against truth"),
-    "matching": ("study_matching", "tie points from image lines alone: quality, and what the adjustment makes of them"),
+    "matching": ("study_matching", "tie points from image lines alone, held against truth"),
+    "ties": ("study_ties", "what an adjustment makes of matched tie points, beside simulated ones of the same noise"),
+    "starts": ("study_starts", "flights whose orientation is wrong by 30 px, in one direction after another"),
     "consistency": ("study_consistency", "whether errors of adjusted blocks are as large as their sigmas say"),
 }
 

@@ -25,10 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from ..report.source import messages_of
+    from ..recording import RecordingReader
     from ..rerun_scene import RerunCanvas, open_canvas
+    from ..scene import TOPICS, TRUTH_TOPICS
 
-    messages = messages_of(args.recording)
+    messages = RecordingReader(args.recording).sorted_messages((*TOPICS, *TRUTH_TOPICS))
     if args.rrd is not None and args.rrd.exists() and args.rrd.samefile(args.recording):
         raise UserError(f"{args.rrd}: is the recording itself")
     mode = f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"

@@ -15,6 +15,9 @@ Array = NDArray[np.floating]
 KNOT_S = 1.0
 #: Poses and corrections older than this are forgotten, s.
 KEPT_S = 120.0
+#: A correction that changes by more than this share of its sigma within so long, s, has been found anew, as when the
+#: first control is met: slow errors change far less. What was told of earlier times was wrong by as much.
+JUMP_SHARE, JUMP_S = 0.2, 0.5
 
 
 class CurrentOrientation:
@@ -26,6 +29,7 @@ class CurrentOrientation:
         self._last_s = -np.inf
         self._knots: dict[int, list[Array | int]] = {}
         self._covariance: dict[int, Array] = {}
+        self._newest: tuple[float, Array] | None = None
 
     @property
     def end_s(self) -> float:
@@ -56,6 +60,12 @@ class CurrentOrientation:
 
     def add_correction(self, time_s: float, correction: Array, covariance: Array) -> None:
         """Add what an adjustment adds to the measured pose at a time (6,), and the covariance (6, 6) of the sum."""
+        if self._newest is not None and 0 <= time_s - self._newest[0] <= JUMP_S:
+            change = correction - self._newest[1]
+            if (np.abs(change) > JUMP_SHARE * np.sqrt(np.diagonal(covariance))).any():
+                self._knots = {k: [total + n * change, n] for k, (total, n) in self._knots.items()}
+                self._covariance = dict.fromkeys(self._covariance, covariance)
+        self._newest = time_s, correction
         knot = int(time_s // KNOT_S)
         total, n = self._knots.get(knot, (np.zeros(6), 0))
         self._knots[knot] = [total + correction, n + 1]
@@ -67,6 +77,7 @@ class CurrentOrientation:
         """A new strip begins: corrections of the last one say little about it."""
         self._knots.clear()
         self._covariance.clear()
+        self._newest = None
 
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Perspective centres (n, 3) and rotations ``R_lc`` (n, 3, 3) at times (n,) inside the poses."""

@@ -105,7 +105,9 @@ class LookMatcher:
         self.counters["too few looks"] += int((~enough).sum())
         if not enough.any():
             return None
-        dz, residual = height_of(shift - expected, parallax, weight)
+        dz, _ = height_of(shift - expected, parallax, weight)
+        # nothing that a height explains may stay in what is expected of the next points: it would never leave it again
+        _, residual = height_of(shift, parallax, weight)
         xyz = np.column_stack([centre[:, :2] + slope * dz[:, None], height + dz])
         pixel_m = np.column_stack([np.full(views + 1, travel), [sample_m(master, centre, line), *scale_across]])
         chosen = np.flatnonzero(enough)
@@ -121,7 +123,7 @@ class LookMatcher:
             chip = self._image(p.master, master, travel).patches(ground, line[enough], self._chip_half, 1)[0]
         return Looked(
             [places[i] for i in chosen], rays, np.where(known, score, 1.0).min(axis=1)[enough], xyz[enough],
-            Disagreement(time_s[enough], across[enough], (residual + expected)[enough]), chip, ground.select(
+            Disagreement(time_s[enough], across[enough], residual[enough]), chip, ground.select(
                 np.arange(len(ground.centre_l)) if self._chip_half else enough
             ),
         )  # fmt: skip
