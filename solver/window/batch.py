@@ -109,6 +109,7 @@ class Batch:
     def __post_init__(self) -> None:
         self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
         self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
+        self.height_m = abs(float(np.median(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])))
         self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
         self._template()
 
@@ -192,10 +193,10 @@ class Batch:
         rest = self.normals.y.T - self.coupling @ theta
         self.points_l = self.origin_l + self.normals.back(rest.T).T
 
-    def has_moved(self, theta: Array, far_m: float, far_rad: float) -> bool:
-        """Whether a correction of a ray has changed by more than this since the linearisation."""
+    def has_moved(self, theta: Array, far: float) -> bool:
+        """Whether a correction of a ray has changed by more since the linearisation, rad or flying heights."""
         change = np.abs(self.layout.corrections(theta - self.theta))
-        return bool(change[:3].max() > far_m or change[3:].max() > far_rad)
+        return bool(change[:3].max() > far * self.height_m or change[3:].max() > far)
 
     def points_moved(self) -> float:
         """How far a point has moved at most since the linearisation, m."""

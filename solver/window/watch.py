@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,11 +73,16 @@ class _Count:
 
 
 class Watch:
-    """Runs once an update; what costs much is spread over updates.
+    """Looks at the window after its updates; what costs much is spread over updates.
 
     Parameters
     ----------
     determine : whether it is tested which additional parameters are determined
+
+    Attributes
+    ----------
+    exposure : of the newest orientation
+    last : the findings of the last look, without its events
     """
 
     def __init__(
@@ -104,6 +109,7 @@ class Watch:
         self._count = 0
         self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None
+        self.last: Watched | None = None
 
     @property
     def most_exposed(self) -> Batch | None:
@@ -113,6 +119,10 @@ class Watch:
     def drop(self, batch: Batch) -> None:
         """A batch is taken apart."""
         self._integrity.drop(batch)
+
+    def note(self, batches: list[Batch]) -> None:
+        """Batches have been judged."""
+        self._integrity.note(batches)
 
     def leaving(self, batches: list[Batch], before_s: float) -> None:
         """Batches leave the window; what left before a time is forgotten."""
@@ -143,7 +153,6 @@ class Watch:
         length_s: float,
         strip: WindowStrip | None,
         batches: list[Batch],
-        changed: list[Batch],
         sigma0: float,
         redundancy: int,
         total: tuple[float, int],
@@ -154,12 +163,11 @@ class Watch:
         Parameters
         ----------
         strip : the newest one, None if all are over
-        batches, changed : of the window; those judged in this update
+        batches : of the window
         sigma0, redundancy, total : over the window, since the start
         apriori_m : (3,) sigma of the position beforehand
         """
         self._count += 1
-        self._integrity.note(changed)
         time_s = -np.inf
         self.exposure = None
         if strip is not None and batches:
@@ -187,9 +195,9 @@ class Watch:
         standing = tuple(d.standing()) if d is not None else ()
         sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
         protection = sigma if self.exposure is None else self.exposure.protection(sigma)
-        return Watched(
-            colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events), sigma, protection
-        )
+        found = Watched(colour, reason, self.exposure, time_s, self._sources.biased, standing, (), sigma, protection)
+        self.last = found
+        return replace(found, events=tuple(events))
 
     def _count_of(self, batch: Batch) -> _Count:
         """Anew only if the batch has changed."""
