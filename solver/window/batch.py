@@ -270,14 +270,23 @@ class Batch:
             return self.judged[2].v_px
         theta = state.values(self.columns)
         self.back_substitute(theta)
-        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
-        return residuals_px(self.rays, lin, self.whitening)
+        return residuals_px(self.rays, self._at(theta), self.whitening)
 
     def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
         """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
-        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
-        view = _AsSolution(_RaysOf(self.rays), lin, self.whitening, self.weight)
+        view = _AsSolution(_RaysOf(self.rays), self._at(theta), self.whitening, self.weight)
         return ray_statistics(cast("Solution", view), cofactors)
+
+    def _at(self, theta: Array) -> Linearisation:
+        """The linear equations with their residuals at values (u,) of the unknowns and the present points.
+
+        They are as good as the linearisation, which follows the unknowns (`following`).
+        """
+        n = len(self.rays)
+        rows = self.full_rows(np.arange(n)).reshape(2 * n, -1)
+        shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
+        moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
+        return replace(self.lin, residual=self.lin.residual - moved)
 
 
 def inverse_factors(normals: PointNormals) -> Array:

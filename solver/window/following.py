@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,8 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
-#: the linear equations then miss goes with its square: a hundredth of a pixel.
-MOVED = 1e-3
+#: the linear equations then miss goes with its square: two hundredths of a pixel.
+MOVED = 1.5e-3
 #: Every so many updates it is looked whether a batch has moved, if new data did not move far.
 LOOKED_AFTER = 16
 #: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
@@ -27,8 +28,9 @@ LOOKED_AFTER = 16
 MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
 #: Rays that get their smoothed orientation in one update, about; the others in the next ones.
 MOST_REPLACED = 600
-#: Batches of one time are joined up to so many rays when they get their smoothed orientation.
-JOINED_RAYS = 160
+#: Batches of one time are joined up to so many rays when they get their smoothed orientation; fewer wait for others so
+#: long, s.
+JOINED_RAYS, GATHERED_S = 160, 1.0
 
 
 class Follower:
@@ -65,12 +67,14 @@ class Follower:
         those that came about that way are returned.
         """
         smoothed_s = self._trajectory.smoothed_to_s
+        due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
+        number = sum(len(b.rays) for b in due)
+        if number < JOINED_RAYS and all(b.newest_s > smoothed_s - GATHERED_S for b in due):
+            return []
         alone: list[Batch] = []
         groups: dict[int, list[list[Batch]]] = {}
         rays = 0
-        for batch in self._batches:
-            if not batch.provisional or batch.newest_s > smoothed_s:
-                continue
+        for batch in due:
             if rays > MOST_REPLACED:
                 break
             rays += len(batch.rays)
@@ -82,7 +86,7 @@ class Follower:
                 chunks.append([])
             chunks[-1].append(batch)
         joined = []
-        for chunk in (chunk for chunks in groups.values() for chunk in chunks):
+        for chunk in chain.from_iterable(groups.values()):
             if len(chunk) > 1:
                 joined.append(self._join(chunk))
             else:

@@ -25,8 +25,8 @@ IntArray = NDArray[np.int64]
 
 #: Level of the tests of parameters on line; they are made again and again.
 ALPHA = 0.01
-#: Steps of the determinability test in one update before the first sweep is over, and updates between two later on.
-STEPS, STEP_EVERY = 2, 2
+#: Steps of the determinability test at one look before the first sweep is over, and time between two later on, s.
+STEPS, STEP_EVERY_S = 2, 0.8
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Watch:
             nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id
             order = ranks(self_calibration, nadir)
             self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
-        self._count = 0
+        self._next_step_s = -np.inf
         self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None
         self.last: Watched | None = None
@@ -167,7 +167,6 @@ class Watch:
         sigma0, redundancy, total : over the window, since the start
         apriori_m : (3,) sigma of the position beforehand
         """
-        self._count += 1
         time_s = -np.inf
         self.exposure = None
         if strip is not None and batches:
@@ -177,7 +176,8 @@ class Watch:
         events: list[str] = []
         d = self._determinability
         if d is not None:
-            for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
+            for _ in range(int(now_s >= self._next_step_s) if d.swept else STEPS):
+                self._next_step_s = now_s + STEP_EVERY_S - 1e-6
                 events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
         self._counts = {id(b): self._count_of(b) for b in batches}
         points = sum(b.n_points for b in batches)

@@ -46,7 +46,9 @@ AHEAD_S = 1.0
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
 #: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
-UNHURRIED_S = 0.1
+HURRIED_S = 0.1
+#: Time between two looks of the watch, s, if updates are not hurried.
+WATCH_S = 0.3
 
 
 class Window:
@@ -95,7 +97,7 @@ class Window:
         self._settler = Settler()
         self._now_s = -np.inf
         self._serial = 0
-        self._newest_ray_s = -np.inf
+        self._newest_ray_s = self._watched_s = -np.inf
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory)
         self._watch = Watch(
@@ -163,7 +165,7 @@ class Window:
 
     def update(self, now_s: float) -> WindowUpdate:
         """Work in what has arrived, let go what is older than the window."""
-        hurried = now_s - self._now_s < UNHURRIED_S
+        hurried = now_s - self._now_s < HURRIED_S
         self._now_s = max(self._now_s, now_s)
         self._serial += 1
         turn = self._serial % 3 if hurried else None
@@ -179,7 +181,8 @@ class Window:
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
-        result.report = self._report(iterations, fresh + joined, turn in (None, 2), result)
+        look = turn == 2 if hurried else self._now_s > self._watched_s + WATCH_S
+        result.report = self._report(iterations, fresh + joined, look, result)
         return result
 
     def finish(self) -> WindowUpdate:
@@ -309,6 +312,7 @@ class Window:
         self._watch.note(changed)
         watched = self._watch.last
         if look or watched is None:
+            self._watched_s = self._now_s
             watched = self._watch.look(
                 self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
                 (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
