@@ -198,6 +198,7 @@ class BusRunner:
             for accepted in self._check.accept(raw.topic, raw.envelope, raw):
                 message = self._decode(accepted)
                 if message is not None:
+                    self._sequencer.hear(accepted.topic, accepted.envelope, self._patience.now_s())
                     self._work(message)
         self._worked_ns = 0  # configuration does not tell how far the flight is
         now = self._patience.now_s()
