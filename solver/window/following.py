@@ -136,15 +136,11 @@ class Follower:
         for batch, theta in due:
             self._batches.linearise(batch, theta, reweigh=False)
         if far:
-            self.suspect_all(fresh)
+            new = {id(b) for b in fresh}
+            self._suspects = {id(b): b for b in self._batches if id(b) not in new}
+            self._following = True
             self._again(MOST_RAYS_AGAIN)
         return bool(due)
-
-    def suspect_all(self, but: Sequence[Batch] = ()) -> None:
-        """All batches may have moved, but for some."""
-        known = {id(b) for b in but}
-        self._suspects = {id(b): b for b in self._batches if id(b) not in known}
-        self._following = True
 
     def _again(self, most_rays: int) -> None:
         """Linearise suspects again that have moved, up to a number of rays, or of batches if that is 0."""

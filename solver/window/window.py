@@ -317,9 +317,6 @@ class Window:
                 self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
                 (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
             )  # fmt: skip
-        if watched.events:  # a parameter has come or gone
-            self._orienter.forget()
-            self._follower.suspect_all()
         result.events += watched.events
         determined = rows = rays = points = control = 0
         for batch in self._batches:
