@@ -43,6 +43,7 @@ class Recorded:
     def __init__(self) -> None:
         self.updates: list[tuple[float, int, list[tuple[Any, ...]]]] = []
         self._known: set[int] = set()
+        self._points: set[str] = set()
         self._kept: list[Any] = []
 
     def watch(self, now_s: float, window: Window) -> None:
@@ -55,7 +56,10 @@ class Recorded:
             self._known.add(id(batch))
             self._kept.append(batch)  # so that no other gets its id
             rows = batch.full_rows(np.arange(len(batch.rays)))
-            for p in range(batch.n_points):
+            for p, name in enumerate(batch.names):
+                if name in self._points:  # of a batch that joins others
+                    continue
+                self._points.add(name)
                 mine = slice(int(batch.first_ray[p]), int(batch.first_ray[p + 1]))
                 A = rows[mine].reshape(-1, rows.shape[2])
                 J = batch.lin.point[:, :, mine].transpose(2, 0, 1).reshape(-1, 3)

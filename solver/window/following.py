@@ -26,7 +26,7 @@ LOOKED_AFTER = 16
 #: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
 #: which leave first, the others in the updates after it.
 MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
-#: Rays that get their smoothed orientation in one update, about; the others in the next ones.
+#: Rays that get their smoothed orientation in one update, about, or half of those that wait; the others in the next.
 MOST_REPLACED = 600
 #: Batches of one time are joined up to so many rays when they get their smoothed orientation; fewer wait for others so
 #: long, s.
@@ -75,7 +75,7 @@ class Follower:
         groups: dict[int, list[list[Batch]]] = {}
         rays = 0
         for batch in due:
-            if rays > MOST_REPLACED:
+            if rays > max(MOST_REPLACED, number // 2):
                 break
             rays += len(batch.rays)
             if batch.ties is not None:
