@@ -176,4 +176,4 @@ class _Decoder:
     def __call__(self, item: int | RawMessage) -> Message:
         raw: Any = self._reader.raw(item) if isinstance(item, int) else item
         e = raw.envelope
-        return Message(raw.topic, e.stamp_ns, codec.decode(raw.topic, raw.data), e.source, e.sequence)
+        return Message(raw.topic, e.stamp_ns, codec.parse(raw.topic, raw.data), e.source, e.sequence)
