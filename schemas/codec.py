@@ -79,14 +79,16 @@ class _Numbers(NamedTuple):
 def _numbers_of(cls: Any) -> _Numbers:
     single, many, message, messages = [], [], [], []
     sizes = _SIZES.get(cls.DESCRIPTOR.full_name, {})
+    empty = cls()
     for field in cls.DESCRIPTOR.fields:
+        repeated = hasattr(getattr(empty, field.name), "extend")
         if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
-            if field.is_repeated:
+            if repeated:
                 many.append((field.name, sizes.get(field.name, 0)))
             else:
                 single.append(field.name)
         elif field.cpp_type == field.CPPTYPE_MESSAGE:
-            (messages if field.is_repeated else message).append(field.name)
+            (messages if repeated else message).append(field.name)
     return _Numbers(tuple(single), tuple(many), tuple(message), tuple(messages))
 
 
