@@ -2,8 +2,8 @@
 
     python bench/long_flight.py [--hours 4] [--pace throughput] [--recording FILE] [-o out/bench]
 
-Prints a row for each half hour as soon as it is flown, and at the end whether memory after warm-up stays within 5 % and
-the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
+Prints a row for each ten minutes as soon as they are flown, and at the end whether memory after warm-up stays within 5 %
+and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from triline.schemas.envelope import RawMessage
 from triline.solver.window.window import Window
 
 #: The flight is warm after so long, s.
-WARM_S = 1800.0
+WARM_S = 1200.0
 #: Of a row of the table, s.
-ROW_S = 1800.0
+ROW_S = 600.0
 #: Of a parallel strip, and with its turn, s.
 STRIP_S, TURN_S = 238.0, 93.0
 
@@ -91,11 +91,11 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
 
 
 def tell(memory: np.ndarray, updates: np.ndarray, to_s: float) -> None:
-    """The row of the half hour that ends at a time."""
+    """The row that ends at a time."""
     m, u = (a[(a[:, 0] >= to_s - ROW_S) & (a[:, 0] < to_s), 1] for a in (memory, updates))
     if len(u):
         p50, p99 = np.percentile(u, [50, 99])
-        hours = f"{(to_s - ROW_S) / 3600:4.1f} - {to_s / 3600:3.1f}"
+        hours = f"{(to_s - ROW_S) / 60:4.0f} - {to_s / 60:3.0f}"
         print(f"{hours}  {m.mean():9.1f}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}", flush=True)
 
 
@@ -110,7 +110,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = args.recording or simulate(folder, args.hours)
-        print("     hour  memory MB  updates  p50 ms  p99 ms", flush=True)
+        print("  minutes  memory MB  updates  p50 ms  p99 ms", flush=True)
         memory, updates = fly(recording, folder / "out.mcap", args.pace)
     tell(memory, updates, np.ceil(memory[-1, 0] / ROW_S) * ROW_S)
     warm = memory[memory[:, 0] > WARM_S]
