@@ -76,6 +76,8 @@ class Apart:
 
     def __init__(self, reader: RecordingReader, driver: Driver) -> None:
         context = multiprocessing.get_context("fork")
+        here: Any
+        there: Any
         here, there = context.Pipe()
         self._name = driver.node.name
         self._process = context.Process(target=_work, args=(there, here, reader, driver), daemon=True)
