@@ -2,8 +2,8 @@
 
     python bench/long_flight.py [--hours 4] [--pace throughput] [--recording FILE] [-o out/bench]
 
-Prints a row for each ten minutes as soon as they are flown, and at the end whether memory after warm-up stays within 5 %
-and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
+Prints a row for each ten minutes as soon as they are flown, and at the end whether memory after warm-up stays within
+5 % and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from ..schemas import codec
 from ..schemas.envelope import Envelope, RawMessage
+from .collection import RareCollections
 from .errors import UserError
 from .node import Message, Node
 from .recording import RecordingReader
@@ -152,7 +153,9 @@ def _work(connection: Connection, other: Connection, reader: RecordingReader, dr
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     other.close()
     decode: Callable[[int | RawMessage], Message] = _Decoder(reader)
+    collections = RareCollections()
     while True:
+        collections.if_due()
         try:
             batch: list[Item] | None = connection.recv()
         except (EOFError, OSError):
