@@ -21,10 +21,12 @@ BENCHMARKS = {
     "sliding window beside GTSAM and Ceres": ["window_peers.py"],
     "tie point to orientation over the bus": ["tie_latency.py"],
     "an hour of flight through process": ["process_hour.py", "--share", "0.05"],
+    "the same at the pace for throughput": ["process_hour.py", "--share", "0.05", "--pace", "throughput"],
     "memory and latency over hours": ["long_flight.py", "--hours", "0.25"],
     "sliding window against the batch adjustment, one strip": ["efficiency.py", "table", "--seeds", "6"],
     "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
     "sliding window: normalised errors": ["consistency.py", "seeds"],
+    "the same as time goes on": ["drift.py", "--minutes", "12"],
     "orthoimage": ["orthoimage.py"],
     "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }

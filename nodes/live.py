@@ -18,7 +18,7 @@ from .bus import Bus
 from .collection import RareCollections
 from .node import Message, Node
 from .ordering import Sequencer, StreamCheck, TopicCounts, order_key
-from .runner import StepDriver
+from .step_driver import StepDriver
 
 #: Waiting messages of lossless topics after which publishers are slowed down.
 LOSSLESS_DEPTH = 20_000

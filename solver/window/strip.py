@@ -24,7 +24,7 @@ UNKNOWN_LENGTH_S = 600.0
 _SAMPLING = 0.05
 #: Of a wander that is fast because the filter learns, so much may be left out between borders, m and rad: small against
 #: the noise of an image coordinate on the ground and in the air. There are half as many unknowns and less.
-LEFT_OUT_M, LEFT_OUT = 0.03, 1e-5
+LEFT_OUT_M, LEFT_OUT = 0.035, 1e-5
 
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
