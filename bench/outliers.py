@@ -140,7 +140,8 @@ def one_flight(seed: int, share: float, px: tuple[float, float]) -> dict[str, np
 
 
 PAIRS = (
-    ("window", "batch"), ("window", "window clean"), ("final", "final clean"), ("batch", "batch clean"),
+    ("window", "batch"), ("window clean", "batch clean"), ("window", "window clean"),
+    ("final", "final clean"), ("batch", "batch clean"),
     ("points window", "points batch"), ("points window", "points window clean"), ("points batch", "points batch clean"),
 )  # fmt: skip
 
@@ -169,7 +170,8 @@ def main() -> None:
     for n in ("window", "batch"):
         missed, lost, good = np.sum([f[f"rays {n}"][0] for f in flights], axis=0)
         print(
-            f"{n}: of points seen three times {missed} blunders used, {lost} of {good} good rays left out ({100 * lost / good:.2f} %)"
+            f"{n}: of points seen three times {missed} blunders used, {lost} of {good} good rays left out "
+            f"({100 * lost / good:.2f} %)"
         )
 
 

@@ -25,6 +25,8 @@ BENCHMARKS = {
     "sliding window against the batch adjustment, one strip": ["efficiency.py", "table", "--seeds", "6"],
     "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
     "sliding window: normalised errors": ["consistency.py", "seeds"],
+    "protection levels with wrong control": ["consistency.py", "control", "--seeds", "20"],
+    "data snooping against the batch adjustment's": ["outliers.py", "--seeds", "6"],
     "orthoimage": ["orthoimage.py"],
     "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }
