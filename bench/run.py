@@ -27,6 +27,8 @@ BENCHMARKS = {
     "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
     "sliding window: normalised errors": ["consistency.py", "seeds"],
     "the same as time goes on": ["drift.py", "--minutes", "12"],
+    "protection levels with wrong control": ["consistency.py", "control", "--seeds", "20"],
+    "data snooping against the batch adjustment's": ["outliers.py", "--seeds", "6"],
     "orthoimage": ["orthoimage.py"],
     "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }

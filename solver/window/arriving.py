@@ -67,7 +67,7 @@ class Arrivals:
                 ready.setdefault(self._share(name), []).append(name)
         fresh = []
         for (_, tied), names in ready.items():
-            few = [n for n in names if len(self._intake.points[n].looks) < 2]
+            few = [n for n in names if len(self._intake.points[n].looks) < 2 and not tied]
             few = [n for n in few if n not in self._intake.control or self._intake.points[n].spent]
             names = [n for n in names if n not in few]
             if not names:
@@ -93,7 +93,7 @@ class Arrivals:
         """Which points go into a batch together: those of a time, and those that tie strips apart."""
         point, earlier = self._intake.points[name], self._block.earlier.points.get(name)
         point.spent = earlier is not None and earlier.with_control and not point.alone
-        tied = len(point.looks) > 1 and not point.alone and self._block.earlier.enter(name, max(point.time_s))
+        tied = not point.alone and self._block.earlier.enter(name, max(point.time_s))
         return int(min(point.time_s) // self._step_s), tied
 
     def apart(self, names: list[str], result: WindowUpdate) -> None:

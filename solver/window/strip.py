@@ -49,7 +49,8 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
         return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
         offset, shift, drift = (_triple(v) for v in (slow.offset_m, np.degrees(slow.shift), np.degrees(slow.drift)))
-        return DgrOptions(offset, shift, drift)
+        degrees = np.degrees(slow.wander)
+        return DgrOptions(offset, shift, drift, slow.wander_m, (degrees[0], degrees[1], degrees[2]))
     if options.model == "lim":
         return LimOptions(max(pieces + 1, 4), False, slow=slow)
     if options.model == "ppm":
