@@ -12,6 +12,8 @@ from .line_quality import GOOD, REASONS, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
+#: A CCD line that gives nothing for so long while others do, s, is told of, and not waited for.
+SILENT_S = 5.0
 #: Events of a strip that are told.
 MOST_TOLD = 100
 #: Names of lines that cannot be used, in events.
@@ -45,15 +47,23 @@ class LineIntake:
         self._state: dict[str, int] = {}
         self._events: list[str] = []
         self._told = 0
+        self._silent_after = np.inf
+        self._ends: dict[str, int] = {}
+        self._good_ends: dict[str, int] = {}
+        self._silent: set[str] = set()
 
-    def begin_strip(self) -> None:
+    def begin_strip(self, line_rate_hz: float) -> None:
         """What is in store is forgotten."""
         self.store = None
+        self._silent_after = SILENT_S * line_rate_hz
+        self._ends = dict.fromkeys(self._samples, 0)
+        self._good_ends = dict.fromkeys(self._samples, 0)
+        self._silent.clear()
         self._told = 0
         self._last_line.clear()
 
-    def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD.
+    def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Lines of one CCD; returns which of them (n,) are fit for use.
 
         Raises
         ------
@@ -71,17 +81,27 @@ class LineIntake:
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
         self._tell(ccd, first_line, verdict)
+        self._listen(ccd, first_line + len(pixels))
+        if (verdict == GOOD).any():
+            self._good_ends[ccd] = max(self._good_ends[ccd], first_line + len(pixels))
         if self.store is None:
             self.store = self._make_store(pixels.dtype)
         if self.store is None:
             self.counters["lines before poses"] += len(pixels)
-            return
+            return verdict == GOOD
         missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
         if missing:
             self.counters["lines missing"] += missing
             self.tell(f"{ccd}: {missing} lines are missing before line {first_line}")
         if late:
             self.counters["lines twice or late"] += late
+        return verdict == GOOD
+
+    @property
+    def seeing(self) -> frozenset[str]:
+        """The CCD lines that have given lines fit for use lately."""
+        newest = max(self._ends.values(), default=0)
+        return frozenset(ccd for ccd, end in self._good_ends.items() if newest - end <= self._silent_after)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -95,6 +115,17 @@ class LineIntake:
             self._events.append(text)
         elif self._told == MOST_TOLD + 1:
             self._events.append("more of the kind is counted, but no longer told in this strip")
+
+    def _listen(self, ccd: str, end: int) -> None:
+        """Tell of CCD lines that nothing comes from any more, and that something comes again."""
+        self._ends[ccd] = max(self._ends.get(ccd, 0), end)
+        if ccd in self._silent:
+            self._silent.discard(ccd)
+            self.tell(f"{ccd}: lines come again")
+        for other, at in self._ends.items():
+            if other not in self._silent and end - at > self._silent_after:
+                self._silent.add(other)
+                self.tell(f"{other}: nothing has come" + (f" after line {at - 1}" if at else ""))
 
     def _tell(self, ccd: str, first_line: int, verdict: NDArray[np.int8]) -> None:
         """Count bad lines; tell where bad ones begin and where they end."""

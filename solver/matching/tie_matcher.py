@@ -101,7 +101,7 @@ class TieMatcher:
         self._strip = strip
         self._pending, self._unjudged, self._next_number = [], [], 0
         self._matched_to = -np.inf
-        self._lines.begin_strip()
+        self._lines.begin_strip(line_rate_hz)
         self._chooser.begin_strip()
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
         self._again.begin_strip(strip)
@@ -114,8 +114,8 @@ class TieMatcher:
         """What the adjustment's window holds, to give it more or less."""
         self._chooser.density.window_holds(points, rays)
 
-    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD.
+    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Lines of one CCD; returns which of them (n,) are fit for use.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class TieMatcher:
         """
         if not self._strip:
             raise ValueError(f"lines of {ccd} before their strip")
-        self._lines.add(ccd, first_line, pixels)
+        return self._lines.add(ccd, first_line, pixels)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -135,6 +135,8 @@ class TieMatcher:
         """The tie points that have become known."""
         store = self._lines.store
         out: list[MatchedTie] = []
+        # a CCD line that is dead is done without, as long as two see
+        self._looks.least_rays = min(self.options.least_rays, max(len(self._lines.seeing), 2))
         if store is not None and np.isfinite(self.orientation.end_s):
             ring = store.rings[self.views[self.prediction.master].ccd]
             self._pending += self._chooser.choose(ring, self.prediction.rate)
@@ -203,12 +205,13 @@ class TieMatcher:
         p = self.prediction
         if not self._pending:
             return []
-        ends = [store.rings[view.ccd].end for view in self.views]
+        seeing = [view for view in self.views if view.ccd in self._lines.seeing] or self.views
+        ends = [store.rings[view.ccd].end for view in seeing]
         height, travel = p.height_and_travel()
         master = self.views[p.master]
-        later = max(0.0, max(master.forward - view.forward for view in self.views) * height / travel)
+        later = max(0.0, max(master.forward - view.forward for view in seeing) * height / travel)
         reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
-        until = min(*ends, p.known_lines)
+        until = min([*ends, p.known_lines])
         soon = [place for place in self._pending if place.line + later + reach < until + SOON_S * p.rate]
         due = self._last_looks(soon, travel) + reach if soon else np.empty(0)
         ready = [place for place, line in zip(soon, due, strict=True) if line < until]
