@@ -14,8 +14,9 @@ from .options import MatchingOptions
 
 #: A CCD line that gives nothing for so long while others do, s, is told of, and not waited for.
 SILENT_S = 5.0
-#: Events of a strip that are told.
-MOST_TOLD = 100
+#: Events of a strip that are told. A fault that comes again and again is told so often by itself, then summed up, every
+#: so many seconds.
+MOST_TOLD, BY_ITSELF, SUMMED_S = 100, 3, 10.0
 #: Names of lines that cannot be used, in events.
 _WORDS = {"dark": "black (lens cap, no light or no data)", "saturated": "saturated", "frozen": "frozen"}
 
@@ -51,6 +52,9 @@ class LineIntake:
         self._ends: dict[str, int] = {}
         self._good_ends: dict[str, int] = {}
         self._silent: set[str] = set()
+        self._rate = 1.0
+        self._faults: dict[tuple[str, str], tuple[int, int, int]] = {}
+        self._told_of: set[str] = set()
 
     def begin_strip(self, line_rate_hz: float) -> None:
         """What is in store is forgotten."""
@@ -59,6 +63,9 @@ class LineIntake:
         self._ends = dict.fromkeys(self._samples, 0)
         self._good_ends = dict.fromkeys(self._samples, 0)
         self._silent.clear()
+        self._rate = line_rate_hz
+        self._faults.clear()
+        self._told_of.clear()
         self._told = 0
         self._last_line.clear()
 
@@ -92,7 +99,8 @@ class LineIntake:
         missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
         if missing:
             self.counters["lines missing"] += missing
-            self.tell(f"{ccd}: {missing} lines are missing before line {first_line}")
+            words = f"{missing} lines are missing before line {first_line}"
+            self._fault(ccd, "missing", words, missing, first_line)
         if late:
             self.counters["lines twice or late"] += late
         return verdict == GOOD
@@ -136,8 +144,29 @@ class LineIntake:
         self._state[ccd] = state
         if state == before == GOOD and len(bad):  # a few bad lines among good ones
             first = first_line + int(np.flatnonzero(verdict != GOOD)[0])
-            self.tell(f"{ccd}: {len(bad)} lines are {_WORDS[REASONS[int(np.bincount(bad).argmax())]]} from {first} on")
+            name = _WORDS[REASONS[int(np.bincount(bad).argmax())]]
+            are = "lines are" if len(bad) > 1 else "line is"
+            self._fault(ccd, name, f"{len(bad)} {are} {name} from {first} on", len(bad), first)
         elif state != before:
             run = first_line + int(np.flatnonzero(np.append(-1, verdict[:-1]) != state)[-1])
-            what = "lines are good again" if state == GOOD else f"lines are {_WORDS[REASONS[state]]}"
-            self.tell(f"{ccd}: {what} from line {run} on")
+            if state == GOOD:
+                if ccd in self._told_of:
+                    self.tell(f"{ccd}: lines are good again from line {run} on")
+                return
+            name = _WORDS[REASONS[state]]
+            told = self._fault(ccd, name, f"lines are {name} from line {run} on", len(bad), run)
+            (self._told_of.add if told else self._told_of.discard)(ccd)
+
+    def _fault(self, ccd: str, name: str, words: str, lines: int, at: int) -> bool:
+        """Tell of a fault; whether it was told by itself and not summed up with others of its kind."""
+        told, more, since = self._faults.get((ccd, name), (0, 0, at))
+        if told < BY_ITSELF:
+            self.tell(f"{ccd}: {words}")
+            self._faults[ccd, name] = told + 1, 0, at
+            return True
+        more += lines
+        if at - since >= SUMMED_S * self._rate:
+            self.tell(f"{ccd}: {more} more lines are {name}, the last ones about line {at}")
+            more, since = 0, at
+        self._faults[ccd, name] = told, more, since
+        return False
