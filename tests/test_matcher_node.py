@@ -112,8 +112,8 @@ def short_lines(ccd, line, pixels):
     return pixels[:, :100] if 60 <= line < 70 and ccd == "F" else pixels
 
 
-def forward_dies(ccd, line, pixels):
-    return None if ccd == "F" and line >= 150 else pixels
+def backward_dies(ccd, line, pixels):
+    return None if ccd == "B" and line >= 150 else pixels
 
 
 FAULTS = {
@@ -123,9 +123,9 @@ FAULTS = {
         ("N: 20 lines are missing", "N: lines are black", "B: lines are frozen", "N: lines are saturated"),
     ),
     "a CCD line falls silent": (
-        forward_dies,
-        {"ties": 40},
-        ("F: nothing has come after line 149",),
+        backward_dies,
+        {"ties": 60},
+        ("B: nothing has come after line 149",),
     ),
     "lens cap, then water": (
         chain(lines_between(40, 100, 0), lines_between(110, 300, water)),

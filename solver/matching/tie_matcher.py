@@ -16,7 +16,7 @@ from .chips import CHIP_HALF, ChipStore
 from .consistency import Disagreement
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
-from .line_scan import LineScan, view_of
+from .line_scan import LineScan, View, view_of
 from .line_store import LineStore
 from .looks import Looked, LookMatcher
 from .options import MatchedRay, MatchedTie, MatchingOptions, Place
@@ -213,7 +213,7 @@ class TieMatcher:
         reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
         until = min([*ends, p.known_lines])
         soon = [place for place in self._pending if place.line + later + reach < until + SOON_S * p.rate]
-        due = self._last_looks(soon, travel) + reach if soon else np.empty(0)
+        due = self._last_looks(soon, travel, seeing) + reach if soon else np.empty(0)
         ready = [place for place, line in zip(soon, due, strict=True) if line < until]
         if len(ready) < BATCH // 2 and until < self._matched_to + BATCH_S * p.rate:
             ready = []
@@ -227,8 +227,8 @@ class TieMatcher:
         self.counters["looks never came"] += len(waiting) - len(self._pending)
         return ready
 
-    def _last_looks(self, places: list[Place], travel: float) -> Array:
-        """Lines in which places (k) are seen last, at the heights that are guessed there."""
+    def _last_looks(self, places: list[Place], travel: float, seeing: list[View]) -> Array:
+        """Lines in which places (k) are seen last by some views, at the heights that are guessed there."""
         p = self.prediction
         line, sample = np.array([[place.line, place.sample] for place in places]).T
         scan = p.scan(p.master, line.min() - 1, line.max() + 1)
@@ -236,7 +236,7 @@ class TieMatcher:
             return np.full(len(places), np.inf)
         xy, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
         above = scan.position_l[:, 2].mean() - p.heights.at(xy[:, :2])[0]
-        forward = p.views[p.master].forward - min(view.forward for view in p.views)
+        forward = p.views[p.master].forward - min(view.forward for view in seeing)
         return line + np.maximum(forward, 0.0) * above / travel
 
     # -- store and counters --------------------------------------------------------------------------------------------
