@@ -180,10 +180,10 @@ class Matcher(Node):
             first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
             matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
             self._targets.begin_strip(strip, first_s)
-        matcher.add_lines(ccd, int(block.first_line), block.pixels)
+        usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
         ties = matcher.match()
         out = [self._tie(strip, tie) for tie in ties]
-        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns)
+        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
         out += targets
         out += [self._log(f"{strip.id}: {text}", warning=True) for text in (*matcher.take_events(), *words)]
         self.counters.update(self._targets.take_counters())

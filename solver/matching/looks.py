@@ -53,13 +53,17 @@ class LookMatcher:
     prediction : of the strip
     image : gives the lines of a view: (index of the view, scan, way from line to line) -> `Image`
     chip_half : half side of the patches that are kept for later strips, px; 0 for none
+
+    Attributes
+    ----------
+    least_rays : of a point
     """
 
     def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Image], chip_half: int):
         self.prediction = prediction
         self.counters: Counter[str] = Counter()
         self._image, self._chip_half = image, chip_half
-        self._least_rays = min(prediction.options.least_rays, len(prediction.views))
+        self.least_rays = min(prediction.options.least_rays, len(prediction.views))
 
     def match(self, places: list[Place]) -> Looked | None:
         """What was found of places, those with enough looks; None if that is none."""
@@ -101,7 +105,7 @@ class LookMatcher:
             shift[~ok, j] = np.nan
             scale_across[j] = sample_m(scan, place, u)
         p.searched(beyond)
-        enough = 1 + np.isfinite(shift).all(axis=2).sum(axis=1) >= self._least_rays
+        enough = 1 + np.isfinite(shift).all(axis=2).sum(axis=1) >= self.least_rays
         self.counters["too few looks"] += int((~enough).sum())
         if not enough.any():
             return None

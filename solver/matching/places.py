@@ -110,8 +110,10 @@ class PlaceChooser:
             places += found
             self.tried += len(found)
             self.empty += cells - len(found)
-            keep = np.exp(-rows / rate_hz / POOR_S)
-            self._found_share = keep * self._found_share + (1 - keep) * len(found) / max(cells, 1)
+            # black or missing lines say nothing about the ground
+            if ring.read(self._next, self._next + rows, 0, 1).usable.mean() > 0.5:
+                keep = np.exp(-rows / rate_hz / POOR_S)
+                self._found_share = keep * self._found_share + (1 - keep) * len(found) / max(cells, 1)
             self._next += rows
         return places
 

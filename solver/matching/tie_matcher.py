@@ -16,7 +16,7 @@ from .chips import CHIP_HALF, ChipStore
 from .consistency import Disagreement
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
-from .line_scan import LineScan, view_of
+from .line_scan import LineScan, View, view_of
 from .line_store import LineStore
 from .looks import Looked, LookMatcher
 from .options import MatchedRay, MatchedTie, MatchingOptions, Place
@@ -101,7 +101,7 @@ class TieMatcher:
         self._strip = strip
         self._pending, self._unjudged, self._next_number = [], [], 0
         self._matched_to = -np.inf
-        self._lines.begin_strip()
+        self._lines.begin_strip(line_rate_hz)
         self._chooser.begin_strip()
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
         self._again.begin_strip(strip)
@@ -114,8 +114,8 @@ class TieMatcher:
         """What the adjustment's window holds, to give it more or less."""
         self._chooser.density.window_holds(points, rays)
 
-    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD.
+    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Lines of one CCD; returns which of them (n,) are fit for use.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class TieMatcher:
         """
         if not self._strip:
             raise ValueError(f"lines of {ccd} before their strip")
-        self._lines.add(ccd, first_line, pixels)
+        return self._lines.add(ccd, first_line, pixels)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -135,6 +135,8 @@ class TieMatcher:
         """The tie points that have become known."""
         store = self._lines.store
         out: list[MatchedTie] = []
+        # a CCD line that is dead is done without, as long as two see
+        self._looks.least_rays = min(self.options.least_rays, max(len(self._lines.seeing), 2))
         if store is not None and np.isfinite(self.orientation.end_s):
             ring = store.rings[self.views[self.prediction.master].ccd]
             self._pending += self._chooser.choose(ring, self.prediction.rate)
@@ -203,14 +205,15 @@ class TieMatcher:
         p = self.prediction
         if not self._pending:
             return []
-        ends = [store.rings[view.ccd].end for view in self.views]
+        seeing = [view for view in self.views if view.ccd in self._lines.seeing] or self.views
+        ends = [store.rings[view.ccd].end for view in seeing]
         height, travel = p.height_and_travel()
         master = self.views[p.master]
-        later = max(0.0, max(master.forward - view.forward for view in self.views) * height / travel)
+        later = max(0.0, max(master.forward - view.forward for view in seeing) * height / travel)
         reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
-        until = min(*ends, p.known_lines)
+        until = min([*ends, p.known_lines])
         soon = [place for place in self._pending if place.line + later + reach < until + SOON_S * p.rate]
-        due = self._last_looks(soon, travel) + reach if soon else np.empty(0)
+        due = self._last_looks(soon, travel, seeing) + reach if soon else np.empty(0)
         ready = [place for place, line in zip(soon, due, strict=True) if line < until]
         if len(ready) < BATCH // 2 and until < self._matched_to + BATCH_S * p.rate:
             ready = []
@@ -224,8 +227,8 @@ class TieMatcher:
         self.counters["looks never came"] += len(waiting) - len(self._pending)
         return ready
 
-    def _last_looks(self, places: list[Place], travel: float) -> Array:
-        """Lines in which places (k) are seen last, at the heights that are guessed there."""
+    def _last_looks(self, places: list[Place], travel: float, seeing: list[View]) -> Array:
+        """Lines in which places (k) are seen last by some views, at the heights that are guessed there."""
         p = self.prediction
         line, sample = np.array([[place.line, place.sample] for place in places]).T
         scan = p.scan(p.master, line.min() - 1, line.max() + 1)
@@ -233,7 +236,7 @@ class TieMatcher:
             return np.full(len(places), np.inf)
         xy, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
         above = scan.position_l[:, 2].mean() - p.heights.at(xy[:, :2])[0]
-        forward = p.views[p.master].forward - min(view.forward for view in p.views)
+        forward = p.views[p.master].forward - min(view.forward for view in seeing)
         return line + np.maximum(forward, 0.0) * above / travel
 
     # -- store and counters --------------------------------------------------------------------------------------------
