@@ -18,6 +18,7 @@ import shutil
 import sys
 import tempfile
 import time
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.strip import WindowStrip
 from triline.solver.window.window import Window
 
 WINDOW_S = 40.0
@@ -44,11 +46,15 @@ class Recorded:
         self.updates: list[tuple[float, int, list[tuple[Any, ...]]]] = []
         self._known: set[int] = set()
         self._points: set[str] = set()
+        self.strip: WindowStrip | None = None
         self._kept: list[Any] = []
 
     def watch(self, now_s: float, window: Window) -> None:
         points = []
         rays = 0
+        if self.strip is None:
+            (strip,) = window.strips.values() or (None,)
+            self.strip = copy(strip)  # when it is over it lets go of what is needed here
         for batch in window._batches:
             rays += len(batch.rays)
             if id(batch) in self._known:
@@ -74,7 +80,8 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
         import gtsam
     except ImportError:
         return None
-    (strip,) = window.strips.values()
+    strip = recorded.strip
+    assert strip is not None
     base = int(strip.numbers[0])
     borders = strip.model.borders
 
