@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,7 +91,7 @@ class PpmOptions(ModelOptions):
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
-        triples = {
+        triples: dict[str, Any] = {
             key: three(settings, key, getattr(cls, key))
             for key in cls.__dataclass_fields__
             if key.endswith(("_m", "_deg"))
