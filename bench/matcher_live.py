@@ -4,7 +4,8 @@
 
 The recording of `matcher.py` is replayed at its pace. All processes share the cores, the player and this listener
 included. The latency of a tie is wall time: from the moment its last look is imaged to its reception here; the moment
-is told by the quickest message of the 200 Hz attitude sensor. What was lost or late is what the nodes' own counters say.
+is told by the quickest message of the 200 Hz attitude sensor. What was lost or late is what the nodes' own counters say
+while lines come.
 """
 
 from __future__ import annotations
@@ -69,29 +70,43 @@ class Ears:
             "counters": {c.name: c.value for c in body.counters},
         }  # fmt: skip
 
+    def bad(self) -> dict[str, int]:
+        """What the nodes counted as lost, late or malformed."""
+        return {
+            f"{node} {topic} {kind}": n
+            for node, told in self.status.items()
+            for topic, counts in told["topics"].items()
+            for kind, n in counts.items()
+            if kind != "received" and n
+        }
+
 
 def live(recording: Path, points_per_s: float, budget_mb: float, cores: int, port: int) -> dict:
     """Replay a recording to the nodes; rates, latencies, losses."""
     available = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, available[-cores:])  # children inherit it
     environment = {**os.environ, **ALLOCATOR}
-    with tempfile.TemporaryDirectory(prefix="triline-bench-") as name, NodeGroup(Path(name), "bench", port) as group:
-        with Bus("bench", source="bench", port=port) as bus:
-            ears = Ears(bus)
-            nodes = [
-                group.start("navigator"),
-                group.start("matcher", "--set", f"points_per_s={points_per_s}", "--set", f"budget_mb={budget_mb}"),
-                group.start("adjuster"),
-            ]
-            while not bus.alive() >= {"navigator", "matcher", "adjuster"}:
-                time.sleep(0.1)
-            time.sleep(1.0)
-            command = [sys.executable, "-m", "triline.nodes.cli", "replay", str(recording), "-q", *group.arguments]
-            player = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
-            watched = {n.name: psutil.Process(n.process.pid) for n in nodes} | {"player": psutil.Process(player.pid)}
-            used = _watch(player, watched, ears)
-            time.sleep(2.5)
-            result = _result(ears, used)
+    with (
+        tempfile.TemporaryDirectory(prefix="triline-bench-") as name,
+        NodeGroup(Path(name), "bench", port) as group,
+        Bus("bench", source="bench", port=port) as bus,
+    ):
+        ears = Ears(bus)
+        nodes = [
+            group.start("navigator"),
+            group.start("matcher", "--set", f"points_per_s={points_per_s}", "--set", f"budget_mb={budget_mb}"),
+            group.start("adjuster"),
+        ]
+        while not bus.alive() >= {"navigator", "matcher", "adjuster"}:
+            time.sleep(0.1)
+        time.sleep(1.0)
+        command = [sys.executable, "-m", "triline.nodes.cli", "replay", str(recording), "-q", *group.arguments]
+        player = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+        watched = {n.name: psutil.Process(n.process.pid) for n in nodes} | {"player": psutil.Process(player.pid)}
+        used = _watch(player, watched, ears)
+        bad = ears.bad()
+        time.sleep(2.5)
+        result = {**_result(ears, used), "bad": bad, "bad_at_the_end": ears.bad()}
     os.sched_setaffinity(0, available)
     return {"points_per_s": points_per_s, "cores_given": cores, **result}
 
@@ -122,20 +137,13 @@ def _result(ears: Ears, used: dict[str, list[tuple[float, float]]]) -> dict:
     pose_s = (pose[:, 0] - pose[:, 1] - ears.ahead_ns) * 1e-9
     # an observation is stamped with when it is to be used; by then it should be there
     spare = (stamp + ears.ahead_ns - received)[steady] * 1e-9
-    bad = {
-        f"{node} {topic} {kind}": n
-        for node, told in ears.status.items()
-        for topic, counts in told["topics"].items()
-        for kind, n in counts.items()
-        if kind != "received" and n
-    }
     return {
         "rays_per_s": float(rays[steady].sum() / seconds), "seconds": float(seconds),
         "latency_p50_s": float(np.quantile(latency, 0.5)), "latency_p95_s": float(np.quantile(latency, 0.95)),
         "latency_max_s": float(latency.max()), "least_spare_s": float(spare.min()),
         "pose_p99_s": float(np.quantile(pose_s, 0.99)), "pose_max_s": float(pose_s.max()),
         "cores": {n: (u[-1][1] - u[0][1]) / (u[-1][0] - u[0][0]) for n, u in used.items() if len(u) > 1},
-        "bad": bad, "paces": dict(ears.paces), "largest_lag_s": ears.lags,
+        "paces": dict(ears.paces), "largest_lag_s": ears.lags,
         "states": {n: s["state"] for n, s in ears.status.items()},
         "problems": {n: s["last_problem"] for n, s in ears.status.items() if s["last_problem"]},
         "counters": ears.status["matcher"]["counters"],

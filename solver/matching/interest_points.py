@@ -78,7 +78,7 @@ class Worth:
     even: Array
 
     def best(self, above: float) -> tuple[int, int, float]:
-        """Row and column of the most even texture among the places with more than ``above``, and its ``least``; or 0."""
+        """Row and column of the most even texture where ``least`` is more than ``above``, and its ``least`` (or 0)."""
         value = np.where(self.least > above, self.even, 0.0)
         row, column = (int(i) for i in np.unravel_index(int(value.argmax()), value.shape))
         return row, column, float(self.least[row, column]) if value[row, column] > 0.0 else 0.0
@@ -95,8 +95,9 @@ def _worth(image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, 
     before = quarter // 2 - window // 2
     quarters = [(u, v) for u in (before, before + window - quarter) for v in (before, before + window - quarter)]
     part = _smaller(*sums)
-    least = _smaller(*(sum(_moved(s, u, v) for u, v in quarters) for s in sums)) * (window / (2 * quarter)) ** 2
-    even = 4.0 / sum(1.0 / np.maximum(_moved(part, u, v), 1e-6) for u, v in quarters)
+    whole = np.sum([_moved(sums, u, v) for u, v in quarters], axis=0) * (window / (2 * quarter)) ** 2
+    least = _smaller(*whole)
+    even = 4.0 / np.sum([1.0 / np.maximum(_moved(part, u, v), 1e-6) for u, v in quarters], axis=0)
     wanted = np.zeros(image.shape, dtype=bool)
     wanted[half:-half, half:-half] = True
     for line in np.flatnonzero(~usable):
@@ -111,4 +112,4 @@ def _smaller(a: Array, b: Array, c: Array) -> Array:
 
 def _moved(values: Array, rows: int, columns: int) -> Array:
     """What lies so many rows and columns further; at the border, anything."""
-    return np.roll(values, (-rows, -columns), axis=(0, 1))
+    return np.roll(values, (-rows, -columns), axis=(-2, -1))
