@@ -201,7 +201,10 @@ class LookMatcher:
             return None
         height = np.array([track.height_m for track in enough])
         g = self._geometry(enough, scan, height)
-        dz, residual = height_of(g.shift - g.expected, g.parallax, np.isfinite(g.shift[:, :, 0]).astype(float))
+        weight = np.isfinite(g.shift[:, :, 0]).astype(float)
+        dz, _ = height_of(g.shift - g.expected, g.parallax, weight)
+        # nothing that a height explains may stay in what is expected of the next points: it would never leave it again
+        _, residual = height_of(g.shift, g.parallax, weight)
         xyz = g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz])
         pixel_m = np.column_stack([np.full(len(g.sample_m), g.travel), g.sample_m])
         # a place is where a noisy pose sees it: line by attitude about y, sample about x, position for both
@@ -214,7 +217,7 @@ class LookMatcher:
         across = 2 * g.sample / p.views[p.master].pixels - 1
         return Looked(
             [track.place for track in enough], rays, np.array([track.score.min() for track in enough]), xyz,
-            Disagreement(p.first_s + line / p.rate, across, residual + g.expected), chip, ground,
+            Disagreement(p.first_s + line / p.rate, across, residual), chip, ground,
         )  # fmt: skip
 
     def _geometry(self, tracks: Sequence[Track], scan: LineScan, height: Array) -> _Geometry:
