@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 
 P = TypeVar("P")
 
-#: Waiting time between two steps up, before a step down, and the longest that grows to where steps down were too early.
+#: Waiting time between two steps up, before a step down, and the longest that this grows to.
 UP_S, DOWN_S, LONGEST_DOWN_S = 0.3, 5.0, 80.0
 #: Of the window, the share to be behind at which nothing is tried out any more.
 ALARM = 0.4
@@ -20,15 +20,17 @@ class Governor:
     levels : how many there are; level 0 is the normal pace
     behind_s, caught_up_s : behind by more (and an interval), a level up, unless it is catching up; behind by less for a
         while, one down
+    down_s : that while; it grows where steps down were too early
     """
 
-    def __init__(self, levels: int, behind_s: float = 0.4, caught_up_s: float = 0.2) -> None:
+    def __init__(self, levels: int, behind_s: float = 0.4, caught_up_s: float = 0.2, down_s: float = DOWN_S) -> None:
         self.level = 0
         self._top, self._behind_s, self._caught_up_s = levels - 1, behind_s, caught_up_s
         self._changed_s = -1e9
         self._went_down = False
         self._fine_since_s: float | None = None
-        self._down_s = DOWN_S
+        self._behind_since_s: float | None = None
+        self._down_s = down_s
         self._worst_s = 0.0  # behind by so much at the last look
 
     def look(self, lag_s: float, now_s: float, interval_s: float, window_s: float) -> bool:
@@ -37,8 +39,11 @@ class Governor:
         behind = lag_s > self._behind_s + interval_s
         if behind:
             self._fine_since_s = None
+            if self._behind_since_s is None:  # a heap that was held up by others goes away by itself
+                self._behind_since_s, self._worst_s = now_s, lag_s
             growing = lag_s > 0.95 * self._worst_s
-            if now_s - self._changed_s > UP_S and growing:
+            waited_s = now_s - max(self._changed_s, self._behind_since_s)
+            if growing and (waited_s > UP_S or lag_s > ALARM * window_s):
                 step = self._top if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
                 self.level = min(self.level + step, self._top)
                 if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early
@@ -47,6 +52,7 @@ class Governor:
             elif not growing:
                 self._worst_s = max(0.98 * self._worst_s, lag_s)
         elif lag_s < self._caught_up_s + interval_s:
+            self._behind_since_s = None
             if self._fine_since_s is None:
                 self._fine_since_s = now_s
             if self.level and now_s - max(self._fine_since_s, self._changed_s) > self._down_s:

@@ -36,10 +36,12 @@ class Density:
     ----------
     options : see `MatchingOptions`
     stages : views in which a place is looked for, one after another
+    load : share of the places that are tried, as far as the machine keeps up
     """
 
     options: MatchingOptions
     stages: int = 1
+    load: float = 1.0
 
     def __post_init__(self) -> None:
         self._tried = np.zeros((self.stages, BANDS))
@@ -76,8 +78,8 @@ class Density:
         self._tried *= fade
         self._left *= fade
         tries = np.minimum(1.0 / self.share, MOST_TRIED)
-        number = self.options.points_per_s * self._factor * seconds * float(tries.mean())
-        n = max(round(number), 1)
+        number = self.options.points_per_s * self._factor * self.load * seconds * float(tries.mean())
+        n = max(round(number), 1 if self.load else 0)
         sums = np.concatenate([[0.0], np.cumsum(tries)]) / tries.sum()
         return n, np.interp(np.linspace(0, 1, n + 1), sums, np.linspace(0, 1, BANDS + 1))
 
@@ -147,6 +149,8 @@ class PlaceChooser:
 
     def _divide(self, ring: LineRing, first: int, seconds: float, rows: int) -> _Chunk:
         n, borders = self.density.cells(seconds)
+        if not n:
+            return _Chunk(first, 0, 0)
         if (first // rows) % 2:  # every other row of cells is shifted by half a cell
             borders = np.clip(borders + 0.5 / n, 0, 1)
             borders = np.unique(np.concatenate([[0.0], borders]))

@@ -108,6 +108,20 @@ class TieMatcher:
         """What the adjustment's window holds, to give it more or less."""
         self._chooser.density.window_holds(points, rays)
 
+    def keep(self, share: float) -> None:
+        """So large a share of the places is tried from now on; of those that wait, fewer than before go on as well.
+
+        Raises
+        ------
+        ValueError : a share outside 0 to 1
+        """
+        if not 0 <= share <= 1:
+            raise ValueError(f"a share of the places of {share}, wanted 0 to 1")
+        density = self._chooser.density
+        if share < density.load:
+            self._waiting.thin(share / density.load)
+        density.load = share
+
     def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
         """Lines of one CCD.
 

@@ -25,6 +25,8 @@ SOON_S = 0.3
 BATCH, ENOUGH, BATCH_S = 64, 12, 0.08
 #: The others have time: so many at once, which wait for company so long.
 EARLY_BATCH, EARLY_S = 12, 0.4
+#: Places within so many lines lie beside each other.
+ROW_LINES = 200
 
 
 class WaitingRoom:
@@ -59,6 +61,16 @@ class WaitingRoom:
     def add(self, places: Sequence[Place]) -> None:
         """Places that wait from now on."""
         self.tracks += [Track(place, len(self.order)) for place in places]
+
+    def thin(self, share: float) -> None:
+        """Keep a share of the places, evenly; all of those that earlier strips have."""
+        chosen = [track for track in self.tracks if not track.place.name]
+        # neighbours follow each other: rows of cells, then across
+        chosen.sort(key=lambda track: (track.tried.sum(), track.place.line // ROW_LINES, track.place.sample))
+        kept = np.diff(np.floor(share * np.arange(len(chosen) + 1) + 0.5)) > 0
+        left_out = {id(track) for track, keep in zip(chosen, kept, strict=True) if not keep}
+        self.counters["left out by load"] += len(left_out)
+        self.tracks = [track for track in self.tracks if id(track) not in left_out]
 
     def first_useful_line(self, store: LineStore) -> float:
         """Line of the master before which too few views have seen the ground, as the strip began later."""
