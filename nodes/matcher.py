@@ -9,7 +9,7 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
-from ..schemas.topics import find
+from ..schemas.topics import CONFIGURATION, POSES, find
 from ..solver.matching.options import MatchedTie, MatchingOptions
 from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
@@ -44,12 +44,9 @@ class Matcher(Node):
 
     name = "matcher"
     inputs = (
-        "configuration/project",
-        "configuration/camera",
-        "configuration/strip",
+        *CONFIGURATION,
         "sensor/lines/*",
-        "trajectory/filtered",
-        "trajectory/smoothed",
+        *POSES,
         "orientation/live",
         "adjustment/report",
         "observation/control",
