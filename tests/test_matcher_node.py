@@ -119,7 +119,7 @@ FAULTS = {
         ("N: 20 lines are missing", "N: lines are black", "B: lines are frozen", "N: lines are saturated"),
     ),
     "lens cap, then water": (
-        chain(lines_between(40, 100, 0), lines_between(300, 460, water)),
+        chain(lines_between(40, 100, 0), lines_between(235, 400, water)),
         {"lines dark": 180, "cells without texture": 30},
         ("N: lines are black (lens cap", "N: lines are good again", "poor in texture", "has texture again"),
     ),
