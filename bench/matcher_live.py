@@ -1,6 +1,6 @@
 """The matcher on the bus at full rate, on two cores: player, navigator, matcher and adjuster as processes of their own.
 
-    python bench/matcher_live.py [--points 36] [--cores 2] [--json]
+    python bench/matcher_live.py [--points 30] [--cores 2] [--json]
 
 The recording of `matcher.py` is replayed at its pace. All processes share the cores, the player and this listener
 included. The latency of a tie is wall time: from the moment its last look is imaged to its reception here; the moment
@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -41,11 +40,12 @@ class Ears:
         self.poses: list[tuple[int, int]] = []  # reception and stamp of the filtered trajectory
         self.status: dict[str, dict] = {}
         self.lags: dict[str, float] = {}
-        self.paces: Counter[str] = Counter()
+        self.paces: dict[str, int] = {}  # highest level
         bus.subscribe("sensor/attitude", self._sensor)
         bus.subscribe("observation/tie", self._tie)
         bus.subscribe("trajectory/filtered", self._pose)
-        bus.subscribe("adjustment/pace", lambda raw: self.paces.update([raw.topic]))
+        bus.subscribe("adjustment/pace", self._paced)
+        bus.subscribe("matching/pace", self._paced)
         bus.subscribe("status/*", self._told)
 
     def _sensor(self, raw: RawMessage) -> None:
@@ -59,6 +59,10 @@ class Ears:
 
     def _pose(self, raw: RawMessage) -> None:
         self.poses.append((raw.receive_ns, raw.envelope.stamp_ns))
+
+    def _paced(self, raw: RawMessage) -> None:
+        level = codec.decode(raw.topic, raw.data).level
+        self.paces[raw.topic] = max(self.paces.get(raw.topic, 0), level)
 
     def _told(self, raw: RawMessage) -> None:
         body = codec.decode(raw.topic, raw.data)
@@ -133,7 +137,9 @@ def _result(ears: Ears, used: dict[str, list[tuple[float, float]]]) -> dict:
     steady = received > received[0] + SETTLE_S * 1e9
     seconds = (received[-1] - received[steady][0]) * 1e-9
     latency = (received - last - ears.ahead_ns)[steady] * 1e-9
-    pose = np.array(ears.poses, dtype=np.int64)
+    # while it works: the last poses of all wait until nothing more comes
+    end = max(stamp for _, stamp in ears.poses) - 200_000_000
+    pose = np.array([p for p in ears.poses if p[0] > received[0] and p[1] < end], dtype=np.int64)
     pose_s = (pose[:, 0] - pose[:, 1] - ears.ahead_ns) * 1e-9
     # an observation is stamped with when it is to be used; by then it should be there
     spare = (stamp + ears.ahead_ns - received)[steady] * 1e-9
@@ -143,7 +149,7 @@ def _result(ears: Ears, used: dict[str, list[tuple[float, float]]]) -> dict:
         "latency_max_s": float(latency.max()), "least_spare_s": float(spare.min()),
         "pose_p99_s": float(np.quantile(pose_s, 0.99)), "pose_max_s": float(pose_s.max()),
         "cores": {n: (u[-1][1] - u[0][1]) / (u[-1][0] - u[0][0]) for n, u in used.items() if len(u) > 1},
-        "paces": dict(ears.paces), "largest_lag_s": ears.lags,
+        "paces": ears.paces, "largest_lag_s": ears.lags,
         "states": {n: s["state"] for n, s in ears.status.items()},
         "problems": {n: s["last_problem"] for n, s in ears.status.items() if s["last_problem"]},
         "counters": ears.status["matcher"]["counters"],
@@ -154,21 +160,28 @@ def lines(result: dict) -> list[str]:
     """The result in words."""
     cores = ", ".join(f"{name} {share:.2f}" for name, share in result["cores"].items())
     bad = ", ".join(f"{name} {n}" for name, n in result["bad"].items()) or "nothing"
+    paces = "; ".join(f"{topic} up to level {level}" for topic, level in result["paces"].items())
     return [
-        f"over the bus on {result['cores_given']} cores, {result['points_per_s']:g} tie points a second wanted:",
+        f"over the bus, player, navigator, matcher and adjuster on {result['cores_given']} cores:",
         f"  {result['rays_per_s']:.0f} rays/s over {result['seconds']:.0f} s; cores: {cores}",
         f"  last look to tie: median {result['latency_p50_s']:.3f} s, 95 % below {result['latency_p95_s']:.3f} s, "
         f"at most {result['latency_max_s']:.3f} s",
         f"  filtered pose: 99 % within {1e3 * result['pose_p99_s']:.0f} ms, "
         f"at most {1e3 * result['pose_max_s']:.0f} ms; lost or late: {bad}",
+        *([f"  the machine was too slow: {paces}"] if paces else []),
     ]
+
+
+def met(result: dict) -> bool:
+    """Whether the rate, the latency and the completeness are as wanted."""
+    return result["rays_per_s"] >= 100 and result["latency_p95_s"] < 0.5 and not result["bad"]
 
 
 def main() -> int:
     from matcher import RECORDING, render
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=float, default=36.0, help="tie points a second that are wanted (36)")
+    parser.add_argument("--points", type=float, default=30.0, help="tie points a second that are wanted (30)")
     parser.add_argument("--budget-mb", type=float, default=1024.0, help="for image lines (1024)")
     parser.add_argument("--cores", type=int, default=2, help="for all processes together (2)")
     parser.add_argument("--port", type=int, default=17651)
@@ -177,7 +190,7 @@ def main() -> int:
     render()
     result = live(RECORDING, args.points, args.budget_mb, args.cores, args.port)
     print(json.dumps(result, indent=2) if args.json else "\n".join(lines(result)))
-    return 0
+    return 0 if met(result) else 1
 
 
 if __name__ == "__main__":
