@@ -286,7 +286,7 @@ def test_views_are_looked_for_as_they_come_and_ties_follow_soon(flown, images, m
     assert np.median([reach for view, _, reach in looked[later:] if view == 1]) < 6.0
     # a patch, the search around it, a block, and what waits for company (the first ones wait to be judged together)
     assert np.quantile(delay[len(delay) // 2 :], 0.9) < 70
-    assert len(matcher._waiting.tracks) < 40
+    assert min(track.place.line for track in matcher._waiting.tracks) > len(images[0]) - 280
 
 
 def test_points_of_two_views_do_without_the_third(flown, images):
