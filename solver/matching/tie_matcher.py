@@ -179,7 +179,6 @@ class TieMatcher:
         # a view without a match is no contradiction, a point with a contradiction is dropped
         fine = (good | ~np.isfinite(d.residual).all(axis=2)).min(axis=1)
         self.counters["contradiction"] += int((~fine).sum())
-        p.slow.remember(d.select(fine))
         p.heights.add(np.concatenate([part.xyz_l for part in parts])[fine])
         distance = np.nanmax(np.hypot(*np.moveaxis(d.residual, 2, 0)), axis=1)
         ties, begin = [], 0
