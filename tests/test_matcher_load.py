@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from bus_rig import Rig, triline, wait_for
 from test_load import payloads
+from test_matcher_node import EPOCH_NS, SETTINGS, run
 
 from triline.nodes.bus import Bus
+from triline.nodes.flight_settings import simulated_flight
 from triline.nodes.matcher import Matcher
 from triline.nodes.matcher_pace import SHARES, MatcherPace
 from triline.nodes.node import Message
 from triline.nodes.recording import RecordingReader
+from triline.nodes.simulator import Simulator
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.solver.matching.options import MatchingOptions, Place
@@ -76,6 +79,27 @@ def test_an_overloaded_matcher_makes_fewer_ties_says_so_and_recovers(tmp_path):
     assert triline("process", live, "-o", again, *nodes).returncode == 0
     for topic in ("observation/tie", "observation/target", "matching/pace", "event/log", "orientation/final"):
         assert payloads(live, topic) == payloads(again, topic), topic
+
+
+def test_recorded_paces_are_followed(tmp_path):
+    flight = simulated_flight(SETTINGS)
+    messages = list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+    begin = next(m.stamp_ns for m in messages if m.topic.startswith("sensor/lines"))
+    spoken = [(11.0, 3), (14.5, 7), (15.5, 0)]
+    for s, level in spoken:
+        stamp = begin + int(s * 1e9)
+        messages.append(Message("matching/pace", stamp, MatcherPace(level, 1.0).message(stamp + 1), "matcher"))
+    messages.sort(key=lambda message: message.stamp_ns)
+    summary, ties, told = run(tmp_path, messages, points_per_s=8.0)
+    at_s = np.sort([(max(image.time_ns for image in tie.images) - begin) * 1e-9 for tie in ties])
+    counted = summary.counters["matcher"]
+    rate = flight.simulation.flight.strips[0].line_rate_hz
+    assert counted["lines gone by"] == pytest.approx(3 * rate, abs=30) and counted["left out by load"] > 10
+    assert any("35 % of the tie points" in text for text in told) and any("lines go by unseen" in text for text in told)
+    assert any("lines are missing" in text for text in told) and any("normal density" in text for text in told)
+    full, few = ((at_s > a) & (at_s < b) for a, b in ((8.2, 9.5), (11.0, 12.3)))
+    assert 0 < few.sum() < 0.6 * full.sum()
+    assert not ((at_s > 14.7) & (at_s < 15.5)).any()
 
 
 def test_a_pace_holds_from_its_time_on_and_levels_there_are_not_are_refused():
