@@ -21,10 +21,15 @@ class Governor:
     behind_s, caught_up_s : behind by more (and an interval), a level up, unless it is catching up; behind by less for a
         while, one down
     down_s : that while; it grows where steps down were too early
+    patience_s : for so long it looks whether a heap goes away by itself, as one does that was held up by others
     """
 
-    def __init__(self, levels: int, behind_s: float = 0.4, caught_up_s: float = 0.2, down_s: float = DOWN_S) -> None:
+    def __init__(
+        self, levels: int, behind_s: float = 0.4, caught_up_s: float = 0.2, down_s: float = DOWN_S,
+        patience_s: float = 0.0,
+    ) -> None:  # fmt: skip
         self.level = 0
+        self._patience_s = patience_s
         self._top, self._behind_s, self._caught_up_s = levels - 1, behind_s, caught_up_s
         self._changed_s = -1e9
         self._went_down = False
@@ -39,11 +44,12 @@ class Governor:
         behind = lag_s > self._behind_s + interval_s
         if behind:
             self._fine_since_s = None
-            if self._behind_since_s is None:  # a heap that was held up by others goes away by itself
-                self._behind_since_s, self._worst_s = now_s, lag_s
+            if self._behind_since_s is None:
+                self._behind_since_s = now_s
+                self._worst_s = lag_s if self._patience_s else self._worst_s
             growing = lag_s > 0.95 * self._worst_s
-            waited_s = now_s - max(self._changed_s, self._behind_since_s)
-            if growing and (waited_s > UP_S or lag_s > ALARM * window_s):
+            waited = now_s - self._changed_s > UP_S and now_s - self._behind_since_s >= self._patience_s
+            if growing and (waited or (self._patience_s and lag_s > ALARM * window_s)):
                 step = self._top if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
                 self.level = min(self.level + step, self._top)
                 if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early

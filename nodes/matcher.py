@@ -14,7 +14,7 @@ from ..solver.matching.options import MatchedTie, MatchingOptions
 from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
 from .governor import Announced, Governor
-from .matcher_pace import BEHIND_S, CAUGHT_UP_S, DOWN_S, SHARES, WINDOW_S, MatcherPace
+from .matcher_pace import BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S, SHARES, WINDOW_S, MatcherPace
 from .node import Message, Node
 from .target_desk import TargetDesk
 
@@ -87,7 +87,7 @@ class Matcher(Node):
         self._targets = TargetDesk()
         self._by_load, self._pace = pace == "load", MatcherPace()
         self._announced: Announced[MatcherPace] = Announced()
-        self._governor = Governor(len(SHARES), BEHIND_S, CAUGHT_UP_S, DOWN_S)
+        self._governor = Governor(len(SHARES), BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S)
         self._delay_ns = round(delay_s * convert.SECOND_NS)
         self._matcher: TieMatcher | None = None
         self._camera: Any = None
