@@ -5,7 +5,7 @@
 The recording of `matcher.py` is replayed at its pace. All processes share the cores, the player and this listener
 included. The latency of a tie is wall time: from the moment its last look is imaged to its reception here; the moment
 is told by the quickest message of the 200 Hz attitude sensor. What was lost or late is what the nodes' own counters say
-while lines come.
+while ties come.
 """
 
 from __future__ import annotations
@@ -107,19 +107,24 @@ def live(recording: Path, points_per_s: float, budget_mb: float, cores: int, por
         command = [sys.executable, "-m", "triline.nodes.cli", "replay", str(recording), "-q", *group.arguments]
         player = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
         watched = {n.name: psutil.Process(n.process.pid) for n in nodes} | {"player": psutil.Process(player.pid)}
-        used = _watch(player, watched, ears)
-        bad = ears.bad()
+        used, before = _watch(player, watched, ears)
+        bad = {name: n - before.get(name, 0) for name, n in ears.bad().items() if n > before.get(name, 0)}
         time.sleep(2.5)
-        result = {**_result(ears, used), "bad": bad, "bad_at_the_end": ears.bad()}
+        result = {**_result(ears, used), "bad": bad, "bad_before_ties": before, "bad_in_all": ears.bad()}
     os.sched_setaffinity(0, available)
     return {"points_per_s": points_per_s, "cores_given": cores, **result}
 
 
-def _watch(player: subprocess.Popen, watched: dict, ears: Ears) -> dict[str, list[tuple[float, float]]]:
-    """Time and core time of the processes, twice a second, while ties come and the player plays."""
+def _watch(
+    player: subprocess.Popen, watched: dict, ears: Ears
+) -> tuple[dict[str, list[tuple[float, float]]], dict[str, int]]:
+    """Time and core time of the processes, twice a second, while ties come; and what had been lost or late before."""
     used: dict[str, list[tuple[float, float]]] = {name: [] for name in watched}
+    before: dict[str, int] = {}
     while player.poll() is None:
-        if ears.ties:
+        if not ears.ties:
+            before = ears.bad()
+        else:
             for name, process in watched.items():
                 try:
                     times = process.cpu_times()
@@ -127,7 +132,7 @@ def _watch(player: subprocess.Popen, watched: dict, ears: Ears) -> dict[str, lis
                     continue
                 used[name].append((time.time(), times.user + times.system))
         time.sleep(0.5)
-    return used
+    return used, before
 
 
 def _result(ears: Ears, used: dict[str, list[tuple[float, float]]]) -> dict:
