@@ -1,9 +1,9 @@
 """Flat over hours: memory and latency of a long flight through the nodes, faster than real time.
 
-    python bench/long_flight.py [--hours 4] [--recording FILE] [-o out/bench]
+    python bench/long_flight.py [--hours 4] [--pace throughput] [--recording FILE] [-o out/bench]
 
-Prints a table with a row each half hour, and whether memory after warm-up stays within 5 % and the latency has no
-trend; draws both. Latency is processor time of the window's updates while a strip is flown.
+Prints a row for each ten minutes as soon as they are flown, and at the end whether memory after warm-up stays within
+5 % and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from triline.nodes import registry
+from triline.nodes.cli.process import at_pace
 from triline.nodes.collection import RareCollections
 from triline.nodes.config import build
 from triline.nodes.recording import RecordingReader, RecordingWriter
@@ -26,8 +27,10 @@ from triline.nodes.runner import process
 from triline.schemas.envelope import RawMessage
 from triline.solver.window.window import Window
 
-#: The flight is warm after so long, s.
-WARM_S = 1800.0
+#: The flight is warm after so long, s, or after half of it.
+WARM_S = 1200.0
+#: Of a row of the table, s.
+ROW_S = 600.0
 #: Of a parallel strip, and with its turn, s.
 STRIP_S, TURN_S = 238.0, 93.0
 
@@ -50,8 +53,8 @@ def resident_mb() -> float:
         return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
 
 
-def fly(recording: Path, output: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Memory (n, 2: s, MB) each minute, and updates (m, 2: s, ms)."""
+def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarray]:
+    """Memory (n, 2: s, MB) each minute, and updates (m, 2: s, ms); told while it goes on."""
     memory: list[tuple[float, float]] = []
     updates: list[tuple[float, float]] = []
     plain = Window.update
@@ -66,46 +69,53 @@ def fly(recording: Path, output: Path) -> tuple[np.ndarray, np.ndarray]:
     Window.update = timed  # type: ignore[method-assign]  # the program measures from outside
     collections = RareCollections()
     reader = RecordingReader(recording)
-    nodes = [build(registry.node_class(name), {}) for name in registry.ESTIMATING]
+    nodes = [build(registry.node_class(name), at_pace({}, pace)) for name in registry.ESTIMATING]
     first_ns = int(reader.index.stamp_ns.min())
     with RecordingWriter(output) as writer:
-        due = 0.0
+        due, row_due = 0.0, ROW_S
 
         def write(raw: RawMessage) -> None:
-            nonlocal due
+            nonlocal due, row_due
             writer.write_raw(raw)
             now_s = (raw.envelope.stamp_ns - first_ns) / 1e9
             if now_s >= due:
                 due = now_s + 60.0
                 collections.if_due()
                 memory.append((now_s, resident_mb()))
+                if now_s >= row_due:
+                    tell(np.array(memory), np.array(updates), row_due)
+                    row_due += ROW_S
 
         process(reader, nodes, write)
     return np.array(memory), np.array(updates)
 
 
+def tell(memory: np.ndarray, updates: np.ndarray, to_s: float) -> None:
+    """The row that ends at a time."""
+    m, u = (a[(a[:, 0] >= to_s - ROW_S) & (a[:, 0] < to_s), 1] for a in (memory, updates))
+    if len(u):
+        p50, p99 = np.percentile(u, [50, 99])
+        hours = f"{(to_s - ROW_S) / 60:4.0f} - {to_s / 60:3.0f}"
+        print(f"{hours}  {m.mean():9.1f}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}", flush=True)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=4.0)
+    parser.add_argument("--pace", choices=("load", "throughput"), default="load", help="as of triline process")
     parser.add_argument("--recording", type=Path, help="a recording instead of a simulated flight")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/bench"), help="folder of the drawing")
     args = parser.parse_args()
     begun = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        memory, updates = fly(args.recording or simulate(folder, args.hours), folder / "out.mcap")
-    print("     hour  memory MB  updates  p50 ms  p99 ms")
-    step = 1800.0
-    for low in np.arange(0.0, memory[-1, 0], step):
-        m = memory[(memory[:, 0] >= low) & (memory[:, 0] < low + step), 1]
-        u = updates[(updates[:, 0] >= low) & (updates[:, 0] < low + step), 1]
-        if len(u):
-            p50, p99 = np.percentile(u, [50, 99])
-            print(
-                f"{low / 3600:4.1f} - {(low + step) / 3600:3.1f}  {m.mean():9.1f}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}"
-            )
-    warm = memory[memory[:, 0] > WARM_S]
-    late = updates[updates[:, 0] > WARM_S]
+        recording = args.recording or simulate(folder, args.hours)
+        print("  minutes  memory MB  updates  p50 ms  p99 ms", flush=True)
+        memory, updates = fly(recording, folder / "out.mcap", args.pace)
+    tell(memory, updates, np.ceil(memory[-1, 0] / ROW_S) * ROW_S)
+    from_s = min(WARM_S, 0.5 * memory[-1, 0])
+    warm = memory[memory[:, 0] >= from_s]
+    late = updates[updates[:, 0] >= from_s]
     half = len(late) // 2
     result = {
         "hours": round(memory[-1, 0] / 3600.0, 2),

@@ -29,7 +29,7 @@ from triline.nodes.matcher import Matcher
 from triline.nodes.navigator import Navigator
 from triline.nodes.node import Message
 from triline.nodes.recording import RecordingReader
-from triline.nodes.runner import StepDriver
+from triline.nodes.step_driver import StepDriver
 from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.line_scan import LineScan, view_of
 from triline.solver.matching.line_store import LineRing

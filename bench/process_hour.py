@@ -1,6 +1,6 @@
 """An hour of flight through ``triline process``: 200 Hz attitude or inertial data, 5 Hz GNSS, 100 tie rays a second.
 
-    python bench/process_hour.py [--imu] [--recording FILE] [--share 1.0]
+    python bench/process_hour.py [--imu] [--pace throughput] [--recording FILE] [--share 1.0]
 
 Prints wall and processor time of the whole command and how many times faster than life it is. ``--share`` flies a part
 of the hour and says what the whole would take.
@@ -25,6 +25,7 @@ STRIPS, STRIP_S, TIES = 11, 238, 23
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--imu", action="store_true", help="inertial data, not attitude")
+    parser.add_argument("--pace", choices=("load", "throughput"), default="load", help="as of triline process")
     parser.add_argument("--recording", type=Path, help="a recording instead of a simulated flight")
     parser.add_argument("--share", type=float, default=1.0)
     args = parser.parse_args()
@@ -37,8 +38,9 @@ def main() -> int:
         before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         output = Path(name) / "out.mcap"
         done = subprocess.run(
-            [*TRILINE, "process", str(recording), "-o", str(output), "--json"], check=True, capture_output=True
-        )
+            [*TRILINE, "process", str(recording), "-o", str(output), "--pace", args.pace, "--json"],
+            check=True, capture_output=True,
+        )  # fmt: skip
         wall, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
         result = json.loads(done.stdout)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

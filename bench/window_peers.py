@@ -18,6 +18,7 @@ import shutil
 import sys
 import tempfile
 import time
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.strip import WindowStrip
 from triline.solver.window.window import Window
 
 WINDOW_S = 40.0
@@ -43,11 +45,16 @@ class Recorded:
     def __init__(self) -> None:
         self.updates: list[tuple[float, int, list[tuple[Any, ...]]]] = []
         self._known: set[int] = set()
+        self._points: set[str] = set()
+        self.strip: WindowStrip | None = None
         self._kept: list[Any] = []
 
     def watch(self, now_s: float, window: Window) -> None:
         points = []
         rays = 0
+        if self.strip is None:
+            (strip,) = window.strips.values() or (None,)
+            self.strip = copy(strip)  # when it is over it lets go of what is needed here
         for batch in window._batches:
             rays += len(batch.rays)
             if id(batch) in self._known:
@@ -55,7 +62,10 @@ class Recorded:
             self._known.add(id(batch))
             self._kept.append(batch)  # so that no other gets its id
             rows = batch.full_rows(np.arange(len(batch.rays)))
-            for p in range(batch.n_points):
+            for p, name in enumerate(batch.names):
+                if name in self._points:  # of a batch that joins others
+                    continue
+                self._points.add(name)
                 mine = slice(int(batch.first_ray[p]), int(batch.first_ray[p + 1]))
                 A = rows[mine].reshape(-1, rows.shape[2])
                 J = batch.lin.point[:, :, mine].transpose(2, 0, 1).reshape(-1, 3)
@@ -70,7 +80,8 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
         import gtsam
     except ImportError:
         return None
-    (strip,) = window.strips.values()
+    strip = recorded.strip
+    assert strip is not None
     base = int(strip.numbers[0])
     borders = strip.model.borders
 

@@ -52,6 +52,8 @@ class Adjuster(Node):
         of long flights: an update every 2 s with what came till then, from smoothed poses alone where there are any,
         and the live orientation with the update
     self_calibration : set of additional parameters, or "none"
+    camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of
+        the image): 0.03 for a camera that a calibration left half a pixel off
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
         for a pose with a known attitude.
@@ -94,6 +96,7 @@ class Adjuster(Node):
         update_rays: int = 16,
         pace: str = "load",
         self_calibration: str = "none",
+        camera_sigma: float = 1.0,
         apriori: str = "trajectory",
     ) -> None:
         super().__init__()
@@ -106,6 +109,8 @@ class Adjuster(Node):
         if self_calibration != "none" and self_calibration not in SELF_CALIBRATIONS:
             known = ", ".join(("none", *SELF_CALIBRATIONS))
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
+        if not camera_sigma > 0:
+            raise ValueError(f"camera_sigma: wanted more than 0, got {camera_sigma}")
         if pace not in PACES:
             raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if apriori not in APRIORI:
@@ -120,7 +125,7 @@ class Adjuster(Node):
         self._by_load = pace == "load"
         self._rays_waiting = 0
         self._pacing, self._governor = Pacing(), Governor(len(LEVELS))
-        self._self_calibration = self_calibration
+        self._self_calibration, self._camera_sigma = self_calibration, camera_sigma
         self._window: Window | None = None
         self._project: Any = None
         self._camera: Any = None
@@ -234,7 +239,9 @@ class Adjuster(Node):
         again = self._window is not None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         camera = convert.camera_from(self._camera)
-        parameters = None if self._self_calibration == "none" else SELF_CALIBRATIONS[self._self_calibration](camera)
+        parameters = None
+        if self._self_calibration != "none":
+            parameters = SELF_CALIBRATIONS[self._self_calibration](camera).scaled(self._camera_sigma)
         self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
         self._strips.begin_window(self._window)
         self._teller.reference_ns = self._reference_ns

@@ -18,7 +18,7 @@ from .bus import Bus
 from .collection import RareCollections
 from .node import Message, Node
 from .ordering import Sequencer, StreamCheck, TopicCounts, order_key
-from .runner import StepDriver
+from .step_driver import StepDriver
 
 #: Waiting messages of lossless topics after which publishers are slowed down.
 LOSSLESS_DEPTH = 20_000
@@ -198,6 +198,7 @@ class BusRunner:
             for accepted in self._check.accept(raw.topic, raw.envelope, raw):
                 message = self._decode(accepted)
                 if message is not None:
+                    self._sequencer.hear(accepted.topic, accepted.envelope, self._patience.now_s())
                     self._work(message)
         self._worked_ns = 0  # configuration does not tell how far the flight is
         now = self._patience.now_s()

@@ -216,10 +216,10 @@ class Matcher(Node):
         if self._pace.blind:
             self.counters["lines gone by"] += len(block.pixels)
             return []
-        matcher.add_lines(ccd, int(block.first_line), block.pixels)
+        usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
         ties = matcher.match()
         out = [self._tie(strip, tie) for tie in ties]
-        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns)
+        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
         out += targets
         out += [self._log(f"{strip.id}: {text}", warning=True) for text in (*matcher.take_events(), *words)]
         self.counters.update(self._targets.take_counters())

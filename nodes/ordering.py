@@ -223,24 +223,29 @@ class Sequencer(Generic[T]):
             self._newest_ns = stamp
         if topics.find(topic).family is not Family.OBSERVATION and (self._time_ns is None or stamp > self._time_ns):
             self._time_ns = stamp
-        stream = self._streams.get((topic, envelope.source))
-        if stream is None:
-            row = topics.find(topic)
-            self._unheard.pop(row.name, None)
-            place = (topics.rank(topic), topic, envelope.source)
-            lateness, grace_s = self._patience(row)
-            stream = _Watermark(place, lateness, grace_s, row.in_bursts or row.rate_hz == 0, stamp, now_s)
-            self._streams[topic, envelope.source] = stream
-        stream.latest_ns = max(stream.latest_ns, stamp)
-        said = stamp, (topics.rank(topic), topic, envelope.source)
-        self._sources[envelope.source] = max(self._sources.get(envelope.source, said), said)
-        stream.heard_s = now_s
+        self.hear(topic, envelope, now_s)
         key = order_key(topic, envelope)
         if self._released is not None and key < self._released:
             return item
         self._arrivals += 1
         heapq.heappush(self._heap, (key, self._arrivals, item))
         return None
+
+    def hear(self, topic: str, envelope: Envelope, now_s: float) -> None:
+        """Note who speaks on a topic, and how far they are; all there is to it for what is worked off elsewhere."""
+        stream = self._streams.get((topic, envelope.source))
+        if stream is None:
+            row = topics.find(topic)
+            self._unheard.pop(row.name, None)
+            place = (topics.rank(topic), topic, envelope.source)
+            lateness, grace_s = self._patience(row)
+            on_events = row.in_bursts or row.rate_hz == 0
+            stream = _Watermark(place, lateness, grace_s, on_events, envelope.stamp_ns, now_s)
+            self._streams[topic, envelope.source] = stream
+        stream.latest_ns = max(stream.latest_ns, envelope.stamp_ns)
+        said = envelope.stamp_ns, (topics.rank(topic), topic, envelope.source)
+        self._sources[envelope.source] = max(self._sources.get(envelope.source, said), said)
+        stream.heard_s = now_s
 
     def pop(self, now_s: float, most: int | None = None) -> list[T]:
         """The messages whose turn has come, in order; if there are more than ``most``, `ready` is set."""

@@ -1,4 +1,4 @@
-"""Recordings: MCAP files of messages with their envelopes. The only file that knows the MCAP library.
+"""Recordings: MCAP files of messages with their envelopes. `mcap_scan` and `mcap_write` know the format.
 
 One channel stands for one run of one publisher on one topic. What all else depends on, the configuration, stands in a
 chunk of its own at the head, and once more at the end, on channels marked as copies; readers take a copy only where the
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from ..schemas import codec, topics
@@ -25,10 +24,10 @@ from ..schemas.envelope import Envelope, RawMessage
 from ..schemas.messages import file_descriptor_set
 from . import mcap_scan as scan
 from .errors import UserError
+from .mcap_write import COMPRESSIONS, McapWriter
 from .node import Message
 from .recording_index import Channel, Index, IndexColumns
 
-COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 LIBRARY = "triline"
 CHANNEL_METADATA = "triline.channel"
 _SEQUENCE_MASK = 0xFFFFFFFF
@@ -59,8 +58,7 @@ class RecordingWriter:
         self._stream: IO[bytes] = (
             open(target, "wb") if isinstance(target, (str, Path)) else target  # noqa: SIM115  # closed by close
         )
-        kind = COMPRESSIONS[compression]
-        self._writer = Writer(self._stream, chunk_size=chunk_size, compression=kind, enable_data_crcs=True)
+        self._writer = McapWriter(self._stream, compression, chunk_size)
         self._platform = platform
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str, int, str, bool], int] = {}
@@ -68,7 +66,7 @@ class RecordingWriter:
         self.counts: Counter[str] = Counter()
         self._head = True
         self._configuration: list[tuple[RawMessage, str | None]] = []
-        self._writer.start("", LIBRARY)
+        self._writer.start(LIBRARY)
         self._stream.flush()
 
     def write(self, message: Message, receive_ns: int | None = None) -> None:
@@ -113,13 +111,8 @@ class RecordingWriter:
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._register(*key)
-        self._writer.add_message(
-            channel,
-            log_time=raw.receive_ns,
-            data=raw.data,  # type: ignore[arg-type]  # a memoryview serves as well
-            publish_time=envelope.stamp_ns,
-            sequence=envelope.sequence & _SEQUENCE_MASK,
-        )
+        sequence = envelope.sequence & _SEQUENCE_MASK
+        self._writer.add_message(channel, raw.receive_ns, envelope.stamp_ns, sequence, raw.data)
 
     def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)

@@ -25,6 +25,7 @@ _NAME = [240, 243, 248]  # of labels, whose ground goes with the theme: grey or 
 _FIELD_OF_VIEW = np.radians(55.0)  # of the viewer, vertical
 _ALWAYS = rrb.TimeRangeBoundary.infinite()  # plots show the whole flight, not what is near the time cursor
 _ASPECT, _WIDE_ASPECT = 1.35, 2.0  # of the 3D view, about; wide above curves
+_MOSAIC_ASPECT = 3.6  # of one orthoimage above the other
 _MARGIN = 1.06
 _MAP_POINTS = 300.0  # height and width of the map, about
 
@@ -185,7 +186,7 @@ def _overview(layout: Layout) -> rrb.Container:
     )
     if layout.lines:
         lines = rrb.Horizontal(*(_lines(ccd, layout) for ccd in layout.lines))
-        left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[1.6, 10, 1.5, 8])
+        left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[2.1, 10, 1.5, 7.6])
         right = rrb.Vertical(lines, side, row_shares=[10, 2.2])
         return rrb.Horizontal(left, right, column_shares=[1, 1], name="Overview")
     left = rrb.Vertical(_light(), _flight(layout), _legend(layout), side, row_shares=[1.5, 10, 1.3, 2.6])
@@ -198,7 +199,7 @@ def _mosaic(layout: Layout) -> rrb.Container:
     low, high = layout.corners.min(axis=0), layout.corners.max(axis=0)
     middle, extent = (low + high) / 2, high - low
     wide = extent[0] >= extent[1]
-    reach = max(extent[0] / (2 * _ASPECT if wide else _ASPECT), extent[1])
+    reach = max(extent[0] / (_MOSAIC_ASPECT if wide else _MOSAIC_ASPECT / 4), extent[1])
     views = [
         rrb.Spatial3DView(
             origin="/",

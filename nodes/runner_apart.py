@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from ..schemas import codec
 from ..schemas.envelope import Envelope, RawMessage
+from .collection import RareCollections
 from .errors import UserError
 from .node import Message, Node
 from .recording import RecordingReader
@@ -76,6 +77,8 @@ class Apart:
 
     def __init__(self, reader: RecordingReader, driver: Driver) -> None:
         context = multiprocessing.get_context("fork")
+        here: Any
+        there: Any
         here, there = context.Pipe()
         self._name = driver.node.name
         self._process = context.Process(target=_work, args=(there, here, reader, driver), daemon=True)
@@ -150,7 +153,9 @@ def _work(connection: Connection, other: Connection, reader: RecordingReader, dr
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     other.close()
     decode: Callable[[int | RawMessage], Message] = _Decoder(reader)
+    collections = RareCollections()
     while True:
+        collections.if_due()
         try:
             batch: list[Item] | None = connection.recv()
         except (EOFError, OSError):
@@ -176,4 +181,4 @@ class _Decoder:
     def __call__(self, item: int | RawMessage) -> Message:
         raw: Any = self._reader.raw(item) if isinstance(item, int) else item
         e = raw.envelope
-        return Message(raw.topic, e.stamp_ns, codec.decode(raw.topic, raw.data), e.source, e.sequence)
+        return Message(raw.topic, e.stamp_ns, codec.parse(raw.topic, raw.data), e.source, e.sequence)

@@ -16,7 +16,7 @@ _NEWEST = 1500  # rays a view shows
 _PERIOD_S = 1.0  # all of them are drawn again
 _LENGTH_S = 60.0  # of a strip whose end is not known
 _BAR = 0.05  # of the view's width is the scale bar,
-_TELLING, _BAR_RMS = 60, 3.0  # which is 1 px, or less: about so many times the residuals, once there are so many
+_TELLING, _BAR_RMS = 240, 3.0  # which is 1 px, or less: about so many times the residuals, once there are so many
 _SETTLED = 0.5  # of the colour is left of the residuals of final points
 _GREY = (110, 110, 120, 255)
 

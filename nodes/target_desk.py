@@ -82,11 +82,13 @@ class TargetDesk:
         if self._finder is not None:
             self._finder.begin_strip(first_s, strip.line_rate_hz)
 
-    def lines(self, ccd: str, first_line: int, pixels: Any, stamp_ns: int) -> tuple[list[Message], list[str]]:
-        """Messages that follow from lines, and what an operator should know."""
+    def lines(
+        self, ccd: str, first_line: int, pixels: Any, stamp_ns: int, usable: Any = None
+    ) -> tuple[list[Message], list[str]]:
+        """Messages that follow from lines, and what an operator should know; ``usable`` says which lines are."""
         if self._finder is None or self._strip is None:
             return [], []
-        self._finder.add_lines(ccd, first_line, pixels)
+        self._finder.add_lines(ccd, first_line, pixels, usable)
         out: list[Message] = []
         words = []
         for look in self._finder.measure(ccd):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -42,19 +43,93 @@ def decode(topic: str, data: bytes | memoryview) -> Any:
     ValueError : it cannot be decoded, or holds values no publisher may send (not finite, of the wrong size)
     KeyError : the topic is not in the topic table
     """
+    body = parse(topic, data)
+    if not isinstance(body, LineBlock):
+        validate(body)
+    return body
+
+
+def parse(topic: str, data: bytes | memoryview) -> Any:
+    """The same of a payload that has been checked before.
+
+    Raises
+    ------
+    ValueError : it cannot be decoded
+    KeyError : the topic is not in the topic table
+    """
     row = topics.find(topic)
     if row.type is m.RawImage:
         return image_lines.decode(data)
     try:
-        body = row.type.FromString(data)
+        return row.type.FromString(data)
     except DecodeError as error:
         raise ValueError(f"not a {row.type_name}: {error}") from None
-    validate(body)
-    return body
+
+
+class _Numbers(NamedTuple):
+    """Where a message type has numbers: fields of one, of many with how many there may be, and of messages."""
+
+    single: tuple[str, ...]
+    many: tuple[tuple[str, int], ...]
+    message: tuple[str, ...]
+    messages: tuple[str, ...]
+
+
+@cache
+def _numbers_of(cls: Any) -> _Numbers:
+    single, many, message, messages = [], [], [], []
+    sizes = _SIZES.get(cls.DESCRIPTOR.full_name, {})
+    empty = cls()
+    for field in cls.DESCRIPTOR.fields:
+        repeated = hasattr(getattr(empty, field.name), "extend")
+        if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
+            if repeated:
+                many.append((field.name, sizes.get(field.name, 0)))
+            else:
+                single.append(field.name)
+        elif field.cpp_type == field.CPPTYPE_MESSAGE:
+            (messages if repeated else message).append(field.name)
+    return _Numbers(tuple(single), tuple(many), tuple(message), tuple(messages))
 
 
 def validate(body: Any) -> None:
     """Raise ValueError for a message with values that are not finite, or with the wrong number of values."""
+    if not _is_fine(body):
+        _find_fault(body)
+    name = body.DESCRIPTOR.full_name
+    if name == "foxglove.LocationFix" and not abs(body.latitude) <= 90:
+        raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
+    if name == "foxglove.PoseInFrame":
+        q = body.pose.orientation
+        norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+
+
+def _is_fine(body: Any) -> bool:
+    """Whether all numbers together are finite (those of a sane message do not overflow) and vectors have their size."""
+    numbers = _numbers_of(type(body))
+    total = 0.0
+    for name in numbers.single:
+        total += getattr(body, name)
+    for name, size in numbers.many:
+        values = getattr(body, name)
+        if values:
+            if size and len(values) != size:
+                return False
+            total += sum(values)
+    for name in numbers.message:
+        if body.HasField(name) and not _is_fine(getattr(body, name)):
+            return False
+    for name in numbers.messages:
+        for part in getattr(body, name):
+            if not _is_fine(part):
+                return False
+    return math.isfinite(total)
+
+
+def _find_fault(body: Any) -> None:
+    """Raise ValueError for the first field that is at fault, if one is."""
     sizes = _SIZES.get(body.DESCRIPTOR.full_name, {})
     for field, value in body.ListFields():  # only fields that are set: a default is always finite
         size = sizes.get(field.name)
@@ -67,14 +142,7 @@ def validate(body: Any) -> None:
                 raise ValueError(f"{field.name} is not finite")
         elif kind == field.CPPTYPE_MESSAGE:
             for part in (value,) if hasattr(value, "ListFields") else value:
-                validate(part)
-    if body.DESCRIPTOR.full_name == "foxglove.LocationFix" and not abs(body.latitude) <= 90:
-        raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
-    if body.DESCRIPTOR.full_name == "foxglove.PoseInFrame":
-        q = body.pose.orientation
-        norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
-        if abs(norm - 1) > 1e-3:
-            raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+                _find_fault(part)
 
 
 def vector_sizes(type_name: str) -> dict[str, int]:

@@ -241,6 +241,8 @@ def test_settings_are_checked():
         Adjuster(update_s=0.0)
     with pytest.raises(ValueError, match="tls18"):
         Adjuster(self_calibration="tls99")
+    with pytest.raises(ValueError, match="camera_sigma: wanted more than 0, got -1"):
+        Adjuster(camera_sigma=-1)
     with pytest.raises(ValueError, match="window_s"):
         Adjuster(window_s=-1.0)
     with pytest.raises(ValueError, match="spline"):

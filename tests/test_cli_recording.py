@@ -21,7 +21,8 @@ from triline.nodes.errors import UserError
 from triline.nodes.node import Message, Node
 from triline.nodes.player import iso, play, time_argument
 from triline.nodes.recording import RecordingReader, RecordingWriter
-from triline.nodes.runner import StepDriver, active_nodes, process
+from triline.nodes.runner import active_nodes, process
+from triline.nodes.step_driver import StepDriver
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.envelope import Envelope, RawMessage

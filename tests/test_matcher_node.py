@@ -112,11 +112,20 @@ def short_lines(ccd, line, pixels):
     return pixels[:, :100] if 60 <= line < 70 and ccd == "F" else pixels
 
 
+def backward_dies(ccd, line, pixels):
+    return None if ccd == "B" and line >= 150 else pixels
+
+
 FAULTS = {
     "faults of the camera": (
         chain(lost_block, short_lines, lines_between(150, 155, 0), frozen_backward, lines_between(330, 350, 4095)),
         {"lines missing": 4, "malformed": 1, "lines dark": 15, "lines frozen": 90, "lines saturated": 60},
         ("N: 20 lines are missing", "N: lines are black", "B: lines are frozen", "N: lines are saturated"),
+    ),
+    "a CCD line falls silent": (
+        backward_dies,
+        {"ties": 60},
+        ("B: nothing has come after line 149",),
     ),
     "lens cap, then water": (
         chain(lines_between(40, 100, 0), lines_between(235, 400, water)),

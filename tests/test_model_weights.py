@@ -2,7 +2,10 @@
 
 import numpy as np
 import pytest
+from adjustment_networks import simulate
 
+from triline.solver.adjustment.adjustment import solve
+from triline.solver.adjustment.problem import continue_problem, pose_problem
 from triline.solver.models.base import Extent
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
@@ -106,3 +109,40 @@ def test_unknowns_and_description_go_together(options):
     assert model.design(np.array([START, END])).columns.max() < model.n_unknowns
     told = model.describe(np.arange(model.n_unknowns, dtype=float), np.ones(model.n_unknowns))
     assert told["offset_m"] == [0.0, 1.0, 2.0] and told["drift_deg_sigma"] == pytest.approx([57.29578] * 3)
+
+
+SETTINGS = {
+    "offset_sigma_m": [0.5, 0.5, 0.8],
+    "wander_sigma_m": [1.0, 1.0, 1.5],
+    "wander_sigma_deg": [0.005, 0.005, 0.01],
+    "wander_time_s": 30.0,
+}
+
+
+@pytest.mark.parametrize("options", [PpmOptions, LimOptions], ids=lambda o: o.name)
+def test_a_project_that_states_its_wander_gets_weights_and_segments_from_it(options):
+    model = options.from_settings(SETTINGS).build(Extent("strip S1", START, END))
+    assert model.options.slow is not None and len(getattr(model, "borders", getattr(model, "fixes", ()))) == 31
+    assert options.from_settings({"offset_sigma_m": 0.5}).slow is None
+    few = options.from_settings(SETTINGS | {"segments": 6, "fixes": 7}).build(Extent("strip S1", START, END))
+    assert len(getattr(few, "borders", getattr(few, "fixes", ()))) == 7
+
+
+def test_own_weights_of_the_piecewise_model_come_first():
+    assert PpmOptions.from_settings(SETTINGS | {"first_sigma_m": 0.1}).slow is None
+
+
+def test_the_batch_weighs_rays_by_what_the_model_cannot_follow():
+    """And a model run after another takes no part of the first one's."""
+    network = simulate(1, LimOptions(5, False)).network
+    few, many = (LimOptions(n, False, slow=SLOW) for n in (5, 25))
+    coarse = pose_problem(network, few)
+    noise = coarse.network.rays.orientation_noise
+    model = coarse.layout.sets[0].model
+    mine = coarse.layout.set_of_ray == 0
+    wanted = model.left_out_variance(network.rays.time_s[mine])
+    before = 0.0 if network.rays.orientation_noise is None else network.rays.orientation_noise[mine]
+    assert np.einsum("nii->ni", noise[mine] - before) == pytest.approx(wanted)
+    following = continue_problem(solve(coarse), many)
+    alone = pose_problem(network, many).network.rays.orientation_noise
+    assert following.network.rays.orientation_noise == pytest.approx(alone, abs=1e-12)

@@ -277,7 +277,7 @@ def test_rejected_coordinates_do_not_count_until_they_are_confirmed():
     flown = simulated_flight({"seconds": 20.0, "seed": 4, "lead_in": 3.0, "attitude_rate": 50.0, "check": 0})
     messages = list(Simulator(flown.simulation).messages(10**18))
     from triline.nodes.navigator import Navigator
-    from triline.nodes.runner import StepDriver
+    from triline.nodes.step_driver import StepDriver
 
     def final(verdicts):
         """Final east of a control point that was given 5 m too far east."""

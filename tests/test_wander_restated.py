@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from triline.solver.models.base import Extent
+from triline.solver.models.base import Extent, PseudoObservations, join_observations
 from triline.solver.models.wander import WanderOptions
 from triline.solver.slow_errors import SlowErrors
 from triline.solver.wander import autocorrelation
@@ -76,3 +76,64 @@ def test_what_has_been_used_does_not_change():
     columns = wander.design([used_s]).columns
     assert changed.size and p.columns[changed].max(axis=1).min() > columns.max()
     assert wander.restate(END, SIGMA, 30.0) == np.inf and border > used_s
+
+
+def sparing():
+    """With segments as long as a small part left out allows."""
+    options = WanderOptions(SLOW, left_out_m=0.1, left_out=1e-5)
+    return options.build(Extent("strip S1", START, END))
+
+
+def test_longer_segments_say_the_same_of_the_process():
+    """Interpolation and what it leaves out together have the covariance of the process, between borders, too."""
+    wander, fine = sparing(), model()
+    assert len(wander.used) <= len(fine.used) // 2 + 1 and wander.step_s == fine.step_s
+    times = np.linspace(START, END, 41)
+    for component in (2, 5):
+        C = covariance(Used(wander), times, component)
+        whole = np.diagonal(C) + wander.left_out_variance(times)[:, component]
+        assert whole == pytest.approx(SIGMA[component] ** 2, rel=1e-6)
+        expected = SIGMA[component] ** 2 * autocorrelation(30.0, times[:, None] - times)
+        assert pytest.approx(expected, abs=0.01 * SIGMA[component] ** 2) == C
+    left = np.sqrt(wander.left_out_variance(times).max(axis=0))
+    assert (left[:3] <= 0.1).all() and (left[3:] <= 1e-5).all() and left[2] > 0.03
+
+
+def test_segments_become_short_where_the_wander_grows_and_long_where_it_is_small_again():
+    wander = sparing()
+    p = wander.pseudo_observations()
+    before, used_s = wander.used.copy(), 112.3
+    columns = wander.design([used_s]).columns
+    up = wander.restate(used_s, 40.0 * SIGMA, 30.0)
+    down = wander.restate(135.0, SIGMA, 30.0)
+    assert wander.design([used_s]).columns.tolist() == columns.tolist()
+    lengths = np.diff(wander.borders[wander.used])
+    starts = wander.borders[wander.used[:-1]]
+    longest = np.diff(wander.borders[before]).max()
+    assert lengths[(starts >= up) & (starts < 135.0)] == pytest.approx(wander.step_s)
+    assert lengths[starts >= down][:-1] == pytest.approx(longest)
+    assert lengths[starts < used_s - longest] == pytest.approx(longest)
+    # what leads to borders that are not in use has no weight, all others do
+    touched = set(p.columns[np.isfinite(p.sigma)].ravel().tolist())
+    assert {9 + 12 * k for k in wander.used.tolist()} <= touched
+    assert not {9 + 12 * k for k in set(range(len(wander.borders))) - set(wander.used.tolist())} & touched
+    C = covariance(Used(wander), np.array([100.0, 0.5 * (up + down), 150.0]), 0)
+    assert np.sqrt(np.diagonal(C)) == pytest.approx(SIGMA[0] * np.array([1.0, 40.0, 1.0]), rel=0.01)
+
+
+class Used:
+    """A wander model with the unknowns that appear nowhere held, so that its normal equations are regular."""
+
+    def __init__(self, wander):
+        self.n_unknowns, self.design = wander.n_unknowns, wander.design
+        p = wander.pseudo_observations()
+        idle = 9 + 12 * np.setdiff1d(np.arange(len(wander.borders)), wander.used)[:, None] + np.arange(12)
+        self._observations = join_observations([p, direct_at(idle.ravel())])
+
+    def pseudo_observations(self):
+        return self._observations
+
+
+def direct_at(columns):
+    n = len(columns)
+    return PseudoObservations(columns[:, None].astype(np.int32), np.ones((n, 1)), np.zeros(n), np.ones(n), ("",) * n)

@@ -199,20 +199,51 @@ def test_a_point_taken_for_another_ties_nothing(flight, online):
     assert far_apart(*kept)[0] < 1.5
 
 
-def test_a_control_point_seen_again_in_one_look_is_not_weighted_again(flight):
-    simulation, poses = flight
-    looks, role = simulation.images.looks, simulation.points.role
-    control = np.isin(looks.point, np.flatnonzero(role == "control"))
+def seen_again_once(simulation, role):
+    """The flight with points of a role seen only once in the strips after the first, their places, and those looks."""
+    looks = simulation.images.looks
+    chosen = np.isin(looks.point, np.flatnonzero(simulation.points.role == role))
     later = looks.strip > 0
     once = np.zeros(len(looks), dtype=bool)
     once[np.unique(looks.point * 10 + looks.strip, return_index=True)[1]] = True
-    thinned = replace(simulation, images=simulation.images.select(~(control & later) | once))
-    first = simulation.flight.strips[0]
+    kept = ~(chosen & later) | once
+    thinned = replace(simulation, images=simulation.images.select(kept))
+    names = set(looks.point[chosen & ~later].tolist()) & set(looks.point[chosen & later].tolist())
+    return thinned, names, np.flatnonzero((chosen & later & once)[kept])
+
+
+def test_a_control_point_seen_again_in_one_look_ties_and_is_not_weighted_again(flight):
+    simulation, poses = flight
+    thinned, seen, _ = seen_again_once(simulation, "control")
     result = adjust_online(thinned, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
-    seen = {p for p in looks.point[control & ~later].tolist()} & {p for p in looks.point[control & later].tolist()}
     assert seen
     for p in seen:
         name = str(simulation.points.id[p])
-        mine = [r for r in result.refused if r.point == name]
-        assert {r.reason for r in mine} == {"too few looks"} and first.id not in {r.look.strip for r in mine}
-        assert result.final_points[name].rays > 1
+        assert not [r for r in result.refused if r.point == name]
+        point = result.whole_points[name]
+        assert point.rays > 1 and np.sqrt(np.diag(point.covariance)).min() > 0.02 / np.sqrt(2)
+
+
+def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
+    """With single looks alone a later strip is better than without; one that is wrong is not used."""
+    simulation, poses = flight
+    thinned, seen, looks = seen_again_once(simulation, "tie")
+    options = replace(OPTIONS, snoop=True)
+    result = adjust_online(thinned, poses, options, live=False, update_s=0.5)
+    single = np.isin(np.arange(len(thinned.images)), looks)
+    none = replace(thinned, images=thinned.images.select(~single))
+    without = adjust_online(none, poses, options, live=False, update_s=0.5)
+    sigma = [
+        np.sqrt(np.einsum("nii->ni", np.concatenate([o.covariance for o in r.final if o.strip == "S2"]))).mean(axis=0)
+        for r in (result, without)
+    ]
+    assert (sigma[0][:3] < 0.9 * sigma[1][:3]).all()
+    assert orientation_errors(simulation, result.final).nees.mean() < 2.0
+    sample = thinned.images.sample.copy()
+    wrong = next(i for i in looks if thinned.images.looks.point[i] in seen and thinned.images.looks.strip[i] == 1)
+    sample[wrong] += 40.0
+    spoilt = replace(thinned, images=replace(thinned.images, sample=sample))
+    spoilt = adjust_online(spoilt, poses, options, live=False, update_s=0.5)
+    name = str(simulation.points.id[thinned.images.looks.point[wrong]])
+    assert any("do not agree with earlier strips" in e and name in e for e in spoilt.events)
+    assert far_apart(spoilt.final, result.final)[0] < 1.0

@@ -10,7 +10,7 @@ from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
-from triline.solver.window import window as module
+from triline.solver.window import arriving as module
 from triline.solver.window.entry import SUSPECTED, _Equations, entry_weight
 
 

@@ -64,3 +64,39 @@ def test_residuals_without_cofactors() -> None:
 
     adjust_online(simulation, navigate(simulation), live=False, watch=watch)
     assert compared > 20
+
+
+def test_a_joined_batch_says_what_its_parts_said() -> None:
+    """Rays that come a few at a time: batches of a time are joined, and together know what they knew."""
+    simulation = simulate(FlightPlan(strip_s=24.0), 1, observation_plan=ObservationPlan(tie_points_per_s=20.0))
+    sizes, compared = [], 0
+
+    def watch(now: float, window: Window) -> None:
+        nonlocal compared
+        sizes.append(max((len(b.rays) for b in window._batches if b.newest_s < now - 3.0), default=0))
+        parts = [b for b in window._batches if b.provisional][:3]
+        if len(parts) < 2 or compared == 20:
+            return
+        compared += 1
+        points, state = window._points, window.state
+        known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
+        made = [window._maker.make(b.names, [points[n] for n in b.names], known)[0] for b in parts]
+        joined = window._maker.make(list(known), [points[n] for n in known], known)[0]
+        total, rhs = np.zeros((len(state), len(state))), np.zeros(len(state))
+        for batch in made:
+            assert batch is not None
+            place = state.places(batch.columns)
+            total[np.ix_(place, place)] += batch.information.matrix
+            rhs[place] += batch.information.rhs
+        assert joined is not None
+        place = state.places(joined.columns)
+        scale = np.sqrt(np.diagonal(state.covariance(joined.columns)))
+        got = joined.information
+        wanted = total[np.ix_(place, place)] * scale * scale[:, None]
+        np.testing.assert_allclose(got.matrix * scale * scale[:, None], wanted, atol=1e-9 * np.abs(wanted).max())
+        np.testing.assert_allclose(got.rhs * scale, rhs[place] * scale, rtol=1e-7, atol=1e-6)
+        assert got.rows == sum(b.information.rows for b in made if b is not None)
+
+    adjust_online(simulation, navigate(simulation), live=False, watch=watch, update_s=0.05)
+    assert compared == 20
+    assert 40 < max(sizes) <= 160  # 60 rays a second, 3 an update

@@ -55,8 +55,14 @@ def run(args: argparse.Namespace) -> int:
             RecordingWriter(part, args.compression, platform=_platform(reader)) as writer,
             progress("processing", args.quiet or args.json) as told,
         ):
-            RareCollections()
-            summary = process(reader, nodes, writer.write_raw, told, apart=True)
+            collections = RareCollections()
+
+            def progressed(fraction: float) -> None:
+                collections.if_due()
+                if told is not None:
+                    told(fraction)
+
+            summary = process(reader, nodes, writer.write_raw, progressed, apart=True)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
         if not summary.outputs:

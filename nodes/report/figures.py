@@ -24,7 +24,7 @@ SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 MDEG = 1000.0 * float(np.degrees(1.0))
 SCALE = np.array([1.0, 1.0, 1.0, MDEG, MDEG, MDEG])
 _TELLING = 30  # redundancy from which sigma0 is shown
-_MANY = 1500  # artists above this number are drawn as pixels
+_MOST_ARROWS = 300  # residuals of a CCD line that are drawn; more would be a carpet
 _SIGMAS = 3.0
 
 
@@ -39,7 +39,7 @@ def trajectory_map(flight: Flight) -> Figure | None:
         low, high = np.minimum(low, points["xyz"].min(axis=0)), np.maximum(high, points["xyz"].max(axis=0))
     extent = np.maximum(high - low, 1.0)[:2]
     turned = extent[1] > 1.15 * extent[0]  # a flight to the north lies on its side, so that it fills the page
-    fig = figure(float(np.clip(1.2 + 8.6 * min(extent) / max(extent), 3.2, 7.5)))
+    fig = figure(float(np.clip(1.2 + 8.6 * min(extent) / max(extent), 2.5, 7.5)))
     ax = fig.add_subplot()
     ax.set_aspect("equal")
 
@@ -161,15 +161,18 @@ def _vectors(ax: Axes, ccd: str, rows: Array, color: str, rms: float, longest: f
     vertical = scale * longest / width * 2.2  # lines of the plot: the axes are about 2.2 times as wide as high
     good, bad = rows[rows[:, 5] == 0], rows[rows[:, 5] > 0]
     shape = {"angles": "xy", "scale_units": "xy", "scale": 1, "headwidth": 3.5, "headlength": 4}
-    quiver = ax.quiver(
-        good[:, 1], good[:, 0], scale * good[:, 3], vertical * good[:, 2], color=color, width=0.0016, **shape
-    )
-    quiver.set_rasterized(len(good) > _MANY)
+    every = max(1, -(-len(good) // _MOST_ARROWS))
+    drawn = good[np.argsort(good[:, 0], kind="stable")][::every]
+    ax.quiver(drawn[:, 1], drawn[:, 0], scale * drawn[:, 3], vertical * drawn[:, 2], color=color, width=0.0016, **shape)
     ax.scatter(bad[:, 1], bad[:, 0], marker="x", s=22, c=REJECTED, lw=1.1, zorder=4)
     ax.set_xlim(0, width)
     ax.set_ylim(0, longest * 1.02)
     ax.set_ylabel("line [px]")
-    ax.set_title(f"CCD line {ccd}: {len(good)} rays" + (f", {len(bad)} rejected (×)" if len(bad) else ""))
+    ax.set_title(
+        f"CCD line {ccd}: {len(good)} rays"
+        + (f", 1 in {every} drawn" if every > 1 else "")
+        + (f", {len(bad)} rejected (×)" if len(bad) else "")
+    )
     bar = 3 * rms
     ax.plot([width - 0.02 * width - scale * bar, width - 0.02 * width], [longest * 0.97] * 2, color="black", lw=2)
     scale_note(ax, f"bar = {bar:.2g} px")

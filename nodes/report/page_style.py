@@ -14,6 +14,7 @@ p { margin: 6px 0; } .soft, figcaption, .note { color: var(--soft); } .note, fig
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(200px, 1fr)); gap: 10px; margin: 14px 0; }
 .tile { background: var(--tint); border-left: 4px solid var(--line); padding: 9px 12px; }
 .tile.good { border-color: var(--good); } .tile.bad { border-color: var(--bad); }
+.tile.careful { border-color: #d08a1d; }
 .tile b { display: block; font-size: 20px; line-height: 1.25; } .tile span { font-size: 12.5px; color: var(--soft); }
 figure { margin: 12px 0 4px; } figure svg { width: 100%; height: auto; display: block; }
 .scroll { overflow-x: auto; }

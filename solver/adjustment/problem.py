@@ -146,6 +146,7 @@ class Solution:
 def pose_problem(network: Network, model: ModelOptions, self_calibration: SelfCalibration | None = None) -> Problem:
     """Unknowns, priors and elimination plan of a network."""
     layout = build_layout(network, model, self_calibration)
+    network = _with_left_out(network, layout)
     prior = whiten_prior(layout.prior, layout.n_unknowns)
     return Problem(
         network,
@@ -156,6 +157,20 @@ def pose_problem(network: Network, model: ModelOptions, self_calibration: SelfCa
         prior,
         weigh_control(network.control, network.n_points),
     )
+
+
+def _with_left_out(network: Network, layout: Layout, sign: float = 1.0) -> Network:
+    """The network with what the model cannot follow in (or, sign -1, no more in) the noise of the rays' orientation."""
+    rays = network.rays
+    variance = np.zeros((len(rays), 6))
+    for i, item in enumerate(layout.sets):
+        mine = np.flatnonzero(layout.set_of_ray == i)
+        variance[mine] = item.model.left_out_variance(rays.time_s[mine])
+    if not variance.any():
+        return network
+    before = 0.0 if rays.orientation_noise is None else rays.orientation_noise
+    noise = before + sign * variance[:, :, None] * np.eye(6)
+    return replace(network, rays=replace(rays, orientation_noise=noise))
 
 
 def start_state(problem: Problem, points_l: Array | None = None) -> State:
@@ -169,7 +184,8 @@ def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
     old = solution.problem
     correction = old.layout.corrections(solution.state.theta)
     rays = old.network.rays
-    refined = old.network.with_orientation(rays.position_l + correction[:3].T, rays.angles + correction[3:].T)
+    refined = _with_left_out(old.network, old.layout, -1.0)
+    refined = refined.with_orientation(rays.position_l + correction[:3].T, rays.angles + correction[3:].T)
     return replace(pose_problem(refined, model, old.self_calibration), earlier=(*old.earlier, solution))
 
 

@@ -12,8 +12,11 @@ from .line_quality import GOOD, REASONS, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
-#: Events of a strip that are told.
-MOST_TOLD = 100
+#: A CCD line that gives nothing for so long while others do, s, is told of, and not waited for.
+SILENT_S = 5.0
+#: Events of a strip that are told. A fault that comes again and again is told so often by itself, then summed up, every
+#: so many seconds.
+MOST_TOLD, BY_ITSELF, SUMMED_S = 100, 3, 10.0
 #: Names of lines that cannot be used, in events.
 _WORDS = {"dark": "black (lens cap, no light or no data)", "saturated": "saturated", "frozen": "frozen"}
 
@@ -45,15 +48,29 @@ class LineIntake:
         self._state: dict[str, int] = {}
         self._events: list[str] = []
         self._told = 0
+        self._silent_after = np.inf
+        self._ends: dict[str, int] = {}
+        self._good_ends: dict[str, int] = {}
+        self._silent: set[str] = set()
+        self._rate = 1.0
+        self._faults: dict[tuple[str, str], tuple[int, int, int]] = {}
+        self._told_of: set[str] = set()
 
-    def begin_strip(self) -> None:
+    def begin_strip(self, line_rate_hz: float) -> None:
         """What is in store is forgotten."""
         self.store = None
+        self._silent_after = SILENT_S * line_rate_hz
+        self._ends = dict.fromkeys(self._samples, 0)
+        self._good_ends = dict.fromkeys(self._samples, 0)
+        self._silent.clear()
+        self._rate = line_rate_hz
+        self._faults.clear()
+        self._told_of.clear()
         self._told = 0
         self._last_line.clear()
 
-    def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD.
+    def add(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Lines of one CCD; returns which of them (n,) are fit for use.
 
         Raises
         ------
@@ -71,17 +88,28 @@ class LineIntake:
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
         self._tell(ccd, first_line, verdict)
+        self._listen(ccd, first_line + len(pixels))
+        if (verdict == GOOD).any():
+            self._good_ends[ccd] = max(self._good_ends[ccd], first_line + len(pixels))
         if self.store is None:
             self.store = self._make_store(pixels.dtype)
         if self.store is None:
             self.counters["lines before poses"] += len(pixels)
-            return
+            return verdict == GOOD
         missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
         if missing:
             self.counters["lines missing"] += missing
-            self.tell(f"{ccd}: {missing} lines are missing before line {first_line}")
+            words = f"{missing} lines are missing before line {first_line}"
+            self._fault(ccd, "missing", words, missing, first_line)
         if late:
             self.counters["lines twice or late"] += late
+        return verdict == GOOD
+
+    @property
+    def seeing(self) -> frozenset[str]:
+        """The CCD lines that have given lines fit for use lately."""
+        newest = max(self._ends.values(), default=0)
+        return frozenset(ccd for ccd, end in self._good_ends.items() if newest - end <= self._silent_after)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -96,6 +124,17 @@ class LineIntake:
         elif self._told == MOST_TOLD + 1:
             self._events.append("more of the kind is counted, but no longer told in this strip")
 
+    def _listen(self, ccd: str, end: int) -> None:
+        """Tell of CCD lines that nothing comes from any more, and that something comes again."""
+        self._ends[ccd] = max(self._ends.get(ccd, 0), end)
+        if ccd in self._silent:
+            self._silent.discard(ccd)
+            self.tell(f"{ccd}: lines come again")
+        for other, at in self._ends.items():
+            if other not in self._silent and end - at > self._silent_after:
+                self._silent.add(other)
+                self.tell(f"{other}: nothing has come" + (f" after line {at - 1}" if at else ""))
+
     def _tell(self, ccd: str, first_line: int, verdict: NDArray[np.int8]) -> None:
         """Count bad lines; tell where bad ones begin and where they end."""
         bad = verdict[verdict != GOOD]
@@ -105,8 +144,29 @@ class LineIntake:
         self._state[ccd] = state
         if state == before == GOOD and len(bad):  # a few bad lines among good ones
             first = first_line + int(np.flatnonzero(verdict != GOOD)[0])
-            self.tell(f"{ccd}: {len(bad)} lines are {_WORDS[REASONS[int(np.bincount(bad).argmax())]]} from {first} on")
+            name = _WORDS[REASONS[int(np.bincount(bad).argmax())]]
+            are = "lines are" if len(bad) > 1 else "line is"
+            self._fault(ccd, name, f"{len(bad)} {are} {name} from {first} on", len(bad), first)
         elif state != before:
             run = first_line + int(np.flatnonzero(np.append(-1, verdict[:-1]) != state)[-1])
-            what = "lines are good again" if state == GOOD else f"lines are {_WORDS[REASONS[state]]}"
-            self.tell(f"{ccd}: {what} from line {run} on")
+            if state == GOOD:
+                if ccd in self._told_of:
+                    self.tell(f"{ccd}: lines are good again from line {run} on")
+                return
+            name = _WORDS[REASONS[state]]
+            told = self._fault(ccd, name, f"lines are {name} from line {run} on", len(bad), run)
+            (self._told_of.add if told else self._told_of.discard)(ccd)
+
+    def _fault(self, ccd: str, name: str, words: str, lines: int, at: int) -> bool:
+        """Tell of a fault; whether it was told by itself and not summed up with others of its kind."""
+        told, more, since = self._faults.get((ccd, name), (0, 0, at))
+        if told < BY_ITSELF:
+            self.tell(f"{ccd}: {words}")
+            self._faults[ccd, name] = told + 1, 0, at
+            return True
+        more += lines
+        if at - since >= SUMMED_S * self._rate:
+            self.tell(f"{ccd}: {more} more lines are {name}, the last ones about line {at}")
+            more, since = 0, at
+        self._faults[ccd, name] = told, more, since
+        return False

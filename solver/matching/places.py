@@ -143,7 +143,9 @@ class PlaceChooser:
             if chunk.cells or self._next + rows + half > ring.end:
                 return places
             if chunk.number:
-                self._count(chunk, rows / rate_hz)
+                # black or missing lines say nothing about the ground
+                seen = ring.read(chunk.first, chunk.first + rows, 0, 1).usable
+                self._count(chunk, rows / rate_hz, seen.mean() > 0.5 if len(seen) else False)
             self._chunk = self._divide(ring, self._next, rows / rate_hz, rows)
             self._next += rows
 
@@ -169,9 +171,11 @@ class PlaceChooser:
         chunk.found += 1
         return [Place(float(stretch.first_line + best[0]), float(max(left - half, 0) + best[1]))]
 
-    def _count(self, chunk: _Chunk, seconds: float) -> None:
+    def _count(self, chunk: _Chunk, seconds: float, seen: bool) -> None:
         self.tried += chunk.found
         self.empty += chunk.number - chunk.found
+        if not seen:
+            return
         keep = np.exp(-seconds / POOR_S)
         self._found_share = keep * self._found_share + (1 - keep) * chunk.found / max(chunk.number, 1)
 

@@ -164,14 +164,20 @@ class TargetFinder:
         self._capacity = lines
         self._open = {(name, ccd) for name in self._targets for ccd in self.views}
 
-    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD line of the strip; nothing is kept while there is no target."""
+    def add_lines(
+        self,
+        ccd: str,
+        first_line: int,
+        pixels: NDArray[np.unsignedinteger],
+        usable: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Lines of one CCD line of the strip, and which (n,) are fit for use; nothing is kept without a target."""
         view = self.views.get(ccd)
         if view is None or not self._targets or not self._rate or pixels.ndim != 2 or pixels.shape[1] != view.pixels:
             return
         if ccd not in self._rings:
             self._rings[ccd] = LineRing(view.pixels, self._capacity, pixels.dtype)
-        self._rings[ccd].add(first_line, pixels)
+        self._rings[ccd].add(first_line, pixels, usable)
 
     def measure(self, ccd: str) -> list[TargetLook]:
         """Targets whose look by a CCD line has become known, in the order of their names."""

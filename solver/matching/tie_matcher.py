@@ -95,7 +95,7 @@ class TieMatcher:
         self._strip = strip
         self._unjudged, self._next_number = [], 0
         self._waiting.clear()
-        self._lines.begin_strip()
+        self._lines.begin_strip(line_rate_hz)
         self._chooser.begin_strip()
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
         self._again.begin_strip(strip)
@@ -122,8 +122,8 @@ class TieMatcher:
             self._waiting.thin(share / density.load)
         density.load = share
 
-    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> None:
-        """Lines of one CCD.
+    def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Lines of one CCD; returns which of them (n,) are fit for use.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class TieMatcher:
         """
         if not self._strip:
             raise ValueError(f"lines of {ccd} before their strip")
-        self._lines.add(ccd, first_line, pixels)
+        return self._lines.add(ccd, first_line, pixels)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -143,7 +143,12 @@ class TieMatcher:
         """The tie points that have become known."""
         store = self._lines.store
         out: list[MatchedTie] = []
+        # a CCD line that is dead is done without, as long as two see
+        seeing = self._lines.seeing
+        self._looks.least_rays = min(self.options.least_rays, max(len(seeing), 2))
         if store is not None and np.isfinite(self.orientation.end_s):
+            if seeing:
+                out += self._settle(self._waiting.give_up(seeing))
             ring = store.rings[self.views[self.prediction.master].ccd]
             self._waiting.add(self._chooser.choose(ring, self.prediction.rate, self._waiting.first_useful_line(store)))
             self._waiting.add(self._again.find(ring.start, ring.end))
@@ -159,12 +164,17 @@ class TieMatcher:
         """Look for places in a view; the ties among those that are through with all views."""
         self._looks.look(tracks, view)
         over, lost = self._waiting.settle(tracks)
-        self.counters["too few looks"] += len(lost)
         gone = set(map(id, lost))
         chosen = [track for track in tracks if not track.place.name]
         across = 2 * np.array([t.place.sample for t in chosen]) / self.views[self.prediction.master].pixels - 1
         stage = self._waiting.order.index(view)
         self._chooser.density.judged(across, np.array([id(t) not in gone for t in chosen], dtype=bool), stage)
+        return self._settle((over, lost))
+
+    def _settle(self, settled: tuple[list[Track], list[Track]]) -> list[MatchedTie]:
+        """The ties among places that are through with all views; the lost ones are counted."""
+        over, lost = settled
+        self.counters["too few looks"] += len(lost)
         looked = self._looks.finish(over) if over else None
         return self._judge(looked) if looked is not None else []
 

@@ -79,7 +79,7 @@ class WaitingRoom:
         for j in self.order:
             ring, later = store.rings[p.views[p.others[j]].ccd], self._lines_later(j)
             first.append(ring.start - later if later < 0 else -np.inf)
-        return sorted(first)[self._looks.least_rays - 2]
+        return sorted(first)[max(self._looks.least_rays - 2, 0)]
 
     def due(self, store: LineStore) -> list[tuple[int, list[Track]]]:
         """Places whose next look is in store, with the view; they do not wait any more."""
@@ -108,6 +108,20 @@ class WaitingRoom:
         gone.update(id(track) for _, tracks in out for track in tracks)
         self.tracks = [track for track in self.tracks if id(track) not in gone]
         return out
+
+    def give_up(self, seeing: frozenset[str]) -> tuple[list[Track], list[Track]]:
+        """Places that wait for a CCD line that sees nothing any more do without it; returned as by `settle`."""
+        p = self.prediction
+        dead = [j for j in self.order if p.views[p.others[j]].ccd not in seeing]
+        waiting = [track for track in self.tracks if track.next_view(self.order) in dead] if dead else []
+        if not waiting:
+            return [], []
+        for track in waiting:
+            while track.next_view(self.order) in dead:
+                track.tried[track.next_view(self.order)] = True
+        gone = set(map(id, waiting))
+        self.tracks = [track for track in self.tracks if id(track) not in gone]
+        return self.settle(waiting)
 
     def settle(self, tracks: Sequence[Track]) -> tuple[list[Track], list[Track]]:
         """Places that were looked for: those that are through with all views, and lost ones; the rest waits on."""

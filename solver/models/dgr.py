@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .base import (
     COMPONENTS,
@@ -23,12 +23,18 @@ from .base import (
 
 @dataclass(frozen=True)
 class DgrOptions(ModelOptions):
-    """A-priori sigmas of the nine unknowns; the drift is the change over the whole strip."""
+    """A-priori sigmas of the nine unknowns; the drift is the change over the whole strip.
+
+    ``wander_sigma_m``, ``wander_sigma_deg`` are of what the nine cannot follow, if that is known: it is then in the
+    weights of the rays and in the covariance of the orientation, though as if it were another at every time.
+    """
 
     name: ClassVar[str] = "dgr"
     offset_sigma_m: tuple[float, float, float] = (0.2, 0.2, 0.2)
     shift_sigma_deg: tuple[float, float, float] = (0.01, 0.01, 0.02)
     drift_sigma_deg: tuple[float, float, float] = (0.01, 0.01, 0.02)
+    wander_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wander_sigma_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
@@ -62,6 +68,10 @@ class DirectGeoreferencing(CorrectionModel):
         share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
         columns = np.broadcast_to(self._columns, (len(t), 2, 6))
         return Design(columns, np.stack([np.ones_like(share), share], axis=1))
+
+    def left_out_variance(self, time_s: ArrayLike) -> NDArray[np.floating]:
+        sigma = np.concatenate([self.options.wander_sigma_m, np.radians(self.options.wander_sigma_deg)])
+        return np.tile(sigma**2, (np.size(time_s), 1))
 
     def pseudo_observations(self) -> PseudoObservations:
         o = self.options

@@ -28,6 +28,8 @@ from .process import (
     describe_constants,
     given_before,
     left_between_values,
+    pieces,
+    slow_errors_stated,
     wander_sigma,
     with_constants,
 )
@@ -45,7 +47,8 @@ class LimOptions(ModelOptions):
 
     Attributes
     ----------
-    fixes : per correction set, 4 at least; fewer remain where too few rays lie between two of them
+    fixes : per correction set, 4 at least; fewer remain where too few rays lie between two of them; 0, where the slow
+        errors are known: as close as their correlation time asks for
     merge : whether fixes are merged at all
     offset_sigma_m, shift_sigma_deg : of the zero observations of every fix
     slow : the slow errors, where they are known as a process (see `process`): instead of zero observations
@@ -59,16 +62,18 @@ class LimOptions(ModelOptions):
     slow: SlowErrors | None = None
 
     def __post_init__(self) -> None:
-        if self.fixes < FEWEST_FIXES:
+        if self.fixes < FEWEST_FIXES and not (self.fixes == 0 and self.slow is not None):
             raise ValueError(f"fixes: wanted {FEWEST_FIXES} or more, got {self.fixes}")
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
+        slow = slow_errors_stated(settings)
         return cls(
-            int(str(settings.get("fixes", cls.fixes))),
-            bool(settings.get("merge", cls.merge)),
+            int(str(settings.get("fixes", cls.fixes if slow is None else 0))),
+            bool(settings.get("merge", cls.merge and slow is None)),
             three(settings, "offset_sigma_m", cls.offset_sigma_m),
             three(settings, "shift_sigma_deg", cls.shift_sigma_deg),
+            slow,
         )
 
     def build(self, extent: Extent) -> LagrangeInterpolation:
@@ -89,14 +94,17 @@ class LagrangeInterpolation(CorrectionModel):
     def __init__(self, extent: Extent, options: LimOptions):
         self.extent = extent
         self.options = options
-        fixes = np.linspace(extent.start_s, extent.end_s, options.fixes)
+        number = options.fixes
+        if options.slow is not None and not number:
+            number = max(pieces(extent, options.slow) + 1, FEWEST_FIXES)
+        fixes = np.linspace(extent.start_s, extent.end_s, number)
         if options.merge:
             self.fixes = merge_fixes(fixes, extent.ray_time_s, extent.self_calibration)
         else:
             self.fixes = fixes
-        gone = options.fixes - len(self.fixes)
+        gone = number - len(self.fixes)
         if gone:
-            self.notes = (f"{extent.name}: {gone} of {options.fixes} fixes merged, too few rays between them",)
+            self.notes = (f"{extent.name}: {gone} of {number} fixes merged, too few rays between them",)
         names = [
             f"{component} at fix {f + 1} of {extent.name}" for f in range(len(self.fixes)) for component in COMPONENTS
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -27,6 +27,8 @@ from .process import (
     constants_stated,
     describe_constants,
     left_beside_quadratic,
+    pieces,
+    slow_errors_stated,
     wander_sigma,
     with_constants,
 )
@@ -50,7 +52,7 @@ class PpmOptions(ModelOptions):
 
     Attributes
     ----------
-    segments : per correction set
+    segments : per correction set; 0, where the slow errors are known: as short as their correlation time asks for
     placed : "equal" in time, or "data": equal numbers of rays, those to control points counting more
     order : 2, or 1 to fix the second-order terms by their weight
     continuity : highest derivative that is continuous at borders: 0, 1 or 2
@@ -78,7 +80,7 @@ class PpmOptions(ModelOptions):
     slow: SlowErrors | None = None
 
     def __post_init__(self) -> None:
-        if self.segments < 1:
+        if self.segments < 1 and not (self.segments == 0 and self.slow is not None):
             raise ValueError(f"segments: wanted 1 or more, got {self.segments}")
         if self.placed not in ("equal", "data"):
             raise ValueError(f"segments are placed 'equal' or by 'data', not {self.placed!r}")
@@ -94,13 +96,16 @@ class PpmOptions(ModelOptions):
             for key in cls.__dataclass_fields__
             if key.endswith(("_m", "_deg"))
         }
-        return cls(
-            int(str(settings.get("segments", cls.segments))),
+        own = any(key.startswith(("first_", "second_", "continuity_")) for key in settings)
+        slow = None if own else slow_errors_stated(settings)
+        options = cls(
+            int(str(settings.get("segments", cls.segments if slow is None else 0))),
             str(settings.get("placed", cls.placed)),
             int(str(settings.get("order", cls.order))),
             int(str(settings.get("continuity", cls.continuity))),
-            **triples,
+            slow=slow,
         )
+        return replace(options, **triples)
 
     def build(self, extent: Extent) -> PiecewisePolynomial:
         return PiecewisePolynomial(extent, self)
@@ -120,6 +125,8 @@ class PiecewisePolynomial(CorrectionModel):
     def __init__(self, extent: Extent, options: PpmOptions):
         self.extent = extent
         self.options = options
+        if options.slow is not None and not options.segments:
+            options = replace(options, segments=pieces(extent, options.slow))
         self.borders = _borders(extent, options)
         names = [
             f"{component} {order} of segment {k + 1} of {extent.name}"

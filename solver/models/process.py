@@ -8,18 +8,32 @@ next piece may differ. The constants (offset, shift, drift) are unknowns of thei
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..slow_errors import SlowErrors
 from ..wander import autocorrelation, second_order_gauss_markov
 from .base import COMPONENTS, Extent, PseudoObservations, direct_observations
-from .wander import GLOBALS, NOTHING
+from .wander import GLOBALS, NOTHING, SEGMENT_SHARE, WanderOptions
 
 Array = NDArray[np.floating]
 
 #: Values before one that say what is known of it; those before them add less than a thousandth of its variance.
 BEFORE = 4
+
+
+def slow_errors_stated(settings: Mapping[str, object]) -> SlowErrors | None:
+    """The slow errors of a ``[trajectory]`` table, if it says that they wander."""
+    stated = WanderOptions.from_settings(settings).slow
+    wanders = any(np.any(np.asarray(settings.get(key, 0.0), float)) for key in ("wander_sigma_m", "wander_sigma_deg"))
+    return stated if wanders else None
+
+
+def pieces(extent: Extent, slow: SlowErrors) -> int:
+    """Segments of a correction set that are short enough for the wander."""
+    return max(1, int(np.ceil((extent.end_s - extent.start_s) / (SEGMENT_SHARE * slow.wander_time_s) - 1e-9)))
 
 
 def constant_names(extent: Extent) -> tuple[str, ...]:

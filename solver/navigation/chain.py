@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..rotation import quaternion_from_matrix
 from .carried import NavigationTrajectory
 from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Start
-from .filter_pass import Carried, Estimates
+from .filter_pass import Carried, Estimates, integrate_blocks
 from .inertial_data import GnssData, InertialData, cut
 from .observations import AntennaPosition, AntennaVelocity, Observation
 from .smoother import corrected, gains, recurse
@@ -100,6 +100,23 @@ class NavigationChain:
             self.close()
         span = self.nodes[-1].span
         span.append(Chunk(pieces, integrate_one(pieces, span.gyro, span.accel)))
+
+    def extend(self, pieces: InertialData, ends: list[int]) -> None:
+        """Many chunks that follow: inertial pieces (corrected), and where each chunk ends. As `append` of each."""
+        borders = np.array([0, *ends])
+        length = np.concatenate([[0.0], np.cumsum(pieces.dt_s)])[borders]
+        i = 0
+        while i < len(ends):
+            if self.nodes[-1].span.chunks and self.nodes[-1].span.total.duration_s >= self.step_s - 1e-9:
+                self.close()
+            span = self.nodes[-1].span
+            before = span.total.duration_s if span.chunks else 0.0
+            n = 1 + int((before + length[i + 1 : -1] - length[i] < self.step_s - 1e-9).sum())
+            block = np.repeat(np.arange(n), np.diff(borders[i : i + n + 1]))
+            blocks, _ = integrate_blocks(pieces[borders[i] : borders[i + n]], block, n, (span.gyro, span.accel))
+            for k, integrals in enumerate(blocks, i):
+                span.append(Chunk(pieces[borders[k] : borders[k + 1]], integrals))
+            i += n
 
     def close(self) -> None:
         """Make a node at the present."""

@@ -216,7 +216,7 @@ def run_filter(
         chunk = slice(k, min(N - 1, max(k + 1, int(np.searchsorted(nodes, nodes[k] + _CHUNK_S)))))
         part = slice(int(first[chunk.start]), int(first[chunk.stop]))
         reference = f.estimate.gyro.copy(), f.estimate.accel.copy()
-        blocks, running = _integrate_chunk(pieces[part], block[part] - k, chunk.stop - chunk.start, reference)
+        blocks, running = integrate_blocks(pieces[part], block[part] - k, chunk.stop - chunk.start, reference)
         carried.append(running)
         for integrals in blocks:
             k += 1
@@ -239,8 +239,17 @@ def run_filter(
     )
 
 
-def _integrate_chunk(pieces: InertialData, block: NDArray[np.intp], n: int, reference: tuple[Array, Array]):
-    """Integrals of n blocks at once: pieces are laid out (block, position in the block), filled with zeros."""
+def integrate_blocks(pieces: InertialData, block: NDArray[np.intp], n: int, reference: tuple[Array, Array]):
+    """Integrals of n blocks at once, and what runs with the pieces.
+
+    Pieces are laid out (block, position in the block), filled with zeros.
+
+    Parameters
+    ----------
+    pieces : corrected inertial data
+    block : that each piece belongs to, in order
+    reference : errors of gyros and accelerometers that are taken off
+    """
     phi, dv = without_errors(pieces, *reference)
     count = np.bincount(block, minlength=n)
     column = np.arange(len(block)) - np.repeat(np.cumsum(count) - count, count)

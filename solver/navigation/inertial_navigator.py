@@ -66,7 +66,8 @@ class InertialNavigator:
         self._alignment = AlignmentBuffer(self.settings, self.options, prior)
         self._waiting: list[tuple[float, GnssData]] = []
         self._open: list[tuple[float, float, Array, Array, float, float]] = []
-        self._next_pose = -np.inf
+        self._ends: list[int] = []  # of chunks among the open ones
+        self._next_pose = self._next_answer = -np.inf
         self._next_smooth = -np.inf
         self._restored: list[float] = []
         self._pose_due = False
@@ -172,6 +173,10 @@ class InertialNavigator:
         if time_s < self._next_pose - 1e-6 and not self._pose_due:
             return []
         self._next_pose = (np.floor(time_s / step + 1e-6) + 1.0) * step
+        if time_s < self._next_answer - 1e-6:
+            self._ends.append(len(self._open))
+            return []
+        self._next_answer = time_s + self.options.filtered_s
         return self._close_chunk()
 
     def _close_chunk(self, answer: bool = True) -> list[NavigationPose]:
@@ -180,14 +185,18 @@ class InertialNavigator:
             return []
         t, dt, th, v, pg, pa = (np.array(column) for column in zip(*self._open, strict=True))
         raw = InertialData(t, dt, th, v, pg, pa)
-        self._open = []
+        ends = [*self._ends, len(t)] if len(t) not in self._ends[-1:] else self._ends
+        self._open, self._ends = [], []
         if self._chain is None:
             self._alignment.append(raw)
             self._previous = th[-1], v[-1], float(dt[-1])
             return []
         pieces = raw.corrected(self._previous)
         self._previous = th[-1], v[-1], float(dt[-1])
-        self._chain.append(pieces)
+        if len(ends) == 1:
+            self._chain.append(pieces)
+        else:
+            self._chain.extend(pieces, ends)
         ready = [w for w in self._waiting if w[0] <= self._last_s]
         self._waiting = [w for w in self._waiting if w[0] > self._last_s]
         for time_s, fix in ready:
@@ -285,7 +294,7 @@ class InertialNavigator:
         start, raw = found.start, found.raw
         self._chain = NavigationChain(self.settings, Start(start.estimate, start.P), self.options.step_s)
         self._previous, self._waiting, self._replaying = None, list(found.fixes), True
-        self._next_pose = -np.inf
+        self._next_pose = self._next_answer = -np.inf
         end = self._last_s
         for i in range(len(raw)):
             self._sample(

@@ -189,16 +189,25 @@ class Archive:
                 self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), control[i]))
             return
         by_name = {p.name: p for p in published}
-        for i, name in enumerate(batch.names):
-            self._tie(batch, i, by_name.get(name))
+        told = [self._tie(batch, i, by_name.get(name)) for i, name in enumerate(batch.names)]
+        told = [t for t in told if t is not None]
+        if not told:
+            return
+        columns = np.unique(np.concatenate([c for c, _, _ in told]))
+        matrix, rhs = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+        for own, N, right in told:
+            at = np.searchsorted(columns, own)
+            matrix[at[:, None], at] += N
+            rhs[at] += right
+        self.add(columns, matrix, rhs)
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""
         self.points.pop(name, None)
         self.points[name] = kept
 
-    def _tie(self, batch: Batch, i: int, published: AdjustedPoint | None) -> None:
-        """A point of a batch that ties strips."""
+    def _tie(self, batch: Batch, i: int, published: AdjustedPoint | None) -> tuple[IntArray, Array, Array] | None:
+        """Keep a point of a batch that ties strips; its information (u, u), (u,) about unknowns (u,), if it has any."""
         assert batch.ties is not None
         name, own = batch.names[i], batch.columns[: len(batch.columns) - batch.n_tied]
         A, J, residual, origin = batch.equations(i)
@@ -221,9 +230,8 @@ class Archive:
         A, J, residual = np.concatenate(rows), np.concatenate(points), np.concatenate(values)
         normal = J.T @ J
         if published is None or np.linalg.cond(normal) > 1e12:
-            return
+            return None
         left, matrix, rhs = _eliminated(A, J, residual, normal, columns, origin, published)
-        self.add(columns, matrix, rhs)
         seen = frozenset(r.look.strip for r in published.residuals)
         if old is not None:
             seen |= old.strips
@@ -233,6 +241,7 @@ class Archive:
             left = replace(left, points=(merged,))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(name, KeptPoint(left, 0, seen, time_s, control or (old is not None and old.with_control)))
+        return columns, matrix, rhs
 
     def add_control(self, name: str, control: ControlPoint) -> bool:
         """Known coordinates of a point that is final; whether they count."""

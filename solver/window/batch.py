@@ -109,6 +109,7 @@ class Batch:
     def __post_init__(self) -> None:
         self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
         self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
+        self.height_m = abs(float(np.median(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])))
         self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
         self._template()
 
@@ -192,10 +193,10 @@ class Batch:
         rest = self.normals.y.T - self.coupling @ theta
         self.points_l = self.origin_l + self.normals.back(rest.T).T
 
-    def has_moved(self, theta: Array, far_m: float, far_rad: float) -> bool:
-        """Whether a correction of a ray has changed by more than this since the linearisation."""
+    def has_moved(self, theta: Array, far: float) -> bool:
+        """Whether a correction of a ray has changed by more since the linearisation, rad or flying heights."""
         change = np.abs(self.layout.corrections(theta - self.theta))
-        return bool(change[:3].max() > far_m or change[3:].max() > far_rad)
+        return bool(change[:3].max() > far * self.height_m or change[3:].max() > far)
 
     def points_moved(self) -> float:
         """How far a point has moved at most since the linearisation, m."""
@@ -269,14 +270,23 @@ class Batch:
             return self.judged[2].v_px
         theta = state.values(self.columns)
         self.back_substitute(theta)
-        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
-        return residuals_px(self.rays, lin, self.whitening)
+        return residuals_px(self.rays, self._at(theta), self.whitening)
 
     def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
         """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
-        lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
-        view = _AsSolution(_RaysOf(self.rays), lin, self.whitening, self.weight)
+        view = _AsSolution(_RaysOf(self.rays), self._at(theta), self.whitening, self.weight)
         return ray_statistics(cast("Solution", view), cofactors)
+
+    def _at(self, theta: Array) -> Linearisation:
+        """The linear equations with their residuals at values (u,) of the unknowns and the present points.
+
+        They are as good as the linearisation, which follows the unknowns (`following`).
+        """
+        n = len(self.rays)
+        rows = self.full_rows(np.arange(n)).reshape(2 * n, -1)
+        shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
+        moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
+        return replace(self.lin, residual=self.lin.residual - moved)
 
 
 def inverse_factors(normals: PointNormals) -> Array:

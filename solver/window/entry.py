@@ -59,8 +59,9 @@ def entry_weight(batch: Batch, state: WindowState, suspected: float = SUSPECTED)
         active[undecided & ~known.any(axis=1)] = False
         open_ &= ~undecided
         active[np.flatnonzero(decided), np.argmax(loss, axis=1)[decided]] = False
-    # one look is left: nothing checks it; a look that never had company is let in at known coordinates
-    alone = (active.sum(axis=1) < 2) & ((equations.present.sum(axis=1) > 1) | ~known.all(axis=1))
+    # one look is left: nothing checks it; a look that never had company is let in at coordinates known or from before
+    before = known.all(axis=1) if batch.ties is None else known.all(axis=1) | batch.ties.active
+    alone = (active.sum(axis=1) < 2) & ((equations.present.sum(axis=1) > 1) | ~before)
     active[alone] = False
     return np.where(active[batch.rays.point, equations.slot], 1.0, 0.0)
 

@@ -146,6 +146,9 @@ class BatchMaker:
             ties = earlier.ties(names, self._weights(names, points, np.zeros(len(names), dtype=bool)).weight)
             columns = np.concatenate([columns, ties.columns])
             control = self._weights(names, points, earlier.with_control(names))
+            # one look places no point
+            seen = np.bincount(rays.point, weight > 0, len(names))
+            known = {n: xyz for n, xyz, k in zip(names, ties.xyz_l, seen, strict=True) if k < 2} | known
         theta = self.state.values(columns)
         points_l = self._place(names, rays, weight, layout.corrections(theta), layout.displacement(theta), known)
         placed = np.isfinite(points_l)

@@ -133,9 +133,10 @@ class SourceMonitor:
         state : solved
         group_of : source and CCD line of each ray of a batch
         """
-        if batches and batches[-1].strips[-1] > self._strip:
-            self._strip = batches[-1].strips[-1]
-            self._restart(batches[-1].oldest_s)
+        newest = max(reversed(batches), key=_last_strip, default=None)
+        if newest is not None and newest.strips[-1] > self._strip:
+            self._strip = newest.strips[-1]
+            self._restart(newest.oldest_s)
         mine = [b for b in batches if b.strips[-1] == self._strip and b.newest_s < now_s - SETTLED_S]
         new = [b for b in mine if id(b) not in self._cells or self._cells[id(b)][1].information is not b.information]
         for batch in new[:AT_ONCE]:
@@ -275,6 +276,10 @@ def _test_of(score: Array, V: Array, i: int, scale: Array, alpha: float) -> tupl
     bias = Q @ score[own]
     limit = float(chi2.isf(alpha, max(int(good.sum()), 1)))
     return float(score[own] @ bias), limit, bias, Q
+
+
+def _last_strip(batch: Batch) -> int:
+    return batch.strips[-1]
 
 
 def place_of(numbers: IntArray, wanted: IntArray) -> IntArray:

@@ -24,7 +24,7 @@ UNKNOWN_LENGTH_S = 600.0
 _SAMPLING = 0.05
 #: Of a wander that is fast because the filter learns, so much may be left out between borders, m and rad: small against
 #: the noise of an image coordinate on the ground and in the air. There are half as many unknowns and less.
-LEFT_OUT_M, LEFT_OUT = 0.03, 1e-5
+LEFT_OUT_M, LEFT_OUT = 0.035, 1e-5
 
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
@@ -49,7 +49,8 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
         return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
         offset, shift, drift = (_triple(v) for v in (slow.offset_m, np.degrees(slow.shift), np.degrees(slow.drift)))
-        return DgrOptions(offset, shift, drift)
+        degrees = np.degrees(slow.wander)
+        return DgrOptions(offset, shift, drift, slow.wander_m, (degrees[0], degrees[1], degrees[2]))
     if options.model == "lim":
         return LimOptions(max(pieces + 1, 4), False, slow=slow)
     if options.model == "ppm":

@@ -24,7 +24,8 @@ TOGETHER = 0.5
 def admit_ties(batch: Batch, state: WindowState) -> list[str]:
     """Drop the ties of a batch that is not in the state which contradict its rays; names of their points.
 
-    The place where the new rays meet, with the orientation as known, is compared with that of the earlier strips.
+    The place where the new rays meet, with the orientation as known, is compared with that of the earlier strips; where
+    they do not meet, as a single one, they are compared with the place itself.
     """
     ties = batch.ties
     if ties is None or not ties.active.any():
@@ -36,6 +37,11 @@ def admit_ties(batch: Batch, state: WindowState) -> list[str]:
         A, J, residual, origin = batch.equations(int(i))
         N = J.T @ J
         if np.linalg.cond(N) > 1e12:
+            G = A.copy()
+            G[:, -m:] += J @ ties.modes[i]
+            off = residual - J @ (ties.xyz_l[i] - origin) - G @ theta
+            C = np.eye(len(J)) + J @ np.linalg.inv(ties.root[i].T @ ties.root[i]) @ J.T + G @ Q @ G.T
+            fails[i] = off @ np.linalg.solve(C, off) > chi2.isf(AT_THE_DOOR, len(J))
             continue
         spread = np.linalg.inv(N)
         G = -spread @ J.T @ A

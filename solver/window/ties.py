@@ -153,19 +153,18 @@ class EarlierStrips:
             part = int(kept.time_s // PATCH_S) if len(archive.strips[strip].entered) > 4 * MOST_MODES else 0
             members.setdefault((strip, part), []).append((name, kept))
         self.points, self._patches = {}, []
-        functionals: list[Array] = []
+        functionals: list[tuple[IntArray, Array]] = []
         first = 0
         for (strip, _), kept in members.items():
             found, M = _patch(kept, solution)
             functionals.append(M)
+            size = len(M[1])
             for (name, k), (xyz, B, root) in zip(kept, found, strict=True):
                 self.points[name] = EarlierPoint(len(self._patches), xyz, B, root, k.with_control)
-            self._patches.append(Patch(strip, slice(first, first + len(M)), np.empty(0, dtype=np.int64)))
-            first += len(M)
-        camera = np.zeros((len(self._camera), len(solution.numbers)))
-        camera[np.arange(len(camera)), solution.places(self._camera)] = 1.0
-        M = np.concatenate([*functionals, camera])
-        self._covariance = M @ solution.cofactors @ M.T
+            self._patches.append(Patch(strip, slice(first, first + size), np.empty(0, dtype=np.int64)))
+            first += size
+        functionals.append((solution.places(self._camera), np.eye(len(self._camera))))
+        self._covariance = _covariance(functionals, solution.cofactors)
         self._camera_values = solution.of(self._camera)[0]
 
     # -- in the window -------------------------------------------------------------------------------------------------
@@ -273,9 +272,9 @@ class EarlierStrips:
 
 def _patch(
     kept: Sequence[tuple[str, KeptPoint]], solution: BlockSolution
-) -> tuple[list[tuple[Array, Array, Array]], Array]:
-    """Points of a patch as (place, modes, root of the weight of the rest), and the modes as functions (r, n) of all
-    unknowns."""
+) -> tuple[list[tuple[Array, Array, Array]], tuple[IntArray, Array]]:
+    """Points of a patch as (place, modes, root of the weight of the rest), and the modes as functions (r, u) of the
+    unknowns at places (u,) of the solution."""
     xyz, own, rows = [], [], []
     columns = np.unique(np.concatenate([k.left.columns for _, k in kept]))
     theta, Q = solution.of(columns)
@@ -294,9 +293,15 @@ def _patch(
     r = min(int((values * len(kept) / len(chosen) > NEGLIGIBLE).sum()), MOST_MODES)
     r = max(r, 1)
     M = (vectors[:, -r:] / np.sqrt(np.maximum(values[-r:], 1e-300))).T @ sample
-    B = P @ (Q @ M.T)
-    rest = P @ Q @ np.swapaxes(P, 1, 2) + noise - B @ np.swapaxes(B, 1, 2)
+    through = (P.reshape(-1, len(columns)) @ Q).reshape(P.shape)
+    B = (through.reshape(-1, len(columns)) @ M.T).reshape(len(P), 3, r)
+    rest = through @ np.swapaxes(P, 1, 2) + noise - B @ np.swapaxes(B, 1, 2)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(rest)), 1, 2)
-    whole = np.zeros((r, len(solution.numbers)))
-    whole[:, solution.places(columns)] = M
-    return list(zip(xyz, B, root, strict=True)), whole
+    return list(zip(xyz, B, root, strict=True)), (solution.places(columns), M)
+
+
+def _covariance(functionals: Sequence[tuple[IntArray, Array]], cofactors: Array) -> Array:
+    """Covariance (r, r) of linear functions, one group below the other, each of few unknowns: their places (u,) in the
+    cofactors (n, n), and coefficients (., u)."""
+    half = np.concatenate([M @ cofactors[places] for places, M in functionals])
+    return np.concatenate([half[:, places] @ M.T for places, M in functionals], axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,8 @@ IntArray = NDArray[np.int64]
 
 #: Level of the tests of parameters on line; they are made again and again.
 ALPHA = 0.01
-#: Steps of the determinability test in one update before the first sweep is over, and updates between two later on.
-STEPS, STEP_EVERY = 2, 2
+#: Steps of the determinability test at one look before the first sweep is over, and time between two later on, s.
+STEPS, STEP_EVERY_S = 2, 0.8
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,16 @@ class _Count:
 
 
 class Watch:
-    """Runs once an update; what costs much is spread over updates.
+    """Looks at the window after its updates; what costs much is spread over updates.
 
     Parameters
     ----------
     determine : whether it is tested which additional parameters are determined
+
+    Attributes
+    ----------
+    exposure : of the newest orientation
+    last : the findings of the last look, without its events
     """
 
     def __init__(
@@ -101,9 +106,10 @@ class Watch:
             nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id
             order = ranks(self_calibration, nadir)
             self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
-        self._count = 0
+        self._next_step_s = -np.inf
         self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None
+        self.last: Watched | None = None
 
     @property
     def most_exposed(self) -> Batch | None:
@@ -113,6 +119,10 @@ class Watch:
     def drop(self, batch: Batch) -> None:
         """A batch is taken apart."""
         self._integrity.drop(batch)
+
+    def note(self, batches: list[Batch]) -> None:
+        """Batches have been judged."""
+        self._integrity.note(batches)
 
     def leaving(self, batches: list[Batch], before_s: float) -> None:
         """Batches leave the window; what left before a time is forgotten."""
@@ -143,7 +153,6 @@ class Watch:
         length_s: float,
         strip: WindowStrip | None,
         batches: list[Batch],
-        changed: list[Batch],
         sigma0: float,
         redundancy: int,
         total: tuple[float, int],
@@ -154,12 +163,10 @@ class Watch:
         Parameters
         ----------
         strip : the newest one, None if all are over
-        batches, changed : of the window; those judged in this update
+        batches : of the window
         sigma0, redundancy, total : over the window, since the start
         apriori_m : (3,) sigma of the position beforehand
         """
-        self._count += 1
-        self._integrity.note(changed)
         time_s = -np.inf
         self.exposure = None
         if strip is not None and batches:
@@ -169,7 +176,8 @@ class Watch:
         events: list[str] = []
         d = self._determinability
         if d is not None:
-            for _ in range(int(self._count % STEP_EVERY == 0) if d.swept else STEPS):
+            for _ in range(int(now_s >= self._next_step_s) if d.swept else STEPS):
+                self._next_step_s = now_s + STEP_EVERY_S - 1e-6
                 events += d.step(self._state, batches, total[0], total[1], self._gsd(batches))
         self._counts = {id(b): self._count_of(b) for b in batches}
         points = sum(b.n_points for b in batches)
@@ -187,9 +195,9 @@ class Watch:
         standing = tuple(d.standing()) if d is not None else ()
         sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
         protection = sigma if self.exposure is None else self.exposure.protection(sigma)
-        return Watched(
-            colour, reason, self.exposure, time_s, self._sources.biased, standing, tuple(events), sigma, protection
-        )
+        found = Watched(colour, reason, self.exposure, time_s, self._sources.biased, standing, (), sigma, protection)
+        self.last = found
+        return replace(found, events=tuple(events))
 
     def _count_of(self, batch: Batch) -> _Count:
         """Anew only if the batch has changed."""

@@ -19,29 +19,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera import LineCamera
 from ..measured_trajectory import MeasuredTrajectory
-from ..models.base import Design
 from ..selfcalibration import SelfCalibration
 from ..slow_errors import SlowErrors
-from .backward import LeftPoints, Step
+from .arriving import Arrivals, look_time
 from .batch import Batch
+from .batches import Batches
 from .block import Block
 from .determinability import Standing
+from .following import Follower
 from .intake import Intake
+from .leaving import Leaver, grid
 from .output import CostHistory, Orienter, adjusted_points, parameters
 from .points import BatchMaker, ControlPoint
-from .results import (
-    Look,
-    Parameter,
-    RefinedOrientation,
-    WindowOptions,
-    WindowReport,
-    WindowUpdate,
-)
+from .results import Look, Parameter, RefinedOrientation, WindowOptions, WindowReport, WindowUpdate
 from .settle import Settler, settle
-from .snooping import admit, reweigh, snoop
+from .snooping import reweigh, snoop
 from .state import WindowState
 from .strip import WindowStrip, segment_length
-from .tie_snooping import admit_ties, snoop_ties
 from .watch import Watch
 
 Array = NDArray[np.floating]
@@ -49,21 +43,12 @@ IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0
-#: Change of a correction, m and rad, beyond which a batch is linearised again. What the linear equations then miss goes
-#: with its square, over the flying height: a hundredth of a pixel.
-MOVED_M, MOVED_RAD = 1.5, 1e-3
-#: Every so many updates it is looked whether a batch has moved, if new data did not move far.
-LOOKED_AFTER = 16
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
-#: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
-#: which leave first, the others in the updates after it.
-MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
-#: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
-MOST_LEAVING = 1000
-#: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
-#: refined again.
-MOST_STEPS = 600
+#: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
+HURRIED_S = 0.1
+#: Time between two looks of the watch, s, if updates are not hurried.
+WATCH_S = 0.3
 
 
 class Window:
@@ -92,8 +77,6 @@ class Window:
         self.trajectory = MeasuredTrajectory()
         self.state = WindowState()
         self.strips: dict[str, WindowStrip] = {}
-        self._steps: list[Step] = []
-        self._left: list[LeftPoints] = []
         self._self_calibration = self_calibration
         self._camera_columns = np.empty(0, dtype=np.int64)
         if self_calibration is not None:
@@ -109,19 +92,28 @@ class Window:
         self._maker = BatchMaker(
             camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
         )
-        self._batches: list[Batch] = []
-        self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
-        self._following = False  # whether they are what was left when new data moved far
+        self._batches = Batches(self.state)
         self._history = CostHistory()
         self._settler = Settler()
         self._now_s = -np.inf
         self._serial = 0
-        self._newest_ray_s = -np.inf
+        self._newest_ray_s = self._watched_s = -np.inf
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory)
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
             options.determine,
+        )  # fmt: skip
+        step_s = segment_length(slow, options)
+        self._arrivals = Arrivals(
+            self._batches, self.state, self._maker, self._intake, self._block, step_s, options.snoop, self._watch.drop
+        )
+        self._follower = Follower(
+            self._batches, self.state, self._maker, self.trajectory, self._intake, step_s, self._watch.drop
+        )
+        self._leaver = Leaver(
+            options, self.state, self.strips, self._batches, self._intake, self.trajectory, self._block, self._watch,
+            self._orienter, self._arrivals.apart,
         )  # fmt: skip
 
     # -- input ---------------------------------------------------------------------------------------------------------
@@ -173,141 +165,77 @@ class Window:
 
     def update(self, now_s: float) -> WindowUpdate:
         """Work in what has arrived, let go what is older than the window."""
+        hurried = now_s - self._now_s < HURRIED_S
         self._now_s = max(self._now_s, now_s)
         self._serial += 1
+        turn = self._serial % 3 if hurried else None
         result = WindowUpdate()
         for strip in self.strips.values():
             if not strip.is_over(self.state):
                 strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
         fresh = self._take_arrived(result)
-        self._replace_filtered()
-        iterations = self._solve(fresh, result)
+        joined = self._follower.replace_filtered()
+        if turn in (None, 0):
+            self._follower.look_after()
+        iterations = self._solve(fresh, joined, turn in (None, 1), result)
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
-        result.refused += self._intake.take_refused()
-        result.report = self._report(iterations, fresh, result)
+        look = turn == 2 if hurried else self._now_s > self._watched_s + WATCH_S
+        result.report = self._report(iterations, fresh + joined, look, result)
         return result
 
     def finish(self) -> WindowUpdate:
         """Everything that is left becomes final."""
         result = WindowUpdate()
         fresh = self._take_arrived(result)
-        iterations = self._solve(fresh, result)
+        iterations = self._solve(fresh, [], True, result)
         for strip in self.strips.values():
             strip.end(0)
         self._let_go(np.inf, result, at_the_end=True)
-        result.refused += self._intake.take_refused()
-        result.report = self._report(iterations, [], result)
+        result.report = self._report(iterations, [], True, result)
         return result
 
     def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
-        """Batches of the points that have new looks with a measured orientation; others wait."""
-        ready: dict[tuple[int, bool], list[str]] = {}
-        step = segment_length(self.slow, self.options)
-        again: list[Batch] = []
-        for name in self._intake.ready(self._now_s):
-            point = self._points[name]
-            if point.batch is not None:
-                again.append(point.batch)
-                continue
-            if point.looks:
-                ready.setdefault(self._share(name, step), []).append(name)
-        known: dict[str, Array] = {}
-        for batch in {id(b): b for b in again}.values():
-            known |= dict(zip(batch.names, batch.points_l, strict=True))
-            self._remove(batch)
-            for name in batch.names:
-                self._intake.place(name, None)
-                ready.setdefault(self._share(name, step), []).append(name)
-        fresh = []
-        for (_, tied), names in ready.items():
-            few = [n for n in names if len(self._points[n].looks) < 2]
-            few = [n for n in few if n not in self._control or self._points[n].spent]
-            names = [n for n in names if n not in few]
-            if not names:
-                continue
-            batch, _ = self._maker.make(
-                names, [self._points[n] for n in names], known, self._block.earlier if tied else None
-            )
-            if batch is None:
-                continue
-            for name in batch.names:
-                self._intake.place(name, batch)
-            fresh.append(batch)
-        if self.options.snoop and fresh:
-            self.state.solve()
-            for batch in fresh:
-                result.refused += admit(batch, self.state, self._points)
-                self._apart(admit_ties(batch, self.state), result)
+        fresh = self._arrivals.take(self._now_s, result)
         for batch in fresh:
-            self._batches.append(batch)
-            self.state.add(batch.columns, batch.information)
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
         if not self._length_s and fresh:
-            self._length_s = self.options.window_looks * self._look_time(fresh[0])
+            self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
         return fresh
 
-    def _share(self, name: str, step_s: float) -> tuple[int, bool]:
-        """Which points go into a batch together: those of a time, and those that tie strips apart."""
-        point, earlier = self._points[name], self._block.earlier.points.get(name)
-        point.spent = earlier is not None and earlier.with_control and not point.alone
-        tied = len(point.looks) > 1 and not point.alone and self._block.earlier.enter(name, max(point.time_s))
-        return int(min(point.time_s) // step_s), tied
+    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
+        self._leaver.let_go(self._now_s, limit_s, self._length_s, self._serial, result, at_the_end)
+        result.refused += self._intake.take_refused()
 
-    def _apart(self, names: list[str], result: WindowUpdate) -> None:
-        """Points that do not agree with earlier strips are points of their own."""
-        for name in names:
-            self._points[name].alone, self._points[name].spent = True, False
-        if names:
-            result.events.append(f"do not agree with earlier strips: {', '.join(names)}")
-
-    def _look_time(self, batch: Batch) -> float:
-        """Time between the first and the last look at a point, from view angles, height and speed."""
-        rays = batch.rays
-        tangent = np.array([line.centre_mm[0] for line in self.camera.lines]) - self.camera.principal_point_mm[:, 0]
-        tangent = tangent / self.camera.focal_length_mm
-        height = float(np.median(rays.position_l[:, 2] - batch.points_l[rays.point, 2]))
-        speed = float(np.median(np.linalg.norm(rays.velocity_l, axis=1)))
-        return float(np.ptp(tangent)) * height / max(speed, 1.0)
-
-    def _replace_filtered(self) -> None:
-        """Put smoothed orientation under batches that had to do with the filtered one."""
-        smoothed_s = self.trajectory.smoothed_to_s
-        due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
-        if due:
-            self._maker.refresh(due)
-            for batch in due:
-                before = batch.information
-                batch.linearise(self.state.values(batch.columns), reweigh=True)
-                self.state.exchange(batch.columns, before, batch.information)
-
-    def _solve(self, fresh: list[Batch], result: WindowUpdate) -> int:
+    def _solve(self, fresh: list[Batch], joined: list[Batch], retest: bool, result: WindowUpdate) -> int:
         """Gauss-Newton from the warm state, then tests; number of solutions computed."""
         iterations = 1
         self.state.solve()
         for batch in fresh:
             batch.back_substitute(self.state.values(batch.columns))
-        if self._follow(fresh):
+        if self._follower.follow(fresh):
             self.state.solve()
             iterations += 1
         if self.options.snoop:
-            due = self._due_for_test()
+            due = joined or (self._due_for_test() if retest else [])
             refused, rounds = snoop(fresh + due, self.state, self._points, self.options.critical, self._serial)
             iterations += rounds
             result.refused += refused
             iterations += self._settle(fresh, result)
+        for batch in joined:
+            batch.judge(self.state)
         self._orienter.forget()
         return iterations
 
     def _settle(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Ask a young strip again which of its points agree; number of solutions computed."""
-        due = self._settler.due(self._batches, fresh)
+        due = self._settler.due(list(self._batches), fresh)
         weights = settle(due, self.state) if due else None
         if weights is None:
             return 0
         result.refused += reweigh(due, weights, self.state, self._points)
-        self._follow(due)
+        self._follower.follow(due)
         self.state.solve()
         refused, rounds = snoop(due, self.state, self._points, self.options.critical, self._serial)
         result.refused += refused
@@ -325,161 +253,6 @@ class Window:
             due.append(batch)
             rays += len(batch.rays)
         return due
-
-    def _follow(self, fresh: list[Batch]) -> bool:
-        """Linearise batches again whose unknowns or points have moved far; whether there were any.
-
-        New batches tell whether anything moved at all; if not, the others are looked after in turn.
-        """
-        values = [self.state.values(batch.columns) for batch in fresh]
-        far = any(b.has_moved(theta, MOVED_M, MOVED_RAD) for b, theta in zip(fresh, values, strict=True))
-        due = [(b, theta) for b, theta in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED_M]
-        new = {id(b) for b in fresh}
-        if far:
-            self._suspects = {id(b): b for b in self._batches if id(b) not in new}
-            self._following = True
-        elif not self._suspects:
-            self._following = False
-            turn = self._batches[self._serial % LOOKED_AFTER :: LOOKED_AFTER]
-            self._suspects = {id(b): b for b in turn if id(b) not in new}
-        rays = 0
-        for key, batch in list(self._suspects.items()):
-            if rays > MOST_RAYS_AGAIN if self._following else len(due) >= MOST_AGAIN:
-                break
-            del self._suspects[key]
-            theta = self.state.values(batch.columns)
-            if batch.has_moved(theta, MOVED_M, MOVED_RAD):
-                batch.back_substitute(theta)
-                due.append((batch, theta))
-                rays += len(batch.rays)
-        for batch, theta in due:
-            before = batch.information
-            batch.linearise(theta, reweigh=False)
-            self.state.exchange(batch.columns, before, batch.information)
-        return bool(due)
-
-    def _remove(self, batch: Batch) -> None:
-        self.state.add(batch.columns, batch.information, -1)
-        self._batches = [b for b in self._batches if b is not batch]
-        self._watch.drop(batch)
-        self._suspects.pop(id(batch), None)
-
-    # -- what leaves ---------------------------------------------------------------------------------------------------
-
-    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
-        """Batches and unknowns older than the limit, and those of strips that are over, become final."""
-        limits = {}
-        for strip in self.strips.values():
-            settled = strip.ended and self._now_s >= strip.end_s + self.options.settle_s
-            limits[strip.id] = max(self._settled_to(strip), limit_s) if settled else limit_s
-        by_index = [limits[id] for id in self.strips]
-        latest = max(by_index, default=-np.inf)
-        old = [b for b in self._batches if b.oldest_s <= latest]
-        leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
-        if self.options.snoop and leaving:
-            refused, rounds = snoop(leaving, self.state, self._points, self.options.critical, self._serial)
-            result.refused += refused
-            failed = snoop_ties([b for b in leaving if b.ties is not None], self.state)
-            self._apart(failed, result)
-            if failed:
-                self.state.solve()
-            if rounds or failed:
-                self._orienter.forget()
-        for batch in leaving:
-            points = adjusted_points(batch, self.state, self._points, self._control, final=True)
-            result.points += points
-            self._left.append(LeftPoints.of(batch, points))
-            self._block.leave(batch, points)
-        self._watch.leaving(leaving, limit_s - self._length_s)
-        for batch in leaving:
-            self.state.fix(batch.columns, batch.information)
-            self._intake.finish(batch)
-        if leaving:
-            gone = {id(b) for b in leaving}
-            self._batches = [b for b in self._batches if id(b) not in gone]
-            self._suspects = {key: b for key, b in self._suspects.items() if key not in gone}
-        for strip in self.strips.values():
-            numbers, to_s = strip.leaving(limits[strip.id], self.state)
-            if not len(numbers):
-                continue
-            final = self._final(strip, to_s)
-            design = noise = None
-            if final is not None:
-                result.final.append(final)
-                design, noise = strip.design(final.time_s), self._orienter.noise(strip, final.time_s)
-                self._block.orientation(strip, final, design, noise)
-            strip.final_to_s = to_s
-            self._step(numbers, final, design, noise)
-            if strip.ended and strip.is_gone(self.state):
-                self._block.gone(strip)
-                strip.release()
-        over = min(limits.values(), default=limit_s)
-        modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in self._batches))
-        if len(modes):
-            self._step(modes)
-        if self._block.quiet:
-            result.whole = self._block.refined(self._steps, at_the_end)
-            result.events += self._block.take_events()
-            if result.whole is not None:
-                self._steps = []
-        del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
-        self._forget(limit_s, result)
-
-    def _settled_to(self, strip: WindowStrip) -> float:
-        """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
-        index = list(self.strips).index(strip.id)
-        rays = 0
-        for batch in sorted((b for b in self._batches if index in b.strips), key=lambda b: b.oldest_s):
-            rays += len(batch.rays)
-            if rays > MOST_LEAVING:
-                return batch.oldest_s
-        return np.inf
-
-    def _step(
-        self,
-        numbers: IntArray,
-        final: RefinedOrientation | None = None,
-        design: Design | None = None,
-        noise: Array | None = None,
-    ) -> None:
-        """Marginalise unknowns, and keep what leads back to them."""
-        marginal = self.state.marginalise(numbers)
-        self._watch.marginalised(marginal)
-        self._steps.append(Step(marginal, final, design, noise, self._left))
-        self._left = []
-        self._orienter.forget()
-
-    def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
-        """Orientation at the grid times that become final now."""
-        end = self.trajectory.end_s
-        if not np.isfinite(end):
-            return None
-        times = self.grid(strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
-        times = times[self.trajectory.covers(times)] if len(times) else times
-        return self._protected(strip, self._orienter.at(strip, times)) if len(times) else None
-
-    def _protected(self, strip: WindowStrip, orientation: RefinedOrientation) -> RefinedOrientation:
-        """With protection levels as the middle of the times is exposed."""
-        exposure = self._watch.exposure_at(strip, float(orientation.time_s[len(orientation.time_s) // 2]))
-        if exposure is None:
-            return orientation
-        sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
-        return replace(orientation, protection=exposure.protection(sigma))
-
-    def grid(self, from_s: float, to_s: float) -> Array:
-        """Times of the published orientation in [from, to)."""
-        hz = self.options.grid_hz
-        return np.arange(np.ceil(from_s * hz - 1e-6), np.ceil(to_s * hz - 1e-6)) / hz
-
-    def _forget(self, limit_s: float, result: WindowUpdate) -> None:
-        """Drop what nothing can need any more: single looks that found no partner, old poses, strips that are over."""
-        if not np.isfinite(limit_s) and limit_s < 0:
-            return
-        result.refused += self._intake.forget(limit_s, limit_s - self._length_s)
-        used = min((b.oldest_s for b in self._batches), default=np.inf)
-        waiting = self._intake.oldest_waiting_s
-        finals = min((s.final_to_s for s in self.strips.values() if not s.is_gone(self.state)), default=np.inf)
-        self.trajectory.forget(min(limit_s - self._length_s, used, waiting, finals) - 1.0)
 
     # -- output --------------------------------------------------------------------------------------------------------
 
@@ -511,8 +284,12 @@ class Window:
                 if strip.activate(float(times[-1]), self.state):
                     self.state.solve()
                     self._orienter.forget()
-                found.append(self._protected(strip, self._orienter.at(strip, times)))
+                found.append(self._leaver.protected(strip, self._orienter.at(strip, times)))
         return found
+
+    def grid(self, from_s: float, to_s: float) -> Array:
+        """Times of the published orientation in [from, to)."""
+        return grid(self.options.grid_hz, from_s, to_s)
 
     def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
         """Orientation at times of a strip, none of them final, that have a measured one."""
@@ -526,18 +303,20 @@ class Window:
                 return strip
         return None
 
-    def _report(self, iterations: int, changed: list[Batch], result: WindowUpdate) -> WindowReport:
+    def _report(self, iterations: int, changed: list[Batch], look: bool, result: WindowUpdate) -> WindowReport:
         state, length = self.state, max(self._length_s, 1.0)
         cost = state.cost()
         sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
         total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
         active = [s for s in self.strips.values() if not s.is_gone(state)]
-        watched = self._watch.look(
-            self._now_s, self._length_s, active[-1] if active else None, self._batches, changed, sigma0, gained,
-            (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
-        )  # fmt: skip
-        if watched.events:
-            self._orienter.forget()
+        self._watch.note(changed)
+        watched = self._watch.last
+        if look or watched is None:
+            self._watched_s = self._now_s
+            watched = self._watch.look(
+                self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
+                (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
+            )  # fmt: skip
         result.events += watched.events
         determined = rows = rays = points = control = 0
         for batch in self._batches:

@@ -1,0 +1,74 @@
+"""The only caller of `Node.step`.
+
+Over the bus (`live`) and over a recording (`runner`) a node gets the same messages in the same order, so the same
+outputs follow, with the same stamps and numbers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+from ..schemas import topics
+from .node import Message, Node
+
+
+class StepDriver:
+    """Feeds one node and gives its outputs their envelopes.
+
+    An output cannot be known before its cause: its stamp is raised to the newest stamp the node has been given, so that
+    the outputs of a node never go back in time.
+
+    Parameters
+    ----------
+    node : the node
+    clock : measures the wall time of a step, s, for messages that tell it (``compute_s``); None = they tell nothing
+    """
+
+    def __init__(self, node: Node, clock: Callable[[], float] | None = None) -> None:
+        self.node = node
+        self.time_ns = 0
+        self._clock = clock
+        self._sequences: Counter[str] = Counter()
+
+    def step(self, message: Message) -> list[Message]:
+        """The outputs that follow from one message."""
+        self.time_ns = max(self.time_ns, message.stamp_ns)
+        return self._collect(lambda: self.node.step(message), f"{message.topic} {message.sequence}")
+
+    def behind(self, lag_s: float, now_s: float) -> list[Message]:
+        """The decisions that follow from being behind; see `Node.behind`."""
+        return self._collect(lambda: self.node.behind(lag_s, now_s), "being behind")
+
+    def finish(self) -> list[Message]:
+        """The outputs that were held back."""
+        return self._collect(self.node.finish, "the end")
+
+    def _collect(self, work: Callable[[], Iterable[Message]], cause: str) -> list[Message]:
+        begun = self._clock() if self._clock else 0.0
+        outputs: list[Message] = []
+        try:
+            outputs.extend(work())  # a generator's outputs before a failure count
+        except Exception as error:  # whatever a message does to a node, the node lives
+            place = _innermost(error)
+            self.node.problem("failed", f"{cause}: {type(error).__name__}: {error} ({place})")
+        elapsed = self._clock() - begun if self._clock else 0.0
+        return [self._stamped(output, elapsed) for output in outputs]
+
+    def _stamped(self, output: Message, elapsed: float) -> Message:
+        allowed = (*self.node.outputs, *self.node.decisions)
+        if not any(topics.find(name).matches(output.topic) for name in allowed):
+            raise ValueError(f"{self.node.name} gave {output.topic}, its outputs are {', '.join(self.node.outputs)}")
+        if self._clock and getattr(output.body, "compute_s", None) == 0.0:
+            output.body.compute_s = elapsed
+        sequence = self._sequences[output.topic]
+        self._sequences[output.topic] += 1
+        stamp = max(output.stamp_ns, self.time_ns)
+        return Message(output.topic, stamp, output.body, self.node.name, sequence)
+
+
+def _innermost(error: Exception) -> str:
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return "" if trace is None else f"{trace.tb_frame.f_code.co_filename.rsplit('/', 1)[-1]}:{trace.tb_lineno}"

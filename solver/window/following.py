@@ -1,0 +1,159 @@
+"""Batches follow what becomes known: smoothed orientation, and unknowns that move on since they were linearised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..measured_trajectory import MeasuredTrajectory
+from .batch import Batch
+from .batches import Batches
+from .intake import Intake
+from .points import BatchMaker
+from .state import WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
+#: the linear equations then miss goes with its square: two hundredths of a pixel.
+MOVED = 1.5e-3
+#: Every so many updates it is looked whether a batch has moved, if new data did not move far.
+LOOKED_AFTER = 16
+#: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
+#: which leave first, the others in the updates after it.
+MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
+#: Rays that get their smoothed orientation in one update, about, or half of those that wait; the others in the next.
+MOST_REPLACED = 600
+#: Batches of one time are joined up to so many rays when they get their smoothed orientation; fewer wait for others so
+#: long, s.
+JOINED_RAYS, GATHERED_S = 160, 1.0
+
+
+class Follower:
+    """Keeps the batches where the window is.
+
+    Parameters
+    ----------
+    dropped : told of a batch that is joined with others
+    """
+
+    def __init__(
+        self,
+        batches: Batches,
+        state: WindowState,
+        maker: BatchMaker,
+        trajectory: MeasuredTrajectory,
+        intake: Intake,
+        step_s: float,
+        dropped: Callable[[Batch], None],
+    ) -> None:
+        self._batches, self._state, self._maker = batches, state, maker
+        self._trajectory, self._intake = trajectory, intake
+        self._step_s, self._dropped = step_s, dropped
+        self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
+        self._following = False  # whether they are what was left when new data moved far
+        self._turn = 0
+
+    # -- smoothed orientation ------------------------------------------------------------------------------------------
+
+    def replace_filtered(self) -> list[Batch]:
+        """Put smoothed orientation under batches that had to do with the filtered one, the oldest first.
+
+        Small ones are joined then, so that a window into which rays come a few at a time costs no more than others;
+        those that came about that way are returned.
+        """
+        smoothed_s = self._trajectory.smoothed_to_s
+        due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
+        number = sum(len(b.rays) for b in due)
+        if number < JOINED_RAYS and all(b.newest_s > smoothed_s - GATHERED_S for b in due):
+            return []
+        alone: list[Batch] = []
+        groups: dict[int, list[list[Batch]]] = {}
+        rays = 0
+        for batch in due:
+            if rays > max(MOST_REPLACED, number // 2):
+                break
+            rays += len(batch.rays)
+            if batch.ties is not None:
+                alone.append(batch)
+                continue
+            chunks = groups.setdefault(int(batch.oldest_s // self._step_s), [[]])
+            if sum(len(b.rays) for b in chunks[-1]) + len(batch.rays) > JOINED_RAYS:
+                chunks.append([])
+            chunks[-1].append(batch)
+        joined = []
+        for chunk in chain.from_iterable(groups.values()):
+            if len(chunk) > 1:
+                joined.append(self._join(chunk))
+            else:
+                alone += chunk
+        if alone:
+            self._maker.refresh(alone)
+            for batch in alone:
+                self._batches.linearise(batch, self._state.values(batch.columns), reweigh=True)
+        for batch in (*alone, *joined):
+            batch.provisional = False  # in a gap of the smoothed poses it stays with the filtered ones
+        return joined
+
+    def _join(self, parts: Sequence[Batch]) -> Batch:
+        """One batch in place of several."""
+        known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
+        names = list(known)
+        joined, lost = self._maker.make(names, [self._intake.points[name] for name in names], known)
+        assert joined is not None and not lost
+        joined.tested = min(b.tested for b in parts)
+        for batch in parts:
+            self._batches.remove(batch)
+            self._dropped(batch)
+        self._batches.enter(joined)
+        for name in names:
+            self._intake.place(name, joined)
+        return joined
+
+    # -- what has moved ------------------------------------------------------------------------------------------------
+
+    def look_after(self) -> None:
+        """Linearise again what has moved, in turn; before the solution, for which it then counts."""
+        if not self._suspects:
+            self._following = False
+            self._turn += 1
+            turn = list(self._batches)[self._turn % LOOKED_AFTER :: LOOKED_AFTER]
+            self._suspects = {id(b): b for b in turn}
+        self._again(MOST_RAYS_AGAIN if self._following else 0)
+
+    def follow(self, fresh: list[Batch]) -> bool:
+        """After a solution, linearise again new batches that have moved far; whether there were any.
+
+        Where unknowns have, all other batches are looked after, too.
+        """
+        values = [self._state.values(batch.columns) for batch in fresh]
+        far = any(b.has_moved(theta, MOVED) for b, theta in zip(fresh, values, strict=True))
+        due = [(b, t) for b, t in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED * b.height_m]
+        for batch, theta in due:
+            self._batches.linearise(batch, theta, reweigh=False)
+        if far:
+            new = {id(b) for b in fresh}
+            self._suspects = {id(b): b for b in self._batches if id(b) not in new}
+            self._following = True
+            self._again(MOST_RAYS_AGAIN)
+        return bool(due)
+
+    def _again(self, most_rays: int) -> None:
+        """Linearise suspects again that have moved, up to a number of rays, or of batches if that is 0."""
+        rays = batches = 0
+        for key, batch in list(self._suspects.items()):
+            if rays > most_rays if most_rays else batches >= MOST_AGAIN:
+                break
+            del self._suspects[key]
+            if batch not in self._batches:
+                continue
+            theta = self._state.values(batch.columns)
+            if batch.has_moved(theta, MOVED):
+                batch.back_substitute(theta)
+                self._batches.linearise(batch, theta, reweigh=False)
+                batches += 1
+                rays += len(batch.rays)
