@@ -14,9 +14,10 @@ from ..solver.window.window import Window
 from . import adjuster_messages as out
 from . import convert
 from .adjuster_control import GroundPoints
-from .adjuster_pace import Governor, Pace, Pacing, pace_message
+from .adjuster_pace import LEVELS, Pace, Pacing, pace_message
 from .adjuster_results import Teller
 from .adjuster_strips import StripDesk
+from .governor import Governor
 from .node import Message, Node
 
 #: Image sigma where neither measurement nor project gives one, px.
@@ -123,7 +124,7 @@ class Adjuster(Node):
         self._update_rays = update_rays if self._early else sys.maxsize
         self._by_load = pace == "load"
         self._rays_waiting = 0
-        self._pacing, self._governor = Pacing(), Governor()
+        self._pacing, self._governor = Pacing(), Governor(len(LEVELS))
         self._self_calibration, self._camera_sigma = self_calibration, camera_sigma
         self._window: Window | None = None
         self._project: Any = None

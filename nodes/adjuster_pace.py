@@ -13,15 +13,10 @@ from typing import Any
 from ..schemas import messages as m
 from ..solver.window.thinning import Candidate, Thinning
 from . import convert
+from .governor import Announced
 
 #: Factor on the time and the number of rays between updates, and share of the tie points kept, by level.
 LEVELS = ((1, 1.0), (2, 1.0), (5, 1.0), (5, 0.5), (5, 0.25), (5, 0.125), (5, 0.05), (5, 0.0))
-#: Behind by more, s (and an interval), a level up, unless it is catching up; behind by less for a while, one down.
-BEHIND_S, CAUGHT_UP_S = 0.4, 0.2
-#: Waiting time between two steps up, before a step down, and the longest that grows to where steps down were too early.
-UP_S, DOWN_S, LONGEST_DOWN_S = 0.3, 5.0, 80.0
-#: Of the window, the share to be behind at which nothing is tried out any more.
-ALARM = 0.4
 
 
 @dataclass(frozen=True)
@@ -51,47 +46,12 @@ class Pace:
         return text + (f", {100 * self.kept:g} % of the tie points" if self.kept < 1.0 else "")
 
 
-class Governor:
-    """Decides on the pace from how far behind the node is. Only live runs ask it; times are waiting times."""
-
-    def __init__(self) -> None:
-        self.level = 0
-        self._changed_s = -1e9
-        self._went_down = False
-        self._fine_since_s: float | None = None
-        self._down_s = DOWN_S
-        self._worst_s = 0.0  # behind by so much at the last look
-
-    def look(self, lag_s: float, now_s: float, interval_s: float, window_s: float) -> bool:
-        """Look at the lag of platform time, s; whether the level has changed."""
-        before = self.level
-        behind = lag_s > BEHIND_S + interval_s
-        if behind:
-            self._fine_since_s = None
-            growing = lag_s > 0.95 * self._worst_s
-            if now_s - self._changed_s > UP_S and growing:
-                step = len(LEVELS) if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
-                self.level = min(self.level + step, len(LEVELS) - 1)
-                if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early
-                    self._down_s = min(2.0 * self._down_s, LONGEST_DOWN_S)
-                self._changed_s, self._worst_s, self._went_down = now_s, lag_s, False
-            elif not growing:
-                self._worst_s = max(0.98 * self._worst_s, lag_s)
-        elif lag_s < CAUGHT_UP_S + interval_s:
-            if self._fine_since_s is None:
-                self._fine_since_s = now_s
-            if self.level and now_s - max(self._fine_since_s, self._changed_s) > self._down_s:
-                self.level -= 1
-                self._changed_s, self._worst_s, self._went_down = now_s, 0.0, True
-        return self.level != before
-
-
 class Pacing:
     """The pace in force, those that are announced, and the tie points that wait while points are left out."""
 
     def __init__(self) -> None:
         self.pace = Pace()
-        self._announced: list[tuple[int, Pace]] = []
+        self._announced: Announced[Pace] = Announced()
         self.waiting: list[tuple[Any, str]] = []  # with the source
         self.left_out_total = 0
         self._thinning = Thinning()
@@ -105,16 +65,13 @@ class Pacing:
         """
         if not 0 <= body.level < len(LEVELS):
             raise ValueError(f"pace of level {body.level}, wanted 0 to {len(LEVELS) - 1}")
-        self._announced.append((body.start_ns, Pace(body.level, body.lag_s)))
+        self._announced.add(body.start_ns, Pace(body.level, body.lag_s))
 
     def follow(self, stamp_ns: int) -> Pace | None:
         """The pace that begins by now, if one does."""
-        begun = [pace for from_ns, pace in self._announced if from_ns <= stamp_ns]
-        if not begun:
-            return None
-        del self._announced[: len(begun)]
-        self.pace = begun[-1]
-        return self.pace
+        begun = self._announced.take(stamp_ns)
+        self.pace = begun or self.pace
+        return begun
 
     def take_waiting(
         self, rates_hz: dict[str, float], starts_ns: dict[str, int], pixels: dict[str, int]

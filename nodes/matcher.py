@@ -9,14 +9,17 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
-from ..schemas.topics import find
+from ..schemas.topics import CONFIGURATION, POSES, find
 from ..solver.matching.options import MatchedTie, MatchingOptions
 from ..solver.matching.tie_matcher import TieMatcher
 from . import convert
+from .governor import Announced, Governor
+from .matcher_pace import BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S, SHARES, WINDOW_S, MatcherPace
 from .node import Message, Node
 from .target_desk import TargetDesk
 
 DEFAULTS = MatchingOptions()
+PACES = ("load", "normal")
 #: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
 DELAY_S = 0.8
 #: Platform time between two words on how far the matcher is, ns.
@@ -35,22 +38,22 @@ class Matcher(Node):
     relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
     delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
         that time, so they may be so long on their way: live and from a recording it sees them at the same place.
+    pace : "load", fewer places where the machine is too slow, and in `process` where it was in flight; "normal", all of
+        them, however long it takes
     """
 
     name = "matcher"
     inputs = (
-        "configuration/project",
-        "configuration/camera",
-        "configuration/strip",
+        *CONFIGURATION,
         "sensor/lines/*",
-        "trajectory/filtered",
-        "trajectory/smoothed",
+        *POSES,
         "orientation/live",
         "adjustment/report",
         "observation/control",
         "observation/verdict",
     )
     outputs = ("observation/tie", "observation/target", "observation/progress", "event/log")
+    decisions = ("matching/pace",)
 
     def __init__(
         self,
@@ -68,8 +71,11 @@ class Matcher(Node):
         chips_mb: float = DEFAULTS.chips_mb,
         full_scale: int = DEFAULTS.full_scale,
         delay_s: float = DELAY_S,
+        pace: str = "load",
     ) -> None:
         super().__init__()
+        if pace not in PACES:
+            raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if not 0 <= delay_s <= 10:
             raise ValueError(f"delay_s: wanted 0 to 10, got {delay_s}")
         self.options = MatchingOptions(
@@ -79,6 +85,9 @@ class Matcher(Node):
             least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
         )  # fmt: skip
         self._targets = TargetDesk()
+        self._by_load, self._pace = pace == "load", MatcherPace()
+        self._announced: Announced[MatcherPace] = Announced()
+        self._governor = Governor(len(SHARES), BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S)
         self._delay_ns = round(delay_s * convert.SECOND_NS)
         self._matcher: TieMatcher | None = None
         self._camera: Any = None
@@ -95,19 +104,39 @@ class Matcher(Node):
             progress = m.Progress(time_ns=message.stamp_ns - 1)
             out.append(Message("observation/progress", message.stamp_ns - 1 + self._delay_ns, progress))
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        out += self._begin_pace(message.stamp_ns)
         try:
             out += self._take(message)
         except ValueError as error:
             self.problem("malformed", f"{message.topic}: {error}")
         return out
 
+    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
+        if self._matcher is None or not self._by_load or not self._governor.look(lag_s, now_s, 0.0, WINDOW_S):
+            return ()
+        pace = MatcherPace(self._governor.level, lag_s)
+        self._announced.add(self._stamp_ns + 1, pace)
+        return [Message("matching/pace", self._stamp_ns, pace.message(self._stamp_ns + 1))]
+
+    def _begin_pace(self, stamp_ns: int) -> list[Message]:
+        pace = self._announced.take(stamp_ns)
+        if pace is None:
+            return []
+        self._pace = pace
+        if self._matcher is not None:
+            self._matcher.keep(pace.share)
+        return [self._log(pace.words(), warning=pace.level > 0)]
+
     @staticmethod
     def _keeps_time(topic: str) -> bool:
         """Whether a message tells how far the flight is; not those of the adjuster, which goes by the matcher."""
-        return topic not in ("orientation/live", "adjustment/report") and not find(topic).latched
+        told_by_others = "orientation/live", "adjustment/report", *Matcher.decisions
+        return topic not in told_by_others and not find(topic).latched
 
     def state(self) -> str:
-        return "running" if self._matcher is not None else "waiting for configuration/camera"
+        if self._matcher is None:
+            return "waiting for configuration/camera"
+        return f"running, {self._pace.words()}" if self._pace.level else "running"
 
     def _take(self, message: Message) -> list[Message]:
         topic, body = message.topic, message.body
@@ -125,6 +154,9 @@ class Matcher(Node):
             self._correction(body)
         elif topic == "adjustment/report" and self._matcher is not None:
             self._matcher.window_holds(int(body.points), int(body.rays))
+        elif topic == "matching/pace":
+            if self._by_load:
+                self._announced.add(body.start_ns, MatcherPace(body.level, body.lag_s))
         elif topic == "observation/control":
             self._targets.ground_point(body)
         elif topic == "observation/verdict":
@@ -139,6 +171,7 @@ class Matcher(Node):
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         self._matcher = TieMatcher(camera, self.options)
+        self._matcher.keep(self._pace.share)
         self._targets.configure(camera, self._matcher.orientation)
         return [self._log("configuration changed: matching starts again", warning=True)] if again else []
 
@@ -180,6 +213,9 @@ class Matcher(Node):
             first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
             matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
             self._targets.begin_strip(strip, first_s)
+        if self._pace.blind:
+            self.counters["lines gone by"] += len(block.pixels)
+            return []
         usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
         ties = matcher.match()
         out = [self._tie(strip, tie) for tie in ties]

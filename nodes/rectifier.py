@@ -9,6 +9,7 @@ import numpy as np
 
 from ..schemas import messages as m
 from ..schemas.image_lines import LineBlock
+from ..schemas.topics import CONFIGURATION, POSES
 from ..solver.camera import LineCamera
 from ..solver.frames import LocalFrame
 from ..solver.orthoimage.ground_grid import GroundGrid
@@ -44,12 +45,9 @@ class Rectifier(Node):
 
     name = "rectifier"
     inputs = (
-        "configuration/project",
-        "configuration/camera",
-        "configuration/strip",
+        *CONFIGURATION,
         "sensor/lines/*",
-        "trajectory/filtered",
-        "trajectory/smoothed",
+        *POSES,
         "observation/control",
         "orientation/live",
         "orientation/final",

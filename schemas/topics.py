@@ -88,7 +88,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("sensor/imu", m.Imu, _S, 200, allowed_lateness_ms=20),
     Topic("sensor/attitude", m.Attitude, _S, 200, allowed_lateness_ms=20),
     Topic("sensor/gnss", m.LocationFix, _S, 5, allowed_lateness_ms=20),
-    Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST),
+    Topic("sensor/lines/*", m.RawImage, _S, 25, queue=Queue.NEWEST, grace_s=0.5),
     Topic("trajectory/filtered", m.PoseInFrame, _R, 200, allowed_lateness_ms=100),
     Topic("trajectory/smoothed", m.PoseInFrame, _R, 200, allowed_lateness_ms=100, in_bursts=True),
     # known before the flight, or stamped half a second ahead
@@ -108,11 +108,16 @@ TOPICS: tuple[Topic, ...] = (
     Topic("orthoimage/live", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("orthoimage/final", m.GroundTile, _R, 2, queue=Queue.NEWEST, allowed_lateness_ms=200),
     Topic("adjustment/pace", m.Pace, Family.DECISION, 0),
+    Topic("matching/pace", m.Pace, Family.DECISION, 0),
     Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
     Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
     Topic("event/log", m.Log, Family.STATUS, 0),
     Topic("status/*", m.NodeStatus, Family.STATUS, 2, queue=Queue.NEWEST),
 )
+
+#: What a flight consists of, and where the platform was: nodes that look at image lines take all of these.
+CONFIGURATION = tuple(row.name for row in TOPICS if row.family is Family.CONFIGURATION)
+POSES = ("trajectory/filtered", "trajectory/smoothed")
 
 
 @lru_cache(maxsize=1024)

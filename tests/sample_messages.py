@@ -83,6 +83,7 @@ def body(topic: str, i: int = 0) -> Any:
         "orthoimage/live": m.GroundTile(**tile),
         "orthoimage/final": m.GroundTile(row=-3, **tile),
         "adjustment/pace": m.Pace(start_ns=time_ns, level=3, interval_factor=5, kept_share=0.5, lag_s=2.5),
+        "matching/pace": m.Pace(start_ns=time_ns, level=2, interval_factor=1, kept_share=0.5, lag_s=0.5),
         "truth/trajectory": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
         "truth/point": ground,
         "event/log": log,

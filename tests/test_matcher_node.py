@@ -128,7 +128,7 @@ FAULTS = {
         ("B: nothing has come after line 149",),
     ),
     "lens cap, then water": (
-        chain(lines_between(40, 100, 0), lines_between(110, 300, water)),
+        chain(lines_between(40, 100, 0), lines_between(235, 400, water)),
         {"lines dark": 180, "cells without texture": 30},
         ("N: lines are black (lens cap", "N: lines are good again", "poor in texture", "has texture again"),
     ),

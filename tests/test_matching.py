@@ -5,15 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from triline.nodes.cli import main
 from triline.nodes.flight_settings import simulated_flight
 from triline.nodes.recording import RecordingReader
+from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.least_squares import match_patches
 from triline.solver.matching.line_intake import LineIntake
 from triline.solver.matching.line_quality import IS_DARK, IS_FROZEN, IS_SATURATED, judge_lines
 from triline.solver.matching.line_scan import LineScan, view_of
 from triline.solver.matching.line_store import LineRing, LineStore
+from triline.solver.matching.looks import LookMatcher
 from triline.solver.matching.tie_matcher import MatchingOptions, TieMatcher
 from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.simulation.imagery import ImagingPlan, LineImager
@@ -42,8 +45,11 @@ def images(flown):
     return [flown.imager.render(0, ccd, 0, lines) for ccd in range(3)]
 
 
-def matched(flight, images, seed=1, wrong_px=0.0, options=None):
-    """Ties and matcher for images of the first strip, with slow attitude errors (0.02 deg) and perhaps large ones."""
+def matched(flight, images, seed=1, wrong_px=0.0, options=None, delay=None):
+    """Ties and matcher for images of the first strip, with slow attitude errors (0.02 deg) and perhaps large ones.
+
+    The list ``delay`` is given the lines from the last look of each tie to the newest one.
+    """
     strip, camera = flight.strips[0], flight.camera
     matcher = TieMatcher(camera, options or MatchingOptions())
     matcher.begin_strip(strip.id, strip.first_line_time_s, strip.line_rate_hz)
@@ -66,7 +72,10 @@ def matched(flight, images, seed=1, wrong_px=0.0, options=None):
             block = image[first : first + BLOCK] if not isinstance(image, dict) else image.get(first, np.empty((0, 0)))
             if len(block):
                 matcher.add_lines(line.id, first, block)
-        ties += matcher.match()
+        new = matcher.match()
+        ties += new
+        if delay is not None:
+            delay += [first + BLOCK - max(ray.line for ray in tie.rays) for tie in new]
         told += matcher.take_events()
     return ties, matcher, told
 
@@ -229,6 +238,21 @@ def test_ground_points_are_found_back_on_their_lines(flown):
     assert np.abs(u - line).max() < 1e-3 and np.abs(v - sample).max() < 1e-3
 
 
+def test_a_place_with_texture_all_over_its_window_is_better_than_one_strong_corner():
+    rng = np.random.default_rng(4)
+    image = np.full((60, 120), 800.0, dtype=np.float32)
+    image[20:40, 20:40] += 1500.0  # one corner in a window, whichever
+    wavy = gaussian_filter(rng.standard_normal((40, 40)), 1.5)
+    image[10:50, 70:110] += (120.0 / wavy.std() * wavy).astype(np.float32)
+    image += 10.0 * rng.standard_normal(image.shape).astype(np.float32)
+    best = interest_point(image, np.ones(60, dtype=bool), 19, 0.1)
+    assert best is not None and 74 <= best[1] <= 106 and best[2] < 0.1
+    # the corner alone is good enough where there is nothing else
+    alone = interest_point(image[:, :60], np.ones(60, dtype=bool), 19, 0.1)
+    assert alone is not None and min(abs(alone[0] - 20), abs(alone[0] - 39)) < 10
+    assert interest_point(np.full((60, 60), 800, np.float32), np.ones(60, dtype=bool), 19, 0.1) is None
+
+
 # ---- all of it
 
 
@@ -241,6 +265,38 @@ def test_ties_lie_where_the_truth_says_with_the_covariance_they_claim(flown, ima
     assert 1.4826 * np.median(np.abs(error)) < 0.06
     assert 0.5 < np.median((error / sigma) ** 2) / 0.455 < 1.4
     assert 0.6 < ((error / sigma)[length < 2] ** 2).mean() < 1.4
+
+
+def test_views_are_looked_for_as_they_come_and_ties_follow_soon(flown, images, monkeypatch):
+    looked, delay = [], []
+    look = LookMatcher.look
+
+    def noted(self, tracks, view):
+        begun = [int(track.found.sum()) for track in tracks]
+        look(self, tracks, view)
+        looked.append((view, begun, float(self.prediction._widest[self.prediction.others[view]])))
+
+    monkeypatch.setattr(LookMatcher, "look", noted)
+    ties, matcher, _ = matched(flown.simulation.flight, images, delay=delay)
+    tried = {view: sum(len(begun) for v, begun, _ in looked if v == view) for view in (0, 1)}
+    # who is not found by the view that looks ahead is not looked for by the other
+    assert all(min(begun) == 1 for view, begun, _ in looked if view == 1)
+    assert tried[1] < 0.95 * tried[0] and tried[1] < 1.2 * len(ties)
+    # with the height from the first view, the second is searched within a few pixels
+    later = len(looked) // 2
+    assert np.median([reach for view, _, reach in looked[later:] if view == 1]) < 6.0
+    # a patch, the search around it, a block, and what waits for company (the first ones wait to be judged together)
+    assert np.quantile(delay[len(delay) // 2 :], 0.9) < 70
+    assert min(track.place.line for track in matcher._waiting.tracks) > len(images[0]) - 280
+
+
+def test_points_of_two_views_do_without_the_third(flown, images):
+    dark = [np.zeros_like(images[0]), images[1], images[2]]
+    ties, matcher, _ = matched(flown.simulation.flight, dark, options=MatchingOptions(least_rays=2))
+    error, _ = errors(flown.simulation.flight, ties)
+    assert len(ties) > 60 and {ray.ccd for tie in ties for ray in tie.rays} == {"N", "B"}
+    assert (np.hypot(*error.T) < 0.3).mean() > 0.95
+    assert matcher.counters["looks never came"] == 0
 
 
 def test_lanes_of_a_small_budget_give_ties_too():

@@ -17,8 +17,9 @@ Array = NDArray[np.floating]
 
 #: A match that is off by so many robust standard deviations is wrong; and by how many pixels at least, before it is.
 LIMIT_SIGMA, LEAST_LIMIT_PX = 3.5, 0.5
-#: Matches are judged together with those of so many seconds before, and not before there are so many.
-MEMORY_S, FEWEST = 4.0, 10
+#: Matches are judged together with those of so many seconds before, and not before there are so many. Many points tell
+#: in a shorter time what is slow: no more of the past than so many.
+MEMORY_S, FEWEST, MOST = 4.0, 10, 40
 #: If a larger share of new matches is off, it is not they who are wrong.
 OUTVOTED = 0.5
 #: Robust standard deviations are never smaller than this, px.
@@ -80,6 +81,7 @@ class SlowDisagreement:
     _fit: Array | None = None
     _scale: Array | None = None
     _middle_s: float = 0.0
+    _reach_s: float = MEMORY_S / 2
 
     def forget(self) -> None:
         """A new strip begins."""
@@ -94,7 +96,7 @@ class SlowDisagreement:
         if self._fit is None:
             return np.zeros((len(time_s), self.views, 2))
         # a trend is not carried on beyond what it was found from
-        t = np.clip(np.asarray(time_s) - self._middle_s, -MEMORY_S / 2, MEMORY_S / 2)
+        t = np.clip(np.asarray(time_s) - self._middle_s, -self._reach_s, self._reach_s)
         return np.einsum("kp,pvi->kvi", _design(t, np.asarray(across)), self._fit)
 
     @property
@@ -103,49 +105,56 @@ class SlowDisagreement:
         return np.full((self.views, 2), np.inf) if self._scale is None else self._scale
 
     def judge(self, new: Disagreement) -> NDArray[np.bool_] | None:
-        """Which views (k, views) of new points agree with the rest; None as long as there are too few to tell."""
-        if len(new):
-            self._past = _since(self._past, float(new.time_s.max()) - MEMORY_S)
-        together = _joined([*self._past, new])
+        """Which views (k, views) of new points agree with the rest; None as long as there are too few to tell.
+
+        All points are kept for those to come, also those that do not agree: a few wrong ones do no harm to a robust
+        fit, and where the orientation turns faster than before it is followed.
+        """
+        past = _newest(self._past, float(new.time_s.max())) if len(new) else self._past
+        together = _joined([*past, new])
         if len(together) < FEWEST:
             return None
-        good = self._judged(together, new)
-        if len(new) >= FEWEST and self._past and _contradicted(new, good).mean() > OUTVOTED:
+        self._past = [together]
+        self._fit_to(together)
+        last = np.arange(len(together))[-max(FEWEST, len(new)) :]
+        lately = together.select(last)
+        if len(lately) < len(together) and _contradicted(lately, self._agree(lately)).mean() > OUTVOTED:
             # the orientation has jumped, as when an adjustment meets its first control: the past says nothing any more
-            alone = self._judged(new, new)
-            if _contradicted(new, alone).mean() < OUTVOTED:
-                self._past = []
-                return alone
-            good = self._judged(together, new)
-        return good
+            self._fit_to(lately)
+            if _contradicted(lately, self._agree(lately)).mean() < OUTVOTED:
+                self._past = [lately]
+            else:
+                self._fit_to(together)
+        return self._agree(new)
 
-    def _judged(self, all_points: Disagreement, new: Disagreement) -> NDArray[np.bool_]:
-        """Which views (k, views) of new points follow the slow part of all points, which is kept."""
-        middle = float(np.median(all_points.time_s))
-        design = _design(all_points.time_s - middle, all_points.across)
+    def _fit_to(self, points: Disagreement) -> None:
+        """Find the slow part."""
+        middle = float(np.median(points.time_s))
+        design = _design(points.time_s - middle, points.across)
         fit, scale = np.zeros((3, self.views, 2)), np.full((self.views, 2), np.inf)
         for v in range(self.views):
             for i in range(2):
-                fit[:, v, i], scale[v, i] = _robust_fit(design, all_points.residual[:, v, i])
-        left = new.residual - np.einsum("kp,pvi->kvi", _design(new.time_s - middle, new.across), fit)
-        limit = np.maximum(LIMIT_SIGMA * scale, LEAST_LIMIT_PX)
+                fit[:, v, i], scale[v, i] = _robust_fit(design, points.residual[:, v, i])
         self._fit, self._scale, self._middle_s = fit, scale, middle
-        return np.asarray((np.abs(left) <= limit).all(axis=2))
+        self._reach_s = float(np.clip(np.abs(points.time_s - middle).max(), 0.0, MEMORY_S / 2))
 
-    def remember(self, accepted: Disagreement) -> None:
-        """Keep points for those to come."""
-        if not len(accepted):
-            return
-        newest = max(float(accepted.time_s.max()), *(float(d.time_s.max()) for d in self._past), -np.inf)
-        self._past = _since([*self._past, accepted], newest - MEMORY_S)
+    def _agree(self, points: Disagreement) -> NDArray[np.bool_]:
+        """Which views (k, views) of points follow the slow part."""
+        assert self._fit is not None and self._scale is not None
+        slow = np.einsum("kp,pvi->kvi", _design(points.time_s - self._middle_s, points.across), self._fit)
+        limit = np.maximum(LIMIT_SIGMA * self._scale, LEAST_LIMIT_PX)
+        return np.asarray((np.abs(points.residual - slow) <= limit).all(axis=2))
 
 
-def _since(parts: Sequence[Disagreement], time_s: float) -> list[Disagreement]:
-    """Points after a time."""
+def _newest(parts: Sequence[Disagreement], now_s: float) -> list[Disagreement]:
+    """Points that count at a time."""
     if not parts:
         return []
     kept = _joined(parts)
-    kept = kept.select(np.flatnonzero(np.greater(kept.time_s, time_s)))
+    since_s = now_s - MEMORY_S
+    if len(kept) > MOST:
+        since_s = max(since_s, float(np.partition(kept.time_s, -MOST - 1)[-MOST - 1]))
+    kept = kept.select(np.flatnonzero(np.greater(kept.time_s, since_s)))
     return [kept] if len(kept) else []
 
 

@@ -63,7 +63,7 @@ class CurrentOrientation:
         if self._newest is not None and 0 <= time_s - self._newest[0] <= JUMP_S:
             change = correction - self._newest[1]
             if (np.abs(change) > JUMP_SHARE * np.sqrt(np.diagonal(covariance))).any():
-                self._knots = {k: [total + n * change, n] for k, (total, n) in self._knots.items()}
+                self._knots = {k: [n * correction, n] for k, (_, n) in self._knots.items()}
                 self._covariance = dict.fromkeys(self._covariance, covariance)
         self._newest = time_s, correction
         knot = int(time_s // KNOT_S)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 
 #: Heights that are kept, and how many neighbours a guess takes.
-KEPT, NEIGHBOURS = 600, 6
+KEPT, NEIGHBOURS = 1000, 6
 #: The ground rises so much over a distance, 1 sigma.
 SLOPE = 0.06
 

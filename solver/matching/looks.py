@@ -1,9 +1,14 @@
-"""The looks at places: each place of the master view is matched in all other views, and gets its height."""
+"""The looks at places, view after view: each place of the master is matched in the other views, and gets its height.
+
+A view is matched as soon as its look is in store. What was found tells how high the ground is, and with that the next
+view is looked for within a few pixels; a place that fails in one view is not looked for in the others, unless it can do
+without.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +21,47 @@ from .prediction import WIDE, Prediction, sample_m
 from .search import Found, Ground, Image, find
 
 Array = NDArray[np.floating]
+
+#: Standard deviation of a match, px, that heights from it are taken to have at least.
+LEAST_MATCH_PX = 0.1
+
+
+@dataclass(eq=False)
+class Track:
+    """A place on its way to a tie point.
+
+    Attributes
+    ----------
+    place : as it was chosen
+    height_m : of the ground, guessed, or from the views in which it was found; NaN before that
+    tried : (views,) in which views it was looked for
+    located : (views, 2) line and sample there, NaN where it was not found
+    covariance : (views, 2, 2) of the matches, px^2 of the ground grid
+    score : (views,) correlation coefficients
+    """
+
+    place: Place
+    views: int
+    height_m: float = np.nan
+    tried: NDArray[np.bool_] = field(init=False)
+    located: Array = field(init=False)
+    covariance: Array = field(init=False)
+    score: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.tried = np.zeros(self.views, dtype=bool)
+        self.located = np.full((self.views, 2), np.nan)
+        self.covariance = np.full((self.views, 2, 2), np.inf)
+        self.score = np.ones(self.views)
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(views,) where it was found."""
+        return np.isfinite(self.located[:, 0])
+
+    def next_view(self, order: Sequence[int]) -> int:
+        """The first of the views in an order in which it was not looked for; -1 if there is none."""
+        return next((view for view in order if not self.tried[view]), -1)
 
 
 @dataclass(frozen=True)
@@ -45,6 +91,32 @@ class Looked:
         return len(self.places)
 
 
+@dataclass(frozen=True)
+class _Geometry:
+    """Where the rays of k places lie, with the orientation of now, on grids at guessed heights.
+
+    Attributes
+    ----------
+    line, sample : (k,) in the master
+    ground, slope : the grids, and the slopes (k, 2) of the master's rays
+    travel : way of the platform from line to line, m
+    expected : (k, views, 2) shifts to be expected, px
+    shift, parallax : (k, views, 2) of the views in which a place was found, px, px a metre of height; else NaN, 0
+    sample_m : (1 + views,) size of a pixel across, m, the master's first
+    """
+
+    scan: LineScan
+    line: Array
+    sample: Array
+    ground: Ground
+    slope: Array
+    travel: float
+    expected: Array
+    shift: Array
+    parallax: Array
+    sample_m: Array
+
+
 class LookMatcher:
     """Matches places in the views.
 
@@ -56,107 +128,149 @@ class LookMatcher:
 
     Attributes
     ----------
-    least_rays : of a point
+    least_rays : of a tie point
     """
 
     def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Image], chip_half: int):
         self.prediction = prediction
         self.counters: Counter[str] = Counter()
-        self._image, self._chip_half = image, chip_half
         self.least_rays = min(prediction.options.least_rays, len(prediction.views))
+        self._image, self._chip_half = image, chip_half
 
-    def match(self, places: list[Place]) -> Looked | None:
-        """What was found of places, those with enough looks; None if that is none."""
+    def guess_heights(self, tracks: Sequence[Track]) -> None:
+        """Give places the heights of their neighbours."""
         p = self.prediction
-        line, sample = np.array([[place.line, place.sample] for place in places]).T
-        master = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
-        if master is None:
-            self.counters["no orientation"] += len(places)
-            return None
-        _, travel = p.height_and_travel()
-        guess_l, _ = master.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
-        height, sigma_height = p.heights.at(guess_l[:, :2])
-        centre, slope = master.to_plane(line, sample, height)
-        ground = p.ground(master, centre)
-        time_s = p.first_s + line / p.rate
-        across = 2 * sample / p.views[p.master].pixels - 1
-        expected = p.slow.expected(time_s, across)
+        line, sample = _at(tracks)
+        scan = p.scan(p.master, line.min() - 4, line.max() + 4)
+        if scan is None:
+            return
+        xy, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
+        for track, height in zip(tracks, p.heights.at(xy[:, :2])[0].tolist(), strict=True):
+            track.height_m = height
 
-        k, views = len(line), len(p.others)
-        shift, parallax = np.full((k, views, 2), np.nan), np.zeros((k, views, 2))
-        weight, covariance = np.zeros((k, views)), np.full((k, views, 2, 2), np.inf)
-        score, located = np.zeros((k, views)), np.full((k, views, 2), np.nan)
-        scale_across, beyond = np.ones(views), 0.0
-        for j, index in enumerate(p.others):
-            done = self._match_view(index, master, line, ground, expected[:, j], sigma_height, slope, travel)
-            if done is None:
-                self.counters["no lines"] += k
-                continue
-            found, scan, other_line, parallax[:, j] = done
-            beyond = max(beyond, float((found.reason == "beyond search").mean()))
-            good = self._accept(found)
-            shift[good, j] = found.shift[good]
-            covariance[good, j], score[:, j] = found.covariance[good], found.score
-            weight[good, j] = 1.0
-            place = ground.moved(np.where(good[:, None], found.shift, 0.0)).centre_l
-            u, v, inside = scan.locate(place, other_line + found.shift[:, 0] * ground.spacing_m / travel)
-            ok = good & inside & np.isfinite(u)
-            located[ok, j] = np.column_stack([u, v])[ok]
-            shift[~ok, j] = np.nan
-            scale_across[j] = sample_m(scan, place, u)
-        p.searched(beyond)
-        enough = 1 + np.isfinite(shift).all(axis=2).sum(axis=1) >= self.least_rays
-        self.counters["too few looks"] += int((~enough).sum())
-        if not enough.any():
+    def look(self, tracks: Sequence[Track], view: int) -> None:
+        """Look for places in a view (of the others); notes in the tracks what was found."""
+        p = self.prediction
+        for track in tracks:
+            track.tried[view] = True
+        line, sample = _at(tracks)
+        scan = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
+        if scan is None:
+            self.counters["no orientation"] += len(tracks)
+            return
+        guess_l, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
+        height, sigma_m = p.heights.at(guess_l[:, :2])
+        known = np.array([track.found.any() for track in tracks])
+        if known.any():
+            height = np.where(known, [track.height_m for track in tracks], height)
+            g = self._geometry(tracks, scan, height)
+            dz, _ = height_of(g.shift - g.expected, g.parallax, np.isfinite(g.shift[:, :, 0]).astype(float))
+            height = np.where(known, height + dz, height)
+            base = np.hypot(*g.parallax.transpose(2, 0, 1)).max(axis=1)
+            px = max(np.hypot(p.sigma_px(i, g.ground.spacing_m), LEAST_MATCH_PX) for i in p.others)
+            sigma_m = np.where(known, np.minimum(px / np.maximum(base, 1e-6), sigma_m), sigma_m)
+        g = self._geometry(tracks, scan, height)
+        done = self._match_view(view, g, sigma_m)
+        if done is None:
+            self.counters["no lines"] += len(tracks)
+            return
+        found, located, parallax = done
+        good = np.isfinite(located[:, 0])
+        # the height that the match tells; until points are judged it is the best guess for their neighbours
+        base = np.maximum(np.sum(parallax**2, axis=1), 1e-12)
+        dz = np.where(good & ~known, np.sum(parallax * (found.shift - g.expected[:, view]), axis=1) / base, 0.0)
+        for i, track in enumerate(tracks):
+            track.height_m = float(height[i] + dz[i])
+            if good[i]:
+                track.located[view], track.covariance[view] = located[i], found.covariance[i]
+                track.score[view] = found.score[i]
+        new = good & ~known
+        p.heights.add((g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[new])
+
+    def finish(self, tracks: Sequence[Track]) -> Looked | None:
+        """Places that have been looked for in all views become points; None if none was found often enough."""
+        p = self.prediction
+        enough = [track for track in tracks if 1 + track.found.sum() >= self.least_rays]
+        self.counters["too few looks"] += len(tracks) - len(enough)
+        if not enough:
             return None
-        dz, _ = height_of(shift - expected, parallax, weight)
+        line, _ = _at(enough)
+        scan = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
+        if scan is None:
+            self.counters["no orientation"] += len(enough)
+            return None
+        height = np.array([track.height_m for track in enough])
+        g = self._geometry(enough, scan, height)
+        weight = np.isfinite(g.shift[:, :, 0]).astype(float)
+        dz, _ = height_of(g.shift - g.expected, g.parallax, weight)
         # nothing that a height explains may stay in what is expected of the next points: it would never leave it again
-        _, residual = height_of(shift, parallax, weight)
-        xyz = np.column_stack([centre[:, :2] + slope * dz[:, None], height + dz])
-        pixel_m = np.column_stack([np.full(views + 1, travel), [sample_m(master, centre, line), *scale_across]])
-        chosen = np.flatnonzero(enough)
+        _, residual = height_of(g.shift, g.parallax, weight)
+        xyz = g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz])
+        pixel_m = np.column_stack([np.full(len(g.sample_m), g.travel), g.sample_m])
         # a place is where a noisy pose sees it: line by attitude about y, sample about x, position for both
         noise = p.orientation.noise_left
         wobble = (noise[:2].mean() + p.height_and_travel()[0] ** 2 * noise[[4, 3]]) / pixel_m**2
-        per_px = ground.spacing_m / pixel_m
-        rays = [self._rays(places[i], located[i], covariance[i], per_px, wobble) for i in chosen]
-        known = np.isfinite(located).all(axis=2)
-        chip = np.empty((len(chosen), 0, 0))
+        rays = [self._rays(track, g.ground.spacing_m / pixel_m, wobble) for track in enough]
+        chip, ground = np.empty((len(enough), 0, 0)), Ground(xyz, g.ground.along, g.ground.across, g.ground.spacing_m)
         if self._chip_half:
-            ground = Ground(xyz[enough], ground.along, ground.across, ground.spacing_m)
-            chip = self._image(p.master, master, travel).patches(ground, line[enough], self._chip_half, 1)[0]
+            chip = self._image(p.master, scan, g.travel).patches(ground, line, self._chip_half, 1)[0]
+        across = 2 * g.sample / p.views[p.master].pixels - 1
         return Looked(
-            [places[i] for i in chosen], rays, np.where(known, score, 1.0).min(axis=1)[enough], xyz[enough],
-            Disagreement(time_s[enough], across[enough], residual[enough]), chip, ground.select(
-                np.arange(len(ground.centre_l)) if self._chip_half else enough
-            ),
+            [track.place for track in enough], rays, np.array([track.score.min() for track in enough]), xyz,
+            Disagreement(p.first_s + line / p.rate, across, residual), chip, ground,
         )  # fmt: skip
 
-    def _match_view(
-        self, index: int, master_scan: LineScan, line: Array, ground: Ground, expected: Array, sigma_height: Array,
-        slope: Array, travel: float,
-    ) -> tuple[Found, LineScan, Array, Array] | None:  # fmt: skip
-        """Matches in one view: what was found, its lines, the predicted line, and the parallax per metre, px."""
+    def _geometry(self, tracks: Sequence[Track], scan: LineScan, height: Array) -> _Geometry:
         p = self.prediction
-        view, m = p.views[index], p.views[p.master]
-        above = float(np.median(master_scan.position_l[:, 2])) - ground.centre_l[:, 2]
-        away = (m.forward - view.forward) * above / travel
-        wide = p.scan(index, (line + away).min() - 2 * WIDE, (line + away).max() + 2 * WIDE)
+        line, sample = _at(tracks)
+        centre, slope = scan.to_plane(line, sample, height)
+        ground = p.ground(scan, centre)
+        axes = np.stack([ground.along, ground.across]) / ground.spacing_m
+        located = np.stack([track.located for track in tracks])
+        shift, parallax = np.full(located.shape, np.nan), np.zeros(located.shape)
+        pixel_m = np.full(1 + len(p.others), sample_m(scan, centre, line))
+        for j, index in enumerate(p.others):
+            seen = np.isfinite(located[:, j, 0])
+            u, v = located[seen, j].T
+            other = p.scan(index, u.min() - 4, u.max() + 4) if seen.any() else None
+            if other is None:
+                continue
+            there, other_slope = other.to_plane(u, v, height[seen])
+            shift[seen, j] = (there - centre[seen])[:, :2] @ axes.T
+            parallax[seen, j] = (slope[seen] - other_slope) @ axes.T
+            pixel_m[1 + j] = sample_m(other, there, u)
+        _, travel = p.height_and_travel()
+        across = 2 * sample / p.views[p.master].pixels - 1
+        expected = p.slow.expected(p.first_s + line / p.rate, across)
+        return _Geometry(scan, line, sample, ground, slope, travel, expected, shift, parallax, pixel_m)
+
+    def _match_view(self, view: int, g: _Geometry, sigma_height: Array) -> tuple[Found, Array, Array] | None:
+        """Matches in one view: what was found; line and sample there (k, 2), NaN unless good; parallax (k, 2)."""
+        p = self.prediction
+        index = p.others[view]
+        expected, ground = g.expected[:, view], g.ground
+        away = p.lines_later(index, ground.centre_l[:, 2])
+        wide = p.scan(index, (g.line + away).min() - 2 * WIDE, (g.line + away).max() + 2 * WIDE)
         if wide is None:
             return None
         moved = ground.moved(expected)
-        other_line, _, _ = wide.locate(moved.centre_l, line + away, rounds=5)
+        other_line, _, _ = wide.locate(moved.centre_l, g.line + away, rounds=5)
         other_line = np.clip(other_line, wide.first_line, wide.first_line + len(wide.position_l) - 1)
         # slope of the other rays, for what height does
         camera = wide.position_l[(other_line - wide.first_line).astype(int)]
         other_slope = (moved.centre_l[:, :2] - camera[:, :2]) / (moved.centre_l[:, 2:] - camera[:, 2:])
         axes = np.stack([ground.along, ground.across]) / ground.spacing_m
-        parallax = (slope - other_slope) @ axes.T
+        parallax = (g.slope - other_slope) @ axes.T
         reach = p.reach(index, ground, sigma_height, parallax)
-        master = self._image(p.master, master_scan, travel)
-        base_line = other_line - expected[:, 0] * ground.spacing_m / travel
-        found = find(master, line, ground, self._image(index, wide, travel), expected, base_line, reach)
-        return found, wide, base_line, parallax
+        master, other = self._image(p.master, g.scan, g.travel), self._image(index, wide, g.travel)
+        base_line = other_line - expected[:, 0] * ground.spacing_m / g.travel
+        found = find(master, g.line, ground, other, expected, base_line, reach)
+        good = self._accept(found)
+        p.searched(index, float((found.reason == "beyond search").mean()))
+        place = ground.moved(np.where(good[:, None], found.shift, 0.0)).centre_l
+        u, v, inside = wide.locate(place, base_line + found.shift[:, 0] * ground.spacing_m / g.travel)
+        good &= inside & np.isfinite(u)
+        return found, np.where(good[:, None], np.column_stack([u, v]), np.nan), parallax
 
     def _accept(self, found: Found) -> NDArray[np.bool_]:
         reason = verdict(found, self.prediction.options)
@@ -164,16 +278,14 @@ class LookMatcher:
         self.counters.update(dict(zip(names.tolist(), counts.tolist(), strict=True)))
         return reason == ""
 
-    def _rays(
-        self, place: Place, located: Array, covariance: Array, px: Array, wobble: Array
-    ) -> tuple[MatchedRay, ...]:
+    def _rays(self, track: Track, px: Array, wobble: Array) -> tuple[MatchedRay, ...]:
         """Half of a match's variance belongs to each of its two images.
 
         ``px`` is ground grid to pixels, ``wobble`` the variance by noisy poses, px^2; per view, of line and sample.
         """
-        p = self.prediction
-        known = np.flatnonzero(np.isfinite(located).all(axis=1))
-        half = 0.5 * np.diagonal(covariance[known], axis1=1, axis2=2)
+        p, place = self.prediction, track.place
+        known = np.flatnonzero(track.found)
+        half = 0.5 * np.diagonal(track.covariance[known], axis1=1, axis2=2)
         floor = 0.5 * p.options.image_sigma_px**2
         own = half.mean(axis=0) * px[0] ** 2 + floor if place.variance is None else np.array(place.variance)
         own = own + wobble[0]
@@ -181,10 +293,15 @@ class LookMatcher:
         rays = [MatchedRay(ccd, place.line, place.sample, float(own[0] ** 0.5), float(own[1] ** 0.5))]
         for j, variance in zip(known, half, strict=True):
             v = np.sqrt(variance * px[1 + j] ** 2 + floor + wobble[1 + j])
-            line, sample = located[j]
-            ccd = p.views[p.others[j]].ccd
-            rays.append(MatchedRay(ccd, float(line), float(sample), float(v[0]), float(v[1])))
+            line, sample = track.located[j].tolist()
+            rays.append(MatchedRay(p.views[p.others[j]].ccd, line, sample, float(v[0]), float(v[1])))
         return tuple(rays)
+
+
+def _at(tracks: Sequence[Track]) -> tuple[Array, Array]:
+    """Lines and samples (k,) of places."""
+    line, sample = np.array([[track.place.line, track.place.sample] for track in tracks]).T
+    return line, sample
 
 
 def verdict(found: Found, options: MatchingOptions) -> NDArray[np.str_]:

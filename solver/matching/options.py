@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import check_ranges
+
 Array = NDArray[np.floating]
 
 
@@ -52,12 +54,7 @@ class MatchingOptions:
 
     def __post_init__(self) -> None:
         positive = "points_per_s", "window_rays", "largest_sigma_px", "least_reach_px", "budget_mb", "relief_sigma_m"
-        for name in positive:
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name}: wanted more than 0, got {getattr(self, name)}")
-        for name in ("window_points", "chips_mb"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name}: wanted 0 or more, got {getattr(self, name)}")
+        check_ranges(self, positive, ("window_points", "chips_mb"))
         if not self.least_reach_px <= self.largest_reach_px <= 80:
             raise ValueError(f"largest_reach_px: wanted {self.least_reach_px:g} to 80, got {self.largest_reach_px}")
         if not 0 <= self.least_score < 1:

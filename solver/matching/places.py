@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +16,8 @@ Array = NDArray[np.floating]
 
 #: Places are chosen so often, s, or in so many lines at least.
 CHUNK_S, LEAST_CHUNK = 0.25, 8
+#: Cells are gone through in this share of the time in which the next chunk comes.
+PROMPT = 0.8
 #: Bands across the image whose success is followed, over so many seconds.
 BANDS, MEMORY_S = 8, 10.0
 #: At most so many places are tried for one tie point that is wanted; the share that succeeds before anything is known.
@@ -33,18 +35,22 @@ class Density:
     Attributes
     ----------
     options : see `MatchingOptions`
+    stages : views in which a place is looked for, one after another
+    load : share of the places that are tried, as far as the machine keeps up
     """
 
     options: MatchingOptions
+    stages: int = 1
+    load: float = 1.0
 
     def __post_init__(self) -> None:
-        self._tried = np.zeros(BANDS)
-        self._tied = np.zeros(BANDS)
+        self._tried = np.zeros((self.stages, BANDS))
+        self._left = np.zeros((self.stages, BANDS))
         self._factor = 1.0
 
     def forget(self) -> None:
         """A new strip begins."""
-        self._tried[:] = self._tied[:] = 0.0
+        self._tried[:] = self._left[:] = 0.0
 
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds: few points are given company, too many rays get fewer."""
@@ -53,28 +59,40 @@ class Density:
         many = o.window_rays / max(rays, 1)
         self._factor = float(np.clip(min(max(few, 1.0), many), LEAST_FACTOR, MOST_FACTOR))
 
-    def judged(self, across: Array, tied: NDArray[np.bool_]) -> None:
-        """Places at -1 .. 1 across the image have become tie points, or not."""
+    def judged(self, across: Array, left: NDArray[np.bool_], stage: int = 0) -> None:
+        """Places at -1 .. 1 across the image were looked for in a view; some can still become tie points."""
         band = np.clip((across + 1) / 2 * BANDS, 0, BANDS - 1).astype(int)
-        self._tried += np.bincount(band, minlength=BANDS)
-        self._tied += np.bincount(band[tied], minlength=BANDS)
+        self._tried[stage] += np.bincount(band, minlength=BANDS)
+        self._left[stage] += np.bincount(band[left], minlength=BANDS)
 
     @property
     def share(self) -> Array:
-        """(BANDS,) share of the places that became tie points lately."""
+        """(BANDS,) share of the places that become tie points."""
         # as if a few had been tried before
-        return (self._tied + 3 * FIRST_YIELD) / (self._tried + 3)
+        first = FIRST_YIELD ** (1.0 / self.stages)
+        return ((self._left + 3 * first) / (self._tried + 3)).prod(axis=0)
 
     def cells(self, seconds: float) -> tuple[int, Array]:
         """How many places are tried in so many seconds, and the borders (n + 1,) of their cells, 0 .. 1 across."""
         fade = np.exp(-seconds / MEMORY_S)
         self._tried *= fade
-        self._tied *= fade
+        self._left *= fade
         tries = np.minimum(1.0 / self.share, MOST_TRIED)
-        number = self.options.points_per_s * self._factor * seconds * float(tries.mean())
-        n = max(round(number), 1)
+        number = self.options.points_per_s * self._factor * self.load * seconds * float(tries.mean())
+        n = max(round(number), 1 if self.load else 0)
         sums = np.concatenate([[0.0], np.cumsum(tries)]) / tries.sum()
         return n, np.interp(np.linspace(0, 1, n + 1), sums, np.linspace(0, 1, BANDS + 1))
+
+
+@dataclass
+class _Chunk:
+    """Lines from ``first`` on, and the cells (first and end sample) in which no place has been chosen yet."""
+
+    first: int
+    number: int
+    done: int
+    cells: list[tuple[int, int]] = field(default_factory=list)
+    found: int = 0
 
 
 class PlaceChooser:
@@ -84,12 +102,14 @@ class PlaceChooser:
     ----------
     options : see `MatchingOptions`
     window : side of the matching window, px
+    stages : views in which a place is looked for
     """
 
-    def __init__(self, options: MatchingOptions, window: int):
-        self.density = Density(options)
+    def __init__(self, options: MatchingOptions, window: int, stages: int):
+        self.density = Density(options, stages)
         self._options, self._window = options, window
         self._next = 0
+        self._chunk = _Chunk(0, 0, 0)
         self._found_share = 1.0
         self._poor = False
         self.tried = self.empty = 0
@@ -97,41 +117,67 @@ class PlaceChooser:
     def begin_strip(self) -> None:
         """Lines begin anew."""
         self._next = 0
+        self._chunk = _Chunk(0, 0, 0)
         self.density.forget()
 
-    def choose(self, ring: LineRing, rate_hz: float) -> list[Place]:
-        """Places in the lines that have come, as many as go into whole chunks."""
+    def choose(self, ring: LineRing, rate_hz: float, first_line: float = 0.0) -> list[Place]:
+        """Places in the lines that have come.
+
+        Lines are gone through in chunks, and the cells of a chunk while the lines of the next one come: so the work is
+        spread evenly.
+
+        Parameters
+        ----------
+        first_line : places before it are of no use
+        """
         rows = max(round(CHUNK_S * rate_hz), LEAST_CHUNK)
         half = self._window // 2 + 2
-        self._next = max(self._next, ring.start)
-        places = []
-        while self._next + rows + half <= ring.end:
-            found, cells = self._chunk(ring, self._next, rows, half, rows / rate_hz)
-            places += found
-            self.tried += len(found)
-            self.empty += cells - len(found)
-            # black or missing lines say nothing about the ground
-            if ring.read(self._next, self._next + rows, 0, 1).usable.mean() > 0.5:
-                keep = np.exp(-rows / rate_hz / POOR_S)
-                self._found_share = keep * self._found_share + (1 - keep) * len(found) / max(cells, 1)
+        self._next = max(self._next, ring.start, int(max(first_line, 0.0)))
+        places: list[Place] = []
+        while True:
+            chunk = self._chunk
+            if chunk.cells:
+                come = (ring.end - chunk.first - rows - half + 1) / (PROMPT * rows)
+                while chunk.cells and chunk.done < come * chunk.number:
+                    places += self._best(ring, chunk, rows, half)
+            if chunk.cells or self._next + rows + half > ring.end:
+                return places
+            if chunk.number:
+                # black or missing lines say nothing about the ground
+                seen = ring.read(chunk.first, chunk.first + rows, 0, 1).usable
+                self._count(chunk, rows / rate_hz, seen.mean() > 0.5 if len(seen) else False)
+            self._chunk = self._divide(ring, self._next, rows / rate_hz, rows)
             self._next += rows
-        return places
 
-    def _chunk(self, ring: LineRing, first: int, rows: int, half: int, seconds: float) -> tuple[list[Place], int]:
+    def _divide(self, ring: LineRing, first: int, seconds: float, rows: int) -> _Chunk:
         n, borders = self.density.cells(seconds)
+        if not n:
+            return _Chunk(first, 0, 0)
         if (first // rows) % 2:  # every other row of cells is shifted by half a cell
             borders = np.clip(borders + 0.5 / n, 0, 1)
             borders = np.unique(np.concatenate([[0.0], borders]))
-        found = []
         cells = _cells(borders, ring)
-        for left, right in cells:
-            stretch = ring.read(first - half, first + rows + half, max(left - half, 0), right + half)
-            best = interest_point(
-                stretch.pixels.astype(np.float32), stretch.usable, self._window, self._options.largest_sigma_px
-            )
-            if best is not None:
-                found.append(Place(float(stretch.first_line + best[0]), float(max(left - half, 0) + best[1])))
-        return found, len(cells)
+        return _Chunk(first, len(cells), 0, cells)
+
+    def _best(self, ring: LineRing, chunk: _Chunk, rows: int, half: int) -> list[Place]:
+        """The best place of the next cell, if there is a good one."""
+        left, right = chunk.cells.pop(0)
+        chunk.done += 1
+        stretch = ring.read(chunk.first - half, chunk.first + rows + half, max(left - half, 0), right + half)
+        largest = self._options.largest_sigma_px
+        best = interest_point(stretch.pixels.astype(np.float32), stretch.usable, self._window, largest)
+        if best is None:
+            return []
+        chunk.found += 1
+        return [Place(float(stretch.first_line + best[0]), float(max(left - half, 0) + best[1]))]
+
+    def _count(self, chunk: _Chunk, seconds: float, seen: bool) -> None:
+        self.tried += chunk.found
+        self.empty += chunk.number - chunk.found
+        if not seen:
+            return
+        keep = np.exp(-seconds / POOR_S)
+        self._found_share = keep * self._found_share + (1 - keep) * chunk.found / max(chunk.number, 1)
 
     def news(self) -> str:
         """One line where the ground becomes poor in texture, or has some again; else empty."""

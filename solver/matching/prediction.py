@@ -31,6 +31,10 @@ class Prediction:
     ----------
     views, master : the CCD lines, and which of them places are chosen in
     options : see `MatchingOptions`
+
+    Attributes
+    ----------
+    nadir_m : height of the ground below the platform, as `height_and_travel` last took it
     """
 
     def __init__(self, views: Sequence[View], master: int, options: MatchingOptions):
@@ -43,15 +47,17 @@ class Prediction:
         self.first_s = self.rate = 0.0
         self._axes: tuple[Array, Array] | None = None
         self._told = (-np.inf, (1.0, 1.0))
-        self._least = LEAST_REACH
-        self._widest = 0.0  # search of late
+        self.nadir_m = 0.0
+        # of each view: least reach, and the widest search of late
+        self._least, self._widest = np.full(len(views), LEAST_REACH), np.zeros(len(views))
 
     def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
         """Lines begin anew."""
         self.first_s, self.rate = first_line_time_s, line_rate_hz
         self.slow.forget()
         self.orientation.forget_corrections()
-        self._axes, self._least = None, LEAST_REACH
+        self._axes = None
+        self._least[:] = LEAST_REACH
         self._told = (-np.inf, (1.0, 1.0))
 
     @property
@@ -65,9 +71,16 @@ class Prediction:
         if t == self._told[0]:
             return self._told[1]
         position, _ = self.orientation.at([t - 1.0 / self.rate * 20, t])
-        height = float(position[1, 2]) - float(self.heights.at(position[1:, :2])[0][0])
+        self.nadir_m = float(self.heights.at(position[1:, :2])[0][0])
+        height = float(position[1, 2]) - self.nadir_m
         self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6))
         return self._told[1]
+
+    def lines_later(self, index: int, height_m: Array) -> Array:
+        """How many lines after the master a view sees ground at heights (k,), about; local frame, m."""
+        above, travel = self.height_and_travel()
+        forward = self.views[self.master].forward - self.views[index].forward
+        return forward * (above + self.nadir_m - height_m) / travel
 
     def scan(self, index: int, first: float, last: float) -> LineScan | None:
         """Lines of a view with their orientation, as far as there is one."""
@@ -94,29 +107,32 @@ class Prediction:
         """Three sigma of the prediction in px: orientation of both looks, height, and what the past has shown."""
         o = self.options
         by_height = float((sigma_height * np.abs(parallax).max(axis=1)).max())
-        if self.slow.known:
-            scale = self.slow.scale_px[self.others.index(index)]
-            by_orientation = float(np.max(np.where(np.isfinite(scale), scale, o.least_reach_px / 3)))
-            least = self._least
-        else:
-            by_orientation = self._orientation_reach(self.views[index], ground.spacing_m) / 3
-            least = o.least_reach_px
+        by_orientation = self.sigma_px(index, ground.spacing_m)
+        least = float(self._least[index]) if self.slow.known else o.least_reach_px
         reach = float(np.clip(3 * np.hypot(by_height, by_orientation), least, o.largest_reach_px))
-        self._widest = max(reach, 0.9 * self._widest)
+        self._widest[index] = max(reach, 0.9 * self._widest[index])
         return reach
 
-    def searched(self, beyond: float) -> None:
-        """A share of the last matches was found to lie beyond the search."""
-        wider = 2 * self._least if beyond > MOST_BEYOND else self._least / 1.4
-        self._least = float(np.clip(wider, LEAST_REACH, self.options.least_reach_px))
+    def sigma_px(self, index: int, pixel_m: float) -> float:
+        """How far a view lies from where it is expected with the right height, px."""
+        if not self.slow.known:
+            return self._orientation_reach(self.views[index], pixel_m) / 3
+        scale = self.slow.scale_px[self.others.index(index)]
+        return float(np.max(np.where(np.isfinite(scale), scale, self.options.least_reach_px / 3)))
 
-    def lines_around(self) -> float:
-        """Lines that a search may need around the predicted ones."""
+    def searched(self, index: int, beyond: float) -> None:
+        """A share of the last matches in a view was found to lie beyond the search."""
+        wider = 2 * self._least[index] if beyond > MOST_BEYOND else self._least[index] / 1.4
+        self._least[index] = np.clip(wider, LEAST_REACH, self.options.least_reach_px)
+
+    def lines_around(self, index: int) -> float:
+        """Lines that a search in a view may need around the predicted ones."""
         if self.slow.known:
-            return float((CORRELATION_HALF + REACH_PX + 2) * coarsest_factor(max(self._widest, self._least)))
+            factor = coarsest_factor(float(max(self._widest[index], self._least[index])))
+            return float((CORRELATION_HALF + REACH_PX + 2) * factor)
         _, travel = self.height_and_travel()
-        reach = max(self._orientation_reach(view, travel) for view in self.views)
-        base = max(abs(view.forward) for view in self.views) * 3 * self.options.relief_sigma_m / travel
+        reach = self._orientation_reach(self.views[index], travel)
+        base = abs(self.views[index].forward) * 3 * self.options.relief_sigma_m / travel
         most = self.options.largest_reach_px
         factor = coarsest_factor(float(np.clip(np.hypot(reach, base), self.options.least_reach_px, most)))
         return float((CORRELATION_HALF + REACH_PX + 2) * factor)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..camera import LineCamera
+from ..ranges import check_ranges
 from ..rotation import angles_from_matrix, matrix_from_angles
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
@@ -71,8 +72,7 @@ class TargetOptions:
             raise ValueError(f"scores {self.least_score}, {self.rival_score}: wanted 0 to 1")
         if not 0 < self.least_reach_px <= self.largest_reach_px:
             raise ValueError(f"largest_reach_px: wanted at least {self.least_reach_px:g}, got {self.largest_reach_px}")
-        if not min(self.image_sigma_px, self.largest_sigma_px, self.critical) > 0:
-            raise ValueError("image_sigma_px, largest_sigma_px and critical: wanted more than 0")
+        check_ranges(self, ("image_sigma_px", "largest_sigma_px", "critical"))
 
 
 @dataclass(frozen=True)

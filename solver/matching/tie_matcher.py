@@ -1,6 +1,6 @@
-"""Tie points as the lines come in: choose places in the master view, wait for the other looks, match, judge.
+"""Tie points as the lines come in: choose places in the master view, match each other look when it is in store, judge.
 
-The master is the CCD line that looks down most steeply. A place is matched when the last of its looks is in store.
+The master is the CCD line that looks down most steeply.
 """
 
 from __future__ import annotations
@@ -16,25 +16,20 @@ from .chips import CHIP_HALF, ChipStore
 from .consistency import Disagreement
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
-from .line_scan import LineScan, View, view_of
+from .line_scan import LineScan, view_of
 from .line_store import LineStore
-from .looks import Looked, LookMatcher
-from .options import MatchedRay, MatchedTie, MatchingOptions, Place
+from .looks import Looked, LookMatcher, Track
+from .options import MatchedRay, MatchedTie, MatchingOptions
 from .places import PlaceChooser
 from .prediction import PAD, Prediction
-from .search import COARSEST, CORRELATION_HALF, LEAST_SQUARES_HALF, MARGIN, REACH_PX, Image
+from .search import COARSEST, CORRELATION_HALF, LEAST_SQUARES_HALF, REACH_PX, Image
 from .seen_again import SeenAgain
+from .waiting import WaitingRoom
 
 Array = NDArray[np.floating]
 
-#: A place waits no longer than this for its other looks once they should be there.
-PATIENCE_S = 5.0
 #: Looks that are wanted from a line store, s, beyond the time between the first look and the last.
 STORE_MARGIN_S = 4.0
-#: Ground may be lower than thought: places are looked at more closely so long before they are due, s.
-SOON_S = 0.3
-#: Places that are matched together: at most so many; fewer than half wait until lines of so many seconds have come.
-BATCH, BATCH_S = 64, 0.08
 
 
 class TieMatcher:
@@ -63,14 +58,13 @@ class TieMatcher:
         self.prediction = Prediction(self.views, master, o)
         self.chips = ChipStore(int(o.chips_mb * 1e6))
         self._lines = LineIntake({v.ccd: v.pixels for v in self.views}, o, self._make_store)
-        self._chooser = PlaceChooser(o, 2 * LEAST_SQUARES_HALF + 1)
+        self._chooser = PlaceChooser(o, 2 * LEAST_SQUARES_HALF + 1, len(self.prediction.others))
         self._looks = LookMatcher(self.prediction, self._image, CHIP_HALF if o.chips_mb else 0)
+        self._waiting = WaitingRoom(self.prediction, self._looks)
         self._again = SeenAgain(self.prediction, self._image, self.chips)
         self._strip = ""
-        self._pending: list[Place] = []
         self._unjudged: list[Looked] = []
         self._next_number = 0
-        self._matched_to = -np.inf
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -99,8 +93,8 @@ class TieMatcher:
         if not (np.isfinite(line_rate_hz) and line_rate_hz > 0 and np.isfinite(first_line_time_s)):
             raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip = strip
-        self._pending, self._unjudged, self._next_number = [], [], 0
-        self._matched_to = -np.inf
+        self._unjudged, self._next_number = [], 0
+        self._waiting.clear()
         self._lines.begin_strip(line_rate_hz)
         self._chooser.begin_strip()
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
@@ -113,6 +107,20 @@ class TieMatcher:
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds, to give it more or less."""
         self._chooser.density.window_holds(points, rays)
+
+    def keep(self, share: float) -> None:
+        """So large a share of the places is tried from now on; of those that wait, fewer than before go on as well.
+
+        Raises
+        ------
+        ValueError : a share outside 0 to 1
+        """
+        if not 0 <= share <= 1:
+            raise ValueError(f"a share of the places of {share}, wanted 0 to 1")
+        density = self._chooser.density
+        if share < density.load:
+            self._waiting.thin(share / density.load)
+        density.load = share
 
     def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
         """Lines of one CCD; returns which of them (n,) are fit for use.
@@ -136,32 +144,39 @@ class TieMatcher:
         store = self._lines.store
         out: list[MatchedTie] = []
         # a CCD line that is dead is done without, as long as two see
-        self._looks.least_rays = min(self.options.least_rays, max(len(self._lines.seeing), 2))
+        seeing = self._lines.seeing
+        self._looks.least_rays = min(self.options.least_rays, max(len(seeing), 2))
         if store is not None and np.isfinite(self.orientation.end_s):
+            if seeing:
+                out += self._settle(self._waiting.give_up(seeing))
             ring = store.rings[self.views[self.prediction.master].ccd]
-            self._pending += self._chooser.choose(ring, self.prediction.rate)
-            self._pending += self._again.find(ring.start, ring.end)
+            self._waiting.add(self._chooser.choose(ring, self.prediction.rate, self._waiting.first_useful_line(store)))
+            self._waiting.add(self._again.find(ring.start, ring.end))
             news = self._chooser.news()
             if news:
                 self._lines.tell(news)
-            # a batch shares one search: what is far apart in time is matched apart
-            ready = sorted(self._ready(store), key=lambda place: place.line)
-            for begin in range(0, len(ready), BATCH):
-                out += self._batch(ready[begin : begin + BATCH])
+            for view, tracks in self._waiting.due(store):
+                out += self._look(tracks, view)
         self._collect_counters()
         return out
 
-    def _batch(self, places: list[Place]) -> list[MatchedTie]:
-        looked = self._looks.match(places)
-        tried = np.array([not place.name for place in places])
-        across = 2 * np.array([place.sample for place in places]) / self.views[self.prediction.master].pixels - 1
-        if looked is None:
-            self._chooser.density.judged(across[tried], np.zeros(int(tried.sum()), dtype=bool))
-            return []
-        made = {id(place) for place in looked.places}
-        tied = np.array([id(place) in made for place in places])
-        self._chooser.density.judged(across[tried], tied[tried])
-        return self._judge(looked)
+    def _look(self, tracks: list[Track], view: int) -> list[MatchedTie]:
+        """Look for places in a view; the ties among those that are through with all views."""
+        self._looks.look(tracks, view)
+        over, lost = self._waiting.settle(tracks)
+        gone = set(map(id, lost))
+        chosen = [track for track in tracks if not track.place.name]
+        across = 2 * np.array([t.place.sample for t in chosen]) / self.views[self.prediction.master].pixels - 1
+        stage = self._waiting.order.index(view)
+        self._chooser.density.judged(across, np.array([id(t) not in gone for t in chosen], dtype=bool), stage)
+        return self._settle((over, lost))
+
+    def _settle(self, settled: tuple[list[Track], list[Track]]) -> list[MatchedTie]:
+        """The ties among places that are through with all views; the lost ones are counted."""
+        over, lost = settled
+        self.counters["too few looks"] += len(lost)
+        looked = self._looks.finish(over) if over else None
+        return self._judge(looked) if looked is not None else []
 
     def _judge(self, looked: Looked) -> list[MatchedTie]:
         self._unjudged.append(looked)
@@ -174,7 +189,6 @@ class TieMatcher:
         # a view without a match is no contradiction, a point with a contradiction is dropped
         fine = (good | ~np.isfinite(d.residual).all(axis=2)).min(axis=1)
         self.counters["contradiction"] += int((~fine).sum())
-        p.slow.remember(d.select(fine))
         p.heights.add(np.concatenate([part.xyz_l for part in parts])[fine])
         distance = np.nanmax(np.hypot(*np.moveaxis(d.residual, 2, 0)), axis=1)
         ties, begin = [], 0
@@ -199,45 +213,6 @@ class TieMatcher:
             name or f"{self._strip}-M{self._next_number}", looked.rays[i], float(looked.score[i]), looked.xyz_l[i],
             prediction_px, bool(name),
         )  # fmt: skip
-
-    def _ready(self, store: LineStore) -> list[Place]:
-        """The places whose looks should all be in store; too old ones are given up."""
-        p = self.prediction
-        if not self._pending:
-            return []
-        seeing = [view for view in self.views if view.ccd in self._lines.seeing] or self.views
-        ends = [store.rings[view.ccd].end for view in seeing]
-        height, travel = p.height_and_travel()
-        master = self.views[p.master]
-        later = max(0.0, max(master.forward - view.forward for view in seeing) * height / travel)
-        reach = (MARGIN + LEAST_SQUARES_HALF) + PAD // 2 + p.lines_around()
-        until = min([*ends, p.known_lines])
-        soon = [place for place in self._pending if place.line + later + reach < until + SOON_S * p.rate]
-        due = self._last_looks(soon, travel, seeing) + reach if soon else np.empty(0)
-        ready = [place for place, line in zip(soon, due, strict=True) if line < until]
-        if len(ready) < BATCH // 2 and until < self._matched_to + BATCH_S * p.rate:
-            ready = []
-        elif ready:
-            self._matched_to = until
-        taken = set(map(id, ready))
-        waiting = [place for place in self._pending if id(place) not in taken]
-        # a CCD line that has fallen silent must not hold up everything for ever
-        oldest = max(ends) - later - reach - PATIENCE_S * p.rate
-        self._pending = [place for place in waiting if place.line >= oldest]
-        self.counters["looks never came"] += len(waiting) - len(self._pending)
-        return ready
-
-    def _last_looks(self, places: list[Place], travel: float, seeing: list[View]) -> Array:
-        """Lines in which places (k) are seen last by some views, at the heights that are guessed there."""
-        p = self.prediction
-        line, sample = np.array([[place.line, place.sample] for place in places]).T
-        scan = p.scan(p.master, line.min() - 1, line.max() + 1)
-        if scan is None:
-            return np.full(len(places), np.inf)
-        xy, _ = scan.to_plane(line, sample, np.full(len(line), p.heights.prior_m))
-        above = scan.position_l[:, 2].mean() - p.heights.at(xy[:, :2])[0]
-        forward = p.views[p.master].forward - min(view.forward for view in seeing)
-        return line + np.maximum(forward, 0.0) * above / travel
 
     # -- store and counters --------------------------------------------------------------------------------------------
 
@@ -296,7 +271,7 @@ class TieMatcher:
         self.counters["places"] += chooser.tried
         self.counters["cells without texture"] += chooser.empty
         chooser.tried = chooser.empty = 0
-        for part in (self._lines, self._looks, self._again):
+        for part in (self._lines, self._looks, self._again, self._waiting):
             self.counters.update(part.counters)
             part.counters.clear()
 
