@@ -43,6 +43,10 @@ IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0
+#: So long after its last look a point is in the window, s; later it is late.
+USUAL_DELAY_S = 2.0
+#: After control that moved the orientation by degrees, good rays would fail a test before the solution has converged.
+MOST_ITERATIONS = 5
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
 #: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
@@ -180,7 +184,7 @@ class Window:
         iterations = self._solve(fresh, joined, turn in (None, 1), result)
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
-        self._let_go(self._now_s - self._length_s if self._length_s else -np.inf, result)
+        self._let_go(self._limit_s(), result)
         look = turn == 2 if hurried else self._now_s > self._watched_s + WATCH_S
         result.report = self._report(iterations, fresh + joined, look, result)
         return result
@@ -204,6 +208,14 @@ class Window:
             self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
         return fresh
 
+    def _limit_s(self) -> float:
+        """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the
+        window waits for their partners, by its own length at most."""
+        if not self._length_s:
+            return -np.inf
+        late_s = self._now_s - self._newest_ray_s - USUAL_DELAY_S
+        return self._now_s - self._length_s - min(max(late_s, 0.0), self._length_s)
+
     def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
         self._leaver.let_go(self._now_s, limit_s, self._length_s, self._serial, result, at_the_end)
         result.refused += self._intake.take_refused()
@@ -212,9 +224,11 @@ class Window:
         """Gauss-Newton from the warm state, then tests; number of solutions computed."""
         iterations = 1
         self.state.solve()
-        for batch in fresh:
-            batch.back_substitute(self.state.values(batch.columns))
-        if self._follower.follow(fresh):
+        for _ in range(MOST_ITERATIONS):
+            for batch in fresh:
+                batch.back_substitute(self.state.values(batch.columns))
+            if not self._follower.follow(fresh):
+                break
             self.state.solve()
             iterations += 1
         if self.options.snoop:
