@@ -151,17 +151,16 @@ class McapWriter:
         times = struct.pack("<QQ", self._begin_ns, self._end_ns)
         name = _text(self._compression)
         head = times + struct.pack("<QI", len(content), zlib.crc32(content)) + name + struct.pack("<Q", len(data))
+        chunk = b"".join((struct.pack("<BQ", CHUNK, len(head) + len(data)), head, data))
         begin = self._stream.tell()
-        self._put(struct.pack("<BQ", CHUNK, len(head) + len(data)) + head)
-        self._put(data)
-        end = self._stream.tell()
+        end = begin + len(chunk)
         index, places = bytearray(), bytearray()
         for channel, entries in self._entries.items():
             places += struct.pack("<HQ", channel, end + len(index))
             packed = struct.pack(f"<{len(entries)}Q", *entries)
             index += _record(MESSAGE_INDEX, struct.pack("<HI", channel, len(packed)) + packed)
             self._counts[channel] = self._counts.get(channel, 0) + len(packed) // _ENTRY_BYTES
-        self._put(index)
+        self._put(chunk + index)  # at once: a full disk takes all of it or nothing
         lengths = struct.pack("<QQ", len(data), len(content))
         where = struct.pack("<QQI", begin, end - begin, len(places)) + places + struct.pack("<Q", len(index))
         self._chunk_indices.append(_record(CHUNK_INDEX, times + where + name + lengths))
