@@ -28,9 +28,9 @@ LOOKED_AFTER = 16
 MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
 #: Rays that get their smoothed orientation in one update, about, or half of those that wait; the others in the next.
 MOST_REPLACED = 600
-#: Batches of one time are joined up to so many rays when they get their smoothed orientation; fewer wait for others so
-#: long, s.
-JOINED_RAYS, GATHERED_S = 160, 1.0
+#: Batches of one time are joined up to so many rays when they get their smoothed orientation. None waits for others: of
+#: two batches of one time, one with filtered and one with smoothed orientation, good rays would fail their tests.
+JOINED_RAYS = 160
 
 
 class Follower:
@@ -69,8 +69,6 @@ class Follower:
         smoothed_s = self._trajectory.smoothed_to_s
         due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
         number = sum(len(b.rays) for b in due)
-        if number < JOINED_RAYS and all(b.newest_s > smoothed_s - GATHERED_S for b in due):
-            return []
         alone: list[Batch] = []
         groups: dict[int, list[list[Batch]]] = {}
         rays = 0
