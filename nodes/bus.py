@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import re
+import socket
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -77,6 +78,17 @@ def configuration(port: int | None = None, file: str | Path | None = None) -> ze
     return config
 
 
+def _is_held(port: int) -> bool:
+    """Whether a program listens on a port of loopback."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just given up is free
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
 class Bus:
     """A session on the bus of one platform.
 
@@ -97,6 +109,8 @@ class Bus:
         self.platform = platform
         self.source = source
         self.start = time.time_ns()
+        self._port = None if file is not None else port or default_port()
+        held = self._port is not None and _is_held(self._port)
         try:
             self._session = zenoh.open(configuration(port, file))
         except zenoh.ZError as error:
@@ -104,6 +118,7 @@ class Bus:
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
         self._sequences: dict[str, int] = {}
+        self._held = held  # by others, when this session was opened
 
     def __enter__(self) -> Bus:
         return self
@@ -246,6 +261,18 @@ class Bus:
         """How many sessions this one is linked with."""
         info = self._session.info
         return len(info.peers_zid()) + len(info.routers_zid())
+
+    def why_alone(self, patience_s: float = 3.0) -> str:
+        """Why this session meets nobody: a program that is none of ours holds the meeting port; "" if none does."""
+        until = time.monotonic() + patience_s
+        while self._held and not self.peers():
+            if time.monotonic() > until:
+                return (
+                    f"nobody can be met: port {self._port} is held by a program that does not answer on it; "
+                    "choose another with --port or TRILINE_PORT"
+                )
+            time.sleep(0.02)
+        return ""
 
     def close(self) -> None:
         """Withdraw everything and close the session; callbacks have ended when this returns."""

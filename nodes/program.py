@@ -47,7 +47,10 @@ class ProgramOptions:
 
     def open_bus(self) -> Bus:
         """The bus, with the node's name as source."""
-        return Bus(self.platform, source=self.name, port=self.port, file=self.bus_file)
+        bus = Bus(self.platform, source=self.name, port=self.port, file=self.bus_file)
+        if alone := bus.why_alone():
+            self.report(alone)
+        return bus
 
 
 #: Names the process that a node must not outlive.

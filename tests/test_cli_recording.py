@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -11,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sample_messages as sample
-from bus_rig import Rig, simulated_flight
+from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
 
 import triline
@@ -303,6 +304,21 @@ def test_replay_command(tmp_path, flight):
     assert got["sensor/lines/F"] == result["messages"]["sensor/lines/F"] and got["configuration/camera"] == 1
 
 
+def test_replay_says_that_nobody_hears_it(tmp_path, flight):
+    with Rig(tmp_path) as rig:
+        done = command("replay", flight, "--rate", 0, "--port", rig.port)
+        assert done.returncode == 0 and "no node lives on platform demo" in done.stderr
+        rig.start("node", "recorder", "-o", tmp_path / "x.mcap")
+        with Bus(port=rig.port) as bus:
+            wait_for(lambda: bus.alive(), 20, "the recorder")
+        done = command("replay", flight, "--rate", 0, "--port", rig.port)
+        assert done.returncode == 0 and "no node" not in done.stderr
+    with socket.create_server(("127.0.0.1", 0)) as foreign:
+        port = foreign.getsockname()[1]
+        done = command("replay", flight, "--rate", 0, "--port", port)
+        assert f"port {port} is held by a program that does not answer" in done.stderr
+
+
 # ---- node
 
 
@@ -323,6 +339,16 @@ def test_node_command_refuses_in_one_line(capsys, tmp_path):
         got, _, err = run(capsys, "node", *arguments)
         assert got == code and text in err, err
         assert code == 2 or len(err.splitlines()) == 1
+
+
+def test_an_unknown_option_is_told_with_the_usage_of_its_command(capsys):
+    code, _, err = run(capsys, "adjust", "block", "--selfcall", "tls18")
+    assert code == 2 and "usage: triline adjust" in err and "unrecognized arguments: --selfcall" in err
+
+
+def test_a_place_that_cannot_be_written_to_is_named_as_it_was_given(capsys):
+    code, _, err = run(capsys, "simulate", "-o", "/proc/x.mcap", "--seconds", 2, "-q")
+    assert code == 1 and err.startswith("triline simulate: /proc/x.mcap: cannot be written"), err
 
 
 # ---- access from Python

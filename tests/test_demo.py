@@ -115,6 +115,22 @@ def node_pid(name: str, port: int) -> int:
     raise AssertionError(f"no process of {name}")
 
 
+def test_the_flight_before_is_kept(tmp_path):
+    from triline.nodes.cli import _parse
+    from triline.nodes.cli.demo import Demo
+
+    demo = Demo(_parse(["demo", "-o", str(tmp_path), "--headless", "-q"]))
+    for content in ("first", "second"):
+        demo._clear()
+        (tmp_path / "flight.mcap").write_text(content)
+    (tmp_path / "flight-2.mcap").write_text("its rest")
+    demo._clear()
+    demo._clear()
+    kept = {path.name: path.read_text() for path in (tmp_path / "before").iterdir()}
+    assert kept == {"flight.mcap": "second", "flight-2.mcap": "its rest"}
+    assert not list(tmp_path.glob("flight*.mcap"))
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds processes in /proc")
 def test_nodes_killed_in_turn_are_started_again_and_the_flight_is_kept(tmp_path):
     from bus_rig import free_port

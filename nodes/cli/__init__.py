@@ -32,7 +32,19 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-def _parser(command: str | None) -> argparse.ArgumentParser:
+def _parse(argv: list[str]) -> argparse.Namespace:
+    """What was asked for; an option nobody knows is told with the usage of its command."""
+    command = next((word for word in argv if not word.startswith("-")), None)
+    parser, subparser = _parser(command if command in COMMANDS else None)
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        (subparser or parser).error(f"unrecognized arguments: {' '.join(unknown)}")
+    return args
+
+
+def _parser(command: str | None) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser | None]:
+    """The parser, and that of the command."""
+    chosen = None
     parser = argparse.ArgumentParser(
         prog="triline",
         description="On-line triangulation for line-scanner (pushbroom) cameras.",
@@ -49,7 +61,8 @@ def _parser(command: str | None) -> argparse.ArgumentParser:
             sub.epilog = f"example:\n  {module.EXAMPLE}"
             sub.set_defaults(run=module.run)
             _add_common(sub)
-    return parser
+            chosen = sub
+    return parser, chosen
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -77,8 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     argv = sys.argv[1:] if argv is None else argv
-    command = next((word for word in argv if not word.startswith("-")), None)
-    args = _parser(command if command in COMMANDS else None).parse_args(argv)
+    args = _parse(argv)
     try:
         return args.run(args)
     except UserError as error:

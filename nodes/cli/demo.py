@@ -95,10 +95,17 @@ class Demo:
     # ---- before the flight
 
     def _clear(self) -> None:
-        """Results of an earlier demo in the same folder go; nothing else in it is touched."""
+        """The flight before goes to ``before``, its logs and scene go; nothing else in the folder is touched."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        for old in [*self.folder.glob("flight*.mcap"), *self.folder.glob("log/*.log"), self.folder / "flight.rrd"]:
+        before, earlier = self.folder / "before", sorted(self.folder.glob("flight*.mcap"))
+        for old in [*(before.glob("flight*.mcap") if earlier else ()), *self.folder.glob("log/*.log"),
+                    self.folder / "flight.rrd"]:  # fmt: skip
             old.unlink(missing_ok=True)
+        for recording in earlier:
+            before.mkdir(exist_ok=True)
+            recording.replace(before / recording.name)
+        if earlier:
+            self._say(f"the flight before is kept in {before}")
 
     def _viewer_mode(self) -> str:
         if self.args.web:

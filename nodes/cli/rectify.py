@@ -196,7 +196,7 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> 
         return
     lines = sum(done.strips.values())
     print(
-        f"{args.output}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} in {result['crs']}, "
+        f"{args.output}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} m in {result['crs']}, "
         f"{lines} lines of {result['ccd']}, {result['orientation']} orientation, {result['ground']}, "
         f"{result['seconds']:.1f} s"
     )

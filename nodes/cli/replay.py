@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import threading
+import time
 from pathlib import Path
 
 from ..bus import Bus
@@ -40,9 +41,12 @@ def run(args: argparse.Namespace) -> int:
     if args.loop:
         report("looping: later rounds have shifted stamps and times, and new names of strips and points (S1~2)")
     with Bus(args.platform, source="player", port=args.port, file=args.bus) as bus:
+        nobody = bus.why_alone() or _nobody(bus)
         bus.announce("player")
         bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
         report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
+        if nobody:
+            report(nobody)
         with progress("playing", args.quiet or args.json) as told:
             result = play(
                 reader,
@@ -71,6 +75,16 @@ def run(args: argparse.Namespace) -> int:
         + f"; at most {1e3 * result.worst_late_s:.1f} ms late, {1e3 * result.mean_late_s:.2f} ms on average"
     )
     return 0
+
+
+def _nobody(bus: Bus, patience_s: float = 0.5) -> str:
+    """That no node is there, or ""; a node that has just been started is waited for a little."""
+    until = time.monotonic() + patience_s
+    while not bus.alive():
+        if time.monotonic() > until:
+            return f"no node lives on platform {bus.platform} yet; who comes later misses what was played before"
+        time.sleep(0.05)
+    return ""
 
 
 def _rate(text: str) -> float:

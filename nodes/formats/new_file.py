@@ -36,7 +36,7 @@ def new_file(target: Path) -> Iterator[Path]:
 
     Raises
     ------
-    UserError : the folder of ``target`` is not there, or ``target`` is not a file
+    UserError : the folder of ``target`` is not there or not to be written to, or ``target`` is not a file
     """
     refuse_unless_file(target)
     if not target.parent.is_dir():
@@ -45,5 +45,9 @@ def new_file(target: Path) -> Iterator[Path]:
     try:
         yield part
         os.replace(part, target)
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != part:
+            raise
+        raise UserError(f"{target}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     finally:
         part.unlink(missing_ok=True)
