@@ -63,6 +63,7 @@ class WindowState:
         self.square = 0.0
         self.redundancy = 0
         self._factor: DenseFactor | None = None
+        self._cofactors: Array | None = None
         self._asked = 0
         self.solution = 0
 
@@ -96,7 +97,7 @@ class WindowState:
         self._fixed, self._live = (np.pad(a, ((0, m), (0, m))) for a in (self._fixed, self._live))
         self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m)) for a in (self._fixed_rhs, self._live_rhs))
         self.redundancy -= m
-        self._factor = None
+        self._factor = self._cofactors = None
 
     def observe(self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array) -> None:
         """Add a-priori observations (m, t) of present unknowns; column -1 is none, infinite sigma no weight."""
@@ -110,7 +111,7 @@ class WindowState:
         self._fixed_rhs += rows.T @ rhs
         self.square += float(rhs @ rhs)
         self.redundancy += len(rows)
-        self._factor = None
+        self._factor = self._cofactors = None
 
     def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
         """Add a batch's information to the live part, or take it back (``sign = -1``)."""
@@ -119,7 +120,7 @@ class WindowState:
         self._live_rhs[place] += sign * information.rhs
         self.square += sign * information.square
         self.redundancy += sign * information.rows
-        self._factor = None
+        self._factor = self._cofactors = None
 
     def exchange(self, columns: IntArray, old: Information, new: Information) -> None:
         """Put a batch's new information in the live part in place of what it said before."""
@@ -128,7 +129,7 @@ class WindowState:
         self._live_rhs[place] += new.rhs - old.rhs
         self.square += new.square - old.square
         self.redundancy += new.rows - old.rows
-        self._factor = None
+        self._factor = self._cofactors = None
 
     def fix(self, columns: IntArray, information: Information) -> None:
         """Move a batch's information from the live to the fixed part."""
@@ -170,12 +171,19 @@ class WindowState:
 
     def covariance(self, numbers: IntArray) -> Array:
         """Cofactors (m, m) of present unknowns."""
-        place, factor = self.places(numbers), self.factor
-        # the whole inverse costs as much as the columns of a third of it
-        self._asked += len(place)
-        if 3 * self._asked > len(self):
-            return factor.cofactors(place)
-        return factor.few_cofactors(place)
+        place = self.places(numbers)
+        if self._cofactors is None:
+            factor = self.factor
+            # the whole inverse costs as much as the columns of a third of it
+            self._asked += len(place)
+            if 3 * self._asked <= len(self):
+                return factor.few_cofactors(place)
+            self._cofactors = factor.inverse()
+        return self._cofactors[np.ix_(place, place)]
+
+    def propagated(self, functions: Array) -> Array:
+        """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
+        return self.factor.solve(functions) if self._cofactors is None else self._cofactors @ functions
 
     def marginalise(self, numbers: IntArray) -> Marginal:
         """Take unknowns out; batches that touch them must have been fixed before.
@@ -204,7 +212,8 @@ class WindowState:
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))
-        self._factor = None
+        # of what stays, the cofactors are what they were
+        self._factor, self._cofactors = None, None if self._cofactors is None else self._cofactors[inside]
         return marginal
 
 
