@@ -146,16 +146,16 @@ class Wander(CorrectionModel):
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
-        out = np.empty((len(t), 6))
-        for components in self._alike():
-            begin, end, inside = self._inside(t, components[0])
-            lengths = end - begin
-            variance, _ = self._between(inside, self._time_s[end], lengths)
-            before, after = (self._sigma[place][:, components] for place in (begin, end))
-            part = inside / (self.step_s * lengths)
-            size = np.where(self._another[end][:, None], before**2 + after**2, (after - before) ** 2)
-            jump = np.clip(part * (1.0 - part), 0.0, 0.25)[:, None] * size  # it can be anywhere between
-            out[:, components] = variance[:, None] * np.maximum(before, after) ** 2 + jump
+        out, alike = np.empty((len(t), 6)), self._alike()
+        places = [self._inside(t, components[0]) for components in alike]
+        begin, end, inside = (np.stack(each, axis=1) for each in zip(*places, strict=True))
+        variance, _ = self._between(inside, self._time_s[end], end - begin)
+        part = inside / (self.step_s * (end - begin))
+        jump = np.clip(part * (1.0 - part), 0.0, 0.25)  # where a wander becomes another can be anywhere between
+        for g, components in enumerate(alike):
+            before, after = (self._sigma[place[:, g, None], components] for place in (begin, end))
+            size = np.where(self._another[end[:, g]][:, None], before**2 + after**2, (after - before) ** 2)
+            out[:, components] = variance[:, g, None] * np.maximum(before, after) ** 2 + jump[:, g, None] * size
         return out
 
     def restate(self, from_s: float, sigma: ArrayLike, time_s: float, another: bool = False) -> float:
@@ -227,14 +227,24 @@ class Wander(CorrectionModel):
         correlated_s = np.broadcast_to(time_s, after.shape)
         for each in set(correlated_s.ravel().tolist()):
             mine = correlated_s == each
-            # the process over the segment, from its beginning, and to its end
-            whole_s = self.step_s * length[mine]
-            F, Q, _ = second_order_gauss_markov(1.0, each, np.stack([whole_s, after[mine], whole_s - after[mine]]))
-            back = Q[1, :, :1] @ np.swapaxes(F[2], 1, 2)
-            right = back @ np.linalg.inv(Q[0])
-            left = F[1, :, :1] - right @ F[0]
-            variance[mine] = np.maximum(Q[1, :, 0, 0] - np.einsum("nk,nk->n", right[:, 0], back[:, 0]), 0.0)
-            coefficients[mine] = np.concatenate([left[:, 0], right[:, 0]], axis=1)
+            # the process over a segment as a whole, from its beginning, and to its end; the value, without the slope
+            lengths, of_length = np.unique(length[mine], return_inverse=True)
+            whole_s = self.step_s * lengths
+            F, Q, _ = second_order_gauss_markov(1.0, each, whole_s)
+            (F00, F01), (F10, F11) = np.moveaxis(F[of_length], 0, -1)
+            (W00, W01), (_, W11) = np.moveaxis(np.linalg.inv(Q)[of_length], 0, -1)
+            parts = np.stack([after[mine], whole_s[of_length] - after[mine]])
+            F, Q, _ = second_order_gauss_markov(1.0, each, parts)
+            from_value, from_slope = F[0, :, 0].T
+            to, q, cross = F[1], Q[0, :, 0, 0], Q[0, :, 0, 1]
+            back_value = q * to[:, 0, 0] + cross * to[:, 0, 1]
+            back_slope = q * to[:, 1, 0] + cross * to[:, 1, 1]
+            right_value = back_value * W00 + back_slope * W01
+            right_slope = back_value * W01 + back_slope * W11
+            left_value = from_value - right_value * F00 - right_slope * F10
+            left_slope = from_slope - right_value * F01 - right_slope * F11
+            variance[mine] = np.maximum(q - right_value * back_value - right_slope * back_slope, 0.0)
+            coefficients[mine] = np.stack([left_value, left_slope, right_value, right_slope], axis=1)
         return variance, coefficients
 
     def pseudo_observations(self) -> PseudoObservations:

@@ -136,6 +136,10 @@ class WindowStrip:
     def time_of(self, line: ArrayLike) -> Array:
         return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz
 
+    def time_of_line(self, line: float) -> float:
+        """`time_of` of one line."""
+        return self.first_line_time_s + line / self.line_rate_hz
+
     def contains(self, line: float) -> bool:
         return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
 
