@@ -80,6 +80,7 @@ class Arrivals:
             for name in batch.names:
                 self._intake.place(name, batch)
         if self._snoop:
+            self._state.expect(sum(len(batch.columns) for batch in fresh))
             for batch in fresh:
                 result.refused += admit(batch, self._state, self._intake.points)
                 self.apart(admit_ties(batch, self._state), result)

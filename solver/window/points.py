@@ -130,7 +130,9 @@ class BatchMaker:
             covariance[mine] += extra[:, :, None] * np.eye(6)
         return measured, covariance
 
-    def make(self, names: list[str], points: list[PointLooks], known: dict[str, Array]) -> tuple[Batch | None, list[str]]:
+    def make(
+        self, names: list[str], points: list[PointLooks], known: dict[str, Array]
+    ) -> tuple[Batch | None, list[str]]:
         """A batch of points, linearised where they are now, and the points that cannot be placed yet.
 
         Parameters

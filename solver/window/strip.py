@@ -179,11 +179,10 @@ class WindowStrip:
         new = np.flatnonzero(~self._entered & (self._first_use <= to_s))
         if not len(new):
             return False
-        state.enter(self.numbers[new])
         self._entered[new] = True
         rows = np.flatnonzero(~self._row_done & (self._need <= to_s))
         self._row_done[rows] = True
-        state.observe(*self._rows(rows))
+        state.extend(self.numbers[new], *self._rows(rows))
         return True
 
     def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:
