@@ -257,18 +257,22 @@ class WindowState:
         R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
         d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
         marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
-        inside = np.ix_(stay, stay)
-        self._fixed = self._fixed[inside] - R12.T @ R12
+        self._fixed = _block(self._fixed, stay) - R12.T @ R12
         self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
-        self._live, self._live_rhs = self._live[inside], self._live_rhs[stay]
+        self._live, self._live_rhs = _block(self._live, stay), self._live_rhs[stay]
         self.square -= float(d @ d)
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))
         # of what stays, the cofactors are what they were
         self._factor, self._asked = None, 0
-        self._cofactors = None if self._cofactors is None else self._cofactors[inside]
+        self._cofactors = None if self._cofactors is None else _block(self._cofactors, stay)
         return marginal
+
+
+def _block(matrix: Array, places: IntArray) -> Array:
+    """Rows and columns of a large symmetric matrix; one after the other is several times faster than both at once."""
+    return matrix.take(places, axis=0).take(places, axis=1)
 
 
 def _hold(matrix: Array, places: IntArray) -> None:
