@@ -25,7 +25,7 @@ DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
 PACES = ("load", "normal", "throughput")
 #: Platform time between updates at the pace for throughput, s.
-THROUGHPUT_S = 2.0
+THROUGHPUT_S = 5.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -49,7 +49,7 @@ class Adjuster(Node):
     update_rays : waiting image points after which an update does not wait for its time
     pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
         the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
-        of long flights: an update every 2 s with what came till then, from smoothed poses alone where there are any,
+        of long flights: an update every 5 s with what came till then, from smoothed poses alone where there are any,
         and the live orientation with the update
     self_calibration : set of additional parameters, or "none"
     camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of

@@ -12,6 +12,8 @@ START, END = 100.0, 160.0
 SLOW = SlowErrors(wander_m=(1.0, 1.0, 1.5), wander=(1e-4, 1e-4, 2e-4), wander_time_s=30.0)
 SIGMA = np.array([1.0, 1.0, 1.5, 1e-4, 1e-4, 2e-4])
 
+Z = 2
+
 
 def model():
     return WanderOptions(SLOW).build(Extent("strip S1", START, END))
@@ -26,10 +28,10 @@ def covariance(wander, times, component):
     scale = 1.0 / np.linalg.norm(A, axis=0)
     N = (A * scale).T @ (A * scale)
     design = wander.design(times)
-    D = np.zeros((len(times), wander.n_unknowns))
+    D = np.zeros((len(times), wander.n_unknowns + 1))  # the last one takes what the component does not have
     for i in range(len(times)):
         np.add.at(D[i], design.columns[i, :, component][2:], design.coefficients[i][2:])
-    D = D * scale
+    D = D[:, :-1] * scale
     return D @ np.linalg.solve(N, D.T)
 
 
@@ -87,7 +89,9 @@ def sparing():
 def test_longer_segments_say_the_same_of_the_process():
     """Interpolation and what it leaves out together have the covariance of the process, between borders, too."""
     wander, fine = sparing(), model()
-    assert len(wander.used) <= len(fine.used) // 2 + 1 and wander.step_s == fine.step_s
+    for used, all_of_them in zip(wander.used, fine.used, strict=True):
+        assert len(used) <= len(all_of_them) // 2 + 1
+    assert wander.step_s == fine.step_s
     times = np.linspace(START, END, 41)
     for component in (2, 5):
         C = covariance(Used(wander), times, component)
@@ -102,23 +106,52 @@ def test_longer_segments_say_the_same_of_the_process():
 def test_segments_become_short_where_the_wander_grows_and_long_where_it_is_small_again():
     wander = sparing()
     p = wander.pseudo_observations()
-    before, used_s = wander.used.copy(), 112.3
+    before, used_s = wander.used[Z], 112.3
     columns = wander.design([used_s]).columns
     up = wander.restate(used_s, 40.0 * SIGMA, 30.0)
     down = wander.restate(135.0, SIGMA, 30.0)
     assert wander.design([used_s]).columns.tolist() == columns.tolist()
-    lengths = np.diff(wander.borders[wander.used])
-    starts = wander.borders[wander.used[:-1]]
+    lengths = np.diff(wander.borders[wander.used[Z]])
+    starts = wander.borders[wander.used[Z][:-1]]
     longest = np.diff(wander.borders[before]).max()
     assert lengths[(starts >= up) & (starts < 135.0)] == pytest.approx(wander.step_s)
     assert lengths[starts >= down][:-1] == pytest.approx(longest)
     assert lengths[starts < used_s - longest] == pytest.approx(longest)
     # what leads to borders that are not in use has no weight, all others do
     touched = set(p.columns[np.isfinite(p.sigma)].ravel().tolist())
-    assert {9 + 12 * k for k in wander.used.tolist()} <= touched
-    assert not {9 + 12 * k for k in set(range(len(wander.borders))) - set(wander.used.tolist())} & touched
+    assert {9 + 12 * k + Z for k in wander.used[Z].tolist()} <= touched
+    assert not {9 + 12 * k + Z for k in set(range(len(wander.borders))) - set(wander.used[Z].tolist())} & touched
     C = covariance(Used(wander), np.array([100.0, 0.5 * (up + down), 150.0]), 0)
     assert np.sqrt(np.diagonal(C)) == pytest.approx(SIGMA[0] * np.array([1.0, 40.0, 1.0]), rel=0.01)
+
+
+def test_each_component_has_segments_as_long_as_its_own_wander_allows():
+    """A heading that is hardly known wants short ones; for all others the longest may do, and it is the same process.
+
+    Where another wander begins in the middle of the strip, it does for all components at one border.
+    """
+    sigma = SIGMA * [1.0, 1.0, 1.0, 1.0, 1.0, 100.0]
+    slow = SlowErrors(wander_m=(1.0, 1.0, 1.5), wander=(1e-4, 1e-4, 2e-2), wander_time_s=30.0)
+    wander = WanderOptions(slow, left_out_m=0.1, left_out=1e-5).build(Extent("strip S1", START, END))
+    length = [np.diff(used)[0] for used in wander.used]
+    assert length[5] == 1 and min(length[:5]) >= 2 and length[0] > length[2]
+    times = np.linspace(START, END, 41)
+    for component in range(6):
+        expected = sigma[component] ** 2 * autocorrelation(30.0, times[:, None] - times)
+        assert pytest.approx(expected, abs=0.01 * sigma[component] ** 2) == covariance(Used(wander), times, component)
+    columns, used_s = wander.design([112.3]).columns, 112.3
+    border = wander.restate(used_s, SIGMA, 30.0)
+    assert used_s < border <= used_s + 2.0 * max(length) * wander.step_s
+    first = int(np.searchsorted(wander.borders, border - 1e-9))
+    assert all(first in used for used in wander.used)
+    assert np.diff(wander.used[5])[-2] == np.diff(sparing().used[5])[0] > 1
+    unchanged = wander.design([used_s])
+    for component in range(6):
+        both = [set(c[0, :, component].tolist()) for c in (columns, unchanged.columns)]
+        assert both[0] == both[1]
+        C = covariance(Used(wander), np.array([100.0, border, 150.0]), component)
+        expected = [sigma[component], SIGMA[component], SIGMA[component]]
+        assert np.sqrt(np.diagonal(C)) == pytest.approx(expected, rel=0.01)
 
 
 class Used:
@@ -127,8 +160,9 @@ class Used:
     def __init__(self, wander):
         self.n_unknowns, self.design = wander.n_unknowns, wander.design
         p = wander.pseudo_observations()
-        idle = 9 + 12 * np.setdiff1d(np.arange(len(wander.borders)), wander.used)[:, None] + np.arange(12)
-        self._observations = join_observations([p, direct_at(idle.ravel())])
+        every = np.arange(len(wander.borders))
+        idle = [9 + 12 * np.setdiff1d(every, used) + c for c, used in enumerate(wander.used)]
+        self._observations = join_observations([p, *(direct_at(i + slope) for i in idle for slope in (0, 6))])
 
     def pseudo_observations(self):
         return self._observations

@@ -25,6 +25,60 @@ def problem(seed=0, n=12):
     return rng, state, numbers, np.diag(1 / sigma)
 
 
+def anew(state):
+    """Solve although nothing has changed."""
+    nothing = Information(np.zeros((1, 1)), np.zeros(1), 0.0, 0)
+    state.add(state.numbers[:1], nothing)
+    solution = state.solution
+    state.solve()
+    assert state.solution == solution + 1
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["values", "values and cofactors"])
+def test_unknowns_that_leave_and_come_change_nothing_that_would_have_to_be_solved(known):
+    """A chain goes on at its end, and its begin leaves; the others keep values and cofactors without a solution."""
+    rng, state, numbers, _ = problem()
+    information = random_information(rng, 8, 12)[0]
+    state.add(numbers[:8], information)
+    state.solve()
+    if known:
+        state.covariance(numbers)
+    state.fix(numbers[:8], information)
+    state.marginalise(numbers[:3])
+    fresh = state.new_numbers(4)
+    # each new one hangs on one before it, the first two on old ones
+    columns = np.array([[numbers[5], fresh[2]], [numbers[11], fresh[0]], [fresh[0], fresh[1]], [fresh[2], fresh[3]]])
+    solution = state.solution
+    state.extend(fresh, columns.astype(np.int32), rng.uniform(0.5, 1.5, (4, 2)), rng.normal(size=4), np.full(4, 0.3))
+    state.solve()
+    assert state.solution == solution
+    values, cost = state.values(state.numbers), state.cost()
+    covariance = state.covariance(state.numbers)
+    propagated = state.propagated(np.eye(len(state)))
+    anew(state)
+    assert len(state) == 13 and state.values(state.numbers) == pytest.approx(values, abs=1e-10)
+    assert state.cost() == pytest.approx(cost)
+    assert state.covariance(state.numbers) == pytest.approx(covariance, abs=1e-10)
+    assert propagated == pytest.approx(covariance, abs=1e-10)
+
+
+def test_unknowns_of_which_more_is_known_are_solved_for():
+    rng, state, numbers, A = problem()
+    information, B, z = random_information(rng, 12, 15)
+    state.add(numbers, information)
+    state.solve()
+    fresh = state.new_numbers(2)
+    columns = np.array([[numbers[5], fresh[0]], [numbers[11], fresh[1]], [fresh[0], fresh[1]]])
+    coefficients, value = rng.normal(size=(3, 2)), rng.normal(size=3)
+    state.extend(fresh, columns.astype(np.int32), coefficients, value, np.ones(3))
+    state.solve()
+    rows = np.zeros((3, 14))
+    np.put_along_axis(rows, columns, coefficients, axis=1)
+    full = np.vstack([np.pad(A, ((0, 0), (0, 2))), np.pad(B, ((0, 0), (0, 2))), rows])
+    x = np.linalg.lstsq(full, np.concatenate([np.zeros(len(A)), z, value]))[0]
+    assert state.theta == pytest.approx(x)
+
+
 def test_solution_cost_and_redundancy_are_those_of_least_squares():
     rng, state, numbers, A = problem()
     y = np.zeros(len(A))
@@ -66,7 +120,7 @@ def test_marginalisation_changes_neither_estimates_nor_cost_of_what_stays():
     theta, cov, cost = state.theta.copy(), state.covariance(numbers), state.cost()
     state.fix(numbers[:7], old)
     marginal = state.marginalise(numbers[:6])
-    state.solve()
+    anew(state)
     assert (state.numbers == numbers[6:]).all()
     assert state.theta == pytest.approx(theta[6:])
     assert state.covariance(numbers[6:]) == pytest.approx(cov[6:, 6:])

@@ -58,8 +58,8 @@ class WanderOptions(ModelOptions):
     ----------
     slow : a-priori sigmas of offset, shift, drift and wander
     segment_s : longest time between borders; 0 = `SEGMENT_SHARE` of the correlation time
-    left_out_m, left_out : segments may be longer, whole numbers of these, where interpolation then leaves out no more
-        than so much of the wander, m and rad
+    left_out_m, left_out : segments of a component may be longer, whole numbers of these, where interpolation then
+        leaves out no more than so much of its wander, m and rad
     """
 
     name: ClassVar[str] = "wander"
@@ -96,7 +96,8 @@ class Wander(CorrectionModel):
     Attributes
     ----------
     borders : (segments + 1,) times, seconds; equally far apart, the last one at the end of the extent or beyond
-    used : places of the borders in use, the first and the last one among them; the unknowns of others appear nowhere
+    used : (6) of each component, places of the borders in use, the first and the last one among them; the unknowns of
+        others appear nowhere
     """
 
     def __init__(self, extent: Extent, options: WanderOptions):
@@ -124,35 +125,38 @@ class Wander(CorrectionModel):
 
     def design(self, time_s: ArrayLike) -> Design:
         t = np.asarray(time_s, dtype=float)
-        begin, end, after = self._inside(t)
-        part = np.empty((len(t), 4))
-        for length in _different(end - begin):
-            mine = end - begin == length
-            part[mine] = self._between(after[mine], self.options.slow.wander_time_s, int(length))[1]
+        alike = self._alike()
         share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
-        columns = np.empty((len(t), 6, 6), dtype=np.int32)
+        columns = np.full((len(t), 2 + 4 * len(alike), 6), -1, dtype=np.int32)
         columns[:, 0] = np.arange(6)
         columns[:, 1] = [-1, -1, -1, 6, 7, 8]
-        columns[:, 2:4] = (GLOBALS + 12 * begin)[:, None, None] + np.arange(12).reshape(2, 6)
-        columns[:, 4:] = (GLOBALS + 12 * end)[:, None, None] + np.arange(12).reshape(2, 6)
-        return Design(columns, np.column_stack([np.ones_like(t), share, part]))
+        coefficients = np.empty(columns.shape[:2])
+        coefficients[:, 0], coefficients[:, 1] = 1.0, share
+        value_and_slope = GLOBALS + 6 * np.arange(2)[:, None]
+        places = [self._inside(t, components[0]) for components in alike]
+        begin, end, after = (np.stack(each, axis=1) for each in zip(*places, strict=True))
+        _, part = self._between(after, self.options.slow.wander_time_s, end - begin)
+        coefficients[:, 2:] = part.reshape(len(t), -1)
+        for g, components in enumerate(alike):
+            first, own = 2 + 4 * g, value_and_slope + components
+            columns[:, first : first + 2, components] = 12 * begin[:, g, None, None] + own
+            columns[:, first + 2 : first + 4, components] = 12 * end[:, g, None, None] + own
+        return Design(columns, coefficients)
 
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
-        begin, end, inside = self._inside(t)
-        variance = np.empty(len(t))
-        correlated_s, lengths = self._time_s[end], end - begin
-        for each in set(correlated_s.tolist()):
-            for length in _different(lengths):
-                mine = (correlated_s == each) & (lengths == length)
-                if mine.any():
-                    variance[mine] = self._between(inside[mine], each, int(length))[0]
-        before, after = self._sigma[begin], self._sigma[end]
-        part = (t - self.borders[begin]) / (self.step_s * lengths)
-        size = np.where(self._another[end][:, None], before**2 + after**2, (after - before) ** 2)
-        jump = np.clip(part * (1.0 - part), 0.0, 0.25)[:, None] * size  # it can be anywhere between
-        return variance[:, None] * np.maximum(before, after) ** 2 + jump
+        out, alike = np.empty((len(t), 6)), self._alike()
+        places = [self._inside(t, components[0]) for components in alike]
+        begin, end, inside = (np.stack(each, axis=1) for each in zip(*places, strict=True))
+        variance, _ = self._between(inside, self._time_s[end], end - begin)
+        part = inside / (self.step_s * (end - begin))
+        jump = np.clip(part * (1.0 - part), 0.0, 0.25)  # where a wander becomes another can be anywhere between
+        for g, components in enumerate(alike):
+            before, after = (self._sigma[place[:, g, None], components] for place in (begin, end))
+            size = np.where(self._another[end[:, g]][:, None], before**2 + after**2, (after - before) ** 2)
+            out[:, components] = variance[:, g, None] * np.maximum(before, after) ** 2 + jump[:, g, None] * size
+        return out
 
     def restate(self, from_s: float, sigma: ArrayLike, time_s: float, another: bool = False) -> float:
         """Another wander from a border on, the second one after a time, so that the segment there and its borders stay.
@@ -171,15 +175,19 @@ class Wander(CorrectionModel):
         -------
         border_s : from here on it holds; infinite if the strip ends before
         """
-        place = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1))
-        stays = int(np.searchsorted(self.used, place, side="right"))  # of those in use, the last that stays as it is
-        if stays >= len(self.used) - 1:
-            return np.inf
+        place, last = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1)), len(self.borders) - 1
         sigma = np.maximum(np.asarray(sigma, dtype=float), NOTHING)
-        kept = self.used[: stays + 1] if place >= -1 else self.used[:0]
-        after = self._spaced(int(kept[-1]) if len(kept) else 0, sigma, time_s)
-        self.used = np.concatenate([kept, after[1:] if len(kept) else after])
-        first = int(self.used[len(kept)])
+        if place < -1:
+            first, self.used = 0, self._spaced(0, sigma, time_s)
+        else:
+            # of all components the last border that stays as it is; all have it, and the next one
+            stays = max(int(used[min(np.searchsorted(used, place, side="right"), len(used) - 1)]) for used in self.used)
+            if stays == last:
+                return np.inf
+            first = min(int(used[1]) for used in self._spaced(stays, sigma, time_s))
+            after = self._spaced(first, sigma, time_s) if first < last else [np.array([last])] * 6
+            kept = [np.append(used[used < stays], stays) for used in self.used]
+            self.used = [np.concatenate(both) for both in zip(kept, after, strict=True)]
         self._sigma[first:] = sigma
         self._time_s[first:] = time_s
         self._another[first] = another
@@ -189,34 +197,55 @@ class Wander(CorrectionModel):
         self._observations.sigma[...] = changed.sigma
         return float(self.borders[first])
 
-    def _spaced(self, first: int, sigma: Array, time_s: float) -> IntArray:
-        """Borders in use from one to the last, as far apart as a wander (6,) allows."""
+    def _spaced(self, first: int, sigma: Array, time_s: float) -> list[IntArray]:
+        """Borders in use of each component from one to the last, as far apart as a wander (6,) allows."""
         o, last = self.options, len(self.borders) - 1
-        length = 1
-        for longer in LENGTHS if o.left_out_m > 0.0 or o.left_out > 0.0 else ():
-            out = np.sqrt(self._between(np.array([0.5 * longer * self.step_s]), time_s, longer)[0][0])
-            if out * sigma[:3].max() <= o.left_out_m and out * sigma[3:].max() <= o.left_out:
-                length = longer
-        return np.append(np.arange(first, last, length), last)
+        allowed = np.repeat([o.left_out_m, o.left_out], 3)
+        lengths = np.ones(6, dtype=np.int64)
+        for longer in LENGTHS if allowed.any() else ():
+            out = np.sqrt(self._between(np.array(0.5 * longer * self.step_s), time_s, np.array(longer))[0])
+            lengths[out * sigma <= allowed] = longer
+        return [np.append(np.arange(first, last, length), last) for length in lengths.tolist()]
 
-    def _inside(self, t: Array) -> tuple[IntArray, IntArray, Array]:
+    def _alike(self) -> list[list[int]]:
+        """Components by the borders they use."""
+        found: dict[bytes, list[int]] = {}
+        for component, used in enumerate(self.used):
+            found.setdefault(used.tobytes(), []).append(component)
+        return list(found.values())
+
+    def _inside(self, t: Array, component: int) -> tuple[IntArray, IntArray, Array]:
         """Places (n,) of the borders in use around times, and the time (n,) since the first of both."""
-        place = np.floor((t - self.borders[0]) / self.step_s)
-        k = np.clip(np.searchsorted(self.used, place, side="right") - 1, 0, len(self.used) - 2)
-        begin, end = self.used[k], self.used[k + 1]
+        place, used = np.floor((t - self.borders[0]) / self.step_s), self.used[component]
+        k = np.clip(np.searchsorted(used, place, side="right") - 1, 0, len(used) - 2)
+        begin, end = used[k], used[k + 1]
         return begin, end, np.clip(t - self.borders[begin], 0.0, self.step_s * (end - begin))
 
-    def _between(self, after: Array, time_s: float, length: int) -> tuple[Array, Array]:
-        """Variance (n,) of what is left out for sigma 1, and coefficients (n, 4), at times after a border."""
-        step_s = self.step_s * length
-        F, Q, _ = second_order_gauss_markov(1.0, time_s, step_s)
-        F0, Q0, _ = second_order_gauss_markov(1.0, time_s, after)
-        F1, _, _ = second_order_gauss_markov(1.0, time_s, step_s - after)
-        back = Q0 @ np.swapaxes(F1, 1, 2)
-        right = back @ np.linalg.inv(Q)
-        left = F0 - right @ F
-        variance = Q0[:, 0, 0] - np.einsum("nk,nk->n", right[:, 0], back[:, 0])
-        return np.maximum(variance, 0.0), np.concatenate([left[:, 0], right[:, 0]], axis=1)
+    def _between(self, after: Array, time_s: ArrayLike, length: IntArray) -> tuple[Array, Array]:
+        """Variance (...) of what is left out for sigma 1, and coefficients (..., 4), at times after a border."""
+        variance, coefficients = np.empty(after.shape), np.empty((*after.shape, 4))
+        correlated_s = np.broadcast_to(time_s, after.shape)
+        for each in set(correlated_s.ravel().tolist()):
+            mine = correlated_s == each
+            # the process over a segment as a whole, from its beginning, and to its end; the value, without the slope
+            lengths, of_length = np.unique(length[mine], return_inverse=True)
+            whole_s = self.step_s * lengths
+            F, Q, _ = second_order_gauss_markov(1.0, each, whole_s)
+            (F00, F01), (F10, F11) = np.moveaxis(F[of_length], 0, -1)
+            (W00, W01), (_, W11) = np.moveaxis(np.linalg.inv(Q)[of_length], 0, -1)
+            parts = np.stack([after[mine], whole_s[of_length] - after[mine]])
+            F, Q, _ = second_order_gauss_markov(1.0, each, parts)
+            from_value, from_slope = F[0, :, 0].T
+            to, q, cross = F[1], Q[0, :, 0, 0], Q[0, :, 0, 1]
+            back_value = q * to[:, 0, 0] + cross * to[:, 0, 1]
+            back_slope = q * to[:, 1, 0] + cross * to[:, 1, 1]
+            right_value = back_value * W00 + back_slope * W01
+            right_slope = back_value * W01 + back_slope * W11
+            left_value = from_value - right_value * F00 - right_slope * F10
+            left_slope = from_slope - right_value * F01 - right_slope * F11
+            variance[mine] = np.maximum(q - right_value * back_value - right_slope * back_slope, 0.0)
+            coefficients[mine] = np.stack([left_value, left_slope, right_value, right_slope], axis=1)
+        return variance, coefficients
 
     def pseudo_observations(self) -> PseudoObservations:
         return self._observations
@@ -241,24 +270,27 @@ class Wander(CorrectionModel):
         """
         n = len(self.borders) - 1
         coefficients, sigma = np.zeros((n, 6, 2, 4)), np.full((n, 6), np.inf)
-        before = np.arange(n)
-        begin, end = self.used[:-1], self.used[1:]
-        before[end - 1] = begin
-        sigma[end - 1] = self._sigma[end]
-        for time_s, length in {*zip(self._time_s[end].tolist(), (end - begin).tolist(), strict=True)}:
-            chosen = (self._time_s[end] == time_s) & (end - begin == length)
-            a, b = begin[chosen], end[chosen]
-            F, Q, P0 = second_order_gauss_markov(1.0, time_s, self.step_s * length)
-            G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
-            ratio = self._sigma[b] / self._sigma[a]  # (m, 6)
-            rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[a]])
-            D = np.zeros((*ratio.shape, 2, 2))
-            D[..., 0, 0], D[..., 1, 1] = ratio, ratio * rate[:, None]
-            falls = ((ratio < 1.0 - 1e-9) | self._another[b][:, None])[..., None, None]
-            coefficients[b - 1, :, :, :2] = np.where(falls, 0.0, -G @ F @ D)
-            coefficients[b - 1, :, :, 2:] = np.where(falls, new, G)
+        before = np.repeat(np.arange(n)[:, None], 6, axis=1)
+        for c in self._alike():
+            begin, end = self.used[c[0]][:-1], self.used[c[0]][1:]
+            before[np.ix_(end - 1, c)] = begin[:, None]
+            sigma[np.ix_(end - 1, c)] = self._sigma[np.ix_(end, c)]
+            for time_s, length in {*zip(self._time_s[end].tolist(), (end - begin).tolist(), strict=True)}:
+                chosen = (self._time_s[end] == time_s) & (end - begin == length)
+                a, b = begin[chosen], end[chosen]
+                F, Q, P0 = second_order_gauss_markov(1.0, time_s, self.step_s * length)
+                G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
+                ratio = (self._sigma[b] / self._sigma[a])[:, c]
+                rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[a]])
+                D = np.zeros((*ratio.shape, 2, 2))
+                D[..., 0, 0], D[..., 1, 1] = ratio, ratio * rate[:, None]
+                falls = ((ratio < 1.0 - 1e-9) | self._another[b][:, None])[..., None, None]
+                place = np.ix_(b - 1, c)
+                coefficients[place] = np.concatenate(
+                    [np.where(falls, 0.0, -G @ F @ D), np.broadcast_to(np.where(falls, new, G), D.shape)], axis=-1
+                )
         segment, component, row = (a.ravel() for a in np.indices((n, 6, 2)))
-        from_column = GLOBALS + 12 * before[segment] + component
+        from_column = GLOBALS + 12 * before[segment, component] + component
         to_column = GLOBALS + 12 * (segment + 1) + component
         columns = np.stack([from_column, from_column + 6, to_column, to_column + 6], axis=1)
         labels = tuple(
@@ -289,8 +321,3 @@ class Wander(CorrectionModel):
             borders.append(one)
         result["borders"] = borders
         return result
-
-
-def _different(values: IntArray) -> list[int]:
-    """The different ones among whole numbers, in order."""
-    return sorted(set(values.tolist()))

@@ -12,7 +12,7 @@ from .batch import Batch
 from .batches import Batches
 from .block import Block
 from .intake import Intake
-from .points import BatchMaker
+from .points import BatchMaker, Draft
 from .results import WindowUpdate
 from .snooping import admit
 from .state import WindowState
@@ -65,23 +65,22 @@ class Arrivals:
             for name in batch.names:
                 self._intake.place(name, None)
                 ready.setdefault(self._share(name), []).append(name)
-        fresh = []
+        if ready:  # what is known of the orientation says where points are, and judges them
+            self._state.solve()
+        drafts = []
         for (_, tied), names in ready.items():
             few = [n for n in names if len(self._intake.points[n].looks) < 2 and not tied]
             few = [n for n in few if n not in self._intake.control or self._intake.points[n].spent]
             names = [n for n in names if n not in few]
-            if not names:
-                continue
-            batch, _ = self._maker.make(
-                names, [self._intake.points[n] for n in names], known, self._block.earlier if tied else None
-            )
-            if batch is None:
-                continue
+            if names:
+                points = [self._intake.points[n] for n in names]
+                drafts.append(Draft(names, points, self._block.earlier if tied else None))
+        fresh = [batch for batch, _ in self._maker.make_each(drafts, known) if batch is not None]
+        for batch in fresh:
             for name in batch.names:
                 self._intake.place(name, batch)
-            fresh.append(batch)
-        if self._snoop and fresh:
-            self._state.solve()
+        if self._snoop:
+            self._state.expect(sum(len(batch.columns) for batch in fresh))
             for batch in fresh:
                 result.refused += admit(batch, self._state, self._intake.points)
                 self.apart(admit_ties(batch, self._state), result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import isfinite
 
 import numpy as np
 
@@ -43,38 +44,44 @@ class Intake:
 
     def add_look(self, name: str, look: Look) -> str:
         """Take a look, or say why not."""
-        reason = self._judge(look) or self._judge_time(name, look)
+        time_s = self._time_of(look)
+        reason = self._judge(look) or self._judge_time(name, look, time_s)
         if reason:
             self._refused.append(Refusal(name, look, reason))
             return reason
         point = self.points.setdefault(name, PointLooks())
         point.looks.append(look)
-        point.time_s.append(float(self._strips[look.strip].time_of(look.line)))
+        point.time_s.append(time_s)
         point.weight.append(1.0)
         self._arrived[name] = None
         if point.batch is None:
             self._waiting[name] = None
         return ""
 
+    def _time_of(self, look: Look) -> float:
+        """NaN for a strip that is not known."""
+        strip = self._strips.get(look.strip)
+        return float("nan") if strip is None else strip.time_of_line(look.line)
+
     def _judge(self, look: Look) -> str:
-        values = (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px)
-        if not np.isfinite(values).all():
+        if not (isfinite(look.line) and isfinite(look.sample)):
             return "value is not finite"
-        if min(values[2:]) <= 0:
+        if not (isfinite(look.sigma_line_px) and isfinite(look.sigma_sample_px)):
+            return "value is not finite"
+        if not (look.sigma_line_px > 0 and look.sigma_sample_px > 0):
             return "sigma is not positive"
         if look.ccd not in self._camera.line_index:
             return "unknown ccd"
         if look.strip not in self._strips:
             return "unknown strip"
-        if not self._camera.lines[self._camera.line_index[look.ccd]].contains(look.sample):
+        if not -0.5 <= look.sample <= self._camera.lines[self._camera.line_index[look.ccd]].pixels - 0.5:
             return "beyond the ccd line"
         if not self._strips[look.strip].contains(look.line):
             return "outside strip"
         return ""
 
-    def _judge_time(self, name: str, look: Look) -> str:
-        strip = self._strips[look.strip]
-        if float(strip.time_of(look.line)) < strip.final_to_s:
+    def _judge_time(self, name: str, look: Look, time_s: float) -> str:
+        if time_s < self._strips[look.strip].final_to_s:
             return "too late"
         if (name, look.strip) in self._is_done:
             return "point is final"

@@ -205,7 +205,7 @@ class Integrity:
         ends = 6 + np.cumsum(widths, dtype=np.int64)
         for e, k, end in zip(again, widths, ends, strict=True):
             G[state.places(e.batch.columns), end - k : end] = e.rows.T
-        S = state.factor.solve(G)
+        S = state.propagated(G)
         for e, k, end in zip(again, widths, ends, strict=True):
             e.renew(e.rows @ S[state.places(e.batch.columns), end - k : end])
         Qg = S[:, :6]
@@ -303,7 +303,7 @@ class _Left:
         place = state.places(self._numbers)
         G = np.zeros((len(state), self._rhs.shape[1]))
         G[place] = self._rhs
-        R = self._rhs.T @ state.factor.solve(G)[place]
+        R = self._rhs.T @ state.propagated(G)[place]
         pair = np.stack(_rows_of(self.exposed), axis=1)
         products = _inverses(self.exposed) @ R[pair[:, :, None], pair[:, None]]
         leverages = np.linalg.eigvals(products).real.max(axis=1)

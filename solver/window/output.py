@@ -67,7 +67,8 @@ class Orienter:
         row = np.arange(len(times))[:, None, None]
         A[row, np.arange(6), local] += design.coefficients[:, :, None]
         A = A[:, :, :-1]
-        covariance = A @ self._cofactors @ np.swapaxes(A, 1, 2)
+        through = (A.reshape(-1, len(columns)) @ self._cofactors).reshape(A.shape)
+        covariance = through @ np.swapaxes(A, 1, 2)
         covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
         return A @ self._state.values(columns), covariance
 

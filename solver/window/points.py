@@ -13,6 +13,7 @@ from ..adjustment.normal_equations import ControlWeights
 from ..camera import LineCamera
 from ..intersection import intersect_rays
 from ..measured_trajectory import MeasuredPoses, MeasuredTrajectory
+from ..models.base import Design
 from ..rotation import matrix_from_angles
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, join_designs, local_layout
@@ -72,6 +73,15 @@ class PointLooks:
 
 
 @dataclass(frozen=True)
+class Draft:
+    """Points that are to become a batch; ``earlier`` are the earlier strips if these have seen all of them."""
+
+    names: list[str]
+    points: list[PointLooks]
+    earlier: EarlierStrips | None = None
+
+
+@dataclass(frozen=True)
 class BatchMaker:
     """Makes batches of points; what it needs to know stands still over a flight."""
 
@@ -83,31 +93,31 @@ class BatchMaker:
     self_calibration: SelfCalibration | None
     camera_columns: IntArray
 
-    def rays(self, names: list[str], points: list[PointLooks]) -> tuple[Rays, Array, Array, bool]:
-        """Rays of points with the measured orientation, its white noise (n, 6, 6), weights (n,), and whether any of it
-        is from the filter alone."""
-        ids = list(self.strips)
+    def rays(self, points: list[PointLooks]) -> tuple[Rays, Array, Array, NDArray[np.bool_]]:
+        """Rays of points with the measured orientation, its white noise (n, 6, 6), weights (n,), and which of them
+        (n,) have the smoothed one."""
+        place = {id: i for i, id in enumerate(self.strips)}
+        line_index = self.camera.line_index
         rows = []
         for p, point in enumerate(points):
-            order = np.argsort(point.time_s, kind="stable")
-            for source in order:
+            for source in sorted(range(len(point.looks)), key=point.time_s.__getitem__):
                 k = point.looks[source]
                 rows.append(
-                    (p, ids.index(k.strip), self.camera.line_index[k.ccd], source, k.line, k.sample, k.sigma_line_px,
+                    (p, place[k.strip], line_index[k.ccd], source, k.line, k.sample, k.sigma_line_px,
                      k.sigma_sample_px, point.time_s[source], point.weight[source])
                 )  # fmt: skip
         table = np.array(rows)
         point_, strip, ccd, source = table[:, :4].T.astype(np.int64)
         line, sample, sigma_line, sigma_sample, time, weight = table[:, 4:].T
         xy, pitch = self.camera.image_coordinates(ccd, sample)
-        period = np.array([1.0 / self.strips[i].line_rate_hz for i in ids])[strip]
+        period = np.array([1.0 / s.line_rate_hz for s in self.strips.values()])[strip]
         measured, covariance = self._measured(time, strip)
         poses, focal = measured.poses, self.camera.focal_length_mm[ccd]
         rays = Rays(
             point_, strip, ccd, source, line, sample, sigma_line, sigma_sample, time, period,
             poses.position_l, poses.angles, poses.velocity_l, poses.angle_rate, xy, pitch, focal,
         )  # fmt: skip
-        return rays, covariance, weight, not bool(measured.smoothed.all())
+        return rays, covariance, weight, measured.smoothed
 
     def _measured(self, time_s: Array, strip: IntArray) -> tuple[MeasuredPoses, Array]:
         """Measured orientation of rays, and the covariance (n, 6, 6) of its noise with what the model leaves out."""
@@ -121,24 +131,49 @@ class BatchMaker:
         return measured, covariance
 
     def make(
-        self,
-        names: list[str],
-        points: list[PointLooks],
-        known: dict[str, Array],
-        earlier: EarlierStrips | None = None,
+        self, names: list[str], points: list[PointLooks], known: dict[str, Array]
     ) -> tuple[Batch | None, list[str]]:
         """A batch of points, linearised where they are now, and the points that cannot be placed yet.
 
         Parameters
         ----------
         known : coordinates of points that were placed before
-        earlier : earlier strips that have seen all of the points
         """
-        rays, covariance, weight, provisional = self.rays(names, points)
+        return self.make_each([Draft(names, points)], known)[0]
+
+    def make_each(self, drafts: list[Draft], known: dict[str, Array]) -> list[tuple[Batch | None, list[str]]]:
+        """Batches as `make` makes them, one of each draft; what their rays need is looked up for all at once."""
+        if not drafts:
+            return []
+        rays, *of_rays = self.rays([point for draft in drafts for point in draft.points])
         ids = list(self.strips)
         groups = [np.flatnonzero(rays.strip == i) for i in np.unique(rays.strip)]
         parts = [(mine, self.strips[ids[rays.strip[mine[0]]]].design(rays.time_s[mine])) for mine in groups]
         design = join_designs(parts, len(rays))
+        made, point = [], 0
+        for draft in drafts:
+            low, high = np.searchsorted(rays.point, (point, point + len(draft.names))).tolist()
+            part = slice(low, high)
+            own = rays.part(part)
+            own = replace(own, point=own.point - point)
+            covariance, weight, smoothed = (a[part] for a in of_rays)
+            columns = Design(design.columns[part], design.coefficients[part])
+            made.append(self._batch(draft, known, own, columns, covariance, weight, not bool(smoothed.all())))
+            point += len(draft.names)
+        return made
+
+    def _batch(
+        self,
+        draft: Draft,
+        known: dict[str, Array],
+        rays: Rays,
+        design: Design,
+        covariance: Array,
+        weight: Array,
+        provisional: bool,
+    ) -> tuple[Batch | None, list[str]]:
+        """One of `make_each`."""
+        names, points, earlier = draft.names, draft.points, draft.earlier
         columns, layout = local_layout(design, rays.strip, self.self_calibration, self.camera_columns, rays)
         ties = None
         control = self._weights(names, points, np.array([p.spent for p in points]))
@@ -157,8 +192,8 @@ class BatchMaker:
             good = [i for i, n in enumerate(names) if n not in lost]
             if not good:
                 return None, lost
-            batch, _ = self.make([names[i] for i in good], [points[i] for i in good], known, earlier)
-            return batch, lost
+            rest = Draft([names[i] for i in good], [points[i] for i in good], earlier)
+            return self.make_each([rest], known)[0][0], lost
         batch = Batch(list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties)
         batch.linearise(theta, reweigh=True)
         return batch, []

@@ -56,6 +56,7 @@ def snoop(
         state.solve()
     pending = batches
     for _ in range(MOST_ROUNDS):
+        state.expect(sum(len(batch.columns) for batch in pending))
         judged = [(batch, *_judge(batch, state)) for batch in pending]
         worst = max((float(w[batch.weight > 0].max(initial=0.0)) for batch, w, *_ in judged), default=0.0)
         worst = max([worst, *(float(c.max(initial=0.0)) for *_, c in judged)])

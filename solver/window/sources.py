@@ -236,7 +236,7 @@ class SourceMonitor:
             coupling[np.ix_(cell.places, state.places(cell.numbers))] += cell.coupling
             count[cell.groups] += cell.rays
         score -= coupling @ state.theta
-        V = normal - coupling @ state.factor.solve(coupling.T)
+        V = normal - coupling @ state.propagated(coupling.T)
         found = []
         age = (now_s - self._start_s) / DRIFT_S
         now = np.array([[1.0, 0.0, age, 0.0], [0.0, 1.0, 0.0, age]])

@@ -63,7 +63,9 @@ class WindowState:
         self.square = 0.0
         self.redundancy = 0
         self._factor: DenseFactor | None = None
+        self._cofactors: Array | None = None
         self._asked = 0
+        self._solved = True
         self.solution = 0
 
     def __len__(self) -> int:
@@ -96,21 +98,68 @@ class WindowState:
         self._fixed, self._live = (np.pad(a, ((0, m), (0, m))) for a in (self._fixed, self._live))
         self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m)) for a in (self._fixed_rhs, self._live_rhs))
         self.redundancy -= m
-        self._factor = None
+        self._changed()
 
     def observe(self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array) -> None:
         """Add a-priori observations (m, t) of present unknowns; column -1 is none, infinite sigma no weight."""
+        self._observe(*self._rows(columns, coefficients, value, sigma))
+
+    def extend(
+        self, numbers: IntArray, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array
+    ) -> None:
+        """Make unknowns present about which these a-priori observations say all that is known.
+
+        Where there are as many as unknowns, these follow from what is known of the others: values and cofactors of
+        those stay what they are, and there is nothing to solve.
+        """
+        solved, cofactors, n = self._solved, self._cofactors, len(self)
+        self.enter(numbers)
+        places, rows, rhs = self._rows(columns, coefficients, value, sigma)
+        self._observe(places, rows, rhs)
+        old, new = np.flatnonzero(places < n), np.flatnonzero(places >= n)
+        if not solved or not len(rows) == len(new) == len(numbers):
+            return
+        own = np.empty((len(new), len(new)))
+        own[:, places[new] - n] = rows[:, new]
+        try:
+            given = np.linalg.solve(own, np.column_stack([-rows[:, old], rhs, np.eye(len(own))]))
+        except np.linalg.LinAlgError:
+            return
+        m, places = len(old), places[old]
+        self.theta[n:] = given[:, :m] @ self.theta[places] + given[:, m]
+        self._solved = True
+        if cofactors is not None:
+            through = cofactors[:, places] @ given[:, :m].T
+            noise = given[:, m + 1 :]
+            self._cofactors = np.empty((len(self), len(self)))
+            self._cofactors[:n, :n] = cofactors
+            self._cofactors[:n, n:], self._cofactors[n:, :n] = through, through.T
+            self._cofactors[n:, n:] = given[:, :m] @ through[places] + noise @ noise.T
+
+    def _rows(
+        self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array
+    ) -> tuple[IntArray, Array, Array]:
+        """Places (u,) of the unknowns that a-priori observations speak of, whitened rows (m, u), right-hand side."""
         keep = np.isfinite(sigma)
         columns, weight = columns[keep], 1.0 / sigma[keep]
-        rows = np.zeros((len(columns), len(self) + 1))
-        place = np.where(columns >= 0, self.places(np.maximum(columns, 0)), -1)
-        np.add.at(rows, (np.arange(len(rows))[:, None], place), coefficients[keep] * weight[:, None])
-        rows, rhs = rows[:, :-1], value[keep] * weight
-        self._fixed += rows.T @ rows
-        self._fixed_rhs += rows.T @ rhs
+        touched = np.unique(columns)
+        touched = touched[touched >= 0].astype(np.int64)
+        rows = np.zeros((len(columns), len(touched) + 1))
+        local = np.where(columns >= 0, np.searchsorted(touched, columns), len(touched))
+        np.add.at(rows, (np.arange(len(rows))[:, None], local), coefficients[keep] * weight[:, None])
+        return self.places(touched), rows[:, :-1], value[keep] * weight
+
+    def _observe(self, places: IntArray, rows: Array, rhs: Array) -> None:
+        self._fixed[np.ix_(places, places)] += rows.T @ rows
+        self._fixed_rhs[places] += rows.T @ rhs
         self.square += float(rhs @ rhs)
         self.redundancy += len(rows)
-        self._factor = None
+        self._changed()
+
+    def _changed(self) -> None:
+        """Something else is known."""
+        self._factor = self._cofactors = None
+        self._solved, self._asked = False, 0
 
     def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
         """Add a batch's information to the live part, or take it back (``sign = -1``)."""
@@ -119,7 +168,7 @@ class WindowState:
         self._live_rhs[place] += sign * information.rhs
         self.square += sign * information.square
         self.redundancy += sign * information.rows
-        self._factor = None
+        self._changed()
 
     def exchange(self, columns: IntArray, old: Information, new: Information) -> None:
         """Put a batch's new information in the live part in place of what it said before."""
@@ -128,7 +177,7 @@ class WindowState:
         self._live_rhs[place] += new.rhs - old.rhs
         self.square += new.square - old.square
         self.redundancy += new.rows - old.rows
-        self._factor = None
+        self._changed()
 
     def fix(self, columns: IntArray, information: Information) -> None:
         """Move a batch's information from the live to the fixed part."""
@@ -155,27 +204,39 @@ class WindowState:
     def factor(self) -> DenseFactor:
         if self._factor is None:
             self._factor = DenseFactor(self._fixed + self._live)
-            self._asked = 0
         return self._factor
 
     def solve(self) -> None:
-        """Values from all information."""
-        rhs = self._fixed_rhs + self._live_rhs
-        self.theta = self.factor.solve(rhs)
+        """Values from all information, if they are not."""
+        if self._solved:
+            return
+        self.theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        self._solved = True
         self.solution += 1
 
     def cost(self) -> float:
         """Weighted squares of everything so far, at the present solution."""
         return max(self.square - float((self._fixed_rhs + self._live_rhs) @ self.theta), 0.0)
 
+    def expect(self, numbers: int) -> None:
+        """Cofactors of so many unknowns, not all of them different, will be asked for."""
+        self._asked += numbers
+
     def covariance(self, numbers: IntArray) -> Array:
         """Cofactors (m, m) of present unknowns."""
-        place, factor = self.places(numbers), self.factor
-        # the whole inverse costs as much as the columns of a third of it
-        self._asked += len(place)
-        if 3 * self._asked > len(self):
-            return factor.cofactors(place)
-        return factor.few_cofactors(place)
+        place = self.places(numbers)
+        if self._cofactors is None:
+            factor = self.factor
+            # the whole inverse costs as much as the columns of a third of it
+            self._asked += len(place)
+            if 3 * self._asked <= len(self):
+                return factor.few_cofactors(place)
+            self._cofactors = factor.inverse()
+        return self._cofactors[np.ix_(place, place)]
+
+    def propagated(self, functions: Array) -> Array:
+        """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
+        return self.factor.solve(functions) if self._cofactors is None else self._cofactors @ functions
 
     def marginalise(self, numbers: IntArray) -> Marginal:
         """Take unknowns out; batches that touch them must have been fixed before.
@@ -196,16 +257,22 @@ class WindowState:
         R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
         d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
         marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
-        inside = np.ix_(stay, stay)
-        self._fixed = self._fixed[inside] - R12.T @ R12
+        self._fixed = _block(self._fixed, stay) - R12.T @ R12
         self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
-        self._live, self._live_rhs = self._live[inside], self._live_rhs[stay]
+        self._live, self._live_rhs = _block(self._live, stay), self._live_rhs[stay]
         self.square -= float(d @ d)
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))
-        self._factor = None
+        # of what stays, the cofactors are what they were
+        self._factor, self._asked = None, 0
+        self._cofactors = None if self._cofactors is None else _block(self._cofactors, stay)
         return marginal
+
+
+def _block(matrix: Array, places: IntArray) -> Array:
+    """Rows and columns of a large symmetric matrix; one after the other is several times faster than both at once."""
+    return matrix.take(places, axis=0).take(places, axis=1)
 
 
 def _hold(matrix: Array, places: IntArray) -> None:

@@ -136,6 +136,10 @@ class WindowStrip:
     def time_of(self, line: ArrayLike) -> Array:
         return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz
 
+    def time_of_line(self, line: float) -> float:
+        """`time_of` of one line."""
+        return self.first_line_time_s + line / self.line_rate_hz
+
     def contains(self, line: float) -> bool:
         return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
 
@@ -175,11 +179,10 @@ class WindowStrip:
         new = np.flatnonzero(~self._entered & (self._first_use <= to_s))
         if not len(new):
             return False
-        state.enter(self.numbers[new])
         self._entered[new] = True
         rows = np.flatnonzero(~self._row_done & (self._need <= to_s))
         self._row_done[rows] = True
-        state.observe(*self._rows(rows))
+        state.extend(self.numbers[new], *self._rows(rows))
         return True
 
     def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:

@@ -45,8 +45,6 @@ IntArray = NDArray[np.int64]
 AHEAD_S = 1.0
 #: So long after its last look a point is in the window, s; later it is late.
 USUAL_DELAY_S = 2.0
-#: After control that moved the orientation by degrees, good rays would fail a test before the solution has converged.
-MOST_ITERATIONS = 5
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
 #: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
@@ -221,14 +219,12 @@ class Window:
         result.refused += self._intake.take_refused()
 
     def _solve(self, fresh: list[Batch], joined: list[Batch], retest: bool, result: WindowUpdate) -> int:
-        """Gauss-Newton from the warm state, then tests; number of solutions computed."""
+        """One or two Gauss-Newton steps from the warm state, then tests; number of solutions computed."""
         iterations = 1
         self.state.solve()
-        for _ in range(MOST_ITERATIONS):
-            for batch in fresh:
-                batch.back_substitute(self.state.values(batch.columns))
-            if not self._follower.follow(fresh):
-                break
+        for batch in fresh:
+            batch.back_substitute(self.state.values(batch.columns))
+        if self._follower.follow(fresh):  # more than once has shown no gain, even where control turns the orientation
             self.state.solve()
             iterations += 1
         if self.options.snoop:
