@@ -31,6 +31,8 @@ from .recording_index import Channel, Index, IndexColumns
 LIBRARY = "triline"
 CHANNEL_METADATA = "triline.channel"
 _SEQUENCE_MASK = 0xFFFFFFFF
+#: Rows of the index that are looked up together.
+_TOGETHER = 8192
 
 
 class RecordingWriter:
@@ -341,6 +343,18 @@ class RecordingReader:
         channel = self.channels[int(index.channel[number])]
         envelope = Envelope(int(index.stamp_ns[number]), channel.source, int(index.sequence[number]), channel.start)
         return RawMessage(channel.topic, envelope, body[scan.MESSAGE_HEAD_SIZE :], int(index.receive_ns[number]))
+
+    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """The same for many messages, one after the other."""
+        index, channels = self.index, self.channels
+        for begin in range(0, len(numbers), _TOGETHER):
+            part = numbers[begin : begin + _TOGETHER]
+            columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
+            for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
+                body = scan.message_at(self._buffer if chunk < 0 else self._content(chunk), place)
+                channel = channels[of]
+                envelope = Envelope(stamp, channel.source, sequence, channel.start)
+                yield RawMessage(channel.topic, envelope, body[scan.MESSAGE_HEAD_SIZE :], receive)
 
     def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
         """Numbers of the messages of some topics (all known topics where none are named), in file order.
