@@ -63,7 +63,8 @@ class RecordingWriter:
         self._writer = McapWriter(self._stream, compression, chunk_size)
         self._platform = platform
         self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str, int, str, bool], int] = {}
+        self._channels: dict[tuple[str, str, int, str | None, bool], int] = {}
+        self._configuring: dict[str, bool] = {}  # topics that were met
         self._last: dict[tuple[str, str], tuple[int, int]] = {}
         self.counts: Counter[str] = Counter()
         self._head = True
@@ -97,9 +98,12 @@ class RecordingWriter:
 
     def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
         """Add a message that is encoded already."""
-        envelope = raw.envelope
-        if topics.find(raw.topic).family is topics.Family.CONFIGURATION:
-            kept = RawMessage(raw.topic, envelope, bytes(raw.data), raw.receive_ns)
+        configuring = self._configuring.get(raw.topic)
+        if configuring is None:
+            configuring = topics.find(raw.topic).family is topics.Family.CONFIGURATION
+            self._configuring[raw.topic] = configuring
+        if configuring:
+            kept = RawMessage(raw.topic, raw.envelope, bytes(raw.data), raw.receive_ns)
             self._configuration.append((kept, platform))
         elif self._head:
             self._head = False
@@ -108,13 +112,16 @@ class RecordingWriter:
         self.counts[raw.topic] += 1
 
     def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> None:
-        envelope = raw.envelope
-        key = (raw.topic, envelope.source, envelope.start, platform or self._platform, copy)
+        topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
+        key = (topic, source, start, platform, copy)
         channel = self._channels.get(key)
         if channel is None:
-            channel = self._channels[key] = self._register(*key)
-        sequence = envelope.sequence & _SEQUENCE_MASK
-        self._writer.add_message(channel, raw.receive_ns, envelope.stamp_ns, sequence, raw.data)
+            named = (topic, source, start, platform or self._platform, copy)
+            channel = self._channels.get(named)
+            if channel is None:
+                channel = self._channels[named] = self._register(*named)
+            self._channels[key] = channel
+        self._writer.add_message(channel, receive_ns, stamp_ns, sequence & _SEQUENCE_MASK, data)
 
     def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)

@@ -17,7 +17,7 @@ from ..schemas.topics import Family
 from .node import Message, Node
 from .ordering import Key, StreamCheck, is_orderly, order_key
 from .recording import RecordingReader
-from .runner_apart import BATCH, UNDER_WAY, Apart, Item, raw_of
+from .runner_apart import BATCH, UNDER_WAY, Apart, Item, flat_from, raw_from, raw_of
 from .step_driver import StepDriver
 
 
@@ -236,8 +236,9 @@ class _LineApart(_Line):
         super().finish()
         self._write_up_to()
         end = self._apart.finish()
-        self._count(end.outputs)
-        for raw in sorted(end.outputs, key=lambda raw: order_key(raw.topic, raw.envelope)):
+        left = [raw_from(flat) for flat in end.outputs]
+        self._count(left)
+        for raw in sorted(left, key=lambda raw: order_key(raw.topic, raw.envelope)):
             self._write(raw)
         self._conclude(self._last.name, end.counters, end.problem, end.state)
 
@@ -251,7 +252,7 @@ class _LineApart(_Line):
 
     def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
         if self._is_heard_apart(raw.topic):
-            self._items.append((len(self._batch), raw if number is None else number))
+            self._items.append((len(self._batch), flat_from(raw) if number is None else number))
         self._batch.append(raw)
         if message is not None:
             for driver in self._listening(raw.topic):
@@ -282,8 +283,9 @@ class _LineApart(_Line):
                 self._write_before(order_key(raw.topic, raw.envelope))
             self._write(raw)
             if i == place:
-                self._count(outputs)
-                for output in outputs:
+                made = [raw_from(flat) for flat in outputs]
+                self._count(made)
+                for output in made:
                     heapq.heappush(self._answered, (order_key(output.topic, output.envelope), output))
                 place, outputs = next(answer, (-1, []))
 

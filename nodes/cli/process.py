@@ -91,7 +91,8 @@ def at_pace(tables: Tables, pace: str) -> Tables:
     """The configuration of the nodes with that of a pace; what the file says goes before it."""
     if pace != "throughput":
         return tables
-    of_pace = {"navigator": {"filtered_s": FILTERED_S, "smooth_every_s": SMOOTH_EVERY_S}, "adjuster": {"pace": "throughput"}}
+    rare = {"filtered_s": FILTERED_S, "smooth_every_s": SMOOTH_EVERY_S}
+    of_pace: Tables = {"navigator": rare, "adjuster": {"pace": "throughput"}}
     return tables | {name: table | tables.get(name, {}) for name, table in of_pace.items()}
 
 
