@@ -342,7 +342,7 @@ def _inputs(
     if len(ordered):
         summary.first_ns, summary.last_ns = (int(index.stamp_ns[n]) for n in (ordered[0], ordered[-1]))
     told = time.monotonic()
-    for done, (number, recorded) in enumerate(zip(ordered.tolist(), reader.raws(ordered), strict=True)):
+    for done, (number, recorded) in enumerate(zip(map(int, ordered), reader.raws(ordered), strict=True)):
         raw = RawMessage(recorded.topic, recorded.envelope, recorded.data, recorded.envelope.stamp_ns)
         message = None
         if is_heard(raw.topic):

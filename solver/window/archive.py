@@ -347,7 +347,8 @@ class Archive:
         self.points = {name: p for name, p in self.points.items() if id not in p.strips}
 
     def close(self, id: str) -> None:
-        """Let a strip's unknowns go; what they say of the others stays (Schur complement)."""
+        """Let a strip's unknowns go; what they say of the others stays (Schur complement), so that the solution of these
+        is the same as before."""
         strip, g = self.strips[id], self._groups[id]
         numbers = np.sort(strip.entered)
         n = len(numbers)
@@ -376,7 +377,6 @@ class Archive:
                 block = self._block(h, k, size, others[k].shape[1])
                 block[:size, : others[k].shape[1]] -= through @ others[k]
         self.drop(id)
-        self.changed = True
 
 
 def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:
