@@ -347,8 +347,7 @@ class Archive:
         self.points = {name: p for name, p in self.points.items() if id not in p.strips}
 
     def close(self, id: str) -> None:
-        """Let a strip's unknowns go; what they say of the others stays (Schur complement), so that the solution of these
-        is the same as before."""
+        """Let a strip's unknowns go; what they say of the others stays (Schur complement): their solution does too."""
         strip, g = self.strips[id], self._groups[id]
         numbers = np.sort(strip.entered)
         n = len(numbers)
