@@ -259,7 +259,8 @@ class RecordingReader:
         if isinstance(record, scan.WholeChunk):
             number = len(self._chunks)
             self._chunks.append(record.chunk)
-            for opcode, place, body in scan.chunk_records(record.content):
+            done = self._note_messages(number, record.content, columns)
+            for opcode, place, body in scan.chunk_records(record.content, done):
                 self._note_inner(opcode, number, place, body, columns)
         elif record.opcode == scan.FOOTER:
             self.complete = self._buffer[record.end : record.end + len(scan.MAGIC)] == scan.MAGIC
@@ -277,6 +278,26 @@ class RecordingReader:
                 self._add_channel(int(number) if number.isdigit() else 0, entries.get("topic", ""), None, entries, 1)
         else:
             self._note_inner(record.opcode, -1, record.offset, record.content, columns)
+
+    def _note_messages(self, chunk: int, content: memoryview, columns: IndexColumns) -> int:
+        """Note what stands in a chunk up to the first record that is not as it should be; returns where that is.
+
+        As `_note_inner` of each record, in a fraction of the time: nearly all are messages.
+        """
+        position, last = 0, len(content) - scan.MESSAGE_RECORD.size
+        unpack, add = scan.MESSAGE_RECORD.unpack_from, columns.add
+        while position <= last:
+            opcode, length, channel, sequence, log_time, publish_time = unpack(content, position)
+            end = position + scan.RECORD_HEAD_SIZE + length
+            if end > len(content):
+                break
+            if opcode == scan.MESSAGE and length >= scan.MESSAGE_HEAD_SIZE:
+                add(chunk, position, channel, sequence, log_time, publish_time)
+            else:
+                body = content[position + scan.RECORD_HEAD_SIZE : end]
+                self._note_inner(opcode, chunk, position, body, columns)
+            position = end
+        return position
 
     def check_outside(self) -> str | None:
         """What is wrong with the bytes outside chunks; takes as long as reading the whole file."""
