@@ -3,7 +3,10 @@
     python bench/long_flight.py [--hours 4] [--pace throughput] [--recording FILE] [-o out/bench]
 
 Prints a row for each ten minutes as soon as they are flown, and at the end whether memory after warm-up stays within
-5 % and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown.
+5 % and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown;
+divided by that of a fixed piece of work (a Cholesky decomposition of 500 x 500) at the same time it does not depend on
+what else the machine does. The flight is warm when the block holds as many strips as it keeps (twenty minutes), and
+what it keeps is no more for hours: memory is told in medians of ten minutes and in single samples, a minute apart.
 """
 
 from __future__ import annotations
@@ -53,17 +56,33 @@ def resident_mb() -> float:
         return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
 
 
+class Reference:
+    """Processor time of a fixed piece of work, ms: the least of the last few times."""
+
+    def __init__(self) -> None:
+        a = np.random.default_rng(0).standard_normal((500, 500))
+        self._matrix = a @ a.T + 500.0 * np.eye(500)
+        self._last: list[float] = []
+
+    def __call__(self) -> float:
+        begun = time.process_time()
+        np.linalg.cholesky(self._matrix)
+        self._last = [*self._last[-4:], 1e3 * (time.process_time() - begun)]
+        return float(np.median(self._last))
+
+
 def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarray]:
-    """Memory (n, 2: s, MB) each minute, and updates (m, 2: s, ms); told while it goes on."""
+    """Memory (n, 2: s, MB) each minute, and updates (m, 3: s, ms, of the reference); told while it goes on."""
     memory: list[tuple[float, float]] = []
-    updates: list[tuple[float, float]] = []
-    plain = Window.update
+    updates: list[tuple[float, float, float]] = []
+    plain, reference = Window.update, Reference()
 
     def timed(self: Window, now_s: float):
         begun = time.process_time()
         result = plain(self, now_s)
         if result.report is not None and result.report.points:
-            updates.append((now_s, 1e3 * (time.process_time() - begun)))
+            took = 1e3 * (time.process_time() - begun)
+            updates.append((now_s, took, took / reference()))
         return result
 
     Window.update = timed  # type: ignore[method-assign]  # the program measures from outside
@@ -92,11 +111,12 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
 
 def tell(memory: np.ndarray, updates: np.ndarray, to_s: float) -> None:
     """The row that ends at a time."""
-    m, u = (a[(a[:, 0] >= to_s - ROW_S) & (a[:, 0] < to_s), 1] for a in (memory, updates))
+    m, u = (a[(a[:, 0] >= to_s - ROW_S) & (a[:, 0] < to_s), 1:] for a in (memory, updates))
     if len(u):
-        p50, p99 = np.percentile(u, [50, 99])
+        p50, p99 = np.percentile(u[:, 0], [50, 99])
         hours = f"{(to_s - ROW_S) / 60:4.0f} - {to_s / 60:3.0f}"
-        print(f"{hours}  {m.mean():9.1f}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}", flush=True)
+        mb = f"{np.median(m):6.1f}  {m.min():6.1f}  {m.max():6.1f}"
+        print(f"{hours}  {mb}  {len(u):7d}  {p50:6.2f}  {p99:6.2f}  {np.median(u[:, 1]):7.2f}", flush=True)
 
 
 def main() -> int:
@@ -110,21 +130,29 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = args.recording or simulate(folder, args.hours)
-        print("  minutes  memory MB  updates  p50 ms  p99 ms", flush=True)
+        print("  minutes  memory MB, least, most  updates  p50 ms  p99 ms  p50/ref", flush=True)
         memory, updates = fly(recording, folder / "out.mcap", args.pace)
     tell(memory, updates, np.ceil(memory[-1, 0] / ROW_S) * ROW_S)
     from_s = min(WARM_S, 0.5 * memory[-1, 0])
     warm = memory[memory[:, 0] >= from_s]
     late = updates[updates[:, 0] >= from_s]
     half = len(late) // 2
+    rows = [warm[(warm[:, 0] >= t) & (warm[:, 0] < t + ROW_S), 1] for t in np.arange(from_s, warm[-1, 0], ROW_S)]
+    medians = [float(np.median(row)) for row in rows if len(row) > 2]
+    slope = np.polyfit(late[:, 0] / 3600.0, late[:, 2], 1)
     result = {
         "hours": round(memory[-1, 0] / 3600.0, 2),
         "wall time, s": round(time.monotonic() - begun),
         "memory after warm-up, MB": [round(float(warm[:, 1].min()), 1), round(float(warm[:, 1].max()), 1)],
+        "memory, medians of ten minutes, MB": [round(min(medians), 1), round(max(medians), 1)],
         "memory, last half over first": round(
             float(np.median(warm[len(warm) // 2 :, 1]) / np.median(warm[: len(warm) // 2, 1])), 4
         ),
         "latency p50, last half over first": round(float(np.median(late[half:, 1]) / np.median(late[:half, 1])), 3),
+        "latency p50 by the reference, last half over first": round(
+            float(np.median(late[half:, 2]) / np.median(late[:half, 2])), 3
+        ),
+        "latency by the reference, trend an hour": round(float(slope[0] / np.polyval(slope, 0.0)), 4),
     }
     print(json.dumps(result, indent=2))
     draw(memory, updates, args.output)

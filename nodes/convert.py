@@ -85,8 +85,8 @@ def pose_message(
     message = m.PoseInFrame(frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip)
     set_time(message.timestamp, time_ns)
     p, q = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = (float(v) for v in np.asarray(position_l))
-    q.x, q.y, q.z, q.w = (float(v) for v in np.asarray(quaternion))
+    p.x, p.y, p.z = np.asarray(position_l, dtype=float).tolist()
+    q.x, q.y, q.z, q.w = np.asarray(quaternion, dtype=float).tolist()
     message.angles.extend(np.asarray(angles, dtype=float).tolist())
     if covariance is not None:
         message.covariance.extend(np.asarray(covariance, dtype=float).ravel().tolist())
@@ -96,7 +96,7 @@ def pose_message(
         message.protection.extend(np.asarray(protection, dtype=float).tolist())
     if velocity_l is not None:
         v = message.velocity
-        v.x, v.y, v.z = (float(c) for c in np.asarray(velocity_l))
+        v.x, v.y, v.z = np.asarray(velocity_l, dtype=float).tolist()
     return message
 
 

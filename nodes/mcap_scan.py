@@ -206,9 +206,10 @@ def parse_chunk(record: Record) -> Chunk | None:
     return Chunk(record.offset, start_ns, end_ns, size, crc, compression, content[begin + 8 : begin + 8 + stored])
 
 
-def chunk_records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-    """(opcode, place, content) of the records inside a chunk; raises ValueError where they run over its end."""
-    position, size = 0, len(content)
+def chunk_records(content: memoryview, position: int = 0) -> Iterator[tuple[int, int, memoryview]]:
+    """(opcode, place, content) of the records inside a chunk, from a place on; raises ValueError where they run over
+    its end."""
+    size = len(content)
     while position < size:
         if position + _RECORD.size > size:
             raise ValueError("a chunk that ends inside a record")
@@ -231,7 +232,9 @@ def message_head(content: memoryview) -> tuple[int, int, int, int]:
     return _MESSAGE_HEAD.unpack_from(content)
 
 
-MESSAGE_HEAD_SIZE = _MESSAGE_HEAD.size
+RECORD_HEAD_SIZE, MESSAGE_HEAD_SIZE = _RECORD.size, _MESSAGE_HEAD.size
+#: Head of a record and of the message in it.
+MESSAGE_RECORD = struct.Struct("<BQHIQQ")
 
 
 def text(content: memoryview, position: int) -> tuple[str, int]:

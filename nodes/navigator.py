@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -12,6 +13,7 @@ from ..schemas import messages as m
 from ..solver.frames import LocalFrame
 from ..solver.navigation.inertial_navigator import InertialNavigator
 from ..solver.navigation.kinematic import KinematicFilter
+from ..solver.navigation.online_poses import OnlineOptions
 from ..solver.navigation.pose import NavigationPose
 from ..solver.rotation import R_ENU_NED
 from . import convert
@@ -32,17 +34,20 @@ class Navigator(Node):
     Parameters
     ----------
     filtered_s : least distance of filtered poses, s; 0 = all of them, which those who want them at once need
+    smooth_every_s : from inertial data smoothed poses come so often, s
     """
 
     name = "navigator"
     inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss")
     outputs = ("trajectory/filtered", "trajectory/smoothed", "event/log")
 
-    def __init__(self, *, filtered_s: float = 0.0) -> None:
+    def __init__(self, *, filtered_s: float = 0.0, smooth_every_s: float = OnlineOptions.smooth_every_s) -> None:
         super().__init__()
         if not 0.0 <= filtered_s <= 1.0:
             raise ValueError(f"filtered_s is {filtered_s:g}, wanted 0 to 1 s")
-        self._filtered_s = filtered_s
+        if not 0.0 < smooth_every_s <= 10.0:
+            raise ValueError(f"smooth_every_s is {smooth_every_s:g}, wanted more than 0 and at most 10 s")
+        self._filtered_s, self._smooth_every_s = filtered_s, smooth_every_s
         self._engine: KinematicFilter | InertialNavigator | None = None
         self._configuration: Any = None
         self._reference_ns = 0
@@ -111,14 +116,16 @@ class Navigator(Node):
             self.problem("before configuration", "sensor/imu came before configuration/project")
             return []
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
-        if not (np.isfinite(force).all() and np.isfinite(rate).all()):
+        if not math.isfinite(sum(force) + sum(rate)):
             raise ValueError("specific force or angular rate is not finite")
         if max(map(abs, force)) > 500.0 or max(map(abs, rate)) > 50.0:
             raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
         if not 0 < body.interval_ns <= convert.SECOND_NS:
             raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
         if not isinstance(self._engine, InertialNavigator):
-            self._engine = inertial_engine(self._configuration, body, filtered_s=self._filtered_s)
+            self._engine = inertial_engine(
+                self._configuration, body, filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s
+            )
             self._seen = Counter()
             wrong = stated_noise(body)[2]
             if wrong:

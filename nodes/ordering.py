@@ -14,6 +14,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..schemas import topics
 from ..schemas.envelope import Envelope
 from ..schemas.topics import Family
@@ -59,6 +62,18 @@ class _Stream(Generic[T]):
     base_stamp: int = 0  # newest stamp of a possible earlier time base ...
     base_count: int = 0  # ... and how many messages support it
     held: tuple[int, T] | None = None  # stamp and message after a jump ahead, waiting to be confirmed
+
+
+def is_orderly(topic: str, sequence: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> bool:
+    """Whether `StreamCheck` would let all messages of a stream pass, each at once."""
+    row = topics.find(topic)
+    if (np.diff(sequence) < 1).any():
+        return False
+    if row.latched or row.family is Family.STATUS:
+        return True
+    step = np.diff(stamp_ns)
+    longest = MAX_JUMP_NS if row.family in (Family.SENSOR, Family.OBSERVATION) else np.inf
+    return bool(((step >= 0) & (step <= longest)).all())
 
 
 class StreamCheck(Generic[T]):

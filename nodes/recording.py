@@ -31,6 +31,8 @@ from .recording_index import Channel, Index, IndexColumns
 LIBRARY = "triline"
 CHANNEL_METADATA = "triline.channel"
 _SEQUENCE_MASK = 0xFFFFFFFF
+#: Rows of the index that are looked up together.
+_TOGETHER = 8192
 
 
 class RecordingWriter:
@@ -61,7 +63,8 @@ class RecordingWriter:
         self._writer = McapWriter(self._stream, compression, chunk_size)
         self._platform = platform
         self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str, int, str, bool], int] = {}
+        self._channels: dict[tuple[str, str, int, str | None, bool], int] = {}
+        self._configuring: dict[str, bool] = {}  # topics that were met
         self._last: dict[tuple[str, str], tuple[int, int]] = {}
         self.counts: Counter[str] = Counter()
         self._head = True
@@ -95,9 +98,12 @@ class RecordingWriter:
 
     def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
         """Add a message that is encoded already."""
-        envelope = raw.envelope
-        if topics.find(raw.topic).family is topics.Family.CONFIGURATION:
-            kept = RawMessage(raw.topic, envelope, bytes(raw.data), raw.receive_ns)
+        configuring = self._configuring.get(raw.topic)
+        if configuring is None:
+            configuring = topics.find(raw.topic).family is topics.Family.CONFIGURATION
+            self._configuring[raw.topic] = configuring
+        if configuring:
+            kept = RawMessage(raw.topic, raw.envelope, bytes(raw.data), raw.receive_ns)
             self._configuration.append((kept, platform))
         elif self._head:
             self._head = False
@@ -106,13 +112,16 @@ class RecordingWriter:
         self.counts[raw.topic] += 1
 
     def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> None:
-        envelope = raw.envelope
-        key = (raw.topic, envelope.source, envelope.start, platform or self._platform, copy)
+        topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
+        key = (topic, source, start, platform, copy)
         channel = self._channels.get(key)
         if channel is None:
-            channel = self._channels[key] = self._register(*key)
-        sequence = envelope.sequence & _SEQUENCE_MASK
-        self._writer.add_message(channel, raw.receive_ns, envelope.stamp_ns, sequence, raw.data)
+            named = (topic, source, start, platform or self._platform, copy)
+            channel = self._channels.get(named)
+            if channel is None:
+                channel = self._channels[named] = self._register(*named)
+            self._channels[key] = channel
+        self._writer.add_message(channel, receive_ns, stamp_ns, sequence & _SEQUENCE_MASK, data)
 
     def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)
@@ -250,7 +259,8 @@ class RecordingReader:
         if isinstance(record, scan.WholeChunk):
             number = len(self._chunks)
             self._chunks.append(record.chunk)
-            for opcode, place, body in scan.chunk_records(record.content):
+            done = self._note_messages(number, record.content, columns)
+            for opcode, place, body in scan.chunk_records(record.content, done):
                 self._note_inner(opcode, number, place, body, columns)
         elif record.opcode == scan.FOOTER:
             self.complete = self._buffer[record.end : record.end + len(scan.MAGIC)] == scan.MAGIC
@@ -268,6 +278,26 @@ class RecordingReader:
                 self._add_channel(int(number) if number.isdigit() else 0, entries.get("topic", ""), None, entries, 1)
         else:
             self._note_inner(record.opcode, -1, record.offset, record.content, columns)
+
+    def _note_messages(self, chunk: int, content: memoryview, columns: IndexColumns) -> int:
+        """Note what stands in a chunk up to the first record that is not as it should be; returns where that is.
+
+        As `_note_inner` of each record, in a fraction of the time: nearly all are messages.
+        """
+        position, last = 0, len(content) - scan.MESSAGE_RECORD.size
+        unpack, add = scan.MESSAGE_RECORD.unpack_from, columns.add
+        while position <= last:
+            opcode, length, channel, sequence, log_time, publish_time = unpack(content, position)
+            end = position + scan.RECORD_HEAD_SIZE + length
+            if end > len(content):
+                break
+            if opcode == scan.MESSAGE and length >= scan.MESSAGE_HEAD_SIZE:
+                add(chunk, position, channel, sequence, log_time, publish_time)
+            else:
+                body = content[position + scan.RECORD_HEAD_SIZE : end]
+                self._note_inner(opcode, chunk, position, body, columns)
+            position = end
+        return position
 
     def check_outside(self) -> str | None:
         """What is wrong with the bytes outside chunks; takes as long as reading the whole file."""
@@ -341,6 +371,18 @@ class RecordingReader:
         channel = self.channels[int(index.channel[number])]
         envelope = Envelope(int(index.stamp_ns[number]), channel.source, int(index.sequence[number]), channel.start)
         return RawMessage(channel.topic, envelope, body[scan.MESSAGE_HEAD_SIZE :], int(index.receive_ns[number]))
+
+    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """The same for many messages, one after the other."""
+        index, channels = self.index, self.channels
+        for begin in range(0, len(numbers), _TOGETHER):
+            part = numbers[begin : begin + _TOGETHER]
+            columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
+            for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
+                body = scan.message_at(self._buffer if chunk < 0 else self._content(chunk), place)
+                channel = channels[of]
+                envelope = Envelope(stamp, channel.source, sequence, channel.start)
+                yield RawMessage(channel.topic, envelope, body[scan.MESSAGE_HEAD_SIZE :], receive)
 
     def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
         """Numbers of the messages of some topics (all known topics where none are named), in file order.

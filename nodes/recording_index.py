@@ -22,6 +22,10 @@ class Channel:
     known: bool
 
 
+#: Times beyond are taken for it: the index holds signed numbers.
+LAST_NS = 0x7FFFFFFFFFFFFFFF
+
+
 @dataclass
 class Index:
     """Where every message of a recording stands, in file order: arrays of one length."""
@@ -43,9 +47,14 @@ class IndexColumns:
 
     columns: list[array[int]] = field(default_factory=lambda: [array("q") for _ in range(6)])
 
-    def add(self, *values: int) -> None:
-        for column, value in zip(self.columns, values, strict=True):
-            column.append(min(value, 0x7FFFFFFFFFFFFFFF))
+    def add(self, chunk: int, place: int, channel: int, sequence: int, receive_ns: int, stamp_ns: int) -> None:
+        chunks, places, channels, sequences, received, stamps = self.columns
+        chunks.append(chunk)
+        places.append(place)
+        channels.append(channel)
+        sequences.append(sequence)
+        received.append(receive_ns if receive_ns < LAST_NS else LAST_NS)
+        stamps.append(stamp_ns if stamp_ns < LAST_NS else LAST_NS)
 
     def index(self) -> Index:
         return Index(*(np.frombuffer(c, dtype=np.int64) if c else np.empty(0, np.int64) for c in self.columns))

@@ -9,14 +9,15 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..schemas import codec, topics
 from ..schemas.envelope import Envelope, RawMessage
 from ..schemas.topics import Family
 from .node import Message, Node
-from .ordering import Key, StreamCheck, order_key
+from .ordering import Key, StreamCheck, is_orderly, order_key
 from .recording import RecordingReader
-from .runner_apart import BATCH, UNDER_WAY, Apart, Item, raw_of
+from .runner_apart import BATCH, UNDER_WAY, Apart, Item, flat_from, raw_from, raw_of
 from .step_driver import StepDriver
 
 
@@ -162,7 +163,8 @@ class _Line:
 
     def take(self, number: int, message: Message | None, raw: RawMessage) -> None:
         """The next input, and its number in the recording; decoded if a node listens."""
-        self._hand_on_pending(order_key(raw.topic, raw.envelope))
+        if self._pending:
+            self._hand_on_pending(order_key(raw.topic, raw.envelope))
         self._hand_on(message, raw, number)
 
     def finish(self) -> None:
@@ -234,8 +236,9 @@ class _LineApart(_Line):
         super().finish()
         self._write_up_to()
         end = self._apart.finish()
-        self._count(end.outputs)
-        for raw in sorted(end.outputs, key=lambda raw: order_key(raw.topic, raw.envelope)):
+        left = [raw_from(flat) for flat in end.outputs]
+        self._count(left)
+        for raw in sorted(left, key=lambda raw: order_key(raw.topic, raw.envelope)):
             self._write(raw)
         self._conclude(self._last.name, end.counters, end.problem, end.state)
 
@@ -249,7 +252,7 @@ class _LineApart(_Line):
 
     def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
         if self._is_heard_apart(raw.topic):
-            self._items.append((len(self._batch), raw if number is None else number))
+            self._items.append((len(self._batch), flat_from(raw) if number is None else number))
         self._batch.append(raw)
         if message is not None:
             for driver in self._listening(raw.topic):
@@ -280,8 +283,9 @@ class _LineApart(_Line):
                 self._write_before(order_key(raw.topic, raw.envelope))
             self._write(raw)
             if i == place:
-                self._count(outputs)
-                for output in outputs:
+                made = [raw_from(flat) for flat in outputs]
+                self._count(made)
+                for output in made:
                     heapq.heappush(self._answered, (order_key(output.topic, output.envelope), output))
                 place, outputs = next(answer, (-1, []))
 
@@ -306,35 +310,40 @@ def _inputs(
     progress: Callable[[float], None] | None,
 ) -> Iterator[tuple[int, Message | None, RawMessage]]:
     """The usable inputs of a recording in order, with their numbers; decoded where a node listens."""
-    numbers = []
-    for number in reader.select():
-        channel = reader.channels[int(reader.index.channel[number])]
+    index, known = reader.index, reader.select()
+    streams: dict[tuple[str, str, int], list[NDArray[np.int64]]] = {}
+    for id in np.unique(index.channel[known]).tolist():
+        channel = reader.channels[id]
+        own = known[index.channel[known] == id]
         if is_remade(channel.topic, channel.source, made, summary.nodes):
-            summary.replaced[channel.topic] += 1
+            summary.replaced[channel.topic] += len(own)
         else:
-            numbers.append(number)
+            streams.setdefault((channel.topic, channel.source, channel.start), []).append(own)
 
     def problem(kind: str, text: str) -> None:
         summary.dropped[kind] += 1
         summary.last_problem = text
 
-    foreign = len(reader.index) - len(reader.select())
+    foreign = len(index) - len(known)
     if foreign:
         summary.dropped["foreign"] = foreign
         summary.last_problem = f"{foreign} messages on topics of other programs"
+    kept, doubtful = [], []
+    for (topic, _, _), parts in streams.items():
+        own = np.sort(np.concatenate(parts))
+        (kept if is_orderly(topic, index.sequence[own], index.stamp_ns[own]) else doubtful).append(own)
     check: StreamCheck[int] = StreamCheck(problem)
-    kept = []
-    for number in numbers:
-        channel = reader.channels[int(reader.index.channel[number])]
-        stamp, sequence = int(reader.index.stamp_ns[number]), int(reader.index.sequence[number])
-        kept.extend(check.accept(channel.topic, Envelope(stamp, channel.source, sequence, channel.start), int(number)))
-    ordered = reader.sort(np.array(kept, dtype=np.int64))
+    for number in np.sort(np.concatenate([*doubtful, np.empty(0, dtype=np.int64)])).tolist():
+        channel = reader.channels[int(index.channel[number])]
+        stamp, sequence = int(index.stamp_ns[number]), int(index.sequence[number])
+        accepted = check.accept(channel.topic, Envelope(stamp, channel.source, sequence, channel.start), number)
+        kept.append(np.array(accepted, dtype=np.int64))
+    ordered = reader.sort(np.concatenate([*kept, np.empty(0, dtype=np.int64)]))
     if len(ordered):
-        summary.first_ns, summary.last_ns = (int(reader.index.stamp_ns[n]) for n in (ordered[0], ordered[-1]))
+        summary.first_ns, summary.last_ns = (int(index.stamp_ns[n]) for n in (ordered[0], ordered[-1]))
     told = time.monotonic()
-    for done, number in enumerate(ordered):
-        raw = reader.raw(int(number))
-        raw = raw._replace(receive_ns=raw.envelope.stamp_ns)
+    for done, (number, recorded) in enumerate(zip(map(int, ordered), reader.raws(ordered), strict=True)):
+        raw = RawMessage(recorded.topic, recorded.envelope, recorded.data, recorded.envelope.stamp_ns)
         message = None
         if is_heard(raw.topic):
             try:
@@ -344,7 +353,7 @@ def _inputs(
                 continue
             message = Message(raw.topic, raw.envelope.stamp_ns, body, raw.envelope.source, raw.envelope.sequence)
         summary.inputs[raw.topic] += 1
-        if progress is not None and time.monotonic() - told > 0.2:
+        if progress is not None and not done % 256 and time.monotonic() - told > 0.2:
             told = time.monotonic()
             progress(done / len(ordered))
-        yield int(number), message, raw
+        yield number, message, raw

@@ -48,22 +48,39 @@ class End:
     counters, problem, state : of the node
     """
 
-    outputs: list[RawMessage] = field(default_factory=list)
+    outputs: list[Flat] = field(default_factory=list)
     counters: Counter[str] = field(default_factory=Counter)
     problem: str = ""
     state: str = ""
 
 
+#: A message of a node on its way to the other process: topic, stamp, source, number, payload.
+Flat = tuple[str, int, str, int, bytes]
 #: A message for the node: its place in the batch, and its number in the recording or the message itself.
-Item = tuple[int, int | RawMessage]
+Item = tuple[int, int | Flat]
 #: Outputs with the place in the batch of what caused them.
-Answer = list[tuple[int, list[RawMessage]]]
+Answer = list[tuple[int, list[Flat]]]
 
 
 def raw_of(output: Message) -> RawMessage:
     """A message as it is written, received when it was made."""
-    envelope = Envelope(output.stamp_ns, output.source, output.sequence)
-    return RawMessage(output.topic, envelope, codec.encode(output.body), output.stamp_ns)
+    return raw_from(flat_of(output))
+
+
+def flat_of(output: Message) -> Flat:
+    """A message as it goes to the other process."""
+    return output.topic, output.stamp_ns, output.source, output.sequence, codec.encode(output.body)
+
+
+def flat_from(raw: RawMessage) -> Flat:
+    """The same of one that is encoded already."""
+    return raw.topic, raw.envelope.stamp_ns, raw.envelope.source, raw.envelope.sequence, bytes(raw.data)
+
+
+def raw_from(flat: Flat) -> RawMessage:
+    """A message that came from the other process."""
+    topic, stamp_ns, source, sequence, data = flat
+    return RawMessage(topic, Envelope(stamp_ns, source, sequence), data, stamp_ns)
 
 
 class Apart:
@@ -152,7 +169,7 @@ def _work(connection: Connection, other: Connection, reader: RecordingReader, dr
     """The other process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     other.close()
-    decode: Callable[[int | RawMessage], Message] = _Decoder(reader)
+    decode: Callable[[int | Flat], Message] = _Decoder(reader)
     collections = RareCollections()
     while True:
         collections.if_due()
@@ -162,13 +179,13 @@ def _work(connection: Connection, other: Connection, reader: RecordingReader, dr
             return
         if batch is None:
             node, left = driver.node, driver.finish()
-            connection.send(End([raw_of(m) for m in left], node.counters, node.last_problem, node.state()))
+            connection.send(End([flat_of(m) for m in left], node.counters, node.last_problem, node.state()))
             return
         answer: Answer = []
         for place, item in batch:
             outputs = driver.step(decode(item))
             if outputs:
-                answer.append((place, [raw_of(output) for output in outputs]))
+                answer.append((place, [flat_of(output) for output in outputs]))
         connection.send(answer)
 
 
@@ -178,7 +195,9 @@ class _Decoder:
     def __init__(self, reader: RecordingReader) -> None:
         self._reader = reader
 
-    def __call__(self, item: int | RawMessage) -> Message:
-        raw: Any = self._reader.raw(item) if isinstance(item, int) else item
-        e = raw.envelope
-        return Message(raw.topic, e.stamp_ns, codec.parse(raw.topic, raw.data), e.source, e.sequence)
+    def __call__(self, item: int | Flat) -> Message:
+        if isinstance(item, int):
+            topic, e, data, _ = self._reader.raw(item)
+            return Message(topic, e.stamp_ns, codec.parse(topic, data), e.source, e.sequence)
+        topic, stamp_ns, source, sequence, data = item
+        return Message(topic, stamp_ns, codec.parse(topic, data), source, sequence)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from ..schemas import topics
 from .node import Message, Node
@@ -30,34 +31,43 @@ class StepDriver:
         self.time_ns = 0
         self._clock = clock
         self._sequences: Counter[str] = Counter()
+        self._allowed: dict[str, bool] = {}
 
     def step(self, message: Message) -> list[Message]:
         """The outputs that follow from one message."""
         self.time_ns = max(self.time_ns, message.stamp_ns)
-        return self._collect(lambda: self.node.step(message), f"{message.topic} {message.sequence}")
+        return self._collect(self.node.step, message)
 
     def behind(self, lag_s: float, now_s: float) -> list[Message]:
         """The decisions that follow from being behind; see `Node.behind`."""
-        return self._collect(lambda: self.node.behind(lag_s, now_s), "being behind")
+        return self._collect(self.node.behind, lag_s, now_s)
 
     def finish(self) -> list[Message]:
         """The outputs that were held back."""
-        return self._collect(self.node.finish, "the end")
+        return self._collect(self.node.finish)
 
-    def _collect(self, work: Callable[[], Iterable[Message]], cause: str) -> list[Message]:
+    def _is_allowed(self, topic: str) -> bool:
+        """Whether the node may put out a topic."""
+        if topic not in self._allowed:
+            names = (*self.node.outputs, *self.node.decisions)
+            self._allowed[topic] = any(topics.find(name).matches(topic) for name in names)
+        return self._allowed[topic]
+
+    def _collect(self, work: Callable[..., Iterable[Message]], *given: Any) -> list[Message]:
         begun = self._clock() if self._clock else 0.0
         outputs: list[Message] = []
         try:
-            outputs.extend(work())  # a generator's outputs before a failure count
+            outputs.extend(work(*given))  # a generator's outputs before a failure count
         except Exception as error:  # whatever a message does to a node, the node lives
             place = _innermost(error)
-            self.node.problem("failed", f"{cause}: {type(error).__name__}: {error} ({place})")
+            self.node.problem("failed", f"{_cause(*given)}: {type(error).__name__}: {error} ({place})")
+        if not outputs:
+            return outputs
         elapsed = self._clock() - begun if self._clock else 0.0
         return [self._stamped(output, elapsed) for output in outputs]
 
     def _stamped(self, output: Message, elapsed: float) -> Message:
-        allowed = (*self.node.outputs, *self.node.decisions)
-        if not any(topics.find(name).matches(output.topic) for name in allowed):
+        if not self._is_allowed(output.topic):
             raise ValueError(f"{self.node.name} gave {output.topic}, its outputs are {', '.join(self.node.outputs)}")
         if self._clock and getattr(output.body, "compute_s", None) == 0.0:
             output.body.compute_s = elapsed
@@ -65,6 +75,14 @@ class StepDriver:
         self._sequences[output.topic] += 1
         stamp = max(output.stamp_ns, self.time_ns)
         return Message(output.topic, stamp, output.body, self.node.name, sequence)
+
+
+def _cause(*given: Any) -> str:
+    """What a node was working on, by what it was given."""
+    if not given:
+        return "the end"
+    message = given[0]
+    return f"{message.topic} {message.sequence}" if isinstance(message, Message) else "being behind"
 
 
 def _innermost(error: Exception) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from functools import cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,9 +69,10 @@ def parse(topic: str, data: bytes | memoryview) -> Any:
 
 
 class _Numbers(NamedTuple):
-    """Where a message type has numbers: fields of one, of many with how many there may be, and of messages."""
+    """Where a message type has numbers: fields of one (what gets them), of many with how many there may be, and of
+    messages."""
 
-    single: tuple[str, ...]
+    single: Callable[[Any], Iterable[float]]
     many: tuple[tuple[str, int], ...]
     message: tuple[str, ...]
     messages: tuple[str, ...]
@@ -89,17 +92,23 @@ def _numbers_of(cls: Any) -> _Numbers:
                 single.append(field.name)
         elif field.cpp_type == field.CPPTYPE_MESSAGE:
             (messages if repeated else message).append(field.name)
-    return _Numbers(tuple(single), tuple(many), tuple(message), tuple(messages))
+    return _Numbers(_getter(single), tuple(many), tuple(message), tuple(messages))
+
+
+def _getter(names: list[str]) -> Callable[[Any], Iterable[float]]:
+    """What gets the values of fields."""
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda body: [getattr(body, name) for name in names]
 
 
 def validate(body: Any) -> None:
     """Raise ValueError for a message with values that are not finite, or with the wrong number of values."""
     if not _is_fine(body):
         _find_fault(body)
-    name = body.DESCRIPTOR.full_name
-    if name == "foxglove.LocationFix" and not abs(body.latitude) <= 90:
+    if isinstance(body, m.LocationFix) and not abs(body.latitude) <= 90:
         raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
-    if name == "foxglove.PoseInFrame":
+    if isinstance(body, m.PoseInFrame):
         q = body.pose.orientation
         norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
         if abs(norm - 1) > 1e-3:
@@ -109,9 +118,7 @@ def validate(body: Any) -> None:
 def _is_fine(body: Any) -> bool:
     """Whether all numbers together are finite (those of a sane message do not overflow) and vectors have their size."""
     numbers = _numbers_of(type(body))
-    total = 0.0
-    for name in numbers.single:
-        total += getattr(body, name)
+    total = sum(numbers.single(body))
     for name, size in numbers.many:
         values = getattr(body, name)
         if values:

@@ -13,6 +13,7 @@ from triline.solver.navigation.carried import CameraMount
 from triline.solver.navigation.inertial_navigator import InertialNavigator
 from triline.solver.navigation.online_poses import OnlineOptions
 from triline.solver.navigation.post_processing import navigate
+from triline.solver.navigation.strapdown import integrate_one, integrate_to
 from triline.solver.rotation import R_BC_NOMINAL, angles_from_matrix
 
 FRAME = LocalFrame(47.55, 9.17, 0.0)
@@ -130,6 +131,38 @@ def test_late_and_disordered_fixes_change_next_to_nothing(usual):
     assert (worst < 2.0).all()  # some had seen a fix or two less when they were due
     at_the_end = same[-1]
     assert (np.abs(at_the_end[0].position_l - at_the_end[1].position_l) < 0.05 * sigma[:3]).all()
+
+
+@pytest.mark.parametrize("latency", [lambda i: 0.1, lambda i: 0.013 if i % 5 else 1.2, lambda i: -0.3])
+def test_rare_answers_are_those_of_all_answers(usual, latency):
+    f = flight()
+    rare = OnlineOptions(filtered_s=0.2, smooth_every_s=2.0)
+    poses, nav = run(f, stream(f, latency=latency), InertialNavigator(FRAME, f.settings, MOUNT, rare))
+    assert not nav.counters
+    (all_filtered, all_smoothed), (filtered, smoothed) = split(usual[0]), split(poses)
+    assert len(smoothed) == pytest.approx(len(all_smoothed), rel=0.02)  # a fix between two samples makes a pose or not
+    assert np.diff([p.time_s for p in filtered]).min() > 0.2 - 1e-6
+    assert len(filtered) > 0.1 * f.inertial.time_s[-1] / rare.filtered_s
+    assert len(filtered) < len(all_filtered) / 5
+    reference = {p.time_s: p for p in all_smoothed if p.time_s > 40.0}
+    pairs = [(reference[p.time_s], p) for p in smoothed if p.time_s in reference]
+    assert len(pairs) > 0.96 * len(reference) > 2000
+    sigma = np.sqrt([np.diag(a.covariance) for a, _ in pairs])
+    apart = np.array([np.concatenate([a.position_l - b.position_l, a.angles - b.angles]) for a, b in pairs]) / sigma
+    assert np.sqrt((apart**2).mean(axis=0)).max() < 0.4  # some had seen seconds more
+    assert np.abs(apart[-50:]).max() < 0.05  # at the end both have seen the same fixes
+    error, sigma = misses(f, [p for p in smoothed if p.time_s > 40.0])
+    assert 0.4 < np.sqrt(((error / sigma) ** 2).mean()) < 1.5
+
+
+def test_integrals_to_several_ends_are_those_of_each():
+    data = flight().inertial[:60].corrected()
+    gyro, accel = np.array([1e-5, -2e-5, 3e-5]), np.array([1e-3, 2e-3, -1e-3])
+    several = integrate_to(data, [1, 7, 8, 60], gyro, accel)
+    for end, run_to in zip([1, 7, 8, 60], several, strict=True):
+        one = integrate_one(data[:end], gyro, accel)
+        for name in one.__slots__:
+            assert np.allclose(getattr(run_to, name), getattr(one, name), rtol=1e-12, atol=1e-15), name
 
 
 def test_fixes_that_are_too_late_or_come_twice_are_counted():

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from triline.nodes.ordering import MAX_JUMP_NS, REBASE_AFTER, Sequencer, StreamCheck, order_key
+from triline.nodes.ordering import MAX_JUMP_NS, REBASE_AFTER, Sequencer, StreamCheck, is_orderly, order_key
 from triline.schemas import topics
 from triline.schemas.envelope import Envelope
 
@@ -224,6 +225,10 @@ def test_one_stream_needs_no_other_to_come_first():
 # ---- checks of one stream
 
 
+#: The longest jump that is believed at once.
+JUMP_MS = MAX_JUMP_NS // MS
+
+
 def accept(check, sequence, stamp_ms, topic="sensor/gnss", source="a", start=0):
     return check.accept(topic, Envelope(stamp_ms * MS, source, sequence, start), (sequence, stamp_ms))
 
@@ -311,3 +316,20 @@ def test_no_message_passes_twice(messages):
     check = StreamCheck()
     passed = [m for q, t in messages for m in accept(check, q, t)]
     assert len({sequence for sequence, _ in passed}) == len(passed)
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0, 1, 1, 1, 1, 3]), st.sampled_from([-1, 0, 5, 5, JUMP_MS, JUMP_MS + 1]))),
+    st.sampled_from(["sensor/gnss", "observation/control", "trajectory/smoothed"]),
+)
+@settings(max_examples=300, deadline=None, derandomize=True, database=None)
+def test_a_stream_is_orderly_only_if_every_message_passes_at_once(steps, topic):
+    sequence = np.cumsum([0, *(n for n, _ in steps)])
+    stamp_ms = 1000 + np.cumsum([0, *(t for _, t in steps)])
+    check = StreamCheck()
+    messages = list(zip(sequence.tolist(), stamp_ms.tolist(), strict=True))
+    passed = [accept(check, *message, topic=topic) == [message] for message in messages]
+    if is_orderly(topic, sequence, stamp_ms * MS):
+        assert all(passed)
+    elif topic == "sensor/gnss":
+        assert not all(passed)

@@ -19,6 +19,7 @@ from triline.solver.simulation.window_study import (
     point_errors,
 )
 from triline.solver.window import archive as window_archive
+from triline.solver.window import block as window_block
 from triline.solver.window.results import WindowOptions
 
 #: Two strips side by side, and one across them.
@@ -174,6 +175,25 @@ def test_a_block_keeps_its_bounds_and_says_so(flight, monkeypatch):
     assert {o.strip for o in bounded.whole} == {"S1", "S2", "C1"}
     assert list(bounded.window._block._archive.strips) == ["C1"]
     assert 0.3 < orientation_errors(flight[0], bounded.whole).nees.mean() < 2.0
+
+
+def test_strips_are_published_when_they_are_over_and_when_they_are_closed_no_more_often(flight, monkeypatch):
+    monkeypatch.setattr(window_archive, "MOST_UNKNOWNS", 200)
+    published, solved = [], []
+    plain, solve = window_block.Block.refined, window_archive.Archive.solve
+
+    def watched(self, steps, at_the_end):
+        result = plain(self, steps, at_the_end)
+        if result is not None:
+            published.append({o.strip for o in result.orientation})
+        return result
+
+    monkeypatch.setattr(window_block.Block, "refined", watched)
+    monkeypatch.setattr(window_archive.Archive, "solve", lambda self: solved.append(1) or solve(self))
+    adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    # the first is published twice: at its end, and when the end of the second closes it
+    assert sum("S1" in strips for strips in published) == 2
+    assert len(published) <= 4 and len(solved) <= 4
 
 
 def test_a_point_taken_for_another_ties_nothing(flight, online):

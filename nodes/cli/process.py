@@ -23,6 +23,8 @@ from .progress import progress
 EXAMPLE = "triline process flight.mcap -o out.mcap"
 #: Distance of filtered poses at the pace for throughput, s: they say how good the trajectory is, no more.
 FILTERED_S = 0.2
+#: At that pace smoothed poses come when the adjuster works them in, s.
+SMOOTH_EVERY_S = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +91,8 @@ def at_pace(tables: Tables, pace: str) -> Tables:
     """The configuration of the nodes with that of a pace; what the file says goes before it."""
     if pace != "throughput":
         return tables
-    of_pace = {"navigator": {"filtered_s": FILTERED_S}, "adjuster": {"pace": "throughput"}}
+    rare = {"filtered_s": FILTERED_S, "smooth_every_s": SMOOTH_EVERY_S}
+    of_pace: Tables = {"navigator": rare, "adjuster": {"pace": "throughput"}}
     return tables | {name: table | tables.get(name, {}) for name, table in of_pace.items()}
 
 

@@ -6,7 +6,9 @@ to the other; the last node has those that lead to the present. After an inserti
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +16,21 @@ from numpy.typing import NDArray
 from ..rotation import quaternion_from_matrix
 from .carried import NavigationTrajectory
 from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Start
-from .filter_pass import Carried, Estimates, integrate_blocks
+from .filter_pass import Carried, Estimates
 from .inertial_data import GnssData, InertialData, cut
 from .observations import AntennaPosition, AntennaVelocity, Observation
 from .smoother import corrected, gains, recurse
-from .strapdown import Block, State, integrate_one, propagate
+from .strapdown import Block, State, integrate_one, integrate_to, propagate
 
 Array = NDArray[np.floating]
 
 
 @dataclass(slots=True)
 class Chunk:
-    """Inertial pieces between two poses, and their integrals."""
+    """Inertial pieces between two poses, and their integrals where they have been needed."""
 
     pieces: InertialData
-    block: Block
+    block: Block | None
 
     @property
     def end_s(self) -> float:
@@ -49,8 +51,21 @@ class Span:
         return self.running[-1]
 
     def append(self, chunk: Chunk) -> None:
+        if chunk.block is None:
+            chunk.block = integrate_one(chunk.pieces, self.gyro, self.accel)
         self.running.append(self.running[-1].then(chunk.block) if self.running else chunk.block)
         self.chunks.append(chunk)
+
+    def extend(self, pieces: InertialData, borders: Sequence[int]) -> None:
+        """Several chunks, of the pieces between borders; only the integrals from the node are made."""
+        runs = integrate_to(pieces, borders[1:], self.gyro, self.accel)
+        before = self.running[-1] if self.running else None
+        self.running += runs if before is None else [before.then(run) for run in runs]
+        self.chunks += [Chunk(pieces[a:b], None) for a, b in pairwise(borders)]
+
+    def start(self, n: int) -> Span:
+        """The first n chunks."""
+        return Span(self.gyro, self.accel, self.chunks[:n], self.running[:n])
 
 
 @dataclass(slots=True)
@@ -103,7 +118,7 @@ class NavigationChain:
 
     def extend(self, pieces: InertialData, ends: list[int]) -> None:
         """Many chunks that follow: inertial pieces (corrected), and where each chunk ends. As `append` of each."""
-        borders = np.array([0, *ends])
+        borders = [0, *ends]
         length = np.concatenate([[0.0], np.cumsum(pieces.dt_s)])[borders]
         i = 0
         while i < len(ends):
@@ -112,10 +127,7 @@ class NavigationChain:
             span = self.nodes[-1].span
             before = span.total.duration_s if span.chunks else 0.0
             n = 1 + int((before + length[i + 1 : -1] - length[i] < self.step_s - 1e-9).sum())
-            block = np.repeat(np.arange(n), np.diff(borders[i : i + n + 1]))
-            blocks, _ = integrate_blocks(pieces[borders[i] : borders[i + n]], block, n, (span.gyro, span.accel))
-            for k, integrals in enumerate(blocks, i):
-                span.append(Chunk(pieces[borders[k] : borders[k + 1]], integrals))
+            span.extend(pieces[borders[i] : borders[i + n]], [b - borders[i] for b in borders[i : i + n + 1]])
             i += n
 
     def close(self) -> None:
@@ -194,11 +206,9 @@ class NavigationChain:
     def _split(self, k: int, time_s: float) -> None:
         """Make a node inside the span of node ``k``."""
         nodes, span = self.nodes, self.nodes[k].span
-        first, second = Span(span.gyro, span.accel), Span(span.gyro, span.accel)
-        for chunk in span.chunks:
-            if chunk.end_s <= time_s + 1e-7:
-                first.append(chunk)
-                continue
+        n = next((i for i, chunk in enumerate(span.chunks) if chunk.end_s > time_s + 1e-7), len(span.chunks))
+        first, second = span.start(n), Span(span.gyro, span.accel)
+        for chunk in span.chunks[n:]:
             begin = float(chunk.pieces.time_s[0] - chunk.pieces.dt_s[0])
             if begin >= time_s - 1e-7:
                 second.append(chunk)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -220,12 +221,12 @@ class GnssData:
         """Earth-fixed positions (m, 3)."""
         return earth.ecef_from_geodetic(self.lat, self.lon, self.height_m)
 
-    @property
+    @cached_property
     def R_en(self) -> Array:
         """North-east-down at each fix to Earth-fixed, (m, 3, 3)."""
         return earth.R_en(self.lat, self.lon)
 
-    @property
+    @cached_property
     def velocity_e(self) -> Array | None:
         return None if self.velocity_n is None else np.einsum("mij,mj->mi", self.R_en, self.velocity_n)
 

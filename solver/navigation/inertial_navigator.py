@@ -7,7 +7,9 @@ gives the same poses as the live run.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +27,10 @@ from .pose import NavigationEvent, NavigationPose
 from .strapdown import State
 
 Array = NDArray[np.floating]
+Vector = tuple[float, float, float]
+#: A sample that waits: its end, length, angle and velocity increments, additional noise; plain numbers, because they
+#: come by the thousand and are worked on together.
+Sample = tuple[float, float, float, float, float, float, float, float, float, float]
 
 
 class InertialNavigator:
@@ -54,7 +60,7 @@ class InertialNavigator:
         self._events: list[NavigationEvent] = []
         self._last_s = -np.inf  # stamp of the last inertial sample
         self._interval = 0.0
-        self._previous: tuple[Array, Array, float] | None = None  # sample before the open ones
+        self._previous: tuple[Vector, Vector, float] | None = None  # sample before the open ones
         self._published = -np.inf
         self._published_smooth = -np.inf
         self._replaying = False
@@ -65,7 +71,7 @@ class InertialNavigator:
         self._chain: NavigationChain | None = None
         self._alignment = AlignmentBuffer(self.settings, self.options, prior)
         self._waiting: list[tuple[float, GnssData]] = []
-        self._open: list[tuple[float, float, Array, Array, float, float]] = []
+        self._open: list[Sample] = []
         self._ends: list[int] = []  # of chunks among the open ones
         self._next_pose = self._next_answer = -np.inf
         self._next_smooth = -np.inf
@@ -88,22 +94,25 @@ class InertialNavigator:
 
     # ------------------------------------------------------------------------------------------------ inertial data
 
-    def add_inertial(self, time_s: float, interval_s: float, force: ArrayLike, rate: ArrayLike) -> list[NavigationPose]:
+    def add_inertial(
+        self, time_s: float, interval_s: float, force: Iterable[float], rate: Iterable[float]
+    ) -> list[NavigationPose]:
         """Mean specific force (m/s^2) and angular rate (rad/s), body axes, over the interval that ends at a time.
 
         Raises
         ------
         ValueError : values that are not finite, or an interval that is not positive
         """
-        f, w = np.asarray(force, dtype=float), np.asarray(rate, dtype=float)
-        return self.add_increments(time_s, interval_s, f * interval_s, w * interval_s)
+        dv, dtheta = [x * interval_s for x in force], [x * interval_s for x in rate]
+        return self.add_increments(time_s, interval_s, dv, dtheta)
 
     def add_increments(
-        self, time_s: float, interval_s: float, dv: ArrayLike, dtheta: ArrayLike
+        self, time_s: float, interval_s: float, dv: Iterable[float], dtheta: Iterable[float]
     ) -> list[NavigationPose]:
         """Velocity (m/s) and angle (rad) increments, body axes, over the interval that ends at a time."""
-        v, th = np.asarray(dv, dtype=float), np.asarray(dtheta, dtype=float)
-        if not (interval_s > 0.0 and np.isfinite(time_s) and np.isfinite(v).all() and np.isfinite(th).all()):
+        vx, vy, vz = map(float, dv)
+        ax, ay, az = map(float, dtheta)
+        if not (interval_s > 0.0 and math.isfinite(time_s + vx + vy + vz + ax + ay + az)):
             raise ValueError(f"inertial sample at {time_s} s over {interval_s} s is not finite")
         if time_s <= self._last_s:
             self.counters["inertial out of order"] += 1
@@ -111,7 +120,8 @@ class InertialNavigator:
         poses: list[NavigationPose] = []
         gap = time_s - interval_s - self._last_s
         step = time_s - self._last_s
-        if np.isfinite(self._last_s) and step > GAP_FACTOR * interval_s:
+        begun = self._last_s > -math.inf
+        if begun and step > GAP_FACTOR * interval_s:
             self.counters["inertial gap"] += 1
             if gap > self.settings.longest_gap_s:
                 self._event(time_s, f"inertial data missing for {gap:.1f} s: aligning anew")
@@ -119,13 +129,13 @@ class InertialNavigator:
                 self._forget()
                 self._previous = None
             else:
-                poses += self._bridge(time_s, interval_s, v, th)
-        elif np.isfinite(self._last_s):
+                poses += self._bridge(time_s, interval_s, (vx, vy, vz), (ax, ay, az))
+        elif begun:
             interval_s = step  # stamps are better than the nominal interval
         if said := self._watch_gnss.inertial(time_s):
             self.counters["gnss outage"] += 1
             self._event(time_s, said if self.aligned else f"{said}: the alignment waits for it")
-        poses += self._sample(time_s, interval_s, th, v, 0.0, 0.0)
+        poses += self._sample((time_s, interval_s, ax, ay, az, vx, vy, vz, 0.0, 0.0))
         return poses
 
     def add_attitude(self, time_s: float, rpy: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]:
@@ -133,7 +143,7 @@ class InertialNavigator:
         self.counters["attitude not used"] += 1
         return []
 
-    def _bridge(self, time_s: float, interval_s: float, v: Array, th: Array) -> list[NavigationPose]:
+    def _bridge(self, time_s: float, interval_s: float, v: Vector, th: Vector) -> list[NavigationPose]:
         before = self._newest()
         if before is None:
             return []
@@ -147,58 +157,53 @@ class InertialNavigator:
             zero,
         ).bridged(self.settings.gap_rate_sigma, self.settings.gap_force_sigma)
         poses: list[NavigationPose] = []
-        for i in range(1, len(pair) - 1):
-            poses += self._sample(
-                float(pair.time_s[i]),
-                float(pair.dt_s[i]),
-                pair.dtheta[i],
-                pair.dv[i],
-                float(pair.gyro_psd[i]),
-                float(pair.accel_psd[i]),
-            )
+        for sample in _samples(pair)[1:-1]:
+            poses += self._sample(sample)
         return poses
 
-    def _newest(self) -> tuple[Array, Array, float] | None:
-        if self._open:
-            _, dt, th, v, _, _ = self._open[-1]
-            return th, v, dt
-        return self._previous
+    def _newest(self) -> tuple[Vector, Vector, float] | None:
+        return _increments(self._open[-1]) if self._open else self._previous
 
-    def _sample(
-        self, time_s: float, dt: float, th: Array, v: Array, psd_g: float, psd_a: float
-    ) -> list[NavigationPose]:
-        self._last_s = time_s
-        self._open.append((time_s, dt, th, v, psd_g, psd_a))
+    def _sample(self, sample: Sample) -> list[NavigationPose]:
+        time_s = self._last_s = sample[0]
+        self._open.append(sample)
         step = self.options.pose_step_s
         if time_s < self._next_pose - 1e-6 and not self._pose_due:
             return []
-        self._next_pose = (np.floor(time_s / step + 1e-6) + 1.0) * step
+        self._next_pose = (math.floor(time_s / step + 1e-6) + 1.0) * step
         if time_s < self._next_answer - 1e-6:
             self._ends.append(len(self._open))
             return []
-        self._next_answer = time_s + self.options.filtered_s
+        # an answer can wait for the fix that belongs to it, which may be a little late
+        self._next_answer = time_s + 2.0 * self.options.filtered_s
         return self._close_chunk()
 
-    def _close_chunk(self, answer: bool = True) -> list[NavigationPose]:
-        """Integrate the open samples, take in fixes that waited for them, and answer."""
-        if not self._open:
+    def _close_chunk(self, answer: bool = True, to_s: float = np.inf) -> list[NavigationPose]:
+        """Integrate the open samples (up to the one that a time lies in), take in fixes that waited for them, and
+        answer."""
+        n = len(self._open)
+        while n > 1 and self._open[n - 2][0] > to_s - 1e-7:
+            n -= 1
+        if not n:
             return []
-        t, dt, th, v, pg, pa = (np.array(column) for column in zip(*self._open, strict=True))
-        raw = InertialData(t, dt, th, v, pg, pa)
-        ends = [*self._ends, len(t)] if len(t) not in self._ends[-1:] else self._ends
-        self._open, self._ends = [], []
+        closed, self._open = self._open[:n], self._open[n:]
+        table, newest = np.array(closed), _increments(closed[-1])
+        raw = InertialData(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5:8], table[:, 8], table[:, 9])
+        ends = [*(end for end in self._ends if end < n), n]
+        self._ends = [end - n for end in self._ends if end > n]
         if self._chain is None:
             self._alignment.append(raw)
-            self._previous = th[-1], v[-1], float(dt[-1])
+            self._previous = newest
             return []
         pieces = raw.corrected(self._previous)
-        self._previous = th[-1], v[-1], float(dt[-1])
+        self._previous = newest
         if len(ends) == 1:
             self._chain.append(pieces)
         else:
             self._chain.extend(pieces, ends)
-        ready = [w for w in self._waiting if w[0] <= self._last_s]
-        self._waiting = [w for w in self._waiting if w[0] > self._last_s]
+        reach = self._chain.end_s
+        ready = [w for w in self._waiting if w[0] <= reach]
+        self._waiting = [w for w in self._waiting if w[0] > reach]
         for time_s, fix in ready:
             self._insert(time_s, fix)
         self._pose_due = False
@@ -240,12 +245,17 @@ class InertialNavigator:
             self._waiting.append((time_s, fix))
             self._waiting.sort(key=lambda f: f[0])
             return []
-        self._close_chunk(answer=False)  # smoothing can wait for the next sample, the fix cannot
+        together = self.options.filtered_s > 0.0
+        # smoothing can wait for the next sample, the fix cannot; where answers are rare, a chunk ends with the fix
+        self._close_chunk(answer=False, to_s=time_s if together else np.inf)
         if self._chain is None or not self._insert(time_s, fix) or self._chain is None:
             return []
         poses = self._filtered()
+        if together:
+            self._next_answer = self._last_s + 2.0 * self.options.filtered_s
+            return [*poses, *self._smoothed(self.options.lag_s)]
         # if no sample has come since the last pose, the next one brings the fix out
-        self._pose_due = not poses and not self.options.filtered_s
+        self._pose_due = not poses
         return poses
 
     def _insert(self, time_s: float, fix: GnssData) -> bool:
@@ -296,11 +306,8 @@ class InertialNavigator:
         self._previous, self._waiting, self._replaying = None, list(found.fixes), True
         self._next_pose = self._next_answer = -np.inf
         end = self._last_s
-        for i in range(len(raw)):
-            self._sample(
-                float(raw.time_s[i]), float(raw.dt_s[i]), raw.dtheta[i], raw.dv[i], float(raw.gyro_psd[i]),
-                float(raw.accel_psd[i]),
-            )  # fmt: skip
+        for sample in _samples(raw):
+            self._sample(sample)
         self._close_chunk()
         self._last_s, self._replaying = end, False
         self._waiting = list(found.ahead)
@@ -369,6 +376,16 @@ class InertialNavigator:
 
     def _event(self, time_s: float, text: str) -> None:
         self._events.append(NavigationEvent(time_s, text))
+
+
+def _increments(sample: Sample) -> tuple[Vector, Vector, float]:
+    """Angle and velocity increments of a sample, and its length."""
+    return sample[2:5], sample[5:8], sample[1]
+
+
+def _samples(data: InertialData) -> list[Sample]:
+    columns = (data.time_s, data.dt_s, data.dtheta, data.dv, data.gyro_psd, data.accel_psd)
+    return [tuple(row) for row in np.column_stack(columns).tolist()]
 
 
 def _states(time_s: list[float], states: list[State]) -> NavigationStates:

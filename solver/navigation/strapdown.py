@@ -20,6 +20,7 @@ alongside. Measured = true (1 + scale) + bias.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,6 +132,9 @@ class Integrals:
     ----------
     duration_s : (b, m) time since the start of the block at the end of each piece
     quaternion, v, p : (b, m, 4), (b, m, 3), (b, m, 3) running values
+    R, A, B, Jv : (b, m, 3, 3), (b, m, 3, k) the same of the others (see `Block`)
+    Jp, Bp : (b, m, 3, k) what each piece adds to the totals
+    variances : (b, m, 2) the same of gyro and accelerometer variance
     blocks : the totals
     """
 
@@ -138,7 +142,24 @@ class Integrals:
     quaternion: Array
     v: Array
     p: Array
+    R: Array
+    A: Array
+    B: Array
+    Jv: Array
+    Jp: Array
+    Bp: Array
+    variances: Array
     blocks: list[Block]
+
+    def running(self, ends: Sequence[int]) -> list[Block]:
+        """Integrals of the first block from its start to several ends (numbers of pieces)."""
+        Jp, Bp, variances = (np.cumsum(x[0], axis=0) for x in (self.Jp, self.Bp, self.variances))
+        durations, noise = self.duration_s[0].tolist(), variances.tolist()
+        R, v, p, A, B, Jv = (x[0] for x in (self.R, self.v, self.p, self.A, self.B, self.Jv))
+        return [
+            Block(durations[i], R[i], v[i], p[i], A[i], B[i], Jv[i], Jp[i], Bp[i], *noise[i])
+            for i in (end - 1 for end in ends)
+        ]
 
 
 def integrate(
@@ -178,12 +199,15 @@ def integrate(
     J = skew(df) @ (At - 0.5 * A)
     Jt = np.cumsum(J, axis=1)
     T = t[..., None]
-    Jp = ((Jt - 0.5 * J) * T).sum(axis=1)
-    Bp = ((Bt - 0.5 * B) * T).sum(axis=1)
+    dJp, dBp = (Jt - 0.5 * J) * T, (Bt - 0.5 * B) * T
+    Jp, Bp = dJp.sum(axis=1), dBp.sum(axis=1)
     duration = np.cumsum(dt, axis=1)
     n = len(dt)
-    vg = np.zeros(n) if gyro_psd is None else (gyro_psd * dt).sum(axis=1)
-    va = np.zeros(n) if accel_psd is None else (accel_psd * dt).sum(axis=1)
+    variances = np.zeros((*dt.shape, 2))
+    for i, psd in enumerate((gyro_psd, accel_psd)):
+        if psd is not None:
+            variances[:, :, i] = psd * dt
+    vg, va = variances.sum(axis=1).T
     blocks = [
         Block(
             float(duration[i, -1]),
@@ -200,16 +224,23 @@ def integrate(
         )
         for i in range(n)
     ]
-    return Integrals(duration, q, v, p, blocks)
+    return Integrals(duration, q, v, p, R_end, At, Bt, Jt, dJp, dBp, variances, blocks)
 
 
 def integrate_one(pieces: InertialData, gyro: Array, accel: Array) -> Block:
     """Integrals over one block of pieces (corrected), with sensor errors (k,) taken off."""
-    scale = len(gyro) == 6
+    return _integrated(pieces, gyro, accel).blocks[0]
+
+
+def integrate_to(pieces: InertialData, ends: Sequence[int], gyro: Array, accel: Array) -> list[Block]:
+    """The same from the start of the pieces to each of several ends (numbers of pieces)."""
+    return _integrated(pieces, gyro, accel).running(ends)
+
+
+def _integrated(pieces: InertialData, gyro: Array, accel: Array) -> Integrals:
     phi, dv = without_errors(pieces, gyro, accel)
-    return integrate(
-        pieces.dt_s[None], phi[None], dv[None], scale, pieces.gyro_psd[None], pieces.accel_psd[None]
-    ).blocks[0]
+    psd = pieces.gyro_psd[None], pieces.accel_psd[None]
+    return integrate(pieces.dt_s[None], phi[None], dv[None], len(gyro) == 6, *psd)
 
 
 def without_errors(pieces: InertialData, gyro: Array, accel: Array) -> tuple[Array, Array]:

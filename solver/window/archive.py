@@ -152,10 +152,14 @@ class Archive:
                 block[np.ix_(row, column)] += matrix[np.ix_(mine, others)]
 
     def _block(self, g: int, h: int, rows: int, columns: int) -> Array:
-        """The block of two groups, made large enough."""
+        """The block of two groups, made large enough: at once for the longest strip, since memory that nothing was
+        written to costs nothing, and copying would write to all of it."""
         old = self._blocks.get((g, h), np.zeros((0, 0)))
         if old.shape[0] < rows or old.shape[1] < columns:
-            size = [max(old.shape[k], wanted + wanted // 4) for k, wanted in enumerate((rows, columns))]
+            size = [
+                max(n, wanted + wanted // 4, MOST_OF_STRIP)
+                for n, wanted in zip(old.shape, (rows, columns), strict=True)
+            ]
             new = np.zeros((max(size), max(size)) if g == h else size)
             new[: old.shape[0], : old.shape[1]] = old
             self._blocks[g, h] = old = new
@@ -347,7 +351,7 @@ class Archive:
         self.points = {name: p for name, p in self.points.items() if id not in p.strips}
 
     def close(self, id: str) -> None:
-        """Let a strip's unknowns go; what they say of the others stays (Schur complement)."""
+        """Let a strip's unknowns go; what they say of the others stays (Schur complement): their solution does too."""
         strip, g = self.strips[id], self._groups[id]
         numbers = np.sort(strip.entered)
         n = len(numbers)
@@ -376,7 +380,6 @@ class Archive:
                 block = self._block(h, k, size, others[k].shape[1])
                 block[:size, : others[k].shape[1]] -= through @ others[k]
         self.drop(id)
-        self.changed = True
 
 
 def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:

@@ -44,7 +44,6 @@ class Block:
         self._state, self._strips = state, strips
         self._touched: set[str] = set()
         self._new: list[str] = []
-        self._solution: BlockSolution | None = None
         self._full = 0
 
     # -- what becomes known --------------------------------------------------------------------------------------------
@@ -119,24 +118,23 @@ class Block:
             chain = backward(steps, self._state)
             points = [p for p in chain.points if p.name not in self._archive.points]
             parts.append(WholeStrips([o for o in chain.orientation if o.strip in alone], points))
-        if over and (self._archive.changed or set(self._new) & set(over)):
-            self._solution = self._archive.solve()
-            self.earlier.learn(self._archive, self._solution)
-        if self._solution is not None and over:
+        if over and (self._archive.changed or at_the_end or set(self._new) & set(over)):
+            solution = self._archive.solve()  # not kept: with all its cofactors it is the largest thing there is
             wanted = over if at_the_end or late else [id for id in self._new if id in over]
-            parts.append(self._archive.whole(self._solution, wanted))
-            parts += self._close_oldest()
+            parts.append(self._archive.whole(solution, wanted))
+            parts += self._close_oldest(solution)
+            if not at_the_end:
+                self.earlier.learn(self._archive, solution)
         self._new = []
         if self.earlier.full > self._full:
             self._full = self.earlier.full
             self.events.append(f"{self._full} points were seen in too many earlier strips at a time to tie all of them")
         return _joined(parts)
 
-    def _close_oldest(self) -> Iterable[WholeStrips]:
+    def _close_oldest(self, solution: BlockSolution) -> Iterable[WholeStrips]:
         """Keep the bounds; strips that are closed are refined a last time."""
-        assert self._solution is not None
         while (id := self._archive.oldest_beyond()) is not None:
-            yield self._archive.whole(self._solution, [id])
+            yield self._archive.whole(solution, [id])
             self._archive.close(id)
             self.events.append(
                 f"strip {id} is refined no more: the block has over {MOST_UNKNOWNS} unknowns or {MOST_POINTS} points"
