@@ -96,7 +96,7 @@ def fly(case: dict[str, Any], again: int) -> dict[str, Any]:
         # control is the same in both: targets as they were measured
         others = [message for message in messages if not message.topic.startswith("sensor/lines/")]
         others += [message for message in ties if is_target(message)]
-        error, sigma = tie_errors(flight, [message.body for message in found])
+        error, sigma, _ = tie_errors(flight, [message.body for message in found])
         normalised = float(((error / sigma)[np.hypot(*error.T) < WRONG_PX] ** 2).mean())
         simulated = []
         for k in range(again):
