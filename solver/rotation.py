@@ -40,6 +40,32 @@ def matrix_from_angles(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Ar
     return R
 
 
+def turned_tilt(omega: ArrayLike, phi: ArrayLike, turn: ArrayLike) -> tuple[Array, Array]:
+    """Omega and phi of a camera (...) that is turned about the vertical by ``turn`` radians.
+
+    Of a tilt of 6 deg, turned by 3 deg, 2e-5 rad are left out.
+    """
+    o, p, s, c = np.asarray(omega), np.asarray(phi), np.sin(turn), np.cos(turn)
+    return c * o - s * p, s * o + c * p
+
+
+def corrected_angles(measured: Array, correction: Array) -> Array:
+    """Measured omega, phi, kappa (n, 3) with corrections (n, 3) as a sliding window finds them.
+
+    The heading of an inertial system is wrong about the vertical, so that its omega and phi, right about level axes,
+    are told in axes that are turned: kappa's correction turns the measured tilt, and then all three are added.
+    """
+    omega, phi = turned_tilt(measured[:, 0], measured[:, 1], correction[:, 2])
+    return np.stack([omega, phi, measured[:, 2]], axis=1) + correction
+
+
+def measured_angles(true: Array, error: Array) -> Array:
+    """Omega, phi, kappa (n, 3) as measured with errors (n, 3); `corrected_angles` with minus the errors goes back."""
+    wrong = true + error
+    omega, phi = turned_tilt(wrong[:, 0], wrong[:, 1], error[:, 2])
+    return np.stack([omega, phi, wrong[:, 2]], axis=1)
+
+
 def angles_from_matrix(R_lc: ArrayLike) -> Array:
     """Angles ``(omega, phi, kappa)`` in radians, shape (..., 3), of rotations (..., 3, 3); phi in [-pi/2, pi/2]."""
     R = np.asarray(R_lc, dtype=float)

@@ -7,7 +7,7 @@ from simulated_rays import EXACT, flown, reprojection_px
 from triline.solver.collinearity import project
 from triline.solver.frames import R_lc_from_navigation
 from triline.solver.navigation.inertial_data import TACTICAL
-from triline.solver.rotation import angles_from_matrix, matrix_from_angles
+from triline.solver.rotation import angles_from_matrix, corrected_angles, matrix_from_angles
 from triline.solver.sensors import preset
 from triline.solver.simulation.error_models import ErrorModel, antenna_position, draw_slow_errors
 from triline.solver.simulation.flight import FlightPlan
@@ -273,7 +273,7 @@ def test_sensors_measure_truth_plus_slow_error_plus_noise(demo):
 
     poses = flight.truth.at(demo.attitude_time_s)
     R = R_lc_from_navigation(flight.frame, poses.position_l, demo.attitude_rpy, demo.mounting.R_bc)
-    rest = angles_from_matrix(R) - poses.angles - demo.slow.at(demo.attitude_time_s)[:, 3:]
+    rest = corrected_angles(angles_from_matrix(R), -demo.slow.at(demo.attitude_time_s)[:, 3:]) - poses.angles
     # flying east and level, roll turns about X, pitch about -Y and heading about -Z
     n = len(rest)
     assert rest.std(axis=0) / np.radians(model.attitude_noise_deg) == pytest.approx(1.0, abs=4 / np.sqrt(2 * n) + 0.01)

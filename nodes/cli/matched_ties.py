@@ -31,12 +31,12 @@ def is_target(message: Message) -> bool:
     return message.topic == "observation/tie" and "-M" not in message.body.point and message.source == Matcher.name
 
 
-def tie_errors(flight: Flight, ties: list[Any]) -> tuple[Array, Array]:
-    """(rays, 2) errors of line and sample against the point's first ray, and their sigma (rays, 2), px."""
+def tie_errors(flight: Flight, ties: list[Any]) -> tuple[Array, Array, list[str]]:
+    """(rays, 2) errors of line and sample against the point's first ray, their sigma (rays, 2), px; CCD lines."""
     true, index = true_rays(flight, ties)
     number = {strip.id: i for i, strip in enumerate(flight.strips)}
     first: dict[str, Any] = {}
-    rows = []
+    rows, ccds = [], []
     for tie in ties:
         base = first.setdefault(tie.point, tie.images[0])
         for ray in tie.images:
@@ -45,8 +45,9 @@ def tie_errors(flight: Flight, ties: list[Any]) -> tuple[Array, Array]:
                 continue
             sigma = np.hypot([ray.sigma_line, ray.sigma_sample], [base.sigma_line, base.sigma_sample])
             rows.append((ray.line - at[0], ray.sample - at[1], *sigma))
+            ccds.append(ray.ccd)
     table = np.array(rows).reshape(-1, 4)
-    return table[:, :2], table[:, 2:]
+    return table[:, :2], table[:, 2:], ccds
 
 
 def simulated_ties(flight: Flight, ties: list[Message], rng: np.random.Generator, scale: float = 1.0) -> list[Message]:

@@ -76,17 +76,24 @@ def fly(settings: dict[str, Any]) -> dict[str, Any]:
 def tie_quality(flight: Flight, ties: list[Any]) -> dict[str, Any]:
     """Errors of matched ties (messages): each ray against the truth of the place of the point's first ray.
 
-    Sigma is the robust one of single coordinates of good rays; normalised errors squared should be 1.
+    Sigma is the robust one of single coordinates of good rays; normalised errors squared should be 1. ``common`` is
+    what good rays of a CCD line have in common: mean of line and sample, and its standard error.
     """
-    error, sigma = tie_errors(flight, ties)
+    error, sigma, ccds = tie_errors(flight, ties)
     if not len(error):
-        return {"ties": 0, "rays": 0, "good": 0.0, "wrong": 0.0, "sigma_px": 0.0, "normalised": [0.0, 0.0]}
+        nothing: dict[str, Any] = {"ties": 0, "rays": 0, "good": 0.0, "wrong": 0.0, "sigma_px": 0.0}
+        return {**nothing, "normalised": [0.0, 0.0], "common": {}}
     length = np.hypot(*error.T)
     good = length < GOOD_PX
+    common = {}
+    for ccd in dict.fromkeys(ccds):
+        mine = error[good & (np.array(ccds) == ccd)]
+        if len(mine) > 1:
+            common[ccd] = [mine.mean(axis=0).tolist(), (mine.std(axis=0) / np.sqrt(len(mine))).tolist()]
     return {
         "ties": len(ties), "rays": len(length) + len(ties), "good": float(good.mean()),
         "wrong": float((length > WRONG_PX).mean()), "sigma_px": float(1.4826 * np.median(np.abs(error[good]))),
-        "normalised": ((error / sigma)[length <= WRONG_PX] ** 2).mean(axis=0).tolist(),
+        "normalised": ((error / sigma)[length <= WRONG_PX] ** 2).mean(axis=0).tolist(), "common": common,
     }  # fmt: skip
 
 
@@ -102,11 +109,27 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
             f" {r['sigma_px']:6.3f} px   " + " ".join(f"{v:6.2f}" for v in r["normalised"])
         )
     low, high = WANTED_NORMALISED
-    pooled = {kind: np.mean([r["normalised"] for r in rows if r["kind"] == kind]) for kind in {r["kind"] for r in rows}}
+    pooled = {
+        kind: np.mean([r["normalised"] for r in rows if r["kind"] == kind])
+        for kind in dict.fromkeys(r["kind"] for r in rows)
+    }
     checks = (
         (f"{100 * WANTED_GOOD:g} % within {GOOD_PX} px", all(r["good"] >= WANTED_GOOD for r in rows)),
         (f"sigma of the good ones below {WANTED_SIGMA_PX} px", all(0 < r["sigma_px"] < WANTED_SIGMA_PX for r in rows)),
         (f"wrong ones below {100 * WANTED_WRONG:g} %", all(r["wrong"] < WANTED_WRONG for r in rows)),
         (f"normalised errors squared of each kind in {low} to {high}", all(low <= v <= high for v in pooled.values())),
     )
-    return out + [f"  {'met' if met else 'NOT MET'}: {text}" for text, met in checks]
+    out += [f"  {'met' if met else 'NOT MET'}: {text}" for text, met in checks]
+    return out + [f"  {kind}, errors common to a CCD line, px: {common_errors(rows, kind)}" for kind in pooled]
+
+
+def common_errors(rows: list[dict[str, Any]], kind: str) -> str:
+    """What rays of a CCD line have in common in flights of a kind, weighted by how well each tells it."""
+    texts, found = [], [r["common"] for r in rows if r["kind"] == kind]
+    for ccd in dict.fromkeys(ccd for common in found for ccd in common):
+        mean, error = np.array([common[ccd] for common in found if ccd in common]).swapaxes(0, 1)
+        weight = 1.0 / np.maximum(error, 1e-6) ** 2
+        value, sigma = (weight * mean).sum(axis=0) / weight.sum(axis=0), weight.sum(axis=0) ** -0.5
+        each = zip(("line", "sample"), value, sigma, strict=True)
+        texts.append(f"{ccd} " + ", ".join(f"{name} {v:+.4f} +- {s:.4f}" for name, v, s in each))
+    return "; ".join(texts)

@@ -96,7 +96,7 @@ def fly(case: dict[str, Any], again: int) -> dict[str, Any]:
         # control is the same in both: targets as they were measured
         others = [message for message in messages if not message.topic.startswith("sensor/lines/")]
         others += [message for message in ties if is_target(message)]
-        error, sigma = tie_errors(flight, [message.body for message in found])
+        error, sigma, _ = tie_errors(flight, [message.body for message in found])
         normalised = float(((error / sigma)[np.hypot(*error.T) < WRONG_PX] ** 2).mean())
         simulated = []
         for k in range(again):
@@ -185,6 +185,24 @@ def ratios(rows: list[dict[str, Any]], rng: np.random.Generator) -> tuple[Array,
     return ratio, ratio * logarithm(rng.integers(0, len(rows), (BOOTSTRAPS, len(rows)))).std(axis=0)
 
 
+def luck(rows: list[dict[str, Any]], rng: np.random.Generator) -> Array:
+    """Standard deviation (10,) of the same ratios by other noise alone, if matched ties are just as good.
+
+    One drawing of simulated noise a flight takes the place of the matched ties, the others are what it is held against;
+    all NaN with one drawing.
+    """
+    squares = np.array([row["simulated"] for row in rows])  # (flights, drawings, 9)
+    flights, again, _ = squares.shape
+    if again < 2:
+        return np.full(len(COMPONENTS) + 1, np.nan)
+    chosen = squares[np.arange(flights), rng.integers(0, again, (BOOTSTRAPS, flights))]
+    others = (squares.sum(axis=1) - chosen) / (again - 1)
+    each = 0.5 * np.log(chosen.mean(axis=1) / others.mean(axis=1))
+    each = np.concatenate([each, each.mean(axis=1, keepdims=True)], axis=1)
+    # it is held against one drawing less than the matched ties are
+    return np.sqrt((each**2).mean(axis=0) * (1 + 1 / again) / (1 + 1 / (again - 1)))
+
+
 def lines(rows: list[dict[str, Any]]) -> list[str]:
     """Tables: flights, and ratios by kind."""
     rng, out = np.random.default_rng(1), []
@@ -201,16 +219,18 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
         for name in ("matched", "simulated"):
             squares = np.mean([np.mean(np.atleast_2d(row[name]), axis=0) for row in mine], axis=0)
             out.append(f"  {'RMSE, ' + name + ' (m, mdeg)':<45}" + " ".join(f"{v:7.3f}" for v in unit * squares**0.5))
-        ratio, error = ratios(mine, rng)
-        for name, values in (("ratio", ratio), ("its standard error", error)):
+        (ratio, error), chance = ratios(mine, rng), luck(mine, rng)
+        for name, values in (("ratio", ratio), ("its standard error", error), ("by other noise alone, +-", chance)):
             out.append(f"  {name:<45}" + " ".join(f"{v:7.3f}" for v in values[:-1]))
         # one that is above by chance alone is no finding: two standard errors
         clear = [name for name, r, e in zip(COMPONENTS, ratio[:-1], error, strict=False) if r - 2 * e > WANTED]
         met = ratio[-1] < WANTED and not clear
-        verdict = f"matched over simulated {ratio[-1]:.3f} +- {error[-1]:.3f} (mean of all), wanted below {WANTED:g}"
+        verdict = f"matched over simulated {ratio[-1]:.3f} +- {error[-1]:.3f} (mean of all), wanted below {WANTED:g};"
+        verdict += f" simulated over simulated 1 +- {chance[-1]:.3f}"
         above = f"; clearly above: {', '.join(clear)}" if clear else ""
         out.append(f"  {'met' if met else 'NOT MET'}: {verdict}{above}")
     out.append(
         "one flight a row: ties, sigma0 with matched / simulated ties, normalised errors squared of the matched, ratios"
     )
+    out.append("standard error: drawing flights again; by other noise: one drawing of simulated noise against the rest")
     return out

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..measured_trajectory import GrowingTrajectory
-from ..rotation import matrix_from_angles
+from ..rotation import corrected_angles, matrix_from_angles
 from .pose_smoothing import PoseSmoother
 
 Array = NDArray[np.floating]
@@ -89,7 +89,7 @@ class CurrentOrientation:
             middle = (np.array(numbers) + 0.5) * KNOT_S
             values = np.array([self._knots[k][0] / self._knots[k][1] for k in numbers])
             correction = np.stack([np.interp(t, middle, column) for column in values.T], axis=1)
-            position, angles = position + correction[:, :3], angles + correction[:, 3:]
+            position, angles = position + correction[:, :3], corrected_angles(angles, correction[:, 3:])
         return position, matrix_from_angles(*angles.T)
 
     def covariance(self, time_s: float) -> Array:

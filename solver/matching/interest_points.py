@@ -24,7 +24,11 @@ def image_noise(image: NDArray[np.floating]) -> float:
 
 
 def interest_point(
-    image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, largest_sigma_px: float
+    image: NDArray[np.floating],
+    usable: NDArray[np.bool_],
+    window: int,
+    largest_sigma_px: float,
+    free: NDArray[np.bool_] | None = None,
 ) -> tuple[int, int, float] | None:
     """Row and column of the best place of a cell, and the sigma (px) to be expected there; None if none is good enough.
 
@@ -37,6 +41,7 @@ def interest_point(
     usable : (n,) lines that may be used; places nearer than half a window to one that may not are left out
     window : side of the matching window
     largest_sigma_px : places that would be measured worse are not good enough
+    free : (n, m) where a place may be; everywhere, if not given
     """
     half = window // 2 + 1
     if min(image.shape) < 2 * half + 1:
@@ -45,19 +50,22 @@ def interest_point(
     noise = max(image_noise(some[: max(LARGE_CELL // some.shape[1], 2)]), 0.5) if len(some) > 2 else 1.0
     step = int(np.ceil(np.sqrt(image.size / LARGE_CELL)))
     top = left = 0
+    if free is None:
+        free = np.ones(image.shape, dtype=bool)
     if step > 1:
-        coarse = _worth(image[::step, ::step], usable[::step], max(window // step, 3), max(half // step, 2), noise)
+        coarse = _worth(
+            image[::step, ::step], usable[::step], max(window // step, 3), max(half // step, 2), noise,
+            free[::step, ::step],
+        )  # fmt: skip
         row, column, _ = coarse.best(0.0)
         reach = half + max(window, 2 * step)
         top, left = max(row * step - reach, 0), max(column * step - reach, 0)
-        image, usable = (
-            image[top : row * step + reach + 1, left : column * step + reach + 1],
-            usable[top : row * step + reach + 1],
-        )
+        rows, columns = slice(top, row * step + reach + 1), slice(left, column * step + reach + 1)
+        image, usable, free = image[rows, columns], usable[rows], free[rows, columns]
         if min(image.shape) < 2 * half + 1:
             return None
     # template and searched image are both noisy
-    row, column, least = _worth(image, usable, window, half, noise).best(2 * noise**2 / largest_sigma_px**2)
+    row, column, least = _worth(image, usable, window, half, noise, free).best(2 * noise**2 / largest_sigma_px**2)
     if least <= 0.0:
         return None
     return row + top, column + left, float(np.sqrt(2 * noise**2 / least))
@@ -84,7 +92,14 @@ class Worth:
         return row, column, float(self.least[row, column]) if value[row, column] > 0.0 else 0.0
 
 
-def _worth(image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, half: int, noise: float) -> Worth:
+def _worth(
+    image: NDArray[np.floating],
+    usable: NDArray[np.bool_],
+    window: int,
+    half: int,
+    noise: float,
+    free: NDArray[np.bool_],
+) -> Worth:
     """What a window about each pixel is worth; 0 where no place is wanted."""
     gu, gv = np.gradient(gaussian_filter(image, 0.7))
     strong = 1.0 / np.sqrt(1.0 + (gu * gu + gv * gv) / np.float32(STRONG * noise) ** 2)
@@ -99,7 +114,7 @@ def _worth(image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, 
     least = _smaller(*whole)
     even = 4.0 / np.sum([1.0 / np.maximum(_moved(part, u, v), 1e-6) for u, v in quarters], axis=0)
     wanted = np.zeros(image.shape, dtype=bool)
-    wanted[half:-half, half:-half] = True
+    wanted[half:-half, half:-half] = free[half:-half, half:-half]
     for line in np.flatnonzero(~usable):
         wanted[max(line - half, 0) : line + half + 1] = False
     return Worth(np.where(wanted, least, 0.0), np.where(wanted, even, 0.0))

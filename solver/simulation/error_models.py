@@ -5,7 +5,8 @@ kappa, ``s`` going from 0 at the first line to 1 at the last. Offset, shift, dri
 two they pass smoothly from one to the next. The wander is one process over the whole flight (`wander`).
 
 Measured = true + error, for positions in the local frame and for omega, phi, kappa; a correction that an adjustment
-estimates is minus the error.
+estimates is minus the error. An error of kappa is one of heading, about the vertical: omega and phi, right about level
+axes, are told in axes that are turned with it (`rotation.measured_angles`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from ..frames import LocalFrame, navigation_from_R_lc
-from ..rotation import matrix_from_angles
+from ..rotation import matrix_from_angles, measured_angles
 from ..trajectory import Trajectory
 from ..wander import second_order_gauss_markov
 
@@ -170,7 +171,7 @@ def measure_attitude(
 ) -> Array:
     """Roll, pitch, heading (n, 3) in radians of the body, as an inertial system reports them at times (n,)."""
     poses = truth.at(time_s)
-    angles = poses.angles + slow.at(time_s)[:, 3:]
+    angles = measured_angles(poses.angles, slow.at(time_s)[:, 3:])
     rpy = navigation_from_R_lc(frame, poses.position_l, matrix_from_angles(*angles.T), R_bc)
     rpy += rng.standard_normal(rpy.shape) * np.radians(sigma_deg)
     rpy[:, 2] %= 2 * np.pi

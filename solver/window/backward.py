@@ -16,6 +16,7 @@ from scipy.linalg import solve_triangular
 
 from ..adjustment.normal_equations import PointNormals
 from ..models.base import Design
+from ..rotation import corrected_angles
 from .batch import Batch, inverse_factors
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 from .state import Marginal, WindowState
@@ -120,7 +121,7 @@ def again(
     A[np.arange(len(A))[:, None, None], np.arange(6), local] += design.coefficients[:, :, None]
     A = A[:, :, :-1]
     change = A @ values[place] - old.correction
-    angles = old.angles + change[:, 3:]
+    angles = corrected_angles(old.angles, change[:, 3:])
     angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
     covariance = A @ Q[np.ix_(place, place)] @ np.swapaxes(A, 1, 2) + noise
     return replace(

@@ -21,6 +21,7 @@ from ..adjustment.normal_equations import ControlWeights, PointNormals, point_no
 from ..adjustment.ray_statistics import RayStatistics, ray_statistics, residuals_px
 from ..collinearity import collinearity
 from ..models.base import Design, PseudoObservations
+from ..rotation import turned_tilt
 from ..selfcalibration import SelfCalibration
 
 if TYPE_CHECKING:
@@ -116,16 +117,21 @@ class Batch:
     def linearise(self, theta: Array, reweigh: bool) -> None:
         """Linearise at values (u,) of the unknowns and the present points; ``reweigh`` renews the rays' weights."""
         self.theta, self.origin_l = theta, self.points_l
+        omega, phi, kappa = self.rays.angles.T
+        correction = self.layout.corrections(theta)
+        omega, phi = turned_tilt(omega, phi, correction[5])
+        rays = replace(self.rays, angles=np.stack([omega, phi, kappa], axis=1))
         if reweigh:
-            self.whitening = self._weigh(theta)
-        self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+            self.whitening = self._weigh(rays, correction)
+        self.lin = linearise(rays, self.layout, self.whitening, theta, self.points_l)
+        d = self.lin.orientation  # kappa's correction turns the measured tilt as well
+        d[:, 5] += omega * d[:, 4] - phi * d[:, 3]
         self.eliminate()
 
-    def _weigh(self, theta: Array) -> Whitening:
-        correction = self.layout.corrections(theta)
+    def _weigh(self, rays: Rays, correction: Array) -> Whitening:
         _, d_orientation, _, _ = collinearity(
-            self.rays.position_l.T + correction[:3],
-            self.rays.angles.T + correction[3:],
+            rays.position_l.T + correction[:3],
+            rays.angles.T + correction[3:],
             self.points_l[self.rays.point].T,
             self.rays.focal_length_mm,
         )

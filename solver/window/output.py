@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..measured_trajectory import MeasuredTrajectory
 from ..models.base import COMPONENTS
+from ..rotation import corrected_angles
 from ..selfcalibration import SelfCalibration
 from .batch import Batch
 from .determinability import ESTIMATED, NOT_YET, Standing
@@ -44,7 +45,7 @@ class Orienter:
         parts = [self._chunk(strip, times[i : i + CHUNK]) for i in range(0, len(times), CHUNK)]
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         measured = self._trajectory.at(times)
-        angles = measured.poses.angles + correction[:, 3:]
+        angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
         covariance = covariance + measured.covariance
         return RefinedOrientation(

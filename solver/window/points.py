@@ -14,7 +14,7 @@ from ..camera import LineCamera
 from ..intersection import intersect_rays
 from ..measured_trajectory import MeasuredPoses, MeasuredTrajectory
 from ..models.base import Design
-from ..rotation import matrix_from_angles
+from ..rotation import corrected_angles, matrix_from_angles
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, join_designs, local_layout
 from .results import Look
@@ -218,7 +218,7 @@ class BatchMaker:
         known: dict[str, Array],
     ) -> Array:
         """Where points are (p, 3): as known, at full control, or where their rays meet; NaN where neither holds."""
-        angles = rays.angles + correction[3:].T
+        angles = corrected_angles(rays.angles, correction[3:].T)
         image = np.column_stack([(rays.xy_mm.T - displacement).T, -rays.focal_length_mm])
         direction = np.einsum("nij,nj->ni", matrix_from_angles(*angles.T), image)
         use = np.flatnonzero(weight > 0)
