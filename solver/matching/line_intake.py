@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .line_quality import GOOD, REASONS, judge_lines
+from .line_quality import GOOD, REASONS, SATURATED, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
@@ -33,6 +33,7 @@ class LineIntake:
     Attributes
     ----------
     counters : lines by what was wrong with them
+    saturated : grey value from which on pixels are saturated
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class LineIntake:
     ):
         self.counters: Counter[str] = Counter()
         self.store: LineStore | None = None
+        self.saturated = np.inf
         self._samples, self._options, self._make_store = samples, options, make_store
         self._last_line: dict[str, NDArray[np.unsignedinteger]] = {}
         self._state: dict[str, int] = {}
@@ -85,6 +87,7 @@ class LineIntake:
         if not len(pixels) or first_line < 0:
             raise ValueError(f"no lines of {ccd}, or their number {first_line} is below 0")
         full_scale = self._options.full_scale or (255 if pixels.dtype == np.uint8 else 4095)
+        self.saturated = SATURATED * full_scale
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
         self._tell(ccd, first_line, verdict)

@@ -76,6 +76,7 @@ class Looked:
     xyz_l : (k, 3) with the orientation of now
     disagreement : what is left of their shifts
     chip : (k, n, n) what the master saw about them, on the ground; empty where no patches are kept
+    holes : (k, n, n) what of it was not measured; None for no such pixel
     ground : the grids of the chips
     """
 
@@ -85,6 +86,7 @@ class Looked:
     xyz_l: Array
     disagreement: Disagreement
     chip: NDArray[np.floating] = field(repr=False)
+    holes: NDArray[np.bool_] | None = field(repr=False)
     ground: Ground
 
     def __len__(self) -> int:
@@ -211,13 +213,15 @@ class LookMatcher:
         noise = p.orientation.noise_left
         wobble = (noise[:2].mean() + p.height_and_travel()[0] ** 2 * noise[[4, 3]]) / pixel_m**2
         rays = [self._rays(track, g.ground.spacing_m / pixel_m, wobble) for track in enough]
-        chip, ground = np.empty((len(enough), 0, 0)), Ground(xyz, g.ground.along, g.ground.across, g.ground.spacing_m)
+        ground = Ground(xyz, g.ground.along, g.ground.across, g.ground.spacing_m)
+        chip, holes = np.empty((len(enough), 0, 0)), None
         if self._chip_half:
-            chip = self._image(p.master, scan, g.travel).patches(ground, line, self._chip_half, 1)[0]
+            patches = self._image(p.master, scan, g.travel).patches(ground, line, self._chip_half, 1)
+            chip, holes = patches.values, patches.holes
         across = 2 * g.sample / p.views[p.master].pixels - 1
         return Looked(
             [track.place for track in enough], rays, np.array([track.score.min() for track in enough]), xyz,
-            Disagreement(p.first_s + line / p.rate, across, residual), chip, ground,
+            Disagreement(p.first_s + line / p.rate, across, residual), chip, holes, ground,
         )  # fmt: skip
 
     def _geometry(self, tracks: Sequence[Track], scan: LineScan, height: Array) -> _Geometry:

@@ -120,7 +120,7 @@ class PlaceChooser:
         self._chunk = _Chunk(0, 0, 0)
         self.density.forget()
 
-    def choose(self, ring: LineRing, rate_hz: float, first_line: float = 0.0) -> list[Place]:
+    def choose(self, ring: LineRing, rate_hz: float, first_line: float = 0.0, saturated: float = np.inf) -> list[Place]:
         """Places in the lines that have come.
 
         Lines are gone through in chunks, and the cells of a chunk while the lines of the next one come: so the work is
@@ -129,6 +129,7 @@ class PlaceChooser:
         Parameters
         ----------
         first_line : places before it are of no use
+        saturated : grey value from which on pixels are saturated
         """
         rows = max(round(CHUNK_S * rate_hz), LEAST_CHUNK)
         half = self._window // 2 + 2
@@ -139,7 +140,7 @@ class PlaceChooser:
             if chunk.cells:
                 come = (ring.end - chunk.first - rows - half + 1) / (PROMPT * rows)
                 while chunk.cells and chunk.done < come * chunk.number:
-                    places += self._best(ring, chunk, rows, half)
+                    places += self._best(ring, chunk, rows, half, saturated)
             if chunk.cells or self._next + rows + half > ring.end:
                 return places
             if chunk.number:
@@ -159,13 +160,15 @@ class PlaceChooser:
         cells = _cells(borders, ring)
         return _Chunk(first, len(cells), 0, cells)
 
-    def _best(self, ring: LineRing, chunk: _Chunk, rows: int, half: int) -> list[Place]:
+    def _best(self, ring: LineRing, chunk: _Chunk, rows: int, half: int, saturated: float) -> list[Place]:
         """The best place of the next cell, if there is a good one."""
         left, right = chunk.cells.pop(0)
         chunk.done += 1
         stretch = ring.read(chunk.first - half, chunk.first + rows + half, max(left - half, 0), right + half)
         largest = self._options.largest_sigma_px
-        best = interest_point(stretch.pixels.astype(np.float32), stretch.usable, self._window, largest)
+        best = interest_point(
+            stretch.pixels.astype(np.float32), stretch.usable, self._window, largest, stretch.filled, saturated
+        )
         if best is None:
             return []
         chunk.found += 1

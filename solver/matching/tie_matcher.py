@@ -150,7 +150,8 @@ class TieMatcher:
             if seeing:
                 out += self._settle(self._waiting.give_up(seeing))
             ring = store.rings[self.views[self.prediction.master].ccd]
-            self._waiting.add(self._chooser.choose(ring, self.prediction.rate, self._waiting.first_useful_line(store)))
+            first = self._waiting.first_useful_line(store)
+            self._waiting.add(self._chooser.choose(ring, self.prediction.rate, first, self._lines.saturated))
             self._waiting.add(self._again.find(ring.start, ring.end))
             news = self._chooser.news()
             if news:
@@ -200,7 +201,9 @@ class TieMatcher:
             new = [i for i, tie in zip(index, accepted, strict=True) if not tie.again]
             if part.chip.size and new:
                 names = [tie.name for tie in accepted if not tie.again]
-                self.chips.add(self._strip, names, part.chip[new], part.ground.select(np.array(new)), part.score[new])
+                holes = None if part.holes is None else part.holes[new]
+                ground = part.ground.select(np.array(new))
+                self.chips.add(self._strip, names, part.chip[new], ground, part.score[new], holes)
         self.counters["ties"] += len(ties)
         self.counters["ties with earlier strips"] += sum(tie.again for tie in ties)
         return ties
@@ -218,7 +221,7 @@ class TieMatcher:
 
     def _image(self, index: int, scan: LineScan, travel: float) -> Image:
         assert self._lines.store is not None
-        return Image(scan, self._lines.store.rings[self.views[index].ccd], travel)
+        return Image(scan, self._lines.store.rings[self.views[index].ccd], travel, self._lines.saturated)
 
     def _make_store(self, dtype: np.dtype) -> LineStore | None:
         """Rings as long as the looks need; made when the first poses tell how fast the ground goes by."""
