@@ -338,7 +338,7 @@ def test_views_are_looked_for_as_they_come_and_ties_follow_soon(flown, images, m
     assert np.median([reach for view, _, reach in looked[later:] if view == 1]) < 6.0
     # a patch, the search around it, a block, and what waits for company (the first ones wait to be judged together)
     assert np.quantile(delay[len(delay) // 2 :], 0.9) < 70
-    assert min(track.place.line for track in matcher._waiting.tracks) > len(images[0]) - 280
+    assert min(track.place.line for track in matcher._master.waiting.tracks) > len(images[0]) - 280
 
 
 def test_points_of_two_views_do_without_the_third(flown, images):
@@ -348,6 +348,34 @@ def test_points_of_two_views_do_without_the_third(flown, images):
     assert len(ties) > 60 and {ray.ccd for tie in ties for ray in tie.rays} == {"N", "B"}
     assert (np.hypot(*error.T) < 0.3).mean() > 0.95
     assert matcher.counters["looks never came"] == 0
+
+
+@pytest.mark.parametrize("dead_s", [(0.0, 99.0), (8.0, 99.0), (8.0, 14.0)], ids=["from the start", "dies", "a while"])
+def test_without_the_nadir_line_ties_begin_in_the_next_steepest(flown, images, clean, dead_s):
+    strip = flown.simulation.flight.strips[0]
+    nadir, (first, end) = images[1].copy(), np.multiply(dead_s, strip.line_rate_hz).astype(int)
+    nadir[first:end] = 0
+    delay = []
+    ties, matcher, told = matched(flown.simulation.flight, [images[0], nadir, images[2]], delay=delay)
+    error, sigma = errors(flown.simulation.flight, ties)
+    length = np.hypot(*error.T)
+    assert len(ties) > 0.75 * len(clean)
+    assert (length < 0.3).mean() > 0.98 and (length > 2.0).mean() < 0.01
+    assert 0.5 < ((error / sigma)[length < 2] ** 2).mean() < 1.3
+    assert len({tie.name for tie in ties}) == len(ties)
+    begun = np.array([(tie.rays[0].ccd == "N", tie.rays[0].line) for tie in ties])
+    assert not ((begun[:, 0] == 1) & (begun[:, 1] >= first) & (begun[:, 1] < end)).any()
+    assert {tie.rays[0].ccd for tie in ties} == ({"B"} if first == 0 else {"N", "B"})
+    # ties that are through come without a long pause: some patience, what is told the other way, ten to be judged by
+    known_s = (
+        np.sort([max(r.line for r in tie.rays) + d for tie, d in zip(ties, delay, strict=True)]) / strip.line_rate_hz
+    )
+    assert np.diff(known_s).max() < 4.0
+    assert known_s[-1] > 24.0
+    assert sum("N sees nothing: tie points begin in B" in text for text in told) == 1
+    assert sum("N sees again: tie points begin in N" in text for text in told) == (end < len(nadir))
+    if end < len(nadir):
+        assert (begun[begun[:, 0] == 1, 1] > end).sum() > 10 and len(matcher._at_work) == 1
 
 
 def test_lanes_of_a_small_budget_give_ties_too():

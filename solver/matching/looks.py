@@ -8,7 +8,7 @@ without.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -130,14 +130,31 @@ class LookMatcher:
 
     Attributes
     ----------
-    least_rays : of a tie point
+    seeing : the CCD lines that see; the others are done without, as long as there are two
+    sees_from : lines from which on some of them do, that did not before
     """
 
     def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Image], chip_half: int):
         self.prediction = prediction
         self.counters: Counter[str] = Counter()
-        self.least_rays = min(prediction.options.least_rays, len(prediction.views))
+        self.seeing = frozenset(view.ccd for view in prediction.views)
+        self.sees_from: Mapping[str, int] = {}
         self._image, self._chip_half = image, chip_half
+
+    @property
+    def least_rays(self) -> int:
+        """Rays that a tie point needs now."""
+        return min(self.prediction.options.least_rays, max(len(self.seeing), 2))
+
+    def least_rays_of(self, track: Track) -> int:
+        """Rays that a place needs to become a tie point: without the views that saw nothing when they came to it."""
+        p, gone = self.prediction, 0
+        for index in p.others if self.sees_from else ():
+            ccd = p.views[index].ccd
+            if ccd in self.seeing and ccd in self.sees_from:
+                look = track.place.line + p.lines_later(index, np.array([p.nadir_m]))[0]
+                gone += bool(look < self.sees_from[ccd])
+        return min(self.least_rays, max(len(self.seeing) - gone, 2))
 
     def guess_heights(self, tracks: Sequence[Track]) -> None:
         """Give places the heights of their neighbours."""
@@ -192,7 +209,7 @@ class LookMatcher:
     def finish(self, tracks: Sequence[Track]) -> Looked | None:
         """Places that have been looked for in all views become points; None if none was found often enough."""
         p = self.prediction
-        enough = [track for track in tracks if 1 + track.found.sum() >= self.least_rays]
+        enough = [track for track in tracks if 1 + track.found.sum() >= self.least_rays_of(track)]
         self.counters["too few looks"] += len(tracks) - len(enough)
         if not enough:
             return None

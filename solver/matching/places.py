@@ -52,6 +52,10 @@ class Density:
         """A new strip begins."""
         self._tried[:] = self._left[:] = 0.0
 
+    def like(self, other: Density) -> None:
+        """As many places as another density has wanted lately."""
+        self.load, self._factor = other.load, other._factor
+
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds: few points are given company, too many rays get fewer."""
         o = self.options
