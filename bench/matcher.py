@@ -178,8 +178,8 @@ def _compare_one(data: dict, rows: dict[str, list], spent: dict[str, float]) -> 
     n = int(np.abs(local).max()) + 60
     big = Ground(ground.centre_l.mean(axis=0)[None], along, across, spacing)
     begin = time.process_time()
-    a = Image(master, ring, travel).patches(big, np.array([line.mean()]), n, 1)[0][0]
-    b = Image(other, other_ring, travel).patches(big, np.array([u.mean()]), n, 1)[0][0]
+    a = Image(master, ring, travel).patches(big, np.array([line.mean()]), n, 1).values[0]
+    b = Image(other, other_ring, travel).patches(big, np.array([u.mean()]), n, 1).values[0]
     warp = time.process_time() - begin
     b = (b - b.mean()) * (a.std() / b.std()) + a.mean()  # Lucas-Kanade takes light for the same
     scale = 255.0 / np.quantile(a, 0.999)

@@ -215,8 +215,6 @@ class Adjuster(Node):
             self._control.take(body, self._window)
         elif topic == "observation/verdict":
             return self._verdict(body)
-        elif topic == "observation/progress":
-            return []
         elif topic == "configuration/strip":
             return self._strip(body)
         else:

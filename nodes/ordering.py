@@ -198,7 +198,8 @@ class Sequencer(Generic[T]):
     the next. A topic without allowed lateness holds nothing up while nobody speaks on it: before it was heard, and
     after its grace. What arrives after its place has passed leaves at once, and is called late. Observations may be
     stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or a
-    steady stream has died.
+    steady stream has died. What only tells how far its publisher is is heard, and goes no further: who begins to speak
+    while others are already past what it says has told nothing wrong.
 
     Parameters
     ----------
@@ -236,9 +237,12 @@ class Sequencer(Generic[T]):
             self._started_s = now_s
         if self._newest_ns is None or stamp > self._newest_ns:
             self._newest_ns = stamp
-        if topics.find(topic).family is not Family.OBSERVATION and (self._time_ns is None or stamp > self._time_ns):
+        row = topics.find(topic)
+        if row.family is not Family.OBSERVATION and (self._time_ns is None or stamp > self._time_ns):
             self._time_ns = stamp
         self.hear(topic, envelope, now_s)
+        if row.order_only:
+            return None
         key = order_key(topic, envelope)
         if self._released is not None and key < self._released:
             return item

@@ -34,7 +34,9 @@ class StepDriver:
         self._allowed: dict[str, bool] = {}
 
     def step(self, message: Message) -> list[Message]:
-        """The outputs that follow from one message."""
+        """The outputs that follow from one message; from one that is there for the order alone, nothing does."""
+        if topics.find(message.topic).order_only:
+            return []
         self.time_ns = max(self.time_ns, message.stamp_ns)
         return self._collect(self.node.step, message)
 

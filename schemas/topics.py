@@ -50,6 +50,8 @@ class Topic:
     recorded : whether the recorder keeps it
     latched : whether all that was sent so far is handed to whoever joins later
     grace_s : waiting time for which whoever needs its order waits for it when it falls silent, s; 0 = by its rate alone
+    order_only : whether it only tells how far its publisher is: sequencers hear it, no node is given it, and as nothing
+        follows from it, it cannot be late
     in_bursts : whether many messages come together and then none for a while; only what its publisher says on other
         topics tells whether something is missing
     """
@@ -64,6 +66,7 @@ class Topic:
     latched: bool = False
     grace_s: float = 0.0
     in_bursts: bool = False
+    order_only: bool = False
 
     @property
     def type_name(self) -> str:
@@ -97,7 +100,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("observation/tie", m.TiePoint, _O, 50),
     Topic("observation/target", m.TargetLook, _O, 0),
     # whoever makes ties late speaks here before the first of them
-    Topic("observation/progress", m.Progress, _O, 20, allowed_lateness_ms=0, recorded=False, grace_s=3.0),
+    Topic(
+        "observation/progress", m.Progress, _O, 20, allowed_lateness_ms=0, recorded=False, grace_s=3.0, order_only=True
+    ),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
     Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
     Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=200),

@@ -69,7 +69,7 @@ def test_constants_of_the_covariance_are_those_of_the_resampling(monkeypatch):
     template, search, shift = pairs(200, 1.0, 0.08)
     match_patches(template, search, np.zeros_like(shift), iterations=20)
     design, weight, box, t = kept["design"], kept["weight"], least_squares.BOX, 19
-    normal = np.swapaxes(design, 1, 2) @ (design * weight[None, :, None])
+    normal = np.swapaxes(design, 1, 2) @ (design * weight[:, :, None])
     cofactors = np.linalg.inv(normal + 1e-6 * np.einsum("kii->ki", normal)[:, :, None] * np.eye(8))
     fit = (cofactors @ np.swapaxes(design, 1, 2)) * weight
     noise = np.random.default_rng(3).standard_normal((len(design), t * t, 1))
@@ -84,7 +84,7 @@ def test_windows_know_what_is_missing():
     values = np.arange(2 * 12 * 12, dtype=np.float32).reshape(2, 12, 12)
     lines, samples = np.ones((2, 12), bool), np.ones((2, 12), bool)
     lines[0, 5] = samples[1, 3] = False
-    windows = Windows(np.array([100, 200]), np.array([7, 9]), values, lines, samples)
+    windows = Windows(np.array([100, 200]), np.array([7, 9]), values, lines, samples, np.zeros_like(lines))
     line, sample = np.array([[104.0], [208.0]]), np.array([[12.5], [14.5]])
     got, known = windows.sample(line, sample, cubic=True)
     assert not known[0, 0] and known[1, 0]

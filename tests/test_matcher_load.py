@@ -119,10 +119,10 @@ def test_fewer_places_keep_their_spread_and_those_of_earlier_strips_stay():
     matcher = TieMatcher(preset("ads40"))
     across = np.linspace(100.0, 11_900.0, 60)
     places = [Place(float(row * 200 + 50), float(s)) for row in range(4) for s in across]
-    matcher._waiting.add(places)
-    matcher._waiting.add([Place(50.0, 500.0, "S1-M3", (0.01, 0.01))] * 3)
+    matcher._master.waiting.add(places)
+    matcher._master.waiting.add([Place(50.0, 500.0, "S1-M3", (0.01, 0.01))] * 3)
     matcher.keep(0.35)
-    left = [track.place for track in matcher._waiting.tracks]
+    left = [track.place for track in matcher._master.waiting.tracks]
     assert sum(bool(place.name) for place in left) == 3
     free = np.array([(place.line, place.sample) for place in left if not place.name])
     assert len(free) == round(0.35 * len(places))

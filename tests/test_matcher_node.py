@@ -116,6 +116,10 @@ def backward_dies(ccd, line, pixels):
     return None if ccd == "B" and line >= 150 else pixels
 
 
+def nadir_dies(ccd, line, pixels):
+    return None if ccd == "N" and line >= 150 else pixels
+
+
 FAULTS = {
     "faults of the camera": (
         chain(lost_block, short_lines, lines_between(150, 155, 0), frozen_backward, lines_between(330, 350, 4095)),
@@ -126,6 +130,11 @@ FAULTS = {
         backward_dies,
         {"ties": 60},
         ("B: nothing has come after line 149",),
+    ),
+    "the nadir line dies": (
+        nadir_dies,
+        {"ties": 60},
+        ("N: nothing has come after line 149", "N sees nothing: tie points begin in B"),
     ),
     "lens cap, then water": (
         chain(lines_between(40, 100, 0), lines_between(235, 400, water)),

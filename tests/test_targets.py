@@ -45,7 +45,7 @@ def signalised(flown):
     return [str(points.id[i]) for i in chosen], points.xyz_l[chosen]
 
 
-def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_deg=0.02, options=None):
+def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_deg=0.02, options=None, lost=None):
     """What a finder sees when the orientation is wrong by errors of the size that its covariance tells."""
     flight = flown.simulation.flight
     strip, camera = flight.strips[0], flight.camera
@@ -70,7 +70,8 @@ def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_d
             orientation.add_pose(time_s[poses], position[poses], quaternion[poses], np.diag(sigma**2))
             poses += 1
         for image, line in zip(images, camera.lines, strict=True):
-            finder.add_lines(line.id, first, image[first : first + BLOCK])
+            usable = None if lost is None else ~lost[line.id][first : first + BLOCK]
+            finder.add_lines(line.id, first, image[first : first + BLOCK], usable)
             out += finder.measure(line.id)
     return out
 
@@ -147,6 +148,25 @@ def test_on_an_unstabilised_mount_they_are_measured_as_well():
     off, sigma = errors_of(looks, true_looks(flown, names, places))
     assert len(looks) > 30 and np.hypot(*off.T).max() < 0.1
     assert 0.25 < np.mean((off / sigma) ** 2) < 1.5
+
+
+def test_lines_that_are_lost_here_and_there_cost_few_targets(flown, images):
+    names, places = signalised(flown)
+    true = true_looks(flown, names, places)
+    rng = np.random.default_rng(4)
+    ids = [line.id for line in flown.simulation.flight.camera.lines]
+    n = flown.simulation.flight.strips[0].lines
+    lost = {ccd: np.convolve(rng.random(n) < 0.05 / 3, np.ones(3))[:n] > 0 for ccd in ids}
+    spoilt = [
+        np.where(lost[ccd][:, None], 0, image).astype(image.dtype) for ccd, image in zip(ids, images, strict=True)
+    ]
+    whole = [x for x in looks_at(flown, images, names, places) if not x.reason]
+    looks = looks_at(flown, spoilt, names, places, lost=lost, options=NO_FLOOR)
+    good = [x for x in looks if not x.reason]
+    assert len(good) > 0.75 * len(whole)
+    assert any(lost[x.ccd][round(x.line) - 4 : round(x.line) + 5].any() for x in good)
+    error, sigma = errors_of(good, true)
+    assert np.hypot(*error.T).max() < 0.1 and 0.25 < np.mean((error / sigma) ** 2) < 1.3
 
 
 def test_nothing_is_taken_for_a_target_where_there_is_none(flown, images):

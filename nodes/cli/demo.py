@@ -232,12 +232,12 @@ class Demo:
         return result
 
     def _lost_so_far(self, kinds: tuple[str, ...]) -> dict[str, int]:
-        """What the nodes lost on the way, by kind; the viewer may, and a late word on progress changes nothing."""
+        """What the nodes lost on the way, by kind; the viewer may."""
         sums: dict[str, int] = {}
         for name, status in self._overview.nodes.items():
             for topic in status.topics if name != "viewer" else ():
                 for kind in kinds:
-                    if getattr(topic, kind) and (topic.topic, kind) != ("observation/progress", "late"):
+                    if getattr(topic, kind):
                         sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
         return sums
 

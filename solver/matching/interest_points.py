@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter
 
 Array = NDArray[np.floating]
 
@@ -15,11 +15,15 @@ LARGE_CELL = 160 * 160
 #: Gradients far above so many times the noise count as that: texture all over a window is measured better than one hard
 #: edge, which detectors alias and which moves where it lies in front of something.
 STRONG = 8.0
+#: No more than this share of a window may lie on pixels that were not measured.
+MOST_HOLES = 0.35
 
 
-def image_noise(image: NDArray[np.floating]) -> float:
+def image_noise(image: NDArray[np.floating], holes: NDArray[np.bool_] | None = None) -> float:
     """Standard deviation of the noise, from second differences along and across: texture is smooth, noise is not."""
     d = image[1:, 1:] - image[1:, :-1] - image[:-1, 1:] + image[:-1, :-1]
+    if holes is not None:
+        d = d[~(holes[1:, 1:] | holes[1:, :-1] | holes[:-1, 1:] | holes[:-1, :-1])]
     return float(np.median(np.abs(d)) / (0.6745 * 2.0)) if d.size else 0.0
 
 
@@ -29,6 +33,8 @@ def interest_point(
     window: int,
     largest_sigma_px: float,
     free: NDArray[np.bool_] | None = None,
+    filled: NDArray[np.bool_] | None = None,
+    saturated: float = np.inf,
 ) -> tuple[int, int, float] | None:
     """Row and column of the best place of a cell, and the sigma (px) to be expected there; None if none is good enough.
 
@@ -42,12 +48,20 @@ def interest_point(
     window : side of the matching window
     largest_sigma_px : places that would be measured worse are not good enough
     free : (n, m) where a place may be; everywhere, if not given
+    filled : (n,) lines that did not come, with what lies between those around them: they say nothing, a few do no harm
+    saturated : grey value from which on pixels, as those that are 0, do not say anything either
     """
     half = window // 2 + 1
-    if min(image.shape) < 2 * half + 1:
+    if min(image.shape) < 2 * half + 1 or not usable.any():
         return None
     some = image[usable]
-    noise = max(image_noise(some[: max(LARGE_CELL // some.shape[1], 2)]), 0.5) if len(some) > 2 else 1.0
+    holes = _holes(image, usable, filled, saturated)
+    some_holes = None if holes is None else holes[usable]
+    if filled is not None:
+        usable = usable | filled
+    first = max(LARGE_CELL // some.shape[1], 2)
+    some_holes = None if some_holes is None else some_holes[:first]
+    noise = max(image_noise(some[:first], some_holes), 0.5) if len(some) > 2 else 1.0
     step = int(np.ceil(np.sqrt(image.size / LARGE_CELL)))
     top = left = 0
     if free is None:
@@ -55,17 +69,19 @@ def interest_point(
     if step > 1:
         coarse = _worth(
             image[::step, ::step], usable[::step], max(window // step, 3), max(half // step, 2), noise,
-            free[::step, ::step],
+            free[::step, ::step], None if holes is None else holes[::step, ::step],
         )  # fmt: skip
         row, column, _ = coarse.best(0.0)
         reach = half + max(window, 2 * step)
         top, left = max(row * step - reach, 0), max(column * step - reach, 0)
         rows, columns = slice(top, row * step + reach + 1), slice(left, column * step + reach + 1)
         image, usable, free = image[rows, columns], usable[rows], free[rows, columns]
+        holes = None if holes is None else holes[rows, columns]
         if min(image.shape) < 2 * half + 1:
             return None
     # template and searched image are both noisy
-    row, column, least = _worth(image, usable, window, half, noise, free).best(2 * noise**2 / largest_sigma_px**2)
+    worth = _worth(image, usable, window, half, noise, free, holes)
+    row, column, least = worth.best(2 * noise**2 / largest_sigma_px**2)
     if least <= 0.0:
         return None
     return row + top, column + left, float(np.sqrt(2 * noise**2 / least))
@@ -92,17 +108,29 @@ class Worth:
         return row, column, float(self.least[row, column]) if value[row, column] > 0.0 else 0.0
 
 
+def _holes(
+    image: NDArray[np.floating], usable: NDArray[np.bool_], filled: NDArray[np.bool_] | None, saturated: float
+) -> NDArray[np.bool_] | None:
+    """Pixels (n, m) of the lines that may be used that were not measured; None for no such pixel."""
+    out = None
+    if image.max() >= saturated or image.min() <= 0.0:
+        out = ((image >= saturated) | (image <= 0.0)) & usable[:, None]
+    if filled is not None and filled.any():
+        out = filled[:, None] | (np.zeros(image.shape, dtype=bool) if out is None else out)
+    return out if out is None or out.any() else None
+
+
 def _worth(
-    image: NDArray[np.floating],
-    usable: NDArray[np.bool_],
-    window: int,
-    half: int,
-    noise: float,
-    free: NDArray[np.bool_],
-) -> Worth:
+    image: NDArray[np.floating], usable: NDArray[np.bool_], window: int, half: int, noise: float,
+    free: NDArray[np.bool_], holes: NDArray[np.bool_] | None = None,
+) -> Worth:  # fmt: skip
     """What a window about each pixel is worth; 0 where no place is wanted."""
     gu, gv = np.gradient(gaussian_filter(image, 0.7))
     strong = 1.0 / np.sqrt(1.0 + (gu * gu + gv * gv) / np.float32(STRONG * noise) ** 2)
+    covered = None
+    if holes is not None:
+        covered = np.asarray(maximum_filter(holes.astype(np.float32), 3))
+        strong = np.where(covered > 0.0, np.float32(0.0), strong)
     gu, gv = gu * strong, gv * strong
     quarter = window // 2 + 1
     sums = np.stack([float(quarter**2) * uniform_filter(g, quarter) for g in (gu * gu, gu * gv, gv * gv)])
@@ -117,6 +145,8 @@ def _worth(
     wanted[half:-half, half:-half] = free[half:-half, half:-half]
     for line in np.flatnonzero(~usable):
         wanted[max(line - half, 0) : line + half + 1] = False
+    if covered is not None:
+        wanted &= uniform_filter(covered, window) <= MOST_HOLES
     return Worth(np.where(wanted, least, 0.0), np.where(wanted, even, 0.0))
 
 

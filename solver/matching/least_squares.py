@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from .patches import interpolate_stack
+from .patches import MOST_HOLE, holes_at, interpolate_stack
 
 Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
 
 #: A shift that changes less has converged, px.
 CONVERGED_PX = 0.003
@@ -29,6 +31,12 @@ SMOOTHED = 0.55
 GRADIENT_TAPS = np.array([-1.0, 10.0, 0.0, -10.0, 1.0]) / 16.0
 #: Scale and shear stay within this of none.
 LARGEST_SHEAR = 0.35
+#: Which pixels are covered by holes of the searched patch is looked up in so many iterations, then it is settled.
+SETTLING = 3
+#: Weights are taken for no less than this in sum.
+LEAST_WEIGHT = 1e-6
+#: Fewer gradients of residuals than this do not tell the noise.
+FEWEST_GRADIENTS = 30
 
 
 @dataclass(frozen=True)
@@ -42,33 +50,45 @@ class PatchMatch:
     affine : (k, 2, 2) change of row and column in the search patch per row and column of the template
     score : (k,) correlation coefficient at the solution
     converged : (k,)
+    measured : (k,) share of the window's weight that lies on pixels which both images measured
     """
 
     shift: Array
     covariance: Array
     affine: Array
     score: Array
-    converged: NDArray[np.bool_]
+    converged: Mask
+    measured: Array
 
 
 def match_patches(
-    template: NDArray[np.floating], search: NDArray[np.floating], start: Array, iterations: int = 8
+    template: NDArray[np.floating],
+    search: NDArray[np.floating],
+    start: Array,
+    iterations: int = 8,
+    holes: tuple[Mask, Mask] | None = None,
 ) -> PatchMatch:
     """Find templates (k, t, t) in search patches (k, s, s) from shifts (k, 2) that are good to a pixel or so.
 
     ``template(r, c) = gain search(a + A (r, c)) + offset``: eight unknowns, Gauss-Newton, both images taken as noisy.
+    ``holes`` are the pixels of both that were not measured: they have no weight, whatever their grey values.
     """
     k, t, _ = template.shape
     window = _Window(t)
     wanted = template.reshape(k, -1).astype(float)
     shift, affine = np.array(start, dtype=float), np.repeat(np.eye(2)[None], k, axis=0)
     moved = np.full(k, np.inf)
-    for _ in range(iterations):
+    # of each pixel, the same for all patches unless some have holes
+    weight = np.broadcast_to(window.weight, (1 if holes is None else k, t * t))
+    for turn in range(iterations):
         on = np.flatnonzero(moved >= CONVERGED_PX)
         if not len(on):
             break
-        design, residual, _ = window.linearise(search[on], wanted[on], shift[on], affine[on])
-        weighted = design * window.weight[None, :, None]
+        if holes is not None and turn < SETTLING:
+            weight = window.weight_beside(holes, shift, affine)
+        here = weight if holes is None else weight[on]
+        design, residual, _ = window.linearise(search[on], wanted[on], shift[on], affine[on], here)
+        weighted = design * here[:, :, None]
         cofactors = np.linalg.inv(_normal(design, weighted))
         step = (cofactors @ np.einsum("kpi,kp->ki", weighted, residual)[:, :, None])[:, :, 0]
         step[:, [0, 3]] = np.clip(step[:, [0, 3]], -1.0, 1.0)
@@ -76,9 +96,10 @@ def match_patches(
         change = np.clip(step[:, [[1, 2], [4, 5]]], -0.1, 0.1)
         affine[on] = np.eye(2) + np.clip(affine[on] + change - np.eye(2), -LARGEST_SHEAR, LARGEST_SHEAR)
         moved[on] = np.abs(step[:, [0, 3]]).max(axis=1)
-    design, residual, found = window.linearise(search, wanted, shift, affine)
-    covariance = _shift_covariance(design, window.weight, residual, t)
-    return PatchMatch(shift, covariance, affine, _score(found, wanted, window.weight), moved < 0.05)
+    design, residual, found = window.linearise(search, wanted, shift, affine, weight)
+    covariance = _shift_covariance(design, weight, residual, t)
+    measured = np.broadcast_to(weight.sum(axis=1) / window.weight.sum(), k)
+    return PatchMatch(shift, covariance, affine, _score(found, wanted, weight), moved < 0.05, measured)
 
 
 class _Window:
@@ -90,18 +111,27 @@ class _Window:
         self.weight = np.exp(-0.5 * (self.rows**2 + self.columns**2) / (WEIGHT_SHARE * t) ** 2)
         self.shape = np.stack([np.ones_like(self.rows), self.rows, self.columns])
 
-    def linearise(
-        self, search: NDArray[np.floating], wanted: Array, shift: Array, affine: Array
-    ) -> tuple[Array, Array, Array]:
-        """Design (k, p, 8), residuals (k, p) and grey values that were found (k, p)."""
+    def places(self, search: NDArray[Any], shift: Array, affine: Array) -> tuple[Array, Array]:
+        """Rows and columns (k, p) of search patches on which the pixels fall."""
         middle = 0.5 * (search.shape[1] - 1)
         y = middle + shift[:, :1] + affine[:, 0, :1] * self.rows + affine[:, 0, 1:] * self.columns
-        x = middle + shift[:, 1:] + affine[:, 1, :1] * self.rows + affine[:, 1, 1:] * self.columns
+        return y, middle + shift[:, 1:] + affine[:, 1, :1] * self.rows + affine[:, 1, 1:] * self.columns
+
+    def weight_beside(self, holes: tuple[Mask, Mask], shift: Array, affine: Array) -> Array:
+        """Weights (k, p) without what falls on holes of templates (k, t, t) or of search patches (k, s, s)."""
+        covered = holes_at(holes[1], *self.places(holes[1], shift, affine)) > MOST_HOLE
+        return np.where(covered | holes[0].reshape(len(shift), -1), 0.0, self.weight)
+
+    def linearise(
+        self, search: NDArray[np.floating], wanted: Array, shift: Array, affine: Array, weight: Array
+    ) -> tuple[Array, Array, Array]:
+        """Design (k, p, 8), residuals (k, p) and grey values that were found (k, p)."""
+        y, x = self.places(search, shift, affine)
         found = interpolate_stack(search, y, x).astype(float)
         gy = interpolate_stack(search, y + 0.5, x).astype(float) - interpolate_stack(search, y - 0.5, x)
         gx = interpolate_stack(search, y, x + 0.5).astype(float) - interpolate_stack(search, y, x - 0.5)
         # gain and offset of the grey values, so that the residual is one of the search image
-        gain, offset = _grey_fit(found, wanted, self.weight)
+        gain, offset = _grey_fit(found, wanted, weight)
         residual = (wanted - offset) / gain - found
         spread = np.maximum(found.std(axis=1), 1.0)[:, None]
         design = np.empty((*found.shape, 8))
@@ -128,11 +158,11 @@ def _shift_covariance(design: Array, weight: Array, left: Array, t: int) -> Arra
     noise makes of the same residuals.
     """
     k = len(left)
-    total = weight.sum()
-    square = np.sum(weight * left**2, axis=1) / (total - 8 * np.sum(weight**2) / total)
-    normal = _normal(design, design * weight[None, :, None])
-    cofactors = np.linalg.inv(normal - _gradient_noise(weight, left, t))
-    gain = (cofactors[:, [0, 3]] @ np.swapaxes(design, 1, 2)) * weight  # (k, 2, p)
+    total = np.maximum(weight.sum(axis=1), LEAST_WEIGHT)
+    square = np.sum(weight * left**2, axis=1) / np.maximum(total - 8 * np.sum(weight**2, axis=1) / total, LEAST_WEIGHT)
+    normal = _normal(design, design * weight[:, :, None])
+    cofactors = np.linalg.inv(normal - _gradient_noise(weight, left, square, t))
+    gain = (cofactors[:, [0, 3]] @ np.swapaxes(design, 1, 2)) * weight[:, None]  # (k, 2, p)
     white = square[:, None, None] / SMOOTHED * (gain @ np.swapaxes(gain, 1, 2))
     moves = (gain * left[:, None]).reshape(k, 2, t, t)
     padded = np.zeros((k, 2, t + 2 * BOX, t + 2 * BOX))
@@ -147,35 +177,49 @@ def _shift_covariance(design: Array, weight: Array, left: Array, t: int) -> Arra
     return covariance
 
 
-def _gradient_noise(weight: Array, left: Array, t: int) -> Array:
+def _gradient_noise(weight: Array, left: Array, square: Array, t: int) -> Array:
     """What noise adds to normal equations (k, 8, 8) through the gradients of the searched image, from the residuals.
 
     Half of a residual's variance is the searched image's. The gradients of the residuals are taken as those of the
     image are: bicubic values half a pixel to either side. Their median counts: at sharp edges residuals are no noise.
+    Where too few lie beside holes, they are as large as the variance of the residuals (``square``) makes them.
     """
     k = len(left)
-    grid = left.reshape(k, t, t)
+    whole = len(weight) == 1
+    grid = (left if whole else np.where(weight > 0.0, left, np.nan)).reshape(k, t, t)
     shape = _Window(t).shape
-    blocks = (shape * weight) @ shape.T
+    blocks = (shape * weight[:, None]) @ shape.T
     out = np.zeros((k, 8, 8))
     for at, values in ((0, grid), (3, np.swapaxes(grid, 1, 2))):
-        g = sum(tap * values[:, i : i + t - 4] for i, tap in enumerate(GRADIENT_TAPS))
-        variance = 0.5 * (1.4826 * np.median(np.abs(g).reshape(k, -1), axis=1)) ** 2
+        g = np.abs(sum(tap * values[:, i : i + t - 4] for i, tap in enumerate(GRADIENT_TAPS))).reshape(k, -1)
+        if whole:
+            variance = 0.5 * (1.4826 * np.median(g, axis=1)) ** 2
+        else:
+            number = np.isfinite(g).sum(axis=1)
+            median = np.sort(g, axis=1)[np.arange(k), np.maximum(number - 1, 0) // 2]  # those of holes come last
+            few = 2.0 * np.sum(GRADIENT_TAPS**2) * square
+            variance = 0.5 * np.where(number < FEWEST_GRADIENTS, few, (1.4826 * median) ** 2)
         out[:, at : at + 3, at : at + 3] = variance[:, None, None] * blocks
     return out
 
 
 def _grey_fit(found: Array, wanted: Array, weight: Array) -> tuple[Array, Array]:
     """Gain and offset (k, 1) that turn found grey values (k, p) into the wanted ones best, equal to both images."""
-    total = weight.sum()
-    mf, mw = (found @ weight)[:, None] / total, (wanted @ weight)[:, None] / total
-    sf = np.sqrt(((found - mf) ** 2) @ weight)[:, None]
-    sw = np.sqrt(((wanted - mw) ** 2) @ weight)[:, None]
+    total = np.maximum(weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
+    mf, mw = _sum(found, weight) / total, _sum(wanted, weight) / total
+    sf = np.sqrt(_sum((found - mf) ** 2, weight))
+    sw = np.sqrt(_sum((wanted - mw) ** 2, weight))
     gain = np.maximum(sw, 1e-3) / np.maximum(sf, 1e-3)
     return gain, mw - gain * mf
 
 
 def _score(found: Array, wanted: Array, weight: Array) -> Array:
-    total = weight.sum()
-    f, w = found - (found @ weight)[:, None] / total, wanted - (wanted @ weight)[:, None] / total
-    return ((f * w) @ weight) / np.sqrt(np.maximum((f * f) @ weight, 1e-6) * np.maximum((w * w) @ weight, 1e-6))
+    total = np.maximum(weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
+    f, w = found - _sum(found, weight) / total, wanted - _sum(wanted, weight) / total
+    fw, ff, ww = (_sum(a, weight)[:, 0] for a in (f * w, f * f, w * w))
+    return fw / np.sqrt(np.maximum(ff, 1e-6) * np.maximum(ww, 1e-6))
+
+
+def _sum(values: Array, weight: Array) -> Array:
+    """Weighted sums (k, 1) of values (k, p); weights are (k, p), or (1, p) for all."""
+    return (values @ weight[0])[:, None] if len(weight) == 1 else np.einsum("kp,kp->k", values, weight)[:, None]

@@ -8,12 +8,16 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .line_quality import GOOD, REASONS, judge_lines
+from .line_quality import GOOD, REASONS, SATURATED, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
-#: A CCD line that gives nothing for so long while others do, s, is told of, and not waited for.
+#: A CCD line that gives nothing for so long while others do, s, is told of.
 SILENT_S = 5.0
+#: One that gives nothing fit for use for so long, s, sees nothing: it is not waited for, places are not chosen in it.
+BLIND_S = 2.0
+#: It sees again once it has given good lines of so many seconds; others that have half of that, at the same time.
+RETURN_S = 1.0
 #: Events of a strip that are told. A fault that comes again and again is told so often by itself, then summed up, every
 #: so many seconds.
 MOST_TOLD, BY_ITSELF, SUMMED_S = 100, 3, 10.0
@@ -33,6 +37,8 @@ class LineIntake:
     Attributes
     ----------
     counters : lines by what was wrong with them
+    saturated : grey value from which on pixels are saturated
+    sees_from : lines from which on CCD lines see again that saw nothing earlier in the strip
     """
 
     def __init__(
@@ -43,6 +49,8 @@ class LineIntake:
     ):
         self.counters: Counter[str] = Counter()
         self.store: LineStore | None = None
+        self.saturated = np.inf
+        self.sees_from: dict[str, int] = {}
         self._samples, self._options, self._make_store = samples, options, make_store
         self._last_line: dict[str, NDArray[np.unsignedinteger]] = {}
         self._state: dict[str, int] = {}
@@ -52,6 +60,7 @@ class LineIntake:
         self._ends: dict[str, int] = {}
         self._good_ends: dict[str, int] = {}
         self._silent: set[str] = set()
+        self._returning: dict[str, int] = {}  # CCD lines that see nothing, and their good lines since
         self._rate = 1.0
         self._faults: dict[tuple[str, str], tuple[int, int, int]] = {}
         self._told_of: set[str] = set()
@@ -63,6 +72,7 @@ class LineIntake:
         self._ends = dict.fromkeys(self._samples, 0)
         self._good_ends = dict.fromkeys(self._samples, 0)
         self._silent.clear()
+        self.sees_from.clear()
         self._rate = line_rate_hz
         self._faults.clear()
         self._told_of.clear()
@@ -85,12 +95,12 @@ class LineIntake:
         if not len(pixels) or first_line < 0:
             raise ValueError(f"no lines of {ccd}, or their number {first_line} is below 0")
         full_scale = self._options.full_scale or (255 if pixels.dtype == np.uint8 else 4095)
+        self.saturated = SATURATED * full_scale
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
         self._tell(ccd, first_line, verdict)
         self._listen(ccd, first_line + len(pixels))
-        if (verdict == GOOD).any():
-            self._good_ends[ccd] = max(self._good_ends[ccd], first_line + len(pixels))
+        self._watch(ccd, first_line + len(pixels), int((verdict == GOOD).sum()))
         if self.store is None:
             self.store = self._make_store(pixels.dtype)
         if self.store is None:
@@ -107,9 +117,8 @@ class LineIntake:
 
     @property
     def seeing(self) -> frozenset[str]:
-        """The CCD lines that have given lines fit for use lately."""
-        newest = max(self._ends.values(), default=0)
-        return frozenset(ccd for ccd, end in self._good_ends.items() if newest - end <= self._silent_after)
+        """The CCD lines that have given lines fit for use lately; from strip to strip."""
+        return frozenset(ccd for ccd in self._samples if ccd not in self._returning)
 
     def take_events(self) -> list[str]:
         """What is worth telling since the last call."""
@@ -123,6 +132,21 @@ class LineIntake:
             self._events.append(text)
         elif self._told == MOST_TOLD + 1:
             self._events.append("more of the kind is counted, but no longer told in this strip")
+
+    def _watch(self, ccd: str, end: int, good: int) -> None:
+        """Note which CCD lines see."""
+        if good:
+            self._good_ends[ccd] = max(self._good_ends[ccd], end)
+        newest = max(self._ends.values())
+        for other, at in self._good_ends.items():
+            if newest - at > BLIND_S * self._rate:
+                self._returning[other] = 0
+        if ccd in self._returning:
+            self._returning[ccd] += good
+            enough = RETURN_S * self._rate
+            if self._returning[ccd] >= enough:
+                back = [c for c, n in self._returning.items() if n >= 0.5 * enough]
+                self.sees_from.update({c: newest - self._returning.pop(c) for c in back})
 
     def _listen(self, ccd: str, end: int) -> None:
         """Tell of CCD lines that nothing comes from any more, and that something comes again."""

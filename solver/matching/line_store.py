@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,10 @@ IntArray = NDArray[np.int64]
 LANE = 512
 #: Fewer lanes than this do not carry an adjustment: then the lines are kept for a shorter time as well.
 FEWEST_LANES = 4
+#: Gaps of no more lines than this are closed: what lies between the lines around them is put in, and marked.
+LONGEST_FILLED = 8
+#: What a ring knows of a line.
+NOTHING, SEEN, FILLED = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -25,17 +30,20 @@ class Stretch:
     first_line : number of the first one
     pixels : (n, samples) grey values, 0 where nothing usable is known
     usable : (n,) whether a line came and is fit for use
+    filled : (n,) whether it did not, but lies between two near ones that did: interpolated
     """
 
     first_line: int
     pixels: NDArray[np.unsignedinteger]
     usable: NDArray[np.bool_]
+    filled: NDArray[np.bool_]
 
 
 class LineRing:
     """The newest ``capacity`` lines of one CCD line, or of lanes of it.
 
-    Lines that never came are known as missing; lines that come twice or out of order are left out.
+    Lines that never came are known as missing; lines that come twice or out of order are left out. Short gaps are
+    closed by what lies between the lines before and after, once that has come.
 
     Parameters
     ----------
@@ -61,8 +69,9 @@ class LineRing:
         for (first, end), at in zip(self.lanes, np.cumsum(wide) - wide, strict=True):
             self._column[first:end] = at + np.arange(end - first)
         self._pixels = np.zeros((capacity, int(wide.sum())), dtype=dtype)
-        self._usable = np.zeros(capacity, dtype=bool)
+        self._state = np.full(capacity, NOTHING, dtype=np.uint8)
         self.start = self.end = 0  # lines from start to end - 1 are in the ring
+        self._seen_end = 0  # after the newest line that was fit for use
 
     @property
     def capacity(self) -> int:
@@ -70,12 +79,12 @@ class LineRing:
 
     @property
     def nbytes(self) -> int:
-        return self._pixels.nbytes + self._usable.nbytes
+        return self._pixels.nbytes + self._state.nbytes
 
     def clear(self) -> None:
         """Forget all lines; the next may have any number."""
-        self.start = self.end = 0
-        self._usable[:] = False
+        self.start = self.end = self._seen_end = 0
+        self._state[:] = NOTHING
 
     def add(
         self, first_line: int, pixels: NDArray[np.unsignedinteger], usable: NDArray[np.bool_] | None = None
@@ -90,14 +99,14 @@ class LineRing:
             raise ValueError(f"lines of shape {pixels.shape}, wanted {self.samples} samples")
         usable = np.ones(len(pixels), dtype=bool) if usable is None else usable
         if self.start == self.end:
-            self.start = self.end = first_line
+            self.start = self.end = self._seen_end = first_line
         late = min(max(self.end - first_line, 0), len(pixels))
         pixels, usable, first_line = pixels[late:], usable[late:], first_line + late
         if not len(pixels):
             return 0, late
         missing = first_line - self.end
         gone = np.arange(max(self.end, first_line - self.capacity), first_line) % self.capacity
-        self._usable[gone] = False
+        self._state[gone] = NOTHING
         self._pixels[gone] = 0
         end = first_line + len(pixels)
         kept = min(len(pixels), self.capacity)
@@ -106,10 +115,27 @@ class LineRing:
         for run in (slice(0, turn), slice(turn, kept)):
             if at[run].size:
                 self._put(int(at[run][0]), pixels[len(pixels) - kept :][run])
-        self._usable[at] = usable[-kept:]
+        self._state[at] = np.where(usable[-kept:], SEEN, NOTHING)
         self.end = end
         self.start = max(self.start, end - self.capacity)
+        if usable.any():
+            if self._seen_end < first_line or not usable.all():
+                self._fill()
+            self._seen_end = end - int(np.argmax(usable[::-1]))
         return missing, late
+
+    def _fill(self) -> None:
+        """Close short gaps from the newest line that was known on."""
+        first = max(self._seen_end - 1, self.start)
+        line = first + np.flatnonzero(self._state[np.arange(first, self.end) % self.capacity] == SEEN)
+        for before, after in pairwise(line.tolist()):
+            n = after - before
+            if not 1 < n <= LONGEST_FILLED + 1:
+                continue
+            a, b = (self._pixels[i % self.capacity].astype(np.float32) for i in (before, after))
+            for i in range(1, n):
+                self._pixels[(before + i) % self.capacity] = np.rint(a + (b - a) * (i / n))
+            self._state[np.arange(before + 1, after) % self.capacity] = FILLED
 
     def _put(self, row: int, pixels: NDArray[np.unsignedinteger]) -> None:
         at = 0
@@ -124,28 +150,31 @@ class LineRing:
         """
         first, end = max(first_line, self.start), min(end_line, self.end)
         at = np.arange(first, max(end, first)) % self.capacity
-        column = self._column[first_sample:end_sample]
+        column, state = self._column[first_sample:end_sample], self._state[at]
         if len(column) and column[0] >= 0 and column[-1] - column[0] == len(column) - 1:
-            return Stretch(first, self._pixels[at, column[0] : column[-1] + 1], self._usable[at])
-        pixels = self._pixels[at[:, None], column]
-        pixels[:, column < 0] = 0
-        return Stretch(first, pixels, self._usable[at])
+            pixels = self._pixels[at, column[0] : column[-1] + 1]
+        else:
+            pixels = self._pixels[at[:, None], column]
+            pixels[:, column < 0] = 0
+        return Stretch(first, pixels, state == SEEN, state == FILLED)
 
     def windows(
         self, first_line: IntArray, first_sample: IntArray, lines: int, samples: int
-    ) -> tuple[NDArray[np.floating], NDArray[np.bool_], NDArray[np.bool_]]:
+    ) -> tuple[NDArray[np.floating], NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
         """Pieces of (lines, samples) pixels that begin at given pixels (k,), as 32-bit floats (k, lines, samples).
 
-        Also which lines (k, lines) and samples (k, samples) are known; what is not known is arbitrary.
+        Also which lines (k, lines) and samples (k, samples) are known - what is not known is arbitrary -, and which
+        lines (k, lines) are known only from those around them.
         """
         line = first_line[:, None] + np.arange(lines)
         row = line % self.capacity
-        lines_known = (line >= self.start) & (line < self.end) & self._usable[row]
+        state = self._state[row]
+        lines_known = (line >= self.start) & (line < self.end) & (state != NOTHING)
         sample = first_sample[:, None] + np.arange(samples)
         column = self._column[np.clip(sample, 0, self.samples - 1)]
         samples_known = (sample >= 0) & (sample < self.samples) & (column >= 0)
         values = self._pixels[row[:, :, None], np.maximum(column, 0)[:, None, :]].astype(np.float32)
-        return values, lines_known, samples_known
+        return values, lines_known, samples_known, state == FILLED
 
 
 class LineStore:

@@ -8,7 +8,7 @@ without.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,6 +76,7 @@ class Looked:
     xyz_l : (k, 3) with the orientation of now
     disagreement : what is left of their shifts
     chip : (k, n, n) what the master saw about them, on the ground; empty where no patches are kept
+    holes : (k, n, n) what of it was not measured; None for no such pixel
     ground : the grids of the chips
     """
 
@@ -85,6 +86,7 @@ class Looked:
     xyz_l: Array
     disagreement: Disagreement
     chip: NDArray[np.floating] = field(repr=False)
+    holes: NDArray[np.bool_] | None = field(repr=False)
     ground: Ground
 
     def __len__(self) -> int:
@@ -128,14 +130,31 @@ class LookMatcher:
 
     Attributes
     ----------
-    least_rays : of a tie point
+    seeing : the CCD lines that see; the others are done without, as long as there are two
+    sees_from : lines from which on some of them do, that did not before
     """
 
     def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Image], chip_half: int):
         self.prediction = prediction
         self.counters: Counter[str] = Counter()
-        self.least_rays = min(prediction.options.least_rays, len(prediction.views))
+        self.seeing = frozenset(view.ccd for view in prediction.views)
+        self.sees_from: Mapping[str, int] = {}
         self._image, self._chip_half = image, chip_half
+
+    @property
+    def least_rays(self) -> int:
+        """Rays that a tie point needs now."""
+        return min(self.prediction.options.least_rays, max(len(self.seeing), 2))
+
+    def least_rays_of(self, track: Track) -> int:
+        """Rays that a place needs to become a tie point: without the views that saw nothing when they came to it."""
+        p, gone = self.prediction, 0
+        for index in p.others if self.sees_from else ():
+            ccd = p.views[index].ccd
+            if ccd in self.seeing and ccd in self.sees_from:
+                look = track.place.line + p.lines_later(index, np.array([p.nadir_m]))[0]
+                gone += bool(look < self.sees_from[ccd])
+        return min(self.least_rays, max(len(self.seeing) - gone, 2))
 
     def guess_heights(self, tracks: Sequence[Track]) -> None:
         """Give places the heights of their neighbours."""
@@ -190,7 +209,7 @@ class LookMatcher:
     def finish(self, tracks: Sequence[Track]) -> Looked | None:
         """Places that have been looked for in all views become points; None if none was found often enough."""
         p = self.prediction
-        enough = [track for track in tracks if 1 + track.found.sum() >= self.least_rays]
+        enough = [track for track in tracks if 1 + track.found.sum() >= self.least_rays_of(track)]
         self.counters["too few looks"] += len(tracks) - len(enough)
         if not enough:
             return None
@@ -211,13 +230,15 @@ class LookMatcher:
         noise = p.orientation.noise_left
         wobble = (noise[:2].mean() + p.height_and_travel()[0] ** 2 * noise[[4, 3]]) / pixel_m**2
         rays = [self._rays(track, g.ground.spacing_m / pixel_m, wobble) for track in enough]
-        chip, ground = np.empty((len(enough), 0, 0)), Ground(xyz, g.ground.along, g.ground.across, g.ground.spacing_m)
+        ground = Ground(xyz, g.ground.along, g.ground.across, g.ground.spacing_m)
+        chip, holes = np.empty((len(enough), 0, 0)), None
         if self._chip_half:
-            chip = self._image(p.master, scan, g.travel).patches(ground, line, self._chip_half, 1)[0]
+            patches = self._image(p.master, scan, g.travel).patches(ground, line, self._chip_half, 1)
+            chip, holes = patches.values, patches.holes
         across = 2 * g.sample / p.views[p.master].pixels - 1
         return Looked(
             [track.place for track in enough], rays, np.array([track.score.min() for track in enough]), xyz,
-            Disagreement(p.first_s + line / p.rate, across, residual), chip, ground,
+            Disagreement(p.first_s + line / p.rate, across, residual), chip, holes, ground,
         )  # fmt: skip
 
     def _geometry(self, tracks: Sequence[Track], scan: LineScan, height: Array) -> _Geometry:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
 
 Array = NDArray[np.floating]
 Float32 = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+#: A value counts as measured if no more of it comes from pixels that were not: a bicubic value has less of them.
+MOST_HOLE = 0.1
+#: Saturated and dead pixels get the mean of those within so many pixels.
+MENDED_PX = 2
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,7 @@ class Windows:
     first_line, first_sample : (k,) full-size pixel that each begins with
     values : (k, n, m) grey values
     lines_known, samples_known : (k, n), (k, m) which lines and samples are there and fit for use
+    lines_filled : (k, n) which lines are known only from those around them
     factor : full-size pixels to one of these, along and across
     """
 
@@ -29,6 +36,7 @@ class Windows:
     values: Float32
     lines_known: Mask
     samples_known: Mask
+    lines_filled: Mask
     factor: int = 1
 
     def reduced(self, factor: int) -> Windows:
@@ -40,14 +48,34 @@ class Windows:
         values = self.values[:, :n, :m].reshape(k, n // factor, factor, m // factor, factor).mean(axis=(2, 4))
         lines = self.lines_known[:, :n].reshape(k, -1, factor).min(axis=2)
         samples = self.samples_known[:, :m].reshape(k, -1, factor).min(axis=2)
-        return Windows(self.first_line, self.first_sample, values, lines, samples, factor * self.factor)
+        filled = self.lines_filled[:, :n].reshape(k, -1, factor).max(axis=2)
+        return Windows(self.first_line, self.first_sample, values, lines, samples, filled, factor * self.factor)
+
+    def mended(self, saturated: float) -> tuple[Windows, Mask | None]:
+        """The same with the mean of their neighbours for saturated pixels (from a grey value on) and those that are 0.
+
+        Also what was not measured (k, n, m): these, with those beside them, which share their values once they are
+        interpolated, and lines that lie between others; None for no such pixel.
+        """
+        bad = (self.values >= saturated) | (self.values <= 0.0)
+        some = np.flatnonzero((bad & self.lines_known[:, :, None] & self.samples_known[:, None]).any(axis=(1, 2)))
+        if not len(some):
+            if not self.lines_filled.any():
+                return self, None
+            return self, np.broadcast_to(self.lines_filled[:, :, None], self.values.shape)
+        good, values = np.where(bad[some], np.float32(0.0), np.float32(1.0)), self.values.copy()
+        side = 2 * MENDED_PX + 1
+        number, total = (uniform_filter(a, side, mode="nearest", axes=(1, 2)) for a in (good, good * values[some]))
+        inside = bad[some] & (number > 1e-3)
+        values[some] = np.where(inside, total / np.maximum(number, np.float32(1e-3)), values[some])
+        holes = np.zeros(bad.shape, dtype=bool)
+        holes[some] = maximum_filter(bad[some], 3, axes=(1, 2))
+        return replace(self, values=values), holes | self.lines_filled[:, :, None]
 
     def sample(self, line: Array, sample: Array, cubic: bool) -> tuple[Float32, Mask]:
         """Bicubic (Keys) or bilinear grey values at full-size lines and samples (k, ...), and which are known."""
         k, n, m = self.values.shape
-        off, wide = 0.5 * (self.factor - 1), (k,) + (1,) * (line.ndim - 1)
-        u = (line - self.first_line.reshape(wide) - off) / self.factor
-        v = (sample - self.first_sample.reshape(wide) - off) / self.factor
+        u, v = self._inside(line, sample)
         before, taps = (1, 4) if cubic else (0, 2)
         if n < taps or m < taps:
             return np.zeros(u.shape, dtype=np.float32), np.zeros(u.shape, dtype=bool)
@@ -64,6 +92,25 @@ class Windows:
                 known &= none.reshape(known.shape)
         total = _weighted(self.values, i, j, *((_cubic(a), _cubic(b)) if cubic else ((1 - a, a), (1 - b, b))))
         return total, known
+
+    def touched(self, holes: Mask, line: Array, sample: Array) -> Mask:
+        """Which grey values at lines and samples (k, ...) come from holes (k, n, m) to a part that counts."""
+        return holes_at(holes, *self._inside(line, sample)) > MOST_HOLE
+
+    def _inside(self, line: Array, sample: Array) -> tuple[Array, Array]:
+        """Rows and columns of full-size lines and samples (k, ...)."""
+        off, wide = 0.5 * (self.factor - 1), (len(self.values),) + (1,) * (line.ndim - 1)
+        u = (line - self.first_line.reshape(wide) - off) / self.factor
+        return u, (sample - self.first_sample.reshape(wide) - off) / self.factor
+
+
+def holes_at(holes: Mask, y: Array, x: Array) -> Float32:
+    """How much of the values at rows and columns (k, ...) comes from holes (k, n, m), interpolated linearly, 0 .. 1."""
+    n, m = holes.shape[1:]
+    y, x = np.clip(y, 0.0, n - 1.001), np.clip(x, 0.0, m - 1.001)
+    i, j = y.astype(np.int64), x.astype(np.int64)
+    a, b = (y - i).astype(np.float32), (x - j).astype(np.float32)
+    return _weighted(holes.astype(np.float32), i, j, (1 - a, a), (1 - b, b))
 
 
 def interpolate_stack(stack: Float32, y: Array, x: Array) -> Float32:

@@ -55,6 +55,10 @@ class Density:
         """A new strip begins."""
         self._tried[:] = self._left[:] = 0.0
 
+    def like(self, other: Density) -> None:
+        """As many places as another density has wanted lately."""
+        self.load, self._factor = other.load, other._factor
+
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds: few points are given company, too many rays get fewer."""
         o = self.options
@@ -126,7 +130,7 @@ class PlaceChooser:
         self._chosen.clear()
         self.density.forget()
 
-    def choose(self, ring: LineRing, rate_hz: float, first_line: float = 0.0) -> list[Place]:
+    def choose(self, ring: LineRing, rate_hz: float, first_line: float = 0.0, saturated: float = np.inf) -> list[Place]:
         """Places in the lines that have come.
 
         Lines are gone through in chunks, and the cells of a chunk while the lines of the next one come: so the work is
@@ -135,6 +139,7 @@ class PlaceChooser:
         Parameters
         ----------
         first_line : places before it are of no use
+        saturated : grey value from which on pixels are saturated
         """
         rows = max(round(CHUNK_S * rate_hz), LEAST_CHUNK)
         half = self._window // 2 + 2
@@ -145,7 +150,7 @@ class PlaceChooser:
             if chunk.cells:
                 come = (ring.end - chunk.first - rows - half + 1) / (PROMPT * rows)
                 while chunk.cells and chunk.done < come * chunk.number:
-                    places += self._best(ring, chunk, rows, half)
+                    places += self._best(ring, chunk, rows, half, saturated)
             if chunk.cells or self._next + rows + half > ring.end:
                 return places
             if chunk.number:
@@ -165,14 +170,15 @@ class PlaceChooser:
         cells = _cells(borders, ring)
         return _Chunk(first, len(cells), 0, cells)
 
-    def _best(self, ring: LineRing, chunk: _Chunk, rows: int, half: int) -> list[Place]:
+    def _best(self, ring: LineRing, chunk: _Chunk, rows: int, half: int, saturated: float) -> list[Place]:
         """The best place of the next cell, if there is a good one."""
         left, right = chunk.cells.pop(0)
         chunk.done += 1
         stretch = ring.read(chunk.first - half, chunk.first + rows + half, max(left - half, 0), right + half)
         largest, begin = self._options.largest_sigma_px, max(left - half, 0)
         free = self._free(stretch.first_line, begin, stretch.pixels.shape)
-        best = interest_point(stretch.pixels.astype(np.float32), stretch.usable, self._window, largest, free)
+        image = stretch.pixels.astype(np.float32)
+        best = interest_point(image, stretch.usable, self._window, largest, free, stretch.filled, saturated)
         if best is None:
             return []
         chunk.found += 1

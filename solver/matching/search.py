@@ -12,7 +12,7 @@ from .correlation import best_place, correlate
 from .least_squares import PatchMatch, match_patches
 from .line_scan import LineScan
 from .line_store import LineRing
-from .patches import Windows, interpolate_stack
+from .patches import MOST_HOLE, Windows, holes_at, interpolate_stack
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -25,6 +25,8 @@ REACH_PX, COARSEST = 10, 8
 LARGEST_UNEVENNESS = float(np.log(1.8))
 #: Shares of a template at coarser levels and of what it is searched in that must be known.
 LEAST_TEMPLATE, LEAST_SEARCH = 0.7, 0.4
+#: Share of a template's weight in least squares that must have been measured in both images.
+LEAST_MEASURED = 0.6
 #: Along a row of a grid every so many pixels are computed exactly; a patch covers at most so many times its size.
 NODE_PX, MOST_STRETCH = 4, 2.0
 
@@ -75,17 +77,33 @@ class Imagery(Protocol):
         """For some of the places."""
         ...
 
-    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Array, Array]:
-        """Grey values (k, n, n) on grids with n = 2 half + 1 and a spacing of ``factor`` pixels.
-
-        Also the share of each (k,) that is known - the rest has the mean of it -, and how uneven their lines lie: (k,)
-        the largest distance of neighbouring lines on the ground against the mean (logarithm).
+    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> Patches:
+        """Grey values on grids with n = 2 half + 1 and a spacing of ``factor`` pixels.
 
         Parameters
         ----------
         line : (k,) line of the middle of each, roughly
         """
         ...
+
+
+@dataclass(frozen=True)
+class Patches:
+    """What images saw on k grids.
+
+    Attributes
+    ----------
+    values : (k, n, n) grey values
+    known : (k,) share of each that is known; the rest has the mean of it
+    uneven : (k,) largest distance of neighbouring lines on the ground against the mean (logarithm)
+    holes : (k, n, n) what is known but was not measured: lines put in between others, saturated pixels; None for no
+        such pixel. Looked for at full size only.
+    """
+
+    values: NDArray[np.floating]
+    known: Array
+    uneven: Array
+    holes: Mask | None = None
 
 
 @dataclass(frozen=True)
@@ -97,19 +115,19 @@ class Image:
     scan : geometry
     ring : the lines
     line_m : way of the platform from one line to the next, m
+    saturated : grey value from which on pixels are saturated
     """
 
     scan: LineScan
     ring: LineRing
     line_m: float
+    saturated: float = np.inf
 
     def select(self, chosen: Mask) -> Image:
         """An image is the same for all places."""
         return self
 
-    def patches(
-        self, ground: Ground, line: Array, half: int, factor: int, lines_per: Array | None = None
-    ) -> tuple[NDArray[np.floating], Array, Array]:
+    def patches(self, ground: Ground, line: Array, half: int, factor: int, lines_per: Array | None = None) -> Patches:
         """See `Imagery`; every row of a grid through the orientation of the lines it falls on.
 
         ``lines_per``: lines for a step along rows and columns of grids that do not lie along the flight.
@@ -129,22 +147,28 @@ class Image:
         density = np.diff(u, axis=axis) / (step * factor)
         uneven = np.abs(np.log(np.clip(density, 0.05, 20.0))).reshape(k, -1).max(axis=1)
         between = _between(grid, nodes)
-        values, known = self._sample(u, v, between, factor)
+        values, known, holes = self._sample(u, v, between, factor)
         known &= inside @ between > 0.999
         share = known.reshape(k, -1).mean(axis=1)
         mean = np.sum(values, axis=(1, 2), where=known) / np.maximum(share * n * n, 1.0)
         values = np.where(known, values, mean[:, None, None].astype(np.float32))
-        return values, share, uneven
+        return Patches(values, share, uneven, holes)
 
-    def _sample(self, u: Array, v: Array, between: Array, factor: int) -> tuple[NDArray[np.floating], Mask]:
-        """Grey values (k, n, n) at lines and samples known in some columns (k, n, c)."""
+    def _sample(
+        self, u: Array, v: Array, between: Array, factor: int
+    ) -> tuple[NDArray[np.floating], Mask, Mask | None]:
+        """Grey values (k, n, n) at lines and samples known in some columns (k, n, c), what is known, and holes."""
         widest = int(MOST_STRETCH * factor * u.shape[1]) + 8
         pad = factor + 2 if factor > 1 else 2
         first = [np.floor(np.clip(a.min(axis=(1, 2)), -1e6, 1e9)).astype(np.int64) - pad for a in (u, v)]
         size = [int(np.ceil(np.quantile(np.ptp(a, axis=(1, 2)), 0.95) * 1.05)) + 2 * pad + 6 for a in (u, v)]
         n, m = (min(x, widest) // factor * factor + factor for x in size)
-        windows = Windows(first[0], first[1], *self.ring.windows(first[0], first[1], n, m)).reduced(factor)
-        return windows.sample(u @ between, v @ between, cubic=factor == 1)
+        windows = Windows(first[0], first[1], *self.ring.windows(first[0], first[1], n, m))
+        windows, holes = windows.mended(self.saturated)
+        windows, line, sample = windows.reduced(factor), u @ between, v @ between
+        return *windows.sample(line, sample, cubic=factor == 1), (
+            None if holes is None or factor > 1 else windows.touched(holes, line, sample)
+        )
 
 
 def _between(grid: Array, nodes: Array) -> Array:
@@ -207,13 +231,13 @@ def find(
     reach = int(np.ceil(min(reach_px / factor, REACH_PX))) + 1
     line_per_row = ground.spacing_m / other.line_m
     while True:
-        t, known_t, _ = master.patches(ground, master_line, CORRELATION_HALF, factor)
+        t = master.patches(ground, master_line, CORRELATION_HALF, factor)
         at = other_line + shift[:, 0] * line_per_row
-        s, known_s, _ = other.patches(ground.moved(shift), at, CORRELATION_HALF + reach, factor)
-        there = (known_t >= (LEAST_TEMPLATE if factor > 1 else 1.0)) & (known_s >= LEAST_SEARCH)
+        s = other.patches(ground.moved(shift), at, CORRELATION_HALF + reach, factor)
+        there = (t.known >= (LEAST_TEMPLATE if factor > 1 else 1.0)) & (s.known >= LEAST_SEARCH)
         reason[alive & ~there] = "no lines"
         alive &= there
-        row, column, top = best_place(correlate(t, s))
+        row, column, top = best_place(correlate(t.values, s.values))
         edge = (np.minimum(row, column) == 0) | (np.maximum(row, column) == 2 * reach)
         reason[alive & edge] = "beyond search"
         alive &= ~edge
@@ -237,28 +261,55 @@ def _refine(
     wide = half + MARGIN
     if alive.any():
         here, moved = ground.select(alive), ground.select(alive).moved(shift[alive])
-        t, known_t, uneven_t = master.select(alive).patches(here, master_line[alive], wide, 1)
+        t = master.select(alive).patches(here, master_line[alive], wide, 1)
         at = other_line[alive] + shift[alive, 0] * ground.spacing_m / other.line_m
-        s, known_s, uneven_s = other.patches(moved, at, wide, 1)
-        inner = slice(MARGIN, MARGIN + 2 * half + 1)
-        there = match_patches(np.ascontiguousarray(t[:, inner, inner]), s, np.zeros((int(alive.sum()), 2)))
-        back = _back(t, s, there)
+        s = other.patches(moved, at, wide, 1)
         index = np.flatnonzero(alive)
-        shift[index] += there.shift
-        covariance[index], score[index] = there.covariance, there.score
-        closing[index] = np.hypot(*back.shift.T)
-        reason[index[np.minimum(known_t, known_s) < 1.0]] = "no lines"
-        shaken = np.maximum(uneven_t, uneven_s) > LARGEST_UNEVENNESS
+        step, lost, gone = np.zeros((len(index), 2)), np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
+        for part, holes in _by_holes(t, s):
+            there, back = _there_and_back(t.values[part], s.values[part], holes)
+            step[part], covariance[index[part]], score[index[part]] = there.shift, there.covariance, there.score
+            closing[index[part]] = np.hypot(*back.shift.T)
+            lost[part] = ~there.converged | (np.abs(there.shift) > 2.0).any(axis=1)
+            gone[part] = there.measured < LEAST_MEASURED
+        shift[index] += step
+        reason[index[(np.minimum(t.known, s.known) < 1.0) | gone]] = "no lines"
+        shaken = np.maximum(t.uneven, s.uneven) > LARGEST_UNEVENNESS
         reason[index[shaken & (reason[index] == "")]] = "shaken"
-        lost = ~there.converged | (np.abs(there.shift) > 2.0).any(axis=1)
         reason[index[lost & (reason[index] == "")]] = "not converged"
     return Found(shift, covariance, score, closing, reason)
 
 
-def _back(template: NDArray[np.floating], search: NDArray[np.floating], there: PatchMatch) -> PatchMatch:
-    """The patch that was found, matched in the master; its shift should be none."""
-    side = 2 * LEAST_SQUARES_HALF + 1
-    r = np.arange(side) - LEAST_SQUARES_HALF + 0.5 * (search.shape[1] - 1)
+def _by_holes(t: Patches, s: Patches) -> list[tuple[NDArray[np.intp] | slice, tuple[Mask, Mask] | None]]:
+    """The places all of whose pixels were measured, and those with holes in their patches, and the holes."""
+    if t.holes is None and s.holes is None:
+        return [(slice(None), None)]
+    some = np.zeros(len(t.values), dtype=bool)
+    for patches in (t, s):
+        if patches.holes is not None:
+            some |= patches.holes.any(axis=(1, 2))
+    parts: list[tuple[NDArray[np.intp] | slice, tuple[Mask, Mask] | None]] = []
+    if not some.all():
+        parts.append((np.flatnonzero(~some), None))
+    if some.any():
+        part = np.flatnonzero(some)
+        a, b = (
+            np.zeros((len(part), *p.values.shape[1:]), dtype=bool) if p.holes is None else p.holes[part] for p in (t, s)
+        )
+        parts.append((part, (a, b)))
+    return parts
+
+
+def _there_and_back(
+    template: NDArray[np.floating], search: NDArray[np.floating], holes: tuple[Mask, Mask] | None
+) -> tuple[PatchMatch, PatchMatch]:
+    """The middles of templates matched, and the patches that were found matched in the master: their shift is none."""
+    inner, none = slice(MARGIN, MARGIN + 2 * LEAST_SQUARES_HALF + 1), np.zeros((len(template), 2))
+    middle = np.ascontiguousarray(template[:, inner, inner])
+    there = match_patches(middle, search, none, holes=None if holes is None else (holes[0][:, inner, inner], holes[1]))
+    r = np.arange(2 * LEAST_SQUARES_HALF + 1) - LEAST_SQUARES_HALF + 0.5 * (search.shape[1] - 1)
     y, x = np.meshgrid(r, r, indexing="ij")
-    found = interpolate_stack(search, y + there.shift[:, 0, None, None], x + there.shift[:, 1, None, None])
-    return match_patches(found, template, np.zeros((len(template), 2)), iterations=5)
+    at = y + there.shift[:, 0, None, None], x + there.shift[:, 1, None, None]
+    found = interpolate_stack(search, *at)
+    turned = None if holes is None else (holes_at(holes[1], *at) > MOST_HOLE, holes[0])
+    return there, match_patches(found, template, none, iterations=5, holes=turned)

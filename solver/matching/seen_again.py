@@ -8,14 +8,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .chips import Chips, ChipStore, StripChips
+from .chips import ChipStore, StripChips
 from .consistency import Disagreement
 from .line_scan import LineScan
 from .looks import verdict
 from .options import Place
 from .places import CHUNK_S, LEAST_CHUNK
 from .prediction import WIDE, Prediction, sample_m
-from .search import CORRELATION_HALF, REACH_PX, Ground, Image, coarsest_factor, find
+from .search import CORRELATION_HALF, REACH_PX, Ground, Image, Patches, coarsest_factor, find
 
 Array = NDArray[np.floating]
 
@@ -86,7 +86,7 @@ class SeenAgain:
             reach = float(np.clip(3 * np.where(np.isfinite(scale), scale, FIRST_REACH).max(), LATER_REACH, FIRST_REACH))
         # along a grid's rows the lines of this strip lie in another direction: each patch finds its own
         image = _Turned(self._image(p.master, scan, travel), turn[0] * strip.spacing_m / travel)
-        found = find(Chips(strip.values[chosen].astype(np.float32)), line, ground, image, expected, line, reach)
+        found = find(strip.chips(chosen), line, ground, image, expected, line, reach)
         reason = verdict(found, p.options)
         good = reason == ""
         self.counters["earlier points tried"] += len(chosen)
@@ -139,7 +139,7 @@ class _Turned:
         """An image is the same for all places."""
         return self
 
-    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> tuple[NDArray[np.floating], Array, Array]:
+    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> Patches:
         """See `search.Imagery`."""
         middle = self.image.scan.locate(ground.centre_l, line, rounds=4)[0]
         return self.image.patches(ground, np.where(np.isfinite(middle), middle, line), half, factor, self.lines_per)

@@ -21,13 +21,14 @@ from ..rotation import angles_from_matrix, matrix_from_angles
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
 from .line_store import LineRing, Stretch
+from .search import LEAST_MEASURED
 from .target_image import RING, Centre, candidates, fit
 
 Array = NDArray[np.floating]
 
 #: Lines kept beyond the widest search: looks wait so long for the pose at their time, s, and lines of vibration.
 WAIT_S, PAD = 2.0, 16
-#: Why a look is not measured whose lines are missing, black or saturated.
+#: Why a look is not measured whose lines are missing, black or saturated, but for a few.
 NO_LINES = "no lines"
 #: A look whose orientation has not come is given up after so long, s.
 PATIENCE_S = 1.5
@@ -292,7 +293,7 @@ class TargetFinder:
         """The target among the pixels about where it should be, with a doubt; or why there is none."""
         away = int((half + PAD) * max(pixel / travel, 1.0))
         stretch = ring.read(int(line) - away, int(line) + away + 1)
-        if len(stretch.pixels) < 2 * away or not stretch.usable.all():
+        if len(stretch.pixels) < 2 * away or not (stretch.usable | stretch.filled).all():
             return NO_LINES
         way = scan.position_l[-1, :2] - scan.position_l[0, :2]
         along = way / np.linalg.norm(way)
@@ -315,7 +316,7 @@ class TargetFinder:
         fits = [self._centre(target, scan, stretch, float(u[a, b]), float(v[a, b]), pixel) for a, b in places]
         good = sorted((c for c in fits if c is not None and c.converged and c.white > c.black), key=lambda c: -c.score)
         if not good or good[0].score < 0.7:
-            return "not found"
+            return NO_LINES if stretch.filled.any() else "not found"
         best = good[0]
         alike = [best] + [
             c for c in good[1:] if c.score > self.options.rival_score and np.hypot(*(c.xy - best.xy)) > 1.5 * pixel
@@ -340,8 +341,14 @@ class TargetFinder:
         line, sample = (a.ravel() for a in np.meshgrid(lines, samples, indexing="ij"))
         xyz, _ = scan.to_plane(line.astype(float), sample.astype(float), np.full(len(line), target.xyz_l[2]))
         grey = stretch.pixels[line - stretch.first_line, sample].astype(float)
-        nearest = int(np.argmin(np.hypot(line - u, sample - v)))
-        return fit(xyz[:, :2], grey, xyz[nearest, :2], target.radius_m, pixel)
+        start = xyz[int(np.argmin(np.hypot(line - u, sample - v))), :2]
+        if stretch.filled.any():  # what lies between other lines was not measured
+            there = stretch.usable[line - stretch.first_line]
+            around = np.hypot(*(xyz[:, :2] - start).T) < RING * target.radius_m
+            if there[around].mean() < LEAST_MEASURED:
+                return None
+            xyz, grey = xyz[there], grey[there]
+        return fit(xyz[:, :2], grey, start, target.radius_m, pixel)
 
     def _judge(
         self, nothing: TargetLook, target: Target, scan: LineScan, found: tuple[Centre, str], expected: Array,

@@ -1,30 +1,25 @@
 """Tie points as the lines come in: choose places in the master view, match each other look when it is in store, judge.
 
-The master is the CCD line that looks down most steeply.
+Places are chosen in the CCD line that looks down most steeply of those that see, the master.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import LineCamera
-from .chips import CHIP_HALF, ChipStore
-from .consistency import Disagreement
+from .chips import ChipStore
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
 from .line_scan import LineScan, view_of
 from .line_store import LineStore
-from .looks import Looked, LookMatcher, Track
+from .master_view import MasterView
 from .options import MatchedRay, MatchedTie, MatchingOptions
-from .places import PlaceChooser
 from .prediction import PAD, Prediction
-from .search import COARSEST, CORRELATION_HALF, LEAST_SQUARES_HALF, REACH_PX, Image
-from .seen_again import SeenAgain
-from .waiting import WaitingRoom
+from .search import COARSEST, CORRELATION_HALF, REACH_PX, Image
 
 Array = NDArray[np.floating]
 
@@ -43,7 +38,6 @@ class TieMatcher:
     Attributes
     ----------
     counters : places by what became of them, lines by what was wrong with them
-    prediction : geometry of the strip; whoever runs the matcher adds poses and corrections to its orientation
     """
 
     def __init__(self, camera: LineCamera, options: MatchingOptions | None = None):
@@ -53,20 +47,25 @@ class TieMatcher:
         if len(camera.lenses) != 1:
             raise ValueError(f"matching wants a camera with one lens, {camera.name} has {len(camera.lenses)}")
         self.views = [view_of(camera, i) for i in range(len(camera.lines))]
-        master = int(np.argmin([abs(view.forward) for view in self.views]))
         self.counters: Counter[str] = Counter()
-        self.prediction = Prediction(self.views, master, o)
         self.chips = ChipStore(int(o.chips_mb * 1e6))
         self._lines = LineIntake({v.ccd: v.pixels for v in self.views}, o, self._make_store)
-        self._chooser = PlaceChooser(o, 2 * LEAST_SQUARES_HALF + 1, len(self.prediction.others))
-        self._looks = LookMatcher(self.prediction, self._image, CHIP_HALF if o.chips_mb else 0)
-        self._waiting = WaitingRoom(self.prediction, self._looks)
-        self._again = SeenAgain(self.prediction, self._image, self.chips)
+        # places are chosen in the last of these; what began in the others goes on
+        self._at_work = [self._view(min(range(len(self.views)), key=self._tilt))]
         self._strip = ""
-        self._unjudged: list[Looked] = []
+        self._named: set[str] = set()
         self._next_number = 0
 
     # -- input ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def _master(self) -> MasterView:
+        return self._at_work[-1]
+
+    @property
+    def prediction(self) -> Prediction:
+        """Geometry of the strip, seen from the master."""
+        return self._master.prediction
 
     @property
     def orientation(self) -> CurrentOrientation:
@@ -93,12 +92,12 @@ class TieMatcher:
         if not (np.isfinite(line_rate_hz) and line_rate_hz > 0 and np.isfinite(first_line_time_s)):
             raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip = strip
-        self._unjudged, self._next_number = [], 0
-        self._waiting.clear()
+        self._next_number = 0
+        self._named.clear()
         self._lines.begin_strip(line_rate_hz)
-        self._chooser.begin_strip()
+        self._at_work = [self._master]
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
-        self._again.begin_strip(strip)
+        self._master.begin_strip(strip)
 
     def set_mean_height(self, height_m: float) -> None:
         """What the ground's height is taken for before anything is known, local frame."""
@@ -106,7 +105,8 @@ class TieMatcher:
 
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds, to give it more or less."""
-        self._chooser.density.window_holds(points, rays)
+        for view in self._at_work:
+            view.chooser.density.window_holds(points, rays)
 
     def keep(self, share: float) -> None:
         """So large a share of the places is tried from now on; of those that wait, fewer than before go on as well.
@@ -117,10 +117,11 @@ class TieMatcher:
         """
         if not 0 <= share <= 1:
             raise ValueError(f"a share of the places of {share}, wanted 0 to 1")
-        density = self._chooser.density
-        if share < density.load:
-            self._waiting.thin(share / density.load)
-        density.load = share
+        for view in self._at_work:
+            density = view.chooser.density
+            if share < density.load:
+                view.waiting.thin(share / density.load)
+            density.load = share
 
     def add_lines(self, ccd: str, first_line: int, pixels: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
         """Lines of one CCD; returns which of them (n,) are fit for use.
@@ -143,82 +144,60 @@ class TieMatcher:
         """The tie points that have become known."""
         store = self._lines.store
         out: list[MatchedTie] = []
-        # a CCD line that is dead is done without, as long as two see
-        seeing = self._lines.seeing
-        self._looks.least_rays = min(self.options.least_rays, max(len(seeing), 2))
         if store is not None and np.isfinite(self.orientation.end_s):
-            if seeing:
-                out += self._settle(self._waiting.give_up(seeing))
-            ring = store.rings[self.views[self.prediction.master].ccd]
-            self._waiting.add(self._chooser.choose(ring, self.prediction.rate, self._waiting.first_useful_line(store)))
-            self._waiting.add(self._again.find(ring.start, ring.end))
-            news = self._chooser.news()
+            self._choose_master(store, self._lines.seeing)
+            for view in self._at_work:
+                out += view.match(self._lines, store, self._named)
+            news = self._master.chooser.news()
             if news:
                 self._lines.tell(news)
-            for view, tracks in self._waiting.due(store):
-                out += self._look(tracks, view)
-        self._collect_counters()
+        for view in self._at_work:
+            self.counters.update(view.take_counters())
+        self._at_work = [view for view in self._at_work if not view.over]
+        self.counters.update(self._lines.counters)
+        self._lines.counters.clear()
         return out
 
-    def _look(self, tracks: list[Track], view: int) -> list[MatchedTie]:
-        """Look for places in a view; the ties among those that are through with all views."""
-        self._looks.look(tracks, view)
-        over, lost = self._waiting.settle(tracks)
-        gone = set(map(id, lost))
-        chosen = [track for track in tracks if not track.place.name]
-        across = 2 * np.array([t.place.sample for t in chosen]) / self.views[self.prediction.master].pixels - 1
-        stage = self._waiting.order.index(view)
-        self._chooser.density.judged(across, np.array([id(t) not in gone for t in chosen], dtype=bool), stage)
-        return self._settle((over, lost))
+    def _choose_master(self, store: LineStore, seeing: frozenset[str]) -> None:
+        """Places are chosen in the steepest of the views that see; what began in another one goes on."""
+        steepest = min((i for i, v in enumerate(self.views) if v.ccd in seeing), key=self._tilt, default=-1)
+        old = self._master
+        if len(seeing) < 2 or steepest == old.prediction.master:
+            return
+        new = next((view for view in self._at_work if view.prediction.master == steepest), None)
+        first = store.rings[self.views[steepest].ccd].end
+        if new is None:
+            new = self._view(steepest)
+            new.prediction.orientation, new.prediction.heights = self.orientation, old.prediction.heights
+            new.prediction.first_s, new.prediction.rate = old.prediction.first_s, old.prediction.rate
+            new.chooser.density.like(old.chooser.density)
+            new.begin_strip(self._strip, first)
+        else:
+            new.resume(first)
+            self._at_work.remove(new)
+        # the old one bridges the time until the new one's looks are complete
+        ring, over = store.rings[old.ccd], new.lines_to_last_look(seeing) - old.lines_to_last_look(seeing)
+        old.until = ring.end + over if old.ccd in seeing else -np.inf
+        self._at_work.append(new)
+        again = f"{new.ccd} sees again" if old.ccd in seeing else f"{old.ccd} sees nothing"
+        self._lines.tell(f"{again}: tie points begin in {new.ccd}, the steepest CCD line that sees")
 
-    def _settle(self, settled: tuple[list[Track], list[Track]]) -> list[MatchedTie]:
-        """The ties among places that are through with all views; the lost ones are counted."""
-        over, lost = settled
-        self.counters["too few looks"] += len(lost)
-        looked = self._looks.finish(over) if over else None
-        return self._judge(looked) if looked is not None else []
+    def _tilt(self, index: int) -> float:
+        return abs(self.views[index].forward)
 
-    def _judge(self, looked: Looked) -> list[MatchedTie]:
-        self._unjudged.append(looked)
-        p, parts = self.prediction, self._unjudged
-        d = _joined(part.disagreement for part in parts)
-        good = p.slow.judge(d)
-        if good is None:
-            return []
-        self._unjudged = []
-        # a view without a match is no contradiction, a point with a contradiction is dropped
-        fine = (good | ~np.isfinite(d.residual).all(axis=2)).min(axis=1)
-        self.counters["contradiction"] += int((~fine).sum())
-        p.heights.add(np.concatenate([part.xyz_l for part in parts])[fine])
-        distance = np.nanmax(np.hypot(*np.moveaxis(d.residual, 2, 0)), axis=1)
-        ties, begin = [], 0
-        for part in parts:
-            index = np.flatnonzero(fine[begin : begin + len(part)])
-            accepted = [self._tie(part, i, float(distance[begin + i])) for i in index.tolist()]
-            begin += len(part)
-            ties += accepted
-            new = [i for i, tie in zip(index, accepted, strict=True) if not tie.again]
-            if part.chip.size and new:
-                names = [tie.name for tie in accepted if not tie.again]
-                self.chips.add(self._strip, names, part.chip[new], part.ground.select(np.array(new)), part.score[new])
-        self.counters["ties"] += len(ties)
-        self.counters["ties with earlier strips"] += sum(tie.again for tie in ties)
-        return ties
+    def _view(self, index: int) -> MasterView:
+        prediction = Prediction(self.views, index, self.options)
+        return MasterView(prediction, self.options, self._image, self.chips, self._new_name)
 
-    def _tie(self, looked: Looked, i: int, prediction_px: float) -> MatchedTie:
-        name = looked.places[i].name
-        if not name:
-            self._next_number += 1
-        return MatchedTie(
-            name or f"{self._strip}-M{self._next_number}", looked.rays[i], float(looked.score[i]), looked.xyz_l[i],
-            prediction_px, bool(name),
-        )  # fmt: skip
+    def _new_name(self) -> str:
+        self._next_number += 1
+        return f"{self._strip}-M{self._next_number}"
 
     # -- store and counters --------------------------------------------------------------------------------------------
 
     def _image(self, index: int, scan: LineScan, travel: float) -> Image:
         assert self._lines.store is not None
-        return Image(scan, self._lines.store.rings[self.views[index].ccd], travel)
+        return Image(scan, self._lines.store.rings[self.views[index].ccd], travel, self._lines.saturated)
 
     def _make_store(self, dtype: np.dtype) -> LineStore | None:
         """Rings as long as the looks need; made when the first poses tell how fast the ground goes by."""
@@ -265,20 +244,6 @@ class TieMatcher:
             away += ahead * height / (view.focal_length_mm * travel)
             seen = np.interp(y, view.y_mm, view.sample)
         return np.interp(np.arange(master.pixels), samples, seen)
-
-    def _collect_counters(self) -> None:
-        chooser = self._chooser
-        self.counters["places"] += chooser.tried
-        self.counters["cells without texture"] += chooser.empty
-        chooser.tried = chooser.empty = 0
-        for part in (self._lines, self._looks, self._again, self._waiting):
-            self.counters.update(part.counters)
-            part.counters.clear()
-
-
-def _joined(parts: Iterable[Disagreement]) -> Disagreement:
-    parts = list(parts)
-    return Disagreement(*(np.concatenate([getattr(d, a) for d in parts]) for a in ("time_s", "across", "residual")))
 
 
 __all__ = ["MatchedRay", "MatchedTie", "MatchingOptions", "TieMatcher"]

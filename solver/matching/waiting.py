@@ -72,14 +72,16 @@ class WaitingRoom:
         self.counters["left out by load"] += len(left_out)
         self.tracks = [track for track in self.tracks if id(track) not in left_out]
 
-    def first_useful_line(self, store: LineStore) -> float:
-        """Line of the master before which too few views have seen the ground, as the strip began later."""
+    def first_useful_line(self, store: LineStore, seeing: frozenset[str]) -> float:
+        """Line of the master before which too few of the views that see have seen the ground: the strip began later."""
         p = self.prediction
         first = []
         for j in self.order:
+            if p.views[p.others[j]].ccd not in seeing:
+                continue
             ring, later = store.rings[p.views[p.others[j]].ccd], self._lines_later(j)
             first.append(ring.start - later if later < 0 else -np.inf)
-        return sorted(first)[max(self._looks.least_rays - 2, 0)]
+        return sorted(first)[max(self._looks.least_rays - 2, 0)] if first else np.inf
 
     def due(self, store: LineStore) -> list[tuple[int, list[Track]]]:
         """Places whose next look is in store, with the view; they do not wait any more."""
@@ -127,7 +129,7 @@ class WaitingRoom:
         """Places that were looked for: those that are through with all views, and lost ones; the rest waits on."""
         over, lost = [], []
         for track in tracks:
-            if 1 + track.found.sum() + (~track.tried).sum() < self._looks.least_rays:
+            if 1 + track.found.sum() + (~track.tried).sum() < self._looks.least_rays_of(track):
                 lost.append(track)
             elif track.tried.all():
                 over.append(track)
