@@ -69,6 +69,8 @@ class Batch:
     points_l : (p, 3)
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
     ties : what earlier strips say of the points
+    noise_version : of what is left of the noise of poses, which the weights are for (`pose_noise`)
+    counted : whether its rays are counted there
     tested : number of the update that tested it last
     active_rays, active_control, determined : rays and control points with weight, determined object coordinates
     coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
@@ -85,6 +87,8 @@ class Batch:
     points_l: Array
     provisional: bool
     ties: PointTies | None = None
+    noise_version: int = 0
+    counted: bool = False
     tested: int = -1
     active_rays: int = field(init=False, default=0)
     active_control: int = field(init=False, default=0)
