@@ -69,6 +69,7 @@ class Batch:
     points_l : (p, 3)
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
     ties : what earlier strips say of the points
+    self_calibration : additional parameters that are estimated
     noise_version : of what is left of the noise of poses, which the weights are for (`pose_noise`)
     counted : whether its rays are counted there
     tested : number of the update that tested it last
@@ -87,6 +88,7 @@ class Batch:
     points_l: Array
     provisional: bool
     ties: PointTies | None = None
+    self_calibration: SelfCalibration | None = None
     noise_version: int = 0
     counted: bool = False
     tested: int = -1
@@ -127,16 +129,40 @@ class Batch:
 
     def _weigh(self, theta: Array) -> Whitening:
         correction = self.layout.corrections(theta)
-        _, d_orientation, _, _ = collinearity(
+        projected, d_orientation, _, _ = collinearity(
             self.rays.position_l.T + correction[:3],
             self.rays.angles.T + correction[3:],
             self.points_l[self.rays.point].T,
             self.rays.focal_length_mm,
         )
+        if self.self_calibration is not None:
+            fitted = self._fitted(projected + self.layout.displacement(theta), d_orientation)
+            r = self.rays
+            camera = self.self_calibration.design(r.ccd, r.sample, fitted, r.focal_length_mm)
+            self.layout = replace(self.layout, camera=camera)
         covariance = residual_covariance(self.rays, d_orientation)
         through = np.einsum("akn,nkl->anl", d_orientation, self.pose_covariance)
         pose = np.einsum("anl,bln->abn", through, d_orientation)
         return whiten(covariance + np.stack([pose[0, 0], pose[0, 1], pose[1, 1]]))
+
+    def _fitted(self, computed: Array, d_orientation: Array) -> Array:
+        """Image coordinates (n, 2) without the residual along the CCD line, where additional parameters act.
+
+        Taken where they were measured, they would act on the noise, too: it is smallest in the smallest image, and many
+        rays that know the scale of the image by the jitter of the attitude alone would make it small.
+
+        Parameters
+        ----------
+        computed : (2, n) mm
+        """
+        rates = np.concatenate([self.rays.velocity_l.T, self.rays.angle_rate.T])
+        motion, pitch = np.einsum("ckn,kn->cn", d_orientation, rates), self.rays.pitch_mm.T
+        residual = self.rays.xy_mm.T - computed
+        across = motion[0] * pitch[1] - motion[1] * pitch[0]
+        along = motion[0] * residual[1] - motion[1] * residual[0]
+        least = 1e-3 * np.linalg.norm(motion, axis=0) * np.linalg.norm(pitch, axis=0)
+        samples = np.where(np.abs(across) > least, along / np.where(across == 0.0, 1.0, across), 0.0)
+        return (self.rays.xy_mm.T - pitch * samples).T
 
     def eliminate(self) -> None:
         """Information about the orientation, with the points eliminated, at the present linearisation and weights."""

@@ -161,7 +161,10 @@ class BatchMaker:
                 return None, lost
             batch, _ = self.make([names[i] for i in good], [points[i] for i in good], known, earlier)
             return batch, lost
-        batch = Batch(list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties)
+        batch = Batch(
+            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties,
+            self.self_calibration,
+        )  # fmt: skip
         batch.noise_version = self.pose_noise.version
         batch.linearise(theta, reweigh=True)
         return batch, []
