@@ -14,7 +14,7 @@ from ..solver.trajectory import Trajectory
 from . import convert
 
 Array = NDArray[np.floating]
-Poses = tuple[list[float], Array, Array, Array, bool]
+Poses = tuple[list[float], Array, Array, Array, bool, float]
 
 #: Of so long, s, each measured pose's validity is remembered, longer than any window; of earlier ones the stretches.
 REMEMBERED_S = 300.0
@@ -139,7 +139,8 @@ class PoseBuffer:
         self._left_out = begin_s, end_s
 
     def take(self, slow: SlowHistory) -> Iterator[Poses]:
-        """Times, positions, quaternions, covariance of the white noise, smoothed or not; filtered ones first."""
+        """Times, positions, quaternions, covariance of the noise, smoothed or not, correlation time of
+        the noise; filtered ones first."""
         begin_s, end_s = self._left_out
         for smoothed in (False, True):
             if not smoothed and self._smoothed_only and self._smoothed_follow():
@@ -154,6 +155,7 @@ class PoseBuffer:
                     np.array([s.quaternion for s in samples]),
                     slow.without([time for time, _ in waiting], np.array([s.covariance for s in samples])),
                     smoothed,
+                    samples[-1].noise_time_s,
                 )
 
     def _smoothed_follow(self) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..solver.adjustment.adjustment import Solution
 from ..solver.adjustment.layout import CorrectionSet
 from ..solver.adjustment.reliability import reliability
-from ..solver.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from ..solver.rotation import angles_from_matrix, corrected_angles, matrix_from_angles, matrix_from_quaternion
 from .adjustment_result import Adjustment, set_name
 
 Array = NDArray[np.floating]
@@ -97,7 +97,8 @@ def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
         time = strip.trajectory.time_s
         correction, sigma = correction_functions(adjustment, item, time)
         position = strip.trajectory.position_l + correction[:, :3]
-        angles = angles_from_matrix(matrix_from_quaternion(strip.trajectory.quaternion)) + correction[:, 3:]
+        angles = angles_from_matrix(matrix_from_quaternion(strip.trajectory.quaternion))
+        angles = corrected_angles(angles, correction[:, 3:]) if adjustment.block.heading else angles + correction[:, 3:]
         places = frame.to_crs(position)
         if frame.crs != "local":
             R = np.swapaxes(frame.R_l_crs(places), 1, 2) @ matrix_from_angles(*angles.T)

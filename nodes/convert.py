@@ -41,6 +41,7 @@ class PoseSample:
     covariance : (6, 6) X, Y, Z, omega, phi, kappa; m, rad; None if the message has none
     valid, strip : as in the message
     correction : (6,) m, rad; None if the message has none
+    noise_time_s : correlation time of the noise of the position, 0 if it is white
     """
 
     time_ns: int
@@ -50,6 +51,7 @@ class PoseSample:
     valid: bool
     strip: str = ""
     correction: Array | None = None
+    noise_time_s: float = 0.0
 
 
 def time_ns(timestamp: Any) -> int:
@@ -75,6 +77,7 @@ def pose_message(
     correction: ArrayLike | None = None,
     velocity_l: ArrayLike | None = None,
     protection: ArrayLike | None = None,
+    noise_time_s: float = 0.0,
 ) -> Any:
     """A PoseInFrame of the image frame in the local frame; angles are omega, phi, kappa in radians.
 
@@ -82,7 +85,7 @@ def pose_message(
     """
     if quaternion is None:
         quaternion = quaternion_from_matrix(matrix_from_angles(*np.asarray(angles, dtype=float)))
-    message = m.PoseInFrame(frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip)
+    message = m.PoseInFrame(frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip, noise_time_s=noise_time_s)
     set_time(message.timestamp, time_ns)
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = np.asarray(position_l, dtype=float).tolist()
@@ -115,6 +118,8 @@ def pose_sample(message: Any) -> PoseSample:
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if abs(norm - 1.0) > 1e-3:
         raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+    if not 0.0 <= message.noise_time_s < math.inf:
+        raise ValueError(f"noise_time_s of {message.noise_time_s:g} s, wanted 0 or more")
     covariance = _square(message.covariance, 6, "covariance")
     correction = np.array(message.correction) if message.correction else None
     return PoseSample(
@@ -125,6 +130,7 @@ def pose_sample(message: Any) -> PoseSample:
         message.valid,
         message.strip,
         correction,
+        message.noise_time_s,
     )
 
 

@@ -200,6 +200,7 @@ class Navigator(Node):
                 convert.pose_message(
                     self._reference_ns + round(p.time_s * 1e9), p.position_l, p.angles, p.covariance,
                     quaternion=p.quaternion, valid=p.valid, reason=p.reason, velocity_l=p.velocity_l,
+                    noise_time_s=p.noise_time_s,
                 ),
             )
             for p in poses

@@ -33,9 +33,10 @@ imaged at ``first_line_time + u / line_rate``. Time stamps are integer nanosecon
 computations use float seconds from a reference stamp that the caller chooses (``time_s``).
 
 **Corrections.** Correction functions are added to the measured orientation: ``X0 = X_measured(t) + dX(t)``,
-``omega0 = omega_measured(t) + domega(t)`` and so on [K 4.4-4.7]. Residual = measured minus computed. In the sliding
-window ``dkappa`` is a correction of heading, about the vertical: it turns the measured tilt as well, which counts where
-it is a tenth of a degree or more (`rotation.corrected_angles`; the simulated sensors err in the same way).
+``omega0 = omega_measured(t) + domega(t)`` and so on [K 4.4-4.7]. Residual = measured minus computed. Where the
+attitude is that of an inertial system (recordings, the sliding window; not block folders) ``dkappa`` is a correction of
+heading, about the vertical: it turns the measured tilt as well, which counts where it is a tenth of a degree or more
+(`rotation.corrected_angles`; the simulated sensors err in the same way).
 
 **Weights.** Everything is whitened with its own sigma, so that the a-priori sigma0 is 1 (times the a-priori image
 sigma where it is given in pixels).

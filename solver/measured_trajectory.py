@@ -97,21 +97,35 @@ class MeasuredTrajectory:
     Parameters
     ----------
     gap_s : samples farther apart than this have a gap between them, in which there is no orientation
+
+    Attributes
+    ----------
+    noise_time_s : lag at which the noise of smoothed positions is correlated by 1/e, as stated last; 0 = white
     """
 
     def __init__(self, gap_s: float = 0.2):
         self.gap_s = gap_s
         self._filtered, self._smoothed = GrowingTrajectory(), GrowingTrajectory()
+        self.noise_time_s = 0.0
 
     def add(
-        self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike, covariance: ArrayLike, smoothed: bool
+        self,
+        time_s: ArrayLike,
+        position_l: ArrayLike,
+        quaternion: ArrayLike,
+        covariance: ArrayLike,
+        smoothed: bool,
+        noise_time_s: float = 0.0,
     ) -> int:
         """Add poses (n,) in time order; returns how many came too late or twice and were left out.
 
         Parameters
         ----------
-        covariance : (n, 6, 6) of the white noise
+        covariance : (n, 6, 6) of the noise, slow errors apart
+        noise_time_s : lag at which that of smoothed positions is correlated by 1/e; 0 = white
         """
+        if smoothed:
+            self.noise_time_s = noise_time_s
         target = self._smoothed if smoothed else self._filtered
         t = np.asarray(time_s, dtype=float)
         last = target.end_s if len(target) else -np.inf

@@ -50,7 +50,7 @@ def turned_tilt(omega: ArrayLike, phi: ArrayLike, turn: ArrayLike) -> tuple[Arra
 
 
 def corrected_angles(measured: Array, correction: Array) -> Array:
-    """Measured omega, phi, kappa (n, 3) with corrections (n, 3) as a sliding window finds them.
+    """Measured omega, phi, kappa (n, 3) with corrections (n, 3) of an inertial system.
 
     The heading of an inertial system is wrong about the vertical, so that its omega and phi, right about level axes,
     are told in axes that are turned: kappa's correction turns the measured tilt, and then all three are added.

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .wander import damping_rate
+
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
 _NONE: Three = (0.0, 0.0, 0.0)
@@ -62,6 +64,12 @@ class SlowErrors:
     def position_sigma(self) -> Array:
         """(3,) of X, Y, Z together."""
         return np.sqrt(np.square(self.offset_m) + np.square(self.wander_m))
+
+    @property
+    def wander_density(self) -> Array:
+        """(6,) ``s`` of the wander's spectral density ``s / w^4`` at frequencies high against its correlation time."""
+        b = damping_rate(self.wander_time_s)
+        return 4.0 * b**3 * np.square([*self.wander_m, *self.wander])
 
     def widened(self, covariance: Array, learning: bool = False) -> SlowErrors:
         """With what the covariance (6, 6) of a pose at the start of a strip says more; no sigma becomes smaller.

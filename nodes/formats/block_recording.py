@@ -106,8 +106,9 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
     point_ids, image = _image_of(found, camera, strips, ground, apriori)
     frame = local_frame(project)
     return Block(
-        project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference
-    )
+        project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
+        heading=True,
+    )  # fmt: skip
 
 
 def _strips_of(

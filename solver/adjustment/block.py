@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +106,7 @@ class Block:
     apriori : see there
     notes : what the reader wants said (ignored columns, rows that cannot be used, assumptions)
     time_reference_ns : times count from here (ns since the Unix epoch)
+    heading : the attitude is that of an inertial system, whose error of kappa is one of heading (`Layout.heading`)
     """
 
     name: str
@@ -118,6 +119,7 @@ class Block:
     apriori: Apriori = Apriori()
     notes: tuple[str, ...] = ()
     time_reference_ns: int = 0
+    heading: bool = False
 
     def image_name(self, row: int) -> tuple[str, str, str]:
         """Point, strip and CCD of an image point, as written."""
@@ -142,7 +144,7 @@ def network_from_block(block: Block) -> Network:
     sigma = block.ground.sigma_m
     image = block.image
     of_sample = image.sigma_px if image.sigma_sample_px is None else image.sigma_sample_px
-    return build_network(
+    network = build_network(
         block.camera,
         block.strips,
         block.point_ids,
@@ -150,3 +152,4 @@ def network_from_block(block: Block) -> Network:
         Control(index[~check], block.ground.xyz_l[~check], sigma[~check]),
         Control(index[check], block.ground.xyz_l[check], sigma[check]),
     )
+    return replace(network, heading=block.heading)

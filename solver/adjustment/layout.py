@@ -59,6 +59,7 @@ class Layout:
     n_model, n_camera : numbers of unknowns
     names : (n_model + n_camera,) in words
     prior : a-priori knowledge of all unknowns
+    heading : kappa's correction is one of heading, about the vertical: it turns the measured omega and phi as well
     """
 
     sets: tuple[CorrectionSet, ...]
@@ -72,6 +73,7 @@ class Layout:
     n_camera: int
     names: tuple[str, ...]
     prior: PseudoObservations
+    heading: bool = False
 
     @property
     def n_unknowns(self) -> int:
@@ -154,6 +156,7 @@ def build_layout(network: Network, options: ModelOptions, self_calibration: Self
         len(names) - first,
         tuple(names),
         join_observations(prior),
+        network.heading,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..collinearity import collinearity
+from ..rotation import corrected_angles
 from .layout import Layout
 from .network import Rays
 
@@ -172,14 +173,23 @@ def _by_chunks(
         part = slice(low, min(low + CHUNK, len(rays)))
         own = rays.part(part)
         correction = layout.corrections(theta, part)
+        position, angles = corrected(own, layout, correction)
         xy, d_orientation, d_point, depth = collinearity(
-            own.position_l.T + correction[:3],
-            own.angles.T + correction[3:],
-            points_l.take(own.point, axis=0).T,
-            own.focal_length_mm,
+            position, angles, points_l.take(own.point, axis=0).T, own.focal_length_mm
         )
+        if layout.heading:  # kappa's correction has turned the tilt
+            omega, phi = angles[:2] - correction[3:5]
+            d_orientation[:, 5] += omega * d_orientation[:, 4] - phi * d_orientation[:, 3]
         residual = own.xy_mm.T - layout.displacement(theta, part) - xy
         yield part, own, residual, d_orientation, d_point, depth
+
+
+def corrected(rays: Rays, layout: Layout, correction: Array) -> tuple[Array, Array]:
+    """Perspective centres and angles (3, n) of rays with corrections (6, n)."""
+    angles = rays.angles.T + correction[3:]
+    if layout.heading:
+        angles = np.ascontiguousarray(corrected_angles(rays.angles, correction[3:].T).T)
+    return rays.position_l.T + correction[:3], angles
 
 
 def _whiten_into(target: Array, raw: Array, g: Array, part: slice) -> None:

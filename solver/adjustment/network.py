@@ -160,6 +160,7 @@ class Network:
     control : weighted coordinates
     check : coordinates to compare with; their rays take part as those of tie points
     refused : rays left out when the network was built: (place in the caller's arrays, reason)
+    heading : the attitude comes from an inertial system, so that an error of kappa is one of heading (`Layout.heading`)
     """
 
     camera: LineCamera
@@ -171,6 +172,7 @@ class Network:
     control: Control
     check: Control
     refused: tuple[tuple[int, str], ...] = ()
+    heading: bool = False
 
     @property
     def n_points(self) -> int:

@@ -11,7 +11,7 @@ from ..models.base import ModelOptions
 from ..selfcalibration import SelfCalibration
 from .elimination import Elimination, plan_elimination
 from .layout import Layout, build_layout
-from .linearisation import Linearisation, Whitening
+from .linearisation import Linearisation, Whitening, corrected
 from .network import Network
 from .normal_equations import ControlWeights, PointNormals, Prior, weigh_control, whiten_prior
 from .reduced_system import Factor
@@ -185,7 +185,8 @@ def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
     correction = old.layout.corrections(solution.state.theta)
     rays = old.network.rays
     refined = _with_left_out(old.network, old.layout, -1.0)
-    refined = refined.with_orientation(rays.position_l + correction[:3].T, rays.angles + correction[3:].T)
+    position, angles = corrected(rays, old.layout, correction)
+    refined = refined.with_orientation(position.T, angles.T)
     return replace(pose_problem(refined, model, old.self_calibration), earlier=(*old.earlier, solution))
 
 

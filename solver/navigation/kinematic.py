@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
 from ..rotation import angles_from_matrix, quaternion_from_matrix
 from ..wander import second_order_gauss_markov
-from .kinematic_model import N_STATES, WD, A, KinematicOptions, P, V, W, quintic, transition
+from .kinematic_model import N_STATES, WD, A, KinematicOptions, P, V, W, noise_time, quintic, transition
 from .pose import AttitudeHistory, NavigationEvent, NavigationPose, PoseMaker
 
 Array = NDArray[np.floating]
@@ -343,10 +343,11 @@ class KinematicFilter:
             np.maximum(white[k], white[k + 1]) <= self.options.sigma_limit_m
         )
         quaternion = quaternion_from_matrix(R_lc)
+        noise_time_s = self._noise_time(part)
         poses = [
             NavigationPose(
                 float(t[i]), position[i], angles[i], quaternion[i], velocity[i], full[i], bool(valid[i]),
-                "" if valid[i] else "no GNSS", True,
+                "" if valid[i] else "no GNSS", True, noise_time_s,
             )
             for i in range(len(t))
         ]  # fmt: skip
@@ -356,6 +357,14 @@ class KinematicFilter:
         del epochs[:keep]
         self._attitude.forget(min(self._smoothed_to, epochs[-1].time_s - self.options.lateness_s) - 0.5)
         return poses
+
+    def _noise_time(self, epochs: list[_Epoch]) -> float:
+        """Correlation time of the smoothed position where fixes come as in these epochs; 0 if there are too few."""
+        variance = [float(np.trace(e.R)) / 3.0 for e in epochs if e.accepted and e.R is not None]
+        if len(variance) < 2:
+            return 0.0
+        step_s = (epochs[-1].time_s - epochs[0].time_s) / (len(epochs) - 1)
+        return noise_time(self.options.jerk_psd, float(np.mean(variance)) * step_s)
 
     def _event(self, time_s: float, text: str) -> None:
         self._events.append(NavigationEvent(time_s, text))

@@ -15,6 +15,8 @@ Array = NDArray[np.floating]
 #: States: position, velocity, acceleration, slow GNSS error and its rate; three axes each, axis fastest.
 P, V, A, W, WD = (slice(3 * i, 3 * i + 3) for i in range(5))
 N_STATES = 15
+#: Lag in units of 1 / w_s at which the error of the smoothed position is correlated by 1/e, see `noise_time`.
+NOISE_TIMES_BANDWIDTH = 1.963
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,19 @@ def transition(dt: float, options: KinematicOptions) -> tuple[Array, Array]:
             F[si, sj] = Fw[i, j] * I3
             Q[si, sj] = Qw[i, j] * variance
     return F, Q
+
+
+def noise_time(jerk_psd: float, fix_density: float) -> float:
+    """Lag at which the error of a smoothed position is correlated by 1/e, s.
+
+    The error of the Wiener smoother of white noise jerk has the spectrum ``fix_density / (1 + (w / w_s)^6)`` with
+    ``w_s^6 = jerk_psd / fix_density``, and is correlated by 1/e at ``NOISE_TIMES_BANDWIDTH / w_s``.
+
+    Parameters
+    ----------
+    fix_density : variance of a fix times the time between two, m^2 s
+    """
+    return NOISE_TIMES_BANDWIDTH * (fix_density / jerk_psd) ** (1.0 / 6.0)
 
 
 def quintic(t: Array, h: Array, x0: Array, x1: Array) -> tuple[Array, Array]:

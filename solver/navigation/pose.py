@@ -38,6 +38,7 @@ class NavigationPose:
     covariance : (6, 6) X, Y, Z, omega, phi, kappa; m, rad
     valid, reason : False with a reason where it should not be relied on
     smoothed : from the fixed-lag smoother
+    noise_time_s : lag at which the noise of the position (slow errors apart) is correlated by 1/e; 0 = white
     """
 
     time_s: float
@@ -49,6 +50,7 @@ class NavigationPose:
     valid: bool
     reason: str
     smoothed: bool
+    noise_time_s: float = 0.0
 
 
 @dataclass(frozen=True)

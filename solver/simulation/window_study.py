@@ -254,6 +254,7 @@ def _update(
                 np.array([p.quaternion for p in poses]),
                 covariance,
                 smoothed,
+                poses[-1].noise_time_s,
             )
             poses.clear()
     begun = process_time()

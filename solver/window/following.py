@@ -123,6 +123,12 @@ class Follower:
             self._suspects = {id(b): b for b in turn}
         self._again(MOST_RAYS_AGAIN if self._following else 0)
 
+    def reweigh(self) -> None:
+        """Other noise of poses has become known: all batches are linearised again, the oldest first."""
+        self._suspects = {id(b): b for b in self._batches}
+        self._following = True
+        self._again(MOST_RAYS_AGAIN)
+
     def follow(self, fresh: list[Batch]) -> bool:
         """After a solution, linearise again new batches that have moved far; whether there were any.
 
@@ -150,8 +156,11 @@ class Follower:
             if batch not in self._batches:
                 continue
             theta = self._state.values(batch.columns)
-            if batch.has_moved(theta, MOVED):
+            reweigh = batch.noise_version != self._maker.pose_noise.version
+            if reweigh or batch.has_moved(theta, MOVED):
+                if reweigh:
+                    self._maker.refresh([batch])
                 batch.back_substitute(theta)
-                self._batches.linearise(batch, theta, reweigh=False)
+                self._batches.linearise(batch, theta, reweigh=reweigh)
                 batches += 1
                 rays += len(batch.rays)

@@ -15,6 +15,7 @@ from ..selfcalibration import SelfCalibration
 from .batch import Batch
 from .determinability import ESTIMATED, NOT_YET, Standing
 from .points import ControlPoint, PointLooks
+from .pose_noise import PoseNoise
 from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation
 from .state import WindowState
 from .strip import WindowStrip
@@ -31,8 +32,8 @@ BETTER = 0.7
 class Orienter:
     """Refined orientation at any time; keeps the cofactors of the unknowns asked for last."""
 
-    def __init__(self, state: WindowState, trajectory: MeasuredTrajectory):
-        self._state, self._trajectory = state, trajectory
+    def __init__(self, state: WindowState, trajectory: MeasuredTrajectory, pose_noise: PoseNoise):
+        self._state, self._trajectory, self._pose_noise = state, trajectory, pose_noise
         self._columns: IntArray = np.empty(0, dtype=np.int64)
         self._cofactors: Array | None = None
 
@@ -47,14 +48,15 @@ class Orienter:
         measured = self._trajectory.at(times)
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = covariance + measured.covariance
+        covariance = covariance + self._pose_noise.at(measured, strip.followed)
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
         )
 
     def noise(self, strip: WindowStrip, times: Array) -> Array:
         """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
-        return self._trajectory.at(times).covariance + strip.left_out_variance(times)[:, :, None] * np.eye(6)
+        noise = self._pose_noise.at(self._trajectory.at(times), strip.followed)
+        return noise + strip.left_out_variance(times)[:, :, None] * np.eye(6)
 
     def _chunk(self, strip: WindowStrip, times: Array) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""

@@ -17,6 +17,7 @@ from ..models.base import Design
 from ..rotation import corrected_angles, matrix_from_angles
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, join_designs, local_layout
+from .pose_noise import PoseNoise
 from .results import Look
 from .state import WindowState
 from .strip import WindowStrip
@@ -92,6 +93,7 @@ class BatchMaker:
     control: dict[str, ControlPoint]
     self_calibration: SelfCalibration | None
     camera_columns: IntArray
+    pose_noise: PoseNoise
 
     def rays(self, points: list[PointLooks]) -> tuple[Rays, Array, Array, NDArray[np.bool_]]:
         """Rays of points with the measured orientation, its white noise (n, 6, 6), weights (n,), and which of them
@@ -122,7 +124,7 @@ class BatchMaker:
     def _measured(self, time_s: Array, strip: IntArray) -> tuple[MeasuredPoses, Array]:
         """Measured orientation of rays, and the covariance (n, 6, 6) of its noise with what the model leaves out."""
         measured = self.trajectory.at(time_s)
-        covariance = measured.covariance.copy()
+        covariance = self.pose_noise.of_rays(measured)
         ids = list(self.strips)
         for i in np.unique(strip):
             mine = strip == i
@@ -194,7 +196,11 @@ class BatchMaker:
                 return None, lost
             rest = Draft([names[i] for i in good], [points[i] for i in good], earlier)
             return self.make_each([rest], known)[0][0], lost
-        batch = Batch(list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties)
+        batch = Batch(
+            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties,
+            self.self_calibration,
+        )  # fmt: skip
+        batch.noise_version = self.pose_noise.version
         batch.linearise(theta, reweigh=True)
         return batch, []
 
@@ -240,7 +246,7 @@ class BatchMaker:
         end = np.cumsum([len(r) for r in rays]).tolist()
         for batch, low, high in zip(batches, [0, *end], end, strict=False):
             part = slice(low, high)
-            batch.pose_covariance = covariance[part]
+            batch.pose_covariance, batch.noise_version = covariance[part], self.pose_noise.version
             batch.rays = replace(
                 batch.rays, position_l=p.position_l[part], angles=p.angles[part], velocity_l=p.velocity_l[part],
                 angle_rate=p.angle_rate[part],

@@ -76,6 +76,7 @@ class WindowStrip:
     lines : number of lines, 0 = not known
     model : its correction functions
     slow : its slow errors, as known beforehand
+    followed : (6,) spectral density of the wander that its model follows, see `SlowErrors`
     ended : whether the last line has been taken
     final_to_s : orientation up to here is final
     """
@@ -94,6 +95,7 @@ class WindowStrip:
         self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
         self.lines = lines
         self.slow = slow
+        self.followed = slow.wander_density if options.model != "dgr" else np.zeros(6)
         self.ended = False
         self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
         self.final_to_s = first_line_time_s

@@ -31,6 +31,7 @@ from .intake import Intake
 from .leaving import Leaver, grid
 from .output import CostHistory, Orienter, adjusted_points, parameters
 from .points import BatchMaker, ControlPoint
+from .pose_noise import PoseNoise
 from .results import Look, Parameter, RefinedOrientation, WindowOptions, WindowReport, WindowUpdate
 from .settle import Settler, settle
 from .snooping import reweigh, snoop
@@ -51,6 +52,8 @@ MOST_RETESTED = 100
 HURRIED_S = 0.1
 #: Time between two looks of the watch, s, if updates are not hurried.
 WATCH_S = 0.3
+#: Time between two looks at what corrections leave of the noise of poses, s.
+LEARNT_S = 2.0
 
 
 class Window:
@@ -91,17 +94,19 @@ class Window:
         self._block = Block(self.state, self.strips, self._camera_columns, sigma)
         self._intake = Intake(camera, self.strips, self.trajectory)
         self._points, self._control = self._intake.points, self._intake.control
+        self._pose_noise = PoseNoise(self.trajectory)
         self._maker = BatchMaker(
-            camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns
-        )
+            camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns,
+            self._pose_noise,
+        )  # fmt: skip
         self._batches = Batches(self.state)
         self._history = CostHistory()
         self._settler = Settler()
         self._now_s = -np.inf
         self._serial = 0
-        self._newest_ray_s = self._watched_s = -np.inf
+        self._newest_ray_s = self._watched_s = self._learnt_s = -np.inf
         self._length_s = options.window_s
-        self._orienter = Orienter(self.state, self.trajectory)
+        self._orienter = Orienter(self.state, self.trajectory, self._pose_noise)
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
             options.determine,
@@ -180,6 +185,7 @@ class Window:
         if turn in (None, 0):
             self._follower.look_after()
         iterations = self._solve(fresh, joined, turn in (None, 1), result)
+        self._learn_noise()
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._limit_s(), result)
@@ -237,6 +243,23 @@ class Window:
             batch.judge(self.state)
         self._orienter.forget()
         return iterations
+
+    def _learn_noise(self) -> None:
+        """What the corrections of the strip that is flown leave of the noise of poses, now and then."""
+        if self._now_s < self._learnt_s + LEARNT_S or not self.trajectory.noise_time_s:
+            return
+        strip = next((s for s in reversed(self.strips.values()) if not s.is_over(self.state)), None)
+        if strip is None:
+            return
+        self._learnt_s = self._now_s
+        for batch in self._batches:
+            if not (batch.provisional or batch.counted):
+                self._pose_noise.count(batch)
+                batch.counted = True
+        if self._pose_noise.learn(strip.followed, self._now_s):
+            self._follower.reweigh()
+            self.state.solve()
+            self._orienter.forget()
 
     def _settle(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Ask a young strip again which of its points agree; number of solutions computed."""
