@@ -107,7 +107,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
     frame = local_frame(project)
     return Block(
         project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
-        heading=True,
+        heading=not any(pose[1] for pose in poses),  # poses of a strip of their own are those of a block folder
     )  # fmt: skip
 
 
