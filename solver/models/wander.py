@@ -133,7 +133,7 @@ class Wander(CorrectionModel):
         coefficients = np.empty(columns.shape[:2])
         coefficients[:, 0], coefficients[:, 1] = 1.0, share
         value_and_slope = GLOBALS + 6 * np.arange(2)[:, None]
-        places = [self._inside(t, components[0]) for components in alike]
+        places = [self._inside(t, int(components[0])) for components in alike]
         begin, end, after = (np.stack(each, axis=1) for each in zip(*places, strict=True))
         _, part = self._between(after, self.options.slow.wander_time_s, end - begin)
         coefficients[:, 2:] = part.reshape(len(t), -1)
@@ -147,7 +147,7 @@ class Wander(CorrectionModel):
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
         out, alike = np.empty((len(t), 6)), self._alike()
-        places = [self._inside(t, components[0]) for components in alike]
+        places = [self._inside(t, int(components[0])) for components in alike]
         begin, end, inside = (np.stack(each, axis=1) for each in zip(*places, strict=True))
         variance, _ = self._between(inside, self._time_s[end], end - begin)
         part = inside / (self.step_s * (end - begin))
@@ -207,12 +207,12 @@ class Wander(CorrectionModel):
             lengths[out * sigma <= allowed] = longer
         return [np.append(np.arange(first, last, length), last) for length in lengths.tolist()]
 
-    def _alike(self) -> list[list[int]]:
+    def _alike(self) -> list[IntArray]:
         """Components by the borders they use."""
         found: dict[bytes, list[int]] = {}
         for component, used in enumerate(self.used):
             found.setdefault(used.tobytes(), []).append(component)
-        return list(found.values())
+        return [np.array(components) for components in found.values()]
 
     def _inside(self, t: Array, component: int) -> tuple[IntArray, IntArray, Array]:
         """Places (n,) of the borders in use around times, and the time (n,) since the first of both."""

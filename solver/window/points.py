@@ -147,7 +147,7 @@ class BatchMaker:
         """Batches as `make` makes them, one of each draft; what their rays need is looked up for all at once."""
         if not drafts:
             return []
-        rays, *of_rays = self.rays([point for draft in drafts for point in draft.points])
+        rays, covariance, weight, smoothed = self.rays([point for draft in drafts for point in draft.points])
         ids = list(self.strips)
         groups = [np.flatnonzero(rays.strip == i) for i in np.unique(rays.strip)]
         parts = [(mine, self.strips[ids[rays.strip[mine[0]]]].design(rays.time_s[mine])) for mine in groups]
@@ -158,9 +158,9 @@ class BatchMaker:
             part = slice(low, high)
             own = rays.part(part)
             own = replace(own, point=own.point - point)
-            covariance, weight, smoothed = (a[part] for a in of_rays)
             columns = Design(design.columns[part], design.coefficients[part])
-            made.append(self._batch(draft, known, own, columns, covariance, weight, not bool(smoothed.all())))
+            provisional = not bool(smoothed[part].all())
+            made.append(self._batch(draft, known, own, columns, covariance[part], weight[part], provisional))
             point += len(draft.names)
         return made
 
