@@ -4,17 +4,18 @@
 
 Strips one after the other, each tied to the one before by its side lap, with ground control now and then. A row each
 ten minutes, as soon as they are flown, of the strips that became final in them: the ratio of final and whole
-orientation and of points, time of updates and memory (the results are kept). At the end the ratio of the second half of
-the strips over the first, with the scatter of strips: without drift it is 1. Set OPENBLAS_NUM_THREADS=1.
+orientation and of points, time of updates and memory (the results are kept). At the end the ratio of the whole flight,
+and that of its second half over the first, with their 95 % bands: 1 has to lie in both. The bands are from the scatter
+of the rows, not of the strips: neighbouring strips share points and errors. Set OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 
 import numpy as np
+from scipy.stats import t as student
 
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
@@ -47,6 +48,7 @@ class Ratios:
         self._simulation = simulation
         self._ends = {s.id: s.first_line_time_s + s.lines / s.line_rate_hz for s in simulation.flight.strips}
         self.of_strip: dict[str, list[float]] = {}
+        self.rows: list[np.ndarray] = []  # means of each row
         self._due_s, self._updates = ROW_S, 0
         self._begun = time.monotonic()
 
@@ -59,7 +61,8 @@ class Ratios:
         rows = self._count(over, result)
         ms = 1e3 * np.array(result.update_s[self._updates :])
         self._updates = len(result.update_s)
-        each = "  ".join(f"{kind} {ratio:.3f}" for kind, ratio in zip(KINDS, np.mean(rows, axis=0), strict=True))
+        self.rows.append(np.mean(rows, axis=0))
+        each = "  ".join(f"{kind} {ratio:.3f}" for kind, ratio in zip(KINDS, self.rows[-1], strict=True))
         print(
             f"to {now_s / 60:4.0f} min, {len(over):2d} strips: {each}   update p50 {np.median(ms):5.1f} ms, p99 "
             f"{np.percentile(ms, 99):5.1f} ms   {resident_mb():5.0f} MB   {time.monotonic() - self._begun:5.0f} s",
@@ -97,19 +100,20 @@ def main() -> int:
     adjust_online(
         simulation, navigate(simulation), WindowOptions(grid_hz=2.0), live=False, update_s=0.5, so_far=ratios.look
     )
-    rows = np.array(list(ratios.of_strip.values()))
+    rows = np.array(ratios.rows)
     first, last = rows[: len(rows) // 2], rows[len(rows) // 2 :]
-    result: dict[str, object] = {"minutes": args.minutes, "strips judged": len(rows)}
+    print(f"{args.minutes:.0f} minutes, {len(ratios.of_strip)} strips judged in {len(rows)} rows")
     for i, kind in enumerate(KINDS):
+        error = student.isf(0.025, len(rows) - 1) * rows[:, i].std(ddof=1) / np.sqrt(len(rows))
         drift = last[:, i].mean() / first[:, i].mean()
-        scatter = np.hypot(*(1.96 * h[:, i].std(ddof=1) / h[:, i].mean() / np.sqrt(len(h)) for h in (first, last)))
-        error = 1.96 * rows[:, i].std(ddof=1) / np.sqrt(len(rows))
-        result[kind] = {
-            "ratio": round(float(rows[:, i].mean()), 3), "+-": round(float(error), 3),
-            "second half over first": round(float(drift), 3), "drift +-": round(float(scatter), 3),
-        }  # fmt: skip
-    print(json.dumps(result, indent=2))
+        each = [h[:, i].std(ddof=1) / h[:, i].mean() / np.sqrt(len(h)) for h in (first, last)]
+        scatter = student.isf(0.025, len(rows) - 2) * drift * np.hypot(*each)
+        print(f"{kind:7} {_banded(rows[:, i].mean(), error)};  second half over first {_banded(drift, scatter)}")
     return 0
+
+
+def _banded(value: float, error: float) -> str:
+    return f"{value:.3f} +- {error:.3f}, {'in the band' if abs(value - 1.0) <= error else 'outside'}"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,78 @@
+"""What corrections leave of the noise of smoothed positions, and where additional parameters act."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from triline.solver.navigation.kinematic_model import noise_time
+from triline.solver.selfcalibration import tls
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.pose_noise import followed, share_left
+from triline.solver.window.results import WindowOptions
+
+JERK_PSD, FIX_DENSITY = 1.0, 1.8e-4
+
+
+def noise_covariance(lag_s: np.ndarray) -> np.ndarray:
+    """Of the error of a Wiener smoother of white jerk, by its spectrum; 1 at lag 0."""
+    w = np.linspace(0.0, 60.0, 6001)
+    spectrum = 1.0 / (1.0 + w**6 * FIX_DENSITY / JERK_PSD)
+    return np.cos(np.multiply.outer(lag_s, w)) @ spectrum / spectrum.sum()
+
+
+def test_noise_time_is_the_lag_at_which_the_error_is_correlated_by_one_over_e():
+    assert noise_covariance(np.array(noise_time(JERK_PSD, FIX_DENSITY))) == pytest.approx(np.exp(-1.0), abs=2e-3)
+
+
+@pytest.mark.parametrize("information", [1e2, 6.6e3, 4e5])
+def test_the_share_is_what_a_least_squares_correction_leaves(information):
+    """The correction of a twice integrated white noise from white observations, as one system of equations."""
+    step_s, n, density = 0.08, 500, 1.46e-3
+    second = np.diff(np.eye(n), 2, axis=0) / step_s**1.5  # each of variance `density`
+    rays = information * step_s * np.eye(n)
+    taken = np.linalg.solve(rays + second.T @ second / density, rays)
+    lag_s = step_s * np.arange(n)
+    noise = noise_covariance(lag_s)[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))]
+    rest = np.eye(n) - taken
+    middle = slice(n // 3, 2 * n // 3)
+    left = np.diagonal(rest @ noise @ rest.T)[middle].mean()
+    bandwidth = (density * information) ** 0.25
+    assert share_left(bandwidth, noise_time(JERK_PSD, FIX_DENSITY)) == pytest.approx(left, abs=0.02)
+    assert 0.02 < left < 0.95
+
+
+def test_each_direction_is_followed_by_its_own_information():
+    density = np.array([1e-3, 1e-3, 4e-3, 1e-9, 1e-9, 1e-9])
+    information = np.diag([1e3, 0.0, 1e4, 1.0, 1.0, 1.0])
+    left = followed(information, density, 0.5)
+    want = np.sqrt(share_left([1.0, 0.0, 40.0**0.25], 0.5))
+    assert np.diagonal(left)[:3] == pytest.approx(want, rel=1e-6)
+    assert np.abs(left - np.diag(np.diagonal(left))).max() < 1e-12
+    seen = np.array([1.0, 0.0, 0.0, 0.0, -1500.0, 0.0])  # X and phi, as a ray from 1500 m sees them together
+    together = followed(500.0 * np.outer(seen, seen), density, 0.5)
+    wanders = density[0] + 1500.0**2 * density[4]
+    assert seen @ together[:, 0] == pytest.approx(np.sqrt(share_left((500.0 * wanders) ** 0.25, 0.5)), rel=1e-6)
+    assert together[4, 0] > 1e-6  # attitude takes its part
+    for nothing in (followed(information, density, 0.0), followed(information, 0.0 * density, 0.5)):
+        assert (nothing == np.eye(6)).all()
+
+
+def test_many_rays_without_control_do_not_make_the_image_small():
+    """Before control the scale is known by the jitter of the attitude alone; noise must not decide it.
+
+    Where additional parameters act on the noise of the samples as well, these three are 3.0, 2.7 and 4.0 sigma off,
+    all to the same side.
+    """
+    off = []
+    for seed in (1, 2, 4):
+        plan = FlightPlan(strip_s=40.0)
+        stated = tls(plan.camera)
+        simulation = simulate(plan, seed, observation_plan=ObservationPlan(tie_points_per_s=30.0, control=0, check=0))
+        options = WindowOptions(window_s=1e3, grid_hz=1.0)
+        result = adjust_online(simulation, navigate(simulation), options, stated, live=False, update_s=1.0)
+        known = next(r.parameters for r in reversed(result.reports) if r.parameters)
+        off.append(np.mean([p.value / p.sigma for p in known if p.name.startswith("sy")]))
+    assert abs(np.mean(off)) < 1.5, off
