@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from triline.nodes.cli.study_ties import COMPONENTS, lines, luck, ratios
+from triline.nodes.cli.study_ties import COMPONENTS, by_flights, lines, luck, ratios
 
 FLIGHTS = 12
 
@@ -31,6 +31,14 @@ def test_luck_is_how_far_ratios_of_equals_scatter(again):
     said = np.sqrt(np.mean([luck(rows, rng) ** 2 for rows in blocks], axis=0))
     np.testing.assert_allclose(said[:-1].mean(), logarithms[:, :-1].std(), rtol=0.1)
     np.testing.assert_allclose(said[-1], logarithms[:, -1].std(), rtol=0.3)
+
+
+def test_each_flight_counts_alike_and_the_standard_error_is_that_of_the_mean():
+    rng = np.random.default_rng(9)
+    found = np.array([by_flights(flights(rng, 4, factor=1.2)) for _ in range(80)])
+    # of chi squares with 6 degrees of freedom against a mean of 4 of them, the logarithm has a mean of its own
+    assert found[:, 0].mean() == pytest.approx(1.2 * 0.94, abs=0.02)
+    assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.2)
 
 
 def test_one_drawing_says_nothing_of_luck():
