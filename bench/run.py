@@ -30,6 +30,7 @@ BENCHMARKS = {
     "protection levels with wrong control": ["consistency.py", "control", "--seeds", "20"],
     "data snooping against the batch adjustment's": ["outliers.py", "--seeds", "6"],
     "orthoimage": ["orthoimage.py"],
+    "tie points of spoilt image lines": ["bad_imagery.py", "--seeds", "1"],
     "image matching at full rate, and beside OpenCV": ["matcher.py"],
 }
 
