@@ -13,7 +13,7 @@ from triline.nodes.recording import RecordingReader
 from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.least_squares import match_patches
 from triline.solver.matching.line_intake import LineIntake
-from triline.solver.matching.line_quality import IS_DARK, IS_FROZEN, IS_SATURATED, judge_lines
+from triline.solver.matching.line_quality import IS_DARK, IS_FROZEN, IS_PARTLY_SATURATED, IS_SATURATED, judge_lines
 from triline.solver.matching.line_scan import LineScan, view_of
 from triline.solver.matching.line_store import LineRing, LineStore
 from triline.solver.matching.looks import LookMatcher
@@ -222,6 +222,12 @@ def test_bad_lines_are_told_apart():
     lines = rng.integers(500, 3000, (5, 600)).astype(np.uint16)
     lines[1], lines[2], lines[4] = rng.integers(0, 50, 600), 4095, lines[3]
     np.testing.assert_array_equal(judge_lines(lines, None, 4095), [0, IS_DARK, IS_SATURATED, 0, IS_FROZEN])
+    lines[3, :300] = 4095  # a cloud: told, and used beside it
+    assert judge_lines(lines, None, 4095)[3] == IS_PARTLY_SATURATED
+    intake = LineIntake({"N": 600}, MatchingOptions(), lambda dtype: None)
+    intake.begin_strip(100.0)
+    assert intake.add("N", 0, lines[:4]).tolist() == [True, False, False, True]
+    assert any("partly saturated" in text for text in intake.take_events())
 
 
 def test_least_squares_matching_finds_shifts():

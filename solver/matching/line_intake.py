@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .line_quality import GOOD, REASONS, SATURATED, judge_lines
+from .line_quality import GOOD, IS_PARTLY_SATURATED, REASONS, SATURATED, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
@@ -22,7 +22,12 @@ RETURN_S = 1.0
 #: so many seconds.
 MOST_TOLD, BY_ITSELF, SUMMED_S = 100, 3, 10.0
 #: Names of lines that cannot be used, in events.
-_WORDS = {"dark": "black (lens cap, no light or no data)", "saturated": "saturated", "frozen": "frozen"}
+_WORDS = {
+    "dark": "black (lens cap, no light or no data)",
+    "saturated": "saturated",
+    "frozen": "frozen",
+    "partly saturated": "partly saturated",
+}
 
 
 class LineIntake:
@@ -98,22 +103,23 @@ class LineIntake:
         self.saturated = SATURATED * full_scale
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
+        usable = (verdict == GOOD) | (verdict == IS_PARTLY_SATURATED)
         self._tell(ccd, first_line, verdict)
         self._listen(ccd, first_line + len(pixels))
-        self._watch(ccd, first_line + len(pixels), int((verdict == GOOD).sum()))
+        self._watch(ccd, first_line + len(pixels), int(usable.sum()))
         if self.store is None:
             self.store = self._make_store(pixels.dtype)
         if self.store is None:
             self.counters["lines before poses"] += len(pixels)
-            return verdict == GOOD
-        missing, late = self.store.rings[ccd].add(first_line, pixels, verdict == GOOD)
+            return usable
+        missing, late = self.store.rings[ccd].add(first_line, pixels, usable)
         if missing:
             self.counters["lines missing"] += missing
             words = f"{missing} lines are missing before line {first_line}"
             self._fault(ccd, "missing", words, missing, first_line)
         if late:
             self.counters["lines twice or late"] += late
-        return verdict == GOOD
+        return usable
 
     @property
     def seeing(self) -> frozenset[str]:

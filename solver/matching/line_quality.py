@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-#: A line is dark if nine tenths of it lie below this share of full scale, saturated if a third lies above.
+#: A line is dark if nine tenths of it lie below this share of full scale, saturated if nine tenths lie above;
+#: if a third does, it is told of, but what is left of it is used.
 DARK, SATURATED = 0.02, 0.995
-GOOD, IS_DARK, IS_SATURATED, IS_FROZEN = 0, 1, 2, 3
-REASONS = ("good", "dark", "saturated", "frozen")
+GOOD, IS_DARK, IS_SATURATED, IS_FROZEN, IS_PARTLY_SATURATED = 0, 1, 2, 3, 4
+REASONS = ("good", "dark", "saturated", "frozen", "partly saturated")
 #: So many samples of a line are looked at.
 SAMPLES = 512
 
@@ -34,6 +35,8 @@ def judge_lines(
         same[0] = False
     out = np.full(len(some), GOOD, dtype=np.int8)
     out[same] = IS_FROZEN
-    out[(some >= SATURATED * full_scale).mean(axis=1) > 1 / 3] = IS_SATURATED
+    saturated = (some >= SATURATED * full_scale).mean(axis=1)
+    out[(saturated > 1 / 3) & ~same] = IS_PARTLY_SATURATED
+    out[saturated > 0.9] = IS_SATURATED
     out[(some < DARK * full_scale).mean(axis=1) > 0.9] = IS_DARK
     return out
