@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from ..formats.block_folder import read_block
 from ..formats.block_recording import TOPICS, block_from_messages
 from ..formats.new_file import refuse_unless_folder
 from ..recording import RecordingReader
+from ..recording_summary import damage_lines
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result"""
@@ -109,7 +111,8 @@ def read_input(path: Path) -> Block:
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
     reader = RecordingReader(path)
-    return block_from_messages(reader.messages(TOPICS), path.name)
+    block = block_from_messages(reader.messages(TOPICS), path.name)
+    return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
 
 
 def job_of(args: argparse.Namespace, block: Block) -> Job:
