@@ -23,7 +23,7 @@ from ...solver.adjustment.snooping import Round
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
 from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
-from ..adjustment_result import Adjustment, result_of, worst_strip
+from ..adjustment_result import PLOTS, TABLES, Adjustment, result_of, worst_strip
 from ..adjustment_summary import summary_lines
 from ..adjustment_tables import write_tables
 from ..errors import UserError
@@ -205,6 +205,8 @@ def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Pat
     """Write ``result.json`` and the tables, and the pictures on request."""
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    for name in ("result.json", *TABLES, *PLOTS):  # of an earlier run: what stands side by side belongs together
+        (folder / name).unlink(missing_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
     if plots:
