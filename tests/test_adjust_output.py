@@ -39,7 +39,7 @@ def test_expected_rmse_of_check_points_holds_the_survey(tmp_path, capsys):
         given = points["role"] == "check"
         rng = np.random.default_rng(100 + seed)
         for axis in "XYZ":  # a survey much worse than the adjustment
-            points.loc[given, f"{axis}_m"] += rng.normal(0.0, 0.8, int(given.sum()))
+            points.loc[given, f"{axis}_m"] += rng.normal(0.0, 0.8, np.count_nonzero(given))
             points.loc[given, f"sigma_{axis}_m"] = 0.8
         points.to_csv(block / "ground_points.csv", index=False)
         code, out, _ = adjust(block, "-o", tmp_path / "out", capsys=capsys)
@@ -82,7 +82,7 @@ def test_residuals_are_thinned_and_say_so(tmp_path):
     for axis, quiver in zip(figure.axes, arrows, strict=True):
         total = int(axis.get_title().rsplit(" of ", 1)[1])
         every = int(axis.get_title().rsplit("1 in ", 1)[1].split()[0])
-        assert 75 < len(quiver.U) == -(-total // every) <= adjustment_plots.MOST_ARROWS and every > 1
+        assert 75 < np.size(quiver.U) == -(-total // every) <= adjustment_plots.MOST_ARROWS and every > 1
 
 
 def test_a_damaged_recording_is_said_to_be_damaged(folder, tmp_path, capsys):

@@ -214,6 +214,9 @@ def test_nothing_of_the_map_is_cut_off(messages, east, north):
         FigureCanvasSVG(figure)
         figure.draw_without_rendering()
         whole = figure.bbox
+        (axes,), (legend,) = figure.axes, figure.legends
+        assert legend.get_tightbbox().y1 <= axes.get_tightbbox().y0  # and nothing lies upon another
+        assert axes.get_tightbbox().y1 <= figure.texts[0].get_tightbbox().y0
         for artist in [*figure.texts, *figure.legends, *figure.axes]:
             box = artist.get_tightbbox()
             assert box.y1 <= whole.y1 + 0.1 and box.y0 >= whole.y0 - 0.1 and box.x0 >= whole.x0 - 0.1, artist

@@ -11,7 +11,7 @@ from typing import Any
 from ..errors import UserError
 from ..formats.new_file import new_file
 from ..recording_summary import Holdings
-from ..report.accuracy_table import accuracy_lines, early_lines
+from ..report.accuracy_table import accuracy_lines
 
 EXAMPLE = "triline analyze flight.mcap -o report.html"
 
@@ -61,13 +61,16 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"report": str(args.output), **result}, indent=2))
     elif not args.quiet:
         lines = accuracy_lines(result)
-        if args.verbose or not lines:
+        compared = result["orientation"] or result["points"] or result["check"]
+        if args.verbose or not compared:
             for line in result["missing"]:
                 print(f"not in this recording: {line}")
         if args.verbose:
             for name, n in result["poses_left_out"].items():
                 print(f"{name}: {n} poses that are not valid, left out of the statistics")
-        print("\n".join([*lines, *(early_lines(result) if not lines else [])]) or "no accuracy without any of these")
+        if not compared:
+            lines.append("no accuracy: neither truth nor check points to compare with")
+        print("\n".join(lines))
         print(f"{args.output}: {args.output.stat().st_size / 1e6:.1f} MB")
     if result["damage"] and not args.json:
         print(f"triline analyze: {args.recording}: {'; '.join(result['damage'])}", file=sys.stderr)

@@ -28,11 +28,11 @@ def accuracy_lines(result: dict[str, Any]) -> list[str]:
     """RMSE against truth of an evaluation (`evaluation.evaluate_flight`), with n and stated sigmas.
 
     The lines have 100 columns at most. Points are compared with check points where no truth is recorded; no lines where
-    there is neither.
+    there is neither, but of what is missing of the flight.
     """
     orientation, points = result["orientation"], result["points"] or result["check"]
     if not orientation and not points:
-        return []
+        return early_lines(result)
     against = "truth" if orientation or result["points"] else "check points"
     lines = [f"{'RMSE against ' + against:<28}{_HEAD}   omega     phi   kappa        NEES"]
     if orientation:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
@@ -35,13 +36,14 @@ def trajectory_map(flight: Flight) -> Figure | None:
         return None
     low, high = poses.position_l.min(axis=0), poses.position_l.max(axis=0)
     points = _point_arrays(flight)
-    if len(points["xyz"]):
-        low, high = np.minimum(low, points["xyz"].min(axis=0)), np.maximum(high, points["xyz"].max(axis=0))
+    for drawn in (points["xyz"], np.array([[g.x, g.y, g.z] for g in flight.ground.values()])):
+        if len(drawn):
+            low, high = np.minimum(low, drawn.min(axis=0)), np.maximum(high, drawn.max(axis=0))
     extent = np.maximum(high - low, 1.0)[:2]
     turned = extent[1] > 1.15 * extent[0]  # a flight to the north lies on its side, so that it fills the page
-    fig = figure(float(np.clip(1.2 + 8.6 * min(extent) / max(extent), 2.5, 7.5)))
+    fig = figure(float(np.clip(1.45 + 8.6 * min(extent) / max(extent), 2.3, 7.5)))
     ax = fig.add_subplot()
-    ax.set_aspect("equal")
+    ax.set_aspect("equal", anchor="N")
 
     def place(xyz: Array) -> tuple[Array, Array]:
         e, n = xyz[..., 0] / 1000, xyz[..., 1] / 1000
@@ -66,6 +68,8 @@ def trajectory_map(flight: Flight) -> Figure | None:
         ax.set_ylabel("north [km]")
     fig.suptitle("Flight and ground points, local frame", x=0.01, ha="left", fontsize=9.5, fontweight="bold")
     fig.legend(loc="outside lower center", ncols=7)
+    FigureCanvasSVG(fig)
+    fig.draw_without_rendering()  # the layout of axes with a fixed aspect is right from the second time on
     return fig
 
 
