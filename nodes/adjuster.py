@@ -415,7 +415,7 @@ class Adjuster(Node):
         if pace is None:
             return []
         words = pace.words(self._update_ns / convert.SECOND_NS)
-        return [self._log(words, warning=pace.level > 0)]
+        return [self._log(words, warning=pace.level > 0 and not pace.eased)]
 
     def _hand_over_poses(self) -> None:
         assert self._window is not None

@@ -7,7 +7,7 @@ same at the same places, so that both give the same answers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..schemas import messages as m
@@ -21,10 +21,11 @@ LEVELS = ((1, 1.0), (2, 1.0), (5, 1.0), (5, 0.5), (5, 0.25), (5, 0.125), (5, 0.0
 
 @dataclass(frozen=True)
 class Pace:
-    """How data are taken in; ``level`` 0 is the normal pace."""
+    """How data are taken in; ``level`` 0 is the normal pace, ``eased`` says that the one before was higher."""
 
     level: int = 0
     lag_s: float = 0.0
+    eased: bool = False
 
     @property
     def factor(self) -> int:
@@ -40,7 +41,8 @@ class Pace:
         """For the operator."""
         if not self.level:
             return "caught up: normal pace again"
-        text = f"{self.lag_s:.1f} s behind: updates every {self.factor * update_s:g} s"
+        why = "catching up, eased off" if self.eased else f"{self.lag_s:.1f} s behind"
+        text = f"{why}: updates every {self.factor * update_s:g} s"
         if self.kept == 0.0:
             return text + ", only control"
         return text + (f", {100 * self.kept:g} % of the tie points" if self.kept < 1.0 else "")
@@ -70,7 +72,8 @@ class Pacing:
     def follow(self, stamp_ns: int) -> Pace | None:
         """The pace that begins by now, if one does."""
         begun = self._announced.take(stamp_ns)
-        self.pace = begun or self.pace
+        if begun is not None:
+            self.pace = begun = replace(begun, eased=begun.level < self.pace.level)
         return begun
 
     def take_waiting(

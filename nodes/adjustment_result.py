@@ -30,6 +30,10 @@ MOST_NAMED = 4
 #: More undetermined combinations than a block with a defect has.
 MANY_WEAK = 30
 
+#: Files beside ``result.json``.
+TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
+PLOTS = ("residuals.png", "points.png", "corrections.png")
+
 
 @dataclass(frozen=True)
 class Adjustment:
@@ -183,12 +187,32 @@ def accuracies(result: BatchResult) -> dict[str, Any]:
     reference = network.check if len(network.check) else network.control
     direct = result.georeferenced
     return {
-        "check": _accuracy(result.compare(network.check, points, sigma)),
-        "control": _accuracy(result.compare(network.control, points, sigma)),
+        "check": _accuracy(result.compare(network.check, points, sigma))
+        | _expected(result, network.check, sigma, independent=True),
+        "control": _accuracy(result.compare(network.control, points, sigma))
+        | _expected(result, network.control, sigma, independent=False),
         "tie": {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()},
         "direct_georeferencing": _accuracy(result.compare(reference, direct.xyz_l, direct.sigma_m))
+        | _expected(result, reference, direct.sigma_m, independent=True)
         | {"against": "check" if len(network.check) else "control"},
     }
+
+
+def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent: bool) -> dict[str, Any]:
+    """RMSE to be expected of the differences to given coordinates, which have errors of their own.
+
+    Points that were adjusted without them differ by both errors; control took part, so that the variance of its
+    differences is that of the given coordinate less that of the adjusted one.
+    """
+    sure = ~np.isin(given.point, [d.point for d in result.doubtful])
+    used = np.isfinite(given.sigma_m) & sure[:, None] & np.isfinite(sigma_m[given.point])
+    sign, scale = (1.0, 1.0) if independent else (-1.0, result.sigma0)  # sigmas of control scale with the others
+    variance = np.where(used, (scale * given.sigma_m) ** 2 + sign * sigma_m[given.point] ** 2, 0.0)
+    n = used.sum(axis=0)
+    if not n.any():
+        return {}
+    mean = np.maximum(variance, 0.0).sum(axis=0) / np.maximum(n, 1)
+    return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
 
 
 def _accuracy(a: PointAccuracy) -> dict[str, Any]:

@@ -11,6 +11,14 @@ Content = Mapping[str, Any]
 MOST_REJECTED = 10
 
 
+#: What the differences to given coordinates hold beside the errors of the points.
+_WITH_SURVEY = {
+    "check": "from sigma and the survey's own",
+    "control": "from the survey's sigma, as it took part",
+    "direct_georeferencing": "from sigma and the survey's own",
+}
+
+
 def summary_lines(content: Content, *, verbose: bool = False) -> Iterator[str]:
     """The lines, without ends of line."""
     yield from _head(content)
@@ -54,6 +62,8 @@ def _accuracy(c: Content) -> Iterator[str]:
         a = c[key]
         if a["n"]:
             yield f"  {name:22s}{a['n']:5d} {_three(a['rmse_m'])} {_three(a['mean_m'])} {_three(a['sigma_m'])}"
+            if _differ(a.get("expected_m"), a["sigma_m"]):
+                yield f"  {'  RMSE to be expected':27s} {_three(a['expected_m'])}  {_WITH_SURVEY[key]}"
     if c["tie"]["n"]:
         yield f"  {'tie points':22s}{c['tie']['n']:5d} {'':27s} {'':27s} {_three(c['tie']['sigma_m'])}"
 
@@ -61,10 +71,15 @@ def _accuracy(c: Content) -> Iterator[str]:
 def _strips(c: Content) -> Iterator[str]:
     for id, strip in c["strips"].items():
         if "offset_m" in strip:
-            yield (
-                f"strip {id}: offset {_list(strip['offset_m'], 4)} m, shift {_list(strip['shift_deg'], 5)} deg, "
-                f"drift {_list(strip['drift_deg'], 5)} deg over the strip"
-            )
+            yield f"{'strip ' + id:22s}{'X, omega':>22s}{'Y, phi':>22s}{'Z, kappa':>22s}"
+            for key, name, unit, digits in (
+                ("offset_m", "offset", "m", 4),
+                ("shift_deg", "shift", "deg", 5),
+                ("drift_deg", "drift over the strip", "deg", 5),
+            ):
+                pairs = zip(strip[key], strip[f"{key}_sigma"], strict=True)
+                values = [f"{_digits(v, digits)} +- {_digits(s, digits)}" for v, s in pairs]
+                yield f"  {name:20s}" + "".join(f"{v:>22s}" for v in values) + f" {unit}"
         else:
             kind = next((k for k in ("segments", "fixes") if k in strip), None)
             if kind:
@@ -134,8 +149,14 @@ def _metres(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
-def _list(values: Sequence[float], digits: int) -> str:
-    return "(" + ", ".join(f"{v:.{digits}f}" for v in values) + ")"
+def _differ(expected: Sequence[float | None] | None, sigma: Sequence[float | None]) -> bool:
+    """Whether the survey tells: by more than 1 %."""
+    pairs = zip(expected or (), sigma, strict=False)
+    return any(e is not None and s is not None and abs(e - s) > 0.01 * s for e, s in pairs)
+
+
+def _digits(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _number(value: float | None) -> str:

@@ -12,7 +12,7 @@ from ..solver.adjustment.adjustment import Solution
 from ..solver.adjustment.layout import CorrectionSet
 from ..solver.adjustment.reliability import reliability
 from ..solver.rotation import angles_from_matrix, corrected_angles, matrix_from_angles, matrix_from_quaternion
-from .adjustment_result import Adjustment, set_name
+from .adjustment_result import TABLES, Adjustment, set_name
 
 Array = NDArray[np.floating]
 
@@ -22,15 +22,10 @@ _ANGLES = ("omega", "phi", "kappa")
 
 def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
     """Write ``points.csv``, ``residuals.csv`` and ``trajectory_refined.csv``; returns their paths."""
-    tables = {
-        "points.csv": points_table(adjustment),
-        "residuals.csv": residuals_table(adjustment),
-        "trajectory_refined.csv": trajectory_table(adjustment),
-    }
     paths = []
-    for name, table in tables.items():
+    for name, table in zip(TABLES, (points_table, residuals_table, trajectory_table), strict=True):
         path = folder / name
-        table.to_csv(path, index=False)
+        table(adjustment).to_csv(path, index=False)
         paths.append(path)
     return paths
 

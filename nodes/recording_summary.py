@@ -10,6 +10,7 @@ from ..schemas import topics
 from ..schemas.topics import Family
 from .recording import RecordingReader
 
+_NO_END = "the file has no end: it was cut off, or its writer was killed"
 #: Families whose stamps tell when a flight was.
 _TIMED = (Family.SENSOR, Family.OBSERVATION, Family.RESULT, Family.TRUTH)
 
@@ -70,10 +71,64 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
 
 
 def time_span_ns(reader: RecordingReader) -> tuple[int, int] | None:
-    """First and last stamp of what was measured and computed; None without any."""
-    timed = [c.id for c in reader.channels.values() if c.known and topics.find(c.topic).family in _TIMED]
+    """First and last stamp of what was measured and computed; None without any.
+
+    What is handed to whoever joins later, such as given ground points, is known before a flight and does not count.
+    """
+    rows = {c.id: topics.find(c.topic) for c in reader.channels.values() if c.known}
+    timed = [id for id, row in rows.items() if row.family in _TIMED and not row.latched]
     stamps = reader.index.stamp_ns[np.isin(reader.index.channel, timed)]
     return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
+
+
+@dataclass(frozen=True)
+class Holdings:
+    """What a recording holds, the same for every command that says it.
+
+    Attributes
+    ----------
+    file, size_bytes : of the recording
+    messages : how many it holds, of all topics
+    span_ns : first and last stamp of what was measured and computed, see `time_span_ns`
+    topics : summaries by topic
+    damage : what cannot be read, one line each
+    """
+
+    file: str
+    size_bytes: int
+    messages: int
+    span_ns: tuple[int, int] | None
+    topics: list[TopicSummary]
+    damage: list[str]
+
+    @property
+    def duration_s(self) -> float:
+        """Between first and last stamp, 0 without any."""
+        return (self.span_ns[1] - self.span_ns[0]) / 1e9 if self.span_ns else 0.0
+
+
+def holdings(reader: RecordingReader) -> Holdings:
+    """What a recording holds; messages that were found unusable so far count as damage."""
+    return Holdings(
+        str(reader.path), reader.size, len(reader.index), time_span_ns(reader), topic_summaries(reader),
+        damage_lines(reader),
+    )  # fmt: skip
+
+
+def damage_lines(reader: RecordingReader) -> list[str]:
+    """What of a recording cannot be read or used, in words; the messages are judged as far as they were decoded."""
+    lines = []
+    if reader.damage:
+        n, lost, first = len(reader.damage), sum(d.length for d in reader.damage), reader.damage[0]
+        several = f"{n} damaged places ({lost} bytes); the first: {first}"
+        lines.append("skipped " + (several if n > 1 else f"1 damaged place: {first}"))
+    elif not reader.complete:
+        lines.append(_NO_END)
+    if reader.problems["without a channel"]:
+        lines.append(f"skipped {reader.problems['without a channel']} messages without a channel")
+    if reader.problems["malformed"]:
+        lines.append(f"skipped {reader.problems['malformed']} unusable messages; the last: {reader.last_problem}")
+    return lines
 
 
 def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:
@@ -86,7 +141,7 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
     if wrong is not None:
         found.append(wrong)
     if not reader.complete and not reader.damage:
-        found.append("the file has no end: it was cut off, or its writer was killed")
+        found.append(_NO_END)
     if not any(channel.known for channel in reader.channels.values()):
         held = ", ".join(sorted({channel.topic for channel in reader.channels.values()})[:3])
         found.append(f"foreign: no topic of triline in it{', only ' + held if held else ''}")

@@ -19,6 +19,7 @@ from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_
 from triline.nodes.report.figures import errors
 from triline.nodes.report.flight import collect, updates_with_new_rays
 from triline.nodes.report.page import page
+from triline.nodes.report.source import read
 from triline.nodes.report.strip_time import StripTime
 
 
@@ -34,6 +35,16 @@ def recording(messages, tmp_path_factory):
         for message in messages:
             writer.write(message)
     return path
+
+
+def analysed(messages, folder):
+    """Flight and analysis of messages, by way of a recording of them."""
+    path = folder / "flight.mcap"
+    with RecordingWriter(path) as writer:
+        for message in messages:
+            writer.write(message)
+    flight, held = read(path)
+    return flight, analyse(flight, held)
 
 
 # ---- evaluation
@@ -71,6 +82,10 @@ def test_point_errors_equal_an_independent_computation(messages, recording):
     truth = {m.body.point: m.body for m in messages if m.topic == "truth/point"}
     final = [m.body for m in messages if m.topic == "point/object" and m.body.status == 1]
     error = np.array([[p.x - truth[p.point].x, p.y - truth[p.point].y, p.z - truth[p.point].z] for p in final])
+    control = {m.body.point for m in messages if m.topic == "observation/control" and m.body.role != 3}
+    used = np.array([p.point not in control for p in final])  # what was put in is no result
+    assert len(control) > 2 and result["points"]["adjusted"]["n"] == used.sum() == len(final) - len(control)
+    final, error = [p for p, u in zip(final, used, strict=True) if u], error[used]
     np.testing.assert_allclose(result["points"]["adjusted"]["rmse_m"], np.sqrt((error**2).mean(axis=0)))
     nees = np.mean(
         [e @ np.linalg.solve(np.reshape(p.covariance, (3, 3)), e) for e, p in zip(error, final, strict=True)]
@@ -81,7 +96,8 @@ def test_point_errors_equal_an_independent_computation(messages, recording):
         [[p.x - check[p.point].x, p.y - check[p.point].y, p.z - check[p.point].z] for p in final if p.point in check]
     )
     np.testing.assert_allclose(result["check"]["adjusted"]["mean_m"], rows.mean(axis=0))
-    ratio = np.divide(result["points"]["direct_georeferencing"]["rmse_m"], result["points"]["final"]["rmse_m"])
+    ratio = np.divide(result["points"]["direct_georeferencing"]["rmse_m"], result["points"]["adjusted"]["rmse_m"])
+    assert result["improvement"]["of"] == "adjusted"
     np.testing.assert_allclose(result["improvement"]["points"], ratio)
 
 
@@ -121,9 +137,8 @@ WITHOUT = [
 
 
 @pytest.mark.parametrize("absent", WITHOUT, ids="+".join)
-def test_partial_recordings_are_evaluated_as_far_as_they_go(messages, absent):
-    flight = collect(m for m in messages if not m.topic.startswith(absent))
-    result = analyse(flight, "part.mcap")
+def test_partial_recordings_are_evaluated_as_far_as_they_go(messages, absent, tmp_path):
+    flight, result = analysed([m for m in messages if not m.topic.startswith(absent)], tmp_path)
     text = page(flight, result)
     json.dumps(result, allow_nan=False)
     assert len(text) > 3000
@@ -134,7 +149,7 @@ def test_partial_recordings_are_evaluated_as_far_as_they_go(messages, absent):
         assert line.split(":")[0] in text
 
 
-def test_poses_that_are_not_valid_are_left_out_and_counted(messages):
+def test_poses_that_are_not_valid_are_left_out_and_counted(messages, tmp_path):
     whole = evaluate_flight(collect(messages))
     copies = []
     for message in messages:
@@ -145,14 +160,13 @@ def test_poses_that_are_not_valid_are_left_out_and_counted(messages):
                 body.pose.position.x += 500.0
             message = replace(message, body=body)
         copies.append(message)
-    flight = collect(copies)
-    result = evaluate_flight(flight)
+    flight, result = analysed(copies, tmp_path)
     left_out = result["poses_left_out"]
     assert set(left_out) == {"filtered"} and left_out["filtered"] > 100 and whole["poses_left_out"] == {}
     n = result["orientation"]["filtered"]["n"]
     assert n + left_out["filtered"] == whole["orientation"]["filtered"]["n"]
     assert result["orientation"]["filtered"]["rmse_m"][0] < 2 * whole["orientation"]["filtered"]["rmse_m"][0]
-    assert f"are left out: {left_out['filtered']} filtered." in page(flight, analyse(flight, "flight.mcap"))
+    assert f"are left out: {left_out['filtered']} filtered." in page(flight, result)
 
 
 @pytest.mark.filterwarnings("error")
@@ -163,7 +177,7 @@ def test_a_recording_with_nothing_but_measurements_and_truth_draws_no_warning(me
     assert errors(flight) is None
 
 
-def test_unusable_messages_are_counted(messages):
+def test_unusable_messages_are_counted(messages, tmp_path):
     broken = [m for m in messages if m.topic == "trajectory/filtered"][:50]
     for message in broken[10:15]:
         copy = type(message.body)()
@@ -171,9 +185,9 @@ def test_unusable_messages_are_counted(messages):
         copy.pose.position.x = float("nan")
         broken[broken.index(message)] = type(message)(message.topic, message.stamp_ns, copy, "test", message.sequence)
     del broken[20:23]
-    flight = collect(broken)
-    assert flight.refused["trajectory/filtered"] == 5
-    assert flight.gaps["trajectory/filtered"] == 3
+    flight, result = analysed(broken, tmp_path)
+    assert result["topics"]["trajectory/filtered"]["unusable"] == 5
+    assert result["topics"]["trajectory/filtered"]["gaps"] == 3
     assert len(flight.poses["filtered"]) == 42
 
 
@@ -253,7 +267,7 @@ def test_bad_input_gets_one_line(tmp_path, capsys):
 
 def test_a_report_that_cannot_be_written_is_said(recording, tmp_path, capsys):
     assert main(["analyze", str(recording), "-o", str(tmp_path / "no" / "report.html")]) == 1
-    assert "report.html: no such file" in capsys.readouterr().err
+    assert "report.html: no folder" in capsys.readouterr().err
 
 
 def test_a_smoothed_trajectory_takes_the_place_of_a_filtered_one(messages):
@@ -301,7 +315,7 @@ def test_updates_without_new_rays_do_not_count_as_latency():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_numbers_that_are_not_finite_do_no_harm(messages, seed):
+def test_numbers_that_are_not_finite_do_no_harm(messages, seed, tmp_path):
     rng = np.random.default_rng(seed)
     keep = () if seed else ("configuration/",)
     spoilt = [
@@ -311,8 +325,11 @@ def test_numbers_that_are_not_finite_do_no_harm(messages, seed):
         for m in messages
         if m.topic != "trajectory/filtered" or rng.random() < 0.3
     ]
-    flight = collect(spoilt)
-    result = analyse(flight, "spoilt.mcap")
+    _, read_back = analysed(spoilt, tmp_path)
+    for topic in ("point/object", "sensor/gnss"):
+        assert read_back["topics"][topic]["unusable"]
+    flight = collect(spoilt)  # past the decoder, which would keep them out
+    result = analyse(flight, read(tmp_path / "flight.mcap")[1])
     json.dumps(result, allow_nan=False)
     assert page(flight, result)
     assert flight.refused["point/object"] and flight.refused["sensor/gnss"]

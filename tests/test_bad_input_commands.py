@@ -129,7 +129,7 @@ def test_process_tells_what_it_skipped(tmp_path, capsys):
     assert code == 0 and err == "" and result["lost_bytes"] == last[1] - last[0]
     assert len(result["damage"]) == 1 and "a chunk with a wrong checksum" in result["damage"][0]
     code, _, err = run_main(capsys, "process", path, "-o", out, "-q")
-    assert code == 0 and "skipped 1 damaged places" in err and len(err.splitlines()) == 1
+    assert code == 0 and "skipped 1 damaged place: a chunk" in err and len(err.splitlines()) == 1
 
 
 # ---- commands

@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from ...solver.adjustment.snooping import Round
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
 from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
-from ..adjustment_result import Adjustment, result_of, worst_strip
+from ..adjustment_result import PLOTS, TABLES, Adjustment, result_of, worst_strip
 from ..adjustment_summary import summary_lines
 from ..adjustment_tables import write_tables
 from ..errors import UserError
@@ -30,6 +31,7 @@ from ..formats.block_folder import read_block
 from ..formats.block_recording import TOPICS, block_from_messages
 from ..formats.new_file import refuse_unless_folder
 from ..recording import RecordingReader
+from ..recording_summary import damage_lines
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result"""
@@ -109,7 +111,8 @@ def read_input(path: Path) -> Block:
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
     reader = RecordingReader(path)
-    return block_from_messages(reader.messages(TOPICS), path.name)
+    block = block_from_messages(reader.messages(TOPICS), path.name)
+    return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
 
 
 def job_of(args: argparse.Namespace, block: Block) -> Job:
@@ -202,6 +205,8 @@ def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Pat
     """Write ``result.json`` and the tables, and the pictures on request."""
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    for name in ("result.json", *TABLES, *PLOTS):  # of an earlier run: what stands side by side belongs together
+        (folder / name).unlink(missing_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
     if plots:

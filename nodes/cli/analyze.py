@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..formats.new_file import new_file
+from ..recording_summary import Holdings
 from ..report.accuracy_table import accuracy_lines
 
 EXAMPLE = "triline analyze flight.mcap -o report.html"
@@ -26,21 +29,30 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     UserError : nothing to analyse, or the page cannot be written
     """
     from ..report.analysis import analyse
-    from ..report.flight import collect
     from ..report.page import page
-    from ..report.source import messages_of
+    from ..report.source import read
 
-    flight = collect(messages_of(recording))
-    if not flight.counts:
-        raise UserError(f"{recording}: nothing in it that can be analysed")
-    if output.exists() and output.samefile(recording):
+    if output.exists() and recording.exists() and output.samefile(recording):
         raise UserError(f"{output}: is the recording itself")
-    result = analyse(flight, recording.name, recording.stat().st_size)
     try:
-        output.write_text(page(flight, result), encoding="utf-8")
+        with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work that it costs
+            flight, held = read(recording)
+            if held.span_ns is None or not flight.counts:
+                raise UserError(f"{recording}: {_nothing(held)}")
+            result = analyse(flight, held)
+            file.write(page(flight, result))
     except OSError as error:
-        raise UserError(f"{output}: {(error.strerror or 'cannot be written').lower()}") from None
+        if error.filename == str(recording):
+            raise
+        raise UserError(f"{output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     return result
+
+
+def _nothing(held: Holdings) -> str:
+    """Why there is nothing to analyse."""
+    topics = ", ".join(row.topic for row in held.topics if row.messages)
+    why = "; ".join(held.damage)
+    return f"no measurement and no result in it, only {topics or 'no message at all'}{'; ' + why if why else ''}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,11 +60,18 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"report": str(args.output), **result}, indent=2))
     elif not args.quiet:
-        if args.verbose:
+        lines = accuracy_lines(result)
+        compared = result["orientation"] or result["points"] or result["check"]
+        if args.verbose or not compared:
             for line in result["missing"]:
                 print(f"not in this recording: {line}")
+        if args.verbose:
             for name, n in result["poses_left_out"].items():
                 print(f"{name}: {n} poses that are not valid, left out of the statistics")
-        print("\n".join(accuracy_lines(result)))
+        if not compared:
+            lines.append("no accuracy: neither truth nor check points to compare with")
+        print("\n".join(lines))
         print(f"{args.output}: {args.output.stat().st_size / 1e6:.1f} MB")
+    if result["damage"] and not args.json:
+        print(f"triline analyze: {args.recording}: {'; '.join(result['damage'])}", file=sys.stderr)
     return 0

@@ -253,6 +253,7 @@ class Demo:
 
         lines = ["", *accuracy_lines(result)]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
+        lines += [f"damaged recording: {text}" for text in result["damage"]]
         if result["waited_s"]:
             lines.append(
                 f"this machine is slow: the flight waited {result['waited_s']:.1f} s for nodes that were behind"

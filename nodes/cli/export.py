@@ -27,6 +27,8 @@ from ..formats.rows import RowLayout, repeated_messages, spread_by_default
 from ..formats.sbet import write_sbet
 from ..node import Message
 from ..recording import RecordingReader
+from ..recording_summary import damage_lines
+from .damage import tell_damage
 
 EXAMPLE = "triline export flight.mcap --topic orientation/final --csv orientation.csv"
 
@@ -75,16 +77,15 @@ def run(args: argparse.Namespace) -> int:
     result = {
         "recording": str(path), "topic": args.topic, "type": row.type_name, "file": str(target), **count,
         "skipped": skipped, "damaged_stretches": len(reader.damage),
+        "damage": damage_lines(reader),
     }  # fmt: skip
     if args.json:
         print(json.dumps(result, indent=2))
-    elif not args.quiet:
+        return 0
+    if not args.quiet:
         what = ", ".join(f"{number} {name}" for name, number in count.items())
         print(f"{args.topic} -> {target}: {what}")
-        if skipped or reader.damage:
-            print(
-                f"  note: {skipped} messages left out ({reader.last_problem}), {len(reader.damage)} damaged stretches"
-            )
+    tell_damage("export", reader)
     return 0
 
 

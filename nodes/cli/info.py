@@ -9,7 +9,7 @@ from typing import Any
 
 from ..access import Recording
 from ..player import iso
-from ..recording_summary import findings, time_span_ns, topic_summaries
+from ..recording_summary import findings, holdings
 
 EXAMPLE = "triline info flight.mcap"
 
@@ -26,36 +26,36 @@ def run(args: argparse.Namespace) -> int:
 
 def _summary(recording: Recording) -> dict[str, Any]:
     reader = recording.reader
-    span = time_span_ns(reader)
-    rows = topic_summaries(reader)
-    held = {row.topic for row in rows if row.messages}  # a channel can be announced by a file whose chunks are gone
+    held = holdings(reader)
+    span, rows = held.span_ns, held.topics
+    present = {row.topic for row in rows if row.messages}  # a channel can be announced by a file whose chunks are gone
     summary: dict[str, Any] = {
         "file": str(reader.path),
         "bytes": reader.size,
         "library": reader.library,
-        "messages": len(reader.index),
+        "messages": held.messages,
         "chunks": reader.n_chunks,
         "platforms": sorted({channel.platform for channel in reader.channels.values() if channel.platform}),
         "start": iso(span[0]) if span else None,
         "end": iso(span[1]) if span else None,
-        "duration_s": (span[1] - span[0]) / 1e9 if span else 0.0,
+        "duration_s": held.duration_s,
         "topics": [vars(row) for row in rows],
         "damage": findings(reader, decode=False, outside=False),
     }
-    if "configuration/project" in held:
+    if "configuration/project" in present:
         p = recording.project()
         summary["project"] = {
             "name": p.name, "crs": p.crs or "local", "origin_latitude": p.origin_latitude,
             "origin_longitude": p.origin_longitude, "origin_height": p.origin_height,
         }  # fmt: skip
-    if "configuration/camera" in held:
+    if "configuration/camera" in present:
         camera = recording.camera()
         summary["camera"] = {
             "name": camera.name,
             "focal_length_mm": [lens.focal_length_mm for lens in camera.lenses],
             "lines": {line.id: len(line.xy_mm) for line in camera.lines},
         }
-    if "configuration/strip" in held:
+    if "configuration/strip" in present:
         summary["strips"] = [
             {"id": str(name), "start": iso(int(s.first_line_time_ns)), "line_rate_hz": float(s.line_rate_hz),
              "lines": int(s.lines), "ended": bool(s.ended)}
@@ -86,6 +86,7 @@ def _lines(s: dict[str, Any]) -> list[str]:
         rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] else "-"
         sources = ", ".join(row["sources"])
         lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
+    lines.append("start, end: of what was measured and computed; rate: between the first and last message of the topic")
     lines += [f"damaged: {text}" for text in s["damage"]]
     return lines
 

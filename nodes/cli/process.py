@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import textwrap
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ from ..formats.new_file import refuse_unless_file
 from ..node import Node
 from ..recording import COMPRESSIONS, RecordingReader, RecordingWriter
 from ..runner import ProcessSummary, process
+from .damage import tell_damage
 from .progress import progress
 
 EXAMPLE = "triline process flight.mcap -o out.mcap"
@@ -80,10 +80,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for line in _lines(summary, reader, args.output, seconds):
         print(line)
-    if reader.damage:  # quiet or not: something is missing in the result
-        lost = sum(d.length for d in reader.damage)
-        print(f"triline process: {args.recording}: skipped {len(reader.damage)} damaged places ({lost} bytes); "
-              f"the first: {reader.damage[0]}", file=sys.stderr)  # fmt: skip
+    tell_damage("process", reader)
     return 0
 
 

@@ -12,39 +12,75 @@ _ORIENTATIONS = {
     "final": "on-line, final",
     "whole": "after the strips",
 }
+#: Points as they were published; without any, those intersected with the final orientation.
 _POINTS = {
     "direct_georeferencing": "direct georeferencing",
-    "final": "on-line, final",
-    "adjusted_whole": "after the strips",
+    "adjusted_live": "adjusted on-line, at once",
+    "adjusted": "adjusted on-line, final",
+    "adjusted_whole": "adjusted after the strips",
 }
+_INTERSECTED = {"direct_georeferencing": "direct georeferencing", "final": "intersected, final pose"}
+_HEAD = f"{'n':>6}       X       Y       Z  "
+_NOTE = "sigma: root mean of the stated variances; NEES: squared errors over stated variances, 1 expected"
 
 
 def accuracy_lines(result: dict[str, Any]) -> list[str]:
-    """RMSE against truth of an evaluation (`evaluation.evaluate_flight`); no lines where no truth is recorded."""
-    orientation, points = result["orientation"], result["points"]
+    """RMSE against truth of an evaluation (`evaluation.evaluate_flight`), with n and stated sigmas.
+
+    The lines have 100 columns at most. Points are compared with check points where no truth is recorded; no lines where
+    there is neither, but of what is missing of the flight.
+    """
+    orientation, points = result["orientation"], result["points"] or result["check"]
     if not orientation and not points:
-        return []
-    lines = ["RMSE against truth            X       Y       Z          omega     phi   kappa", "exterior orientation"]
+        return early_lines(result)
+    against = "truth" if orientation or result["points"] else "check points"
+    lines = [f"{'RMSE against ' + against:<28}{_HEAD}   omega     phi   kappa        NEES"]
+    if orientation:
+        lines.append("exterior orientation")
     # the smoothed trajectory says something of its own only where nothing else was measured
     shown = [
         name for name in _ORIENTATIONS if name in orientation and (name != "smoothed" or "filtered" not in orientation)
     ]
-    lines += [_row(_ORIENTATIONS[name], orientation[name]["rmse_m"], orientation[name]["rmse_deg"]) for name in shown]
-    lines.append("object points")
-    lines += [_row(title, points[name]["rmse_m"]) for name, title in _POINTS.items() if name in points]
+    for name in shown:
+        row = orientation[name]
+        nees = None if name == "measured" else row.get("nees")  # sensors state their noise, not their slow errors
+        lines.append(_row(_ORIENTATIONS[name], row, [f"{1e3 * v:8.2f}" for v in row["rmse_deg"]], "mdeg", nees))
+    title = "object points" if result["points"] or not points else "object points, check points"
+    lines.append(f"{title:<60} sigma X       Y       Z")
+    titles = _POINTS if "adjusted" in points else _INTERSECTED
+    for name in (n for n in titles if n in points):
+        row = points[name]
+        sigma = [f"{v:8.3f}" for v in row["sigma_m"]] if "sigma_m" in row else ["       -"] * 3
+        lines.append(_row(titles[name], row, sigma, "m", row.get("nees")))
+    lines += _conclusion(result, points)
+    return [line.rstrip() for line in lines]
+
+
+def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
+    lines = []
     gain = result.get("improvement", {}).get("points")
     if gain:
-        lines.append("  improvement           " + "".join(f"{v:7.1f}x" if v else "       -" for v in gain))
+        lines.append(f"{'  improvement, final':<34}" + "".join(f"{v:7.1f}x" if v else "       -" for v in gain))
     elif not points:
         lines.append("  none: the flight was too short, or no point got two looks")
+    lines.append(_NOTE)
     if "sigma0" in result:
         lines.append(
             f"sigma0 {result['sigma0']:.3f}, redundancy {result['redundancy']}, {result['updates']} updates, "
             f"{result['rejected']} observations rejected"
         )
-    return lines
+    return lines + early_lines(result)
 
 
-def _row(title: str, metres: list[float], degrees: list[float] | None = None) -> str:
-    text = f"  {title:<22}" + "".join(f"{v:8.3f}" for v in metres) + " m"
-    return text + ("   " + "".join(f"{1e3 * v:8.2f}" for v in degrees) + " mdeg" if degrees else "")
+def early_lines(result: dict[str, Any]) -> list[str]:
+    """What was planned and is not in the recording, a line each strip."""
+    what = "the recording is cut off" if result.get("damage") else "flight ended early"
+    return [
+        f"{what}: strip {s['strip']} after {s['flown_s']:.1f} s of {s['planned_s']:.1f} s planned"
+        for s in result["ended_early"]
+    ]
+
+
+def _row(title: str, row: dict[str, Any], others: list[str], unit: str, nees: float | None) -> str:
+    text = f"  {title:<26}{row['n']:6d}" + "".join(f"{v:8.3f}" for v in row["rmse_m"]) + " m"
+    return f"{text}{''.join(others)} {unit:<4}" + (f"{nees:7.2f}" if nees is not None else f"{'-':>7}")

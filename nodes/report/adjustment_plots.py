@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjustment_result import Adjustment, set_name
+from ..adjustment_result import PLOTS, Adjustment, set_name
 from ..adjustment_tables import correction_functions
 
 matplotlib.use("Agg")
@@ -17,8 +17,8 @@ from matplotlib import pyplot as plt
 
 Array = NDArray[np.floating]
 
-#: Image points drawn at most for a CCD line.
-MOST_ARROWS = 3000
+#: Image points drawn at most in a frame; more would be a carpet.
+MOST_ARROWS = 150
 
 _BLUE, _RED, _GREY, _GREEN = "#2b5d8a", "#c0392b", "#9aa5b1", "#3a7d44"
 
@@ -28,11 +28,7 @@ def write_plots(adjustment: Adjustment, folder: Path) -> list[Path]:
     style: Any = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.25, "axes.axisbelow": True, "figure.dpi": 110}
     paths = []
     with plt.rc_context(style):
-        for name, draw in (
-            ("residuals.png", draw_residuals),
-            ("points.png", draw_points),
-            ("corrections.png", draw_corrections),
-        ):
+        for name, draw in zip(PLOTS, (draw_residuals, draw_points, draw_corrections), strict=True):
             figure = draw(adjustment)
             path = folder / name
             figure.savefig(path)
@@ -58,11 +54,14 @@ def draw_residuals(adjustment: Adjustment) -> Any:
         for b, k in enumerate(lines):
             axis = axes[a, b]
             mine = np.flatnonzero((rays.strip == i) & (rays.ccd == k))
-            used = _thin(mine[~out[mine]])
+            used = mine[~out[mine]]
+            used = used[np.argsort(rays.line[used], kind="stable")]
+            every = max(1, -(-len(used) // MOST_ARROWS))
+            drawn = used[::every]
             pixels = network.camera.lines[k].pixels
             # both residuals in the same scale on paper: one rms is 1/25 of the picture's width
             axis.quiver(
-                rays.line[used], rays.sample[used], s.v_px[used, 0], s.v_px[used, 1], color=_BLUE, width=0.003,
+                rays.line[drawn], rays.sample[drawn], s.v_px[drawn, 0], s.v_px[drawn, 1], color=_BLUE, width=0.003,
                 scale=25 * rms, scale_units="width", angles="uv",
             )  # fmt: skip
             bad = mine[out[mine]]
@@ -71,7 +70,8 @@ def draw_residuals(adjustment: Adjustment) -> Any:
             axis.set_ylim(-0.03 * pixels, 1.03 * pixels)
             rms_here = np.sqrt(np.mean(s.v_px[used] ** 2, axis=0)) if len(used) else np.full(2, np.nan)
             name = f"strip {network.strips[i].id}, {network.camera.lines[k].id}"
-            axis.set_title(f"{name}: rms {rms_here[0]:.2f}, {rms_here[1]:.2f} px", fontsize=9)
+            thinned = f"; 1 in {every} of {len(used)}" if every > 1 else f"; {len(used)}"
+            axis.set_title(f"{name}: rms {rms_here[0]:.2f}, {rms_here[1]:.2f} px{thinned}", fontsize=9)
             if a == len(strips) - 1:
                 axis.set_xlabel("line")
             if b == 0:
@@ -81,10 +81,6 @@ def draw_residuals(adjustment: Adjustment) -> Any:
     )
     figure.tight_layout()
     return figure
-
-
-def _thin(places: NDArray[np.int64]) -> NDArray[np.int64]:
-    return places[:: max(1, -(-len(places) // MOST_ARROWS))]
 
 
 def draw_points(adjustment: Adjustment) -> Any:

@@ -4,27 +4,45 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from pathlib import Path
 from statistics import median
 from typing import Any
 
+from ...schemas import topics
 from .. import convert
+from ..recording_summary import Holdings, TopicSummary
 from .evaluation import evaluate_flight
 from .flight import Flight, updates_with_new_rays
+from .source import WANTED
 
 _LARGEST_REJECTED = 200
 
 
-def analyse(flight: Flight, recording: str, size_bytes: int | None = None) -> dict[str, Any]:
+def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     """Numbers of the report.
+
+    Parameters
+    ----------
+    flight : what its messages say
+    held : what the recording holds, see `recording_summary.holdings`
 
     Returns
     -------
     the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
-    ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status), ``parameters`` (of the newest
-    report that has any), ``rejected_observations`` (the largest first), ``latency_s`` (median, max), ``events``
+    ``damage`` (one line each), ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status),
+    ``parameters`` (of the newest report that has any), ``rejected_observations`` (the largest first), ``latency_s``
+    (median, max), ``events``
     """
-    result = {"recording": _recording(flight, recording, size_bytes), **evaluate_flight(flight)}
-    result["topics"] = {topic: _topic(flight, topic) for topic in sorted(flight.counts)}
+    result = {"recording": _recording(flight, held), "damage": held.damage, **evaluate_flight(flight)}
+    result["topics"] = {
+        row.topic: {
+            "messages": row.messages,
+            "rate_hz": row.rate_hz or None,
+            "gaps": row.gaps,
+            "unusable": _unusable(flight, row),
+        }
+        for row in held.topics
+    }
     result["nodes"] = {name: _node(status) for name, status in sorted(flight.status.items())}
     newest = next((r for _, r in reversed(flight.reports) if r.parameters), None)
     result["parameters"] = [] if newest is None else [_parameter(p) for p in newest.parameters]
@@ -41,14 +59,23 @@ def analyse(flight: Flight, recording: str, size_bytes: int | None = None) -> di
     return finite(result)
 
 
-def _recording(flight: Flight, recording: str, size_bytes: int | None) -> dict[str, Any]:
-    start = datetime.fromtimestamp(flight.start_ns / convert.SECOND_NS, UTC)
+def _unusable(flight: Flight, row: TopicSummary) -> int | None:
+    """Messages of a topic that could not be decoded or hold no usable value; None where nobody looked."""
+    try:
+        looked_at = topics.find(row.topic).name in WANTED
+    except KeyError:
+        looked_at = False
+    return row.messages - flight.counts[row.topic] + flight.refused[row.topic] if looked_at else None
+
+
+def _recording(flight: Flight, held: Holdings) -> dict[str, Any]:
+    start = datetime.fromtimestamp((held.span_ns[0] if held.span_ns else flight.start_ns) / convert.SECOND_NS, UTC)
     return {
-        "file": recording,
-        "bytes": size_bytes,
+        "file": Path(held.file).name,
+        "bytes": held.size_bytes,
         "start": start.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
-        "seconds": (flight.end_ns - flight.start_ns) / convert.SECOND_NS,
-        "messages": flight.counts.total(),
+        "seconds": held.duration_s,
+        "messages": held.messages,
         "project": flight.project.name if flight.project is not None else None,
         "camera": flight.camera.name if flight.camera is not None else None,
         "strips": len(flight.strips),
@@ -56,17 +83,6 @@ def _recording(flight: Flight, recording: str, size_bytes: int | None) -> dict[s
         "rays": len(flight.looks),
         "control_points": sum(convert.role_of(g) != "check" for g in flight.ground.values()),
         "check_points": sum(convert.role_of(g) == "check" for g in flight.ground.values()),
-    }
-
-
-def _topic(flight: Flight, topic: str) -> dict[str, Any]:
-    seconds = (flight.end_ns - flight.start_ns) / convert.SECOND_NS
-    count = flight.counts[topic]
-    return {
-        "messages": count,
-        "rate_hz": count / seconds if seconds > 0 else None,
-        "gaps": flight.gaps[topic],
-        "unusable": flight.refused[topic],
     }
 
 
@@ -82,7 +98,8 @@ def _node(status: Any) -> dict[str, Any]:
 
 
 def _parameter(p: Any) -> dict[str, Any]:
-    return {"name": p.name, "unit": p.unit, "value": p.value, "sigma": p.sigma, "t": p.t, "status": p.status}
+    names = ("name", "unit", "value", "sigma", "t", "status", "reason")
+    return {name: getattr(p, name) for name in names}
 
 
 def _rejected(r: Any) -> dict[str, Any]:

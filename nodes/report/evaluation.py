@@ -22,7 +22,10 @@ Array = NDArray[np.floating]
 ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final", "whole")
 #: Points are intersected with these orientations; "" stands for the trajectory before triangulation.
 INTERSECTED = {"direct_georeferencing": "", "live": "live", "final": "final"}
+#: What a flight is judged by: the points as published; where none were, those intersected with the final orientation.
+TRIANGULATED = ("adjusted", "final")
 _LARGEST_GAP_S = 1.0
+_EARLY_S = 1.0  # a strip that lacks less than this was flown to its end
 _IMAGE_SIGMA_PX = 0.3  # where the project names none
 
 
@@ -51,10 +54,13 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     - ``points``: ``direct_georeferencing`` (space intersection with the filtered trajectory, or the smoothed
       one where a recording holds no other), ``live`` and ``final``
       (with these orientations), ``adjusted_live``, ``adjusted`` and ``adjusted_whole`` (as published), against true
-      points: ``n, rmse_m, mean_m, max_m, sigma_m, nees``;
+      points that were not given as control: ``n, rmse_m, mean_m, max_m, sigma_m, nees``; where there are both direct
+      georeferencing and adjusted points, all rows count only points that both have;
     - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
-    - ``improvement``: RMSE of direct georeferencing (filtered) / final: ``points`` (3), ``orientation`` (6);
-    - ``sigma0`` over the flight, ``redundancy``, ``updates``, ``rejected``;
+    - ``improvement``: RMSE of direct georeferencing (filtered) / triangulated: ``points`` (3), ``of`` (the row of
+      TRIANGULATED that is meant), ``orientation`` (6, of "final");
+    - ``ended_early``: strips whose end the recording does not reach: ``strip, flown_s, planned_s``;
+    - ``sigma0`` over the flight, ``redundancy``, ``updates``, ``rejected`` (without those that were taken back);
     - ``poses_left_out``: how many poses of each orientation are not valid and so not compared;
     - ``missing``: what the recording does not hold, one line each.
 
@@ -66,15 +72,49 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
         result["orientation"][name] = _orientation_row(error, covariance)
     result["poses_left_out"] = poses_left_out(flight)
     intersections = intersect_points(flight)
-    truth, check = flight.truth_points, _given(flight, "check")
-    for target, known in (("points", truth), ("check", check), ("control", _given(flight, "control"))):
-        for name, (ids, xyz, covariance) in {**intersections, **_adjusted(flight)}.items():
+    rows = {**intersections, **_adjusted(flight)}
+    shared = _shared(rows)
+    check, control = _given(flight, "check"), _given(flight, "control")
+    given = {id for id, g in flight.ground.items() if convert.role_of(g) != "check"}
+    truth = {id: xyz for id, xyz in flight.truth_points.items() if id not in given}  # what was put in is no result
+    for target, known in (("points", truth), ("check", check), ("control", control)):
+        known = {id: xyz for id, xyz in known.items() if shared is None or id in shared}
+        for name, (ids, xyz, covariance) in rows.items():
             row = _point_row(ids, xyz, covariance, known)
             if row is not None:
                 result[target][name] = row
     _improvement(result, flight.measured)
+    result["ended_early"] = ended_early(flight)
     result.update(_totals(flight))
     return result
+
+
+def _shared(rows: dict[str, tuple[list[str], Array, Array]]) -> set[str] | None:
+    """Points by direct georeferencing and by triangulation, so that rows compare like with like; None without both."""
+    if "direct_georeferencing" not in rows or "adjusted" not in rows:
+        return None
+    return set(rows["direct_georeferencing"][0]) & set(rows["adjusted"][0])
+
+
+def triangulated(rows: dict[str, Any]) -> str | None:
+    """The row of points that a flight is judged by, see TRIANGULATED; None where there is none."""
+    return next((name for name in TRIANGULATED if name in rows), None)
+
+
+def ended_early(flight: Flight) -> list[dict[str, Any]]:
+    """Strips that were planned longer than the recording goes; a strip that ended says how long it became."""
+    measured = [convert.time_ns(g.timestamp) for g in flight.gnss[-1:]] + [a.time_ns for a in flight.attitude[-1:]]
+    end_ns = max(measured, default=flight.end_ns)  # results come later
+    found = []
+    for id, strip in flight.strips.items():
+        span = flight.strip_times(id)
+        if span is None or strip.ended:
+            continue
+        planned = (span[1] - span[0]) / convert.SECOND_NS
+        flown = max(0.0, (end_ns - span[0]) / convert.SECOND_NS)
+        if flown < planned - _EARLY_S:
+            found.append({"strip": id, "flown_s": flown, "planned_s": planned})
+    return found
 
 
 def _totals(flight: Flight) -> dict[str, Any]:
@@ -85,7 +125,7 @@ def _totals(flight: Flight) -> dict[str, Any]:
     totals: dict[str, Any] = {
         "redundancy": last.redundancy_total or last.redundancy,
         "updates": len(flight.reports),
-        "rejected": max(last.rejected_total, len(flight.rejected)),
+        "rejected": max(last.rejected_total - last.returned_total, len(flight.rejected)),
     }
     redundant = [r.sigma0 for _, r in flight.reports if r.redundancy > 0]
     if last.sigma0_total > 0:
@@ -352,9 +392,10 @@ def _orientation_row(error: Array, covariance: Array) -> dict[str, Any]:
 def _improvement(result: dict[str, Any], measured: str) -> None:
     points, orientation = result["points"], result["orientation"]
     better: dict[str, Any] = {}
-    final = points.get("final") or points.get("adjusted")
-    if final and "direct_georeferencing" in points:
-        better["points"] = _ratio(points["direct_georeferencing"]["rmse_m"], final["rmse_m"])
+    name = triangulated(points)
+    if name and "direct_georeferencing" in points:
+        better["points"] = _ratio(points["direct_georeferencing"]["rmse_m"], points[name]["rmse_m"])
+        better["of"] = name
     if measured in orientation and "final" in orientation:
         rows = [orientation[n]["rmse_m"] + orientation[n]["rmse_deg"] for n in (measured, "final")]
         better["orientation"] = _ratio(*rows)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
@@ -13,7 +14,7 @@ from scipy.stats import chi2, norm
 from ...solver.accuracy import angle_difference
 from .. import convert
 from .evaluation import corrections_of, orientation_errors
-from .flight import Flight, Poses, updates_with_new_rays
+from .flight import Flight, Key, Look, Poses, rejected_key, updates_with_new_rays
 from .strip_time import StripTime
 from .style import CCDS, CHECK, CONTROL, FILTERED, FINAL, LIVE, REJECTED, TIE, TRUTH, figure, scale_note
 
@@ -35,13 +36,14 @@ def trajectory_map(flight: Flight) -> Figure | None:
         return None
     low, high = poses.position_l.min(axis=0), poses.position_l.max(axis=0)
     points = _point_arrays(flight)
-    if len(points["xyz"]):
-        low, high = np.minimum(low, points["xyz"].min(axis=0)), np.maximum(high, points["xyz"].max(axis=0))
+    for drawn in (points["xyz"], np.array([[g.x, g.y, g.z] for g in flight.ground.values()])):
+        if len(drawn):
+            low, high = np.minimum(low, drawn.min(axis=0)), np.maximum(high, drawn.max(axis=0))
     extent = np.maximum(high - low, 1.0)[:2]
     turned = extent[1] > 1.15 * extent[0]  # a flight to the north lies on its side, so that it fills the page
-    fig = figure(float(np.clip(1.2 + 8.6 * min(extent) / max(extent), 2.5, 7.5)))
+    fig = figure(float(np.clip(1.45 + 8.6 * min(extent) / max(extent), 2.3, 7.5)))
     ax = fig.add_subplot()
-    ax.set_aspect("equal")
+    ax.set_aspect("equal", anchor="N")
 
     def place(xyz: Array) -> tuple[Array, Array]:
         e, n = xyz[..., 0] / 1000, xyz[..., 1] / 1000
@@ -64,8 +66,10 @@ def trajectory_map(flight: Flight) -> Figure | None:
     else:
         ax.set_xlabel("east [km]")
         ax.set_ylabel("north [km]")
-    ax.set_title("Flight and ground points, local frame", pad=18)
+    fig.suptitle("Flight and ground points, local frame", x=0.01, ha="left", fontsize=9.5, fontweight="bold")
     fig.legend(loc="outside lower center", ncols=7)
+    FigureCanvasSVG(fig)
+    fig.draw_without_rendering()  # the layout of axes with a fixed aspect is right from the second time on
     return fig
 
 
@@ -114,26 +118,40 @@ def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: boo
 
 def _point_arrays(flight: Flight) -> dict[str, Any]:
     values = list(flight.points.values())
-    status = np.array([_status(p) for p in values], dtype="<U8")
+    bad = {r.point for r in flight.rejected}
+    status = np.array([_status(p, p.point in bad) for p in values], dtype="<U8")
     return {"xyz": np.array([[p.x, p.y, p.z] for p in values]).reshape(-1, 3), "status": status}
 
 
-def _status(point: Any) -> str:
-    if any(r.rejected for r in point.residuals):
+def _status(point: Any, rejected: bool) -> str:
+    if rejected:
         return "rejected"
     return "final" if point.status == point.FINAL else "live"
 
 
 def residuals_by_ccd(flight: Flight) -> dict[str, Array]:
-    """Rays by CCD line: line, sample, v_line, v_sample (px), w, rejected; (n, 6)."""
+    """Rays by CCD line: line, sample, v_line, v_sample (px), w, rejected; (n, 6).
+
+    A rejected ray whose point was given up, or was not estimated again, has residual 0.
+    """
     rows: dict[str, list[Any]] = {}
+    bad = {rejected_key(r) for r in flight.rejected}
     for point in flight.points.values():
         for r in point.residuals:
-            rows.setdefault(r.ccd, []).append((r.line, r.sample, r.v_line, r.v_sample, r.w, r.rejected))
+            if _ray_key(point.point, r) not in bad:
+                rows.setdefault(r.ccd, []).append((r.line, r.sample, r.v_line, r.v_sample, r.w, 0.0))
+    for r in flight.rejected:
+        rows.setdefault(r.ccd, []).append((r.line, r.sample, 0.0, 0.0, r.w, 1.0))
     order = list(flight.camera.line_index) if flight.camera is not None else sorted(rows)
     arrays = {ccd: np.array(rows[ccd], dtype=float) for ccd in order if ccd in rows}
     finite = {ccd: values[np.isfinite(values).all(axis=1)] for ccd, values in arrays.items()}
     return {ccd: values for ccd, values in finite.items() if len(values)}
+
+
+def _ray_key(point: str, residual: Any) -> Key:
+    """As `rejected_key`, of a residual of a point."""
+    r = residual
+    return Look(point, r.strip, r.ccd, r.line, r.sample, 0.0, 0.0).key
 
 
 def residuals(flight: Flight) -> Figure | None:
@@ -164,14 +182,14 @@ def _vectors(ax: Axes, ccd: str, rows: Array, color: str, rms: float, longest: f
     every = max(1, -(-len(good) // _MOST_ARROWS))
     drawn = good[np.argsort(good[:, 0], kind="stable")][::every]
     ax.quiver(drawn[:, 1], drawn[:, 0], scale * drawn[:, 3], vertical * drawn[:, 2], color=color, width=0.0016, **shape)
-    ax.scatter(bad[:, 1], bad[:, 0], marker="x", s=22, c=REJECTED, lw=1.1, zorder=4)
+    ax.scatter(bad[:, 1], bad[:, 0], marker="x", s=34, c=REJECTED, lw=1.6, zorder=4, clip_on=False)
     ax.set_xlim(0, width)
     ax.set_ylim(0, longest * 1.02)
     ax.set_ylabel("line [px]")
     ax.set_title(
         f"CCD line {ccd}: {len(good)} rays"
         + (f", 1 in {every} drawn" if every > 1 else "")
-        + (f", {len(bad)} rejected (×)" if len(bad) else "")
+        + (f"; {len(bad)} rejected (×), all drawn" if len(bad) else "")
     )
     bar = 3 * rms
     ax.plot([width - 0.02 * width - scale * bar, width - 0.02 * width], [longest * 0.97] * 2, color="black", lw=2)

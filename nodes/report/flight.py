@@ -95,8 +95,9 @@ class Flight:
     live_points, points, whole_points : first LIVE, last FINAL (or last LIVE, without one) and last WHOLE message of
         each object point
     ground : control and check points by id; truth_points : true coordinates by id
-    reports : adjustment reports in order; rejected : the rejected observations they name, once each
-    counts : messages by topic; gaps : missing sequence numbers by topic; refused : messages that hold no usable value
+    reports : adjustment reports in order; rejected : the rejected observations they name, once each, without those
+        that were taken back
+    counts : messages taken in, by topic; refused : messages that hold no usable value
     status : newest status of each node
     """
 
@@ -119,7 +120,6 @@ class Flight:
     events: list[tuple[int, Any]] = field(default_factory=list)
     status: dict[str, Any] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
-    gaps: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -154,18 +154,11 @@ def collect(messages: Iterable[Message]) -> Flight:
     """Read the messages of a recording once; what cannot be used is counted, never raised."""
     flight = Flight()
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
-    last_sequence: dict[tuple[str, str], int] = {}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
     for message in messages:
         topic, body, stamp = message.topic, message.body, message.stamp_ns
         flight.counts[topic] += 1
-        if message.sequence >= 0:
-            key = topic, message.source
-            last = last_sequence.get(key)
-            if last is not None and message.sequence > last + 1:
-                flight.gaps[topic] += message.sequence - last - 1
-            last_sequence[key] = message.sequence if last is None else max(last, message.sequence)
         if topic.startswith(("configuration/", "observation/control", "truth/point", "status/")):
             configured_ns.append(stamp)
         else:
@@ -230,6 +223,8 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         )
         for r in body.rejected:
             rejected[rejected_key(r)] = r
+        for r in body.returned:
+            rejected.pop(rejected_key(r), None)
     elif topic == "sensor/gnss":
         flight.gnss.append(_finite(body, body.latitude, body.longitude, body.altitude, *body.position_covariance))
     elif topic == "sensor/attitude":

@@ -6,7 +6,11 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
+from ...solver.window.determinability import LEFT_OF_PRIOR, NOT_YET
+from ...solver.window.output import BETTER
 from . import figures
+from .accuracy_table import early_lines
+from .evaluation import triangulated
 from .flight import Flight
 from .page_style import CSS
 from .style import styled, svg
@@ -28,6 +32,13 @@ _POINTS = {
     "adjusted": "adjusted, final",
     "adjusted_whole": "adjusted, after the strips",
 }
+#: The flight is over: what was not determined by now will not be.
+_OVER = {NOT_YET: "not determined by this flight"}
+_PARAMETERS_NOTE = (
+    f'<p class="note">Estimated: the sigma is at most {BETTER:g} of the a-priori one (of the camera: '
+    f"{LEFT_OF_PRIOR**0.5:g}, and the tests of significance and correlation are passed). What is not determined is in "
+    "the sigmas of all results.</p>"
+)
 _SHOWN_REJECTED = 40
 _SHOWN_EVENTS = 60
 
@@ -41,6 +52,7 @@ def page(flight: Flight, result: dict[str, Any]) -> str:
             f"<h1>{escape(title)}</h1>",
             f'<p class="soft">{escape(_about(recording))}</p>',
             f'<p class="summary">{summary(result)}</p>',
+            _warnings(result),
             _tiles(result),
             _missing(result["missing"]),
             _section("Flight", _figure(figures.trajectory_map(flight), _MAP_NOTE)),
@@ -71,7 +83,10 @@ _ERRORS_NOTE = (
 _CORRECTIONS_NOTE = (
     "What is added to the measured orientation. The dashed line is what would have been right (truth minus measured)."
 )
-_RESIDUALS_NOTE = "Measured minus computed at the last estimate of each point. Rejected rays are marked at their place."
+_RESIDUALS_NOTE = (
+    "Measured minus computed at the last estimate of each point. Crosses: rejected rays at their place, without those "
+    "that were taken back."
+)
 
 
 def summary(result: dict[str, Any]) -> str:
@@ -79,11 +94,12 @@ def summary(result: dict[str, Any]) -> str:
     parts = []
     points, better = result["points"] or result["check"], result.get("improvement", {})
     against = "truth" if result["points"] else "check points"
-    direct, final = points.get("direct_georeferencing"), points.get("final") or points.get("adjusted")
-    if direct and final:
-        d, f = (" / ".join(f"{v:.2f}" for v in row["rmse_m"]) for row in (direct, final))
+    direct, name = points.get("direct_georeferencing"), triangulated(points)
+    if direct and name:
+        d, f = (" / ".join(f"{v:.2f}" for v in points[n]["rmse_m"]) for n in ("direct_georeferencing", name))
         parts.append(
-            f"object points {d} m by direct georeferencing, <b>{f} m</b> after triangulation (X / Y / Z, {against})"
+            f"object points {d} m by direct georeferencing, <b>{f} m</b> by on-line triangulation "
+            f"({_POINTS[name]}; RMSE X / Y / Z of {points[name]['n']} points against {against})"
         )
     if "points" in better and all(better["points"]):
         parts.append(f"{min(better['points']):.1f} times better at least")
@@ -123,7 +139,8 @@ def _tiles(result: dict[str, Any]) -> str:
         good = "good" if 0.5 <= final["nees"] <= 2.0 else "bad"
         tiles.append((f"{final['nees']:.2f}", "normalised error squared of the final orientation, 1 expected", good))
     better = result.get("improvement", {})
-    for key, text in (("points", "object points"), ("orientation", "orientation")):
+    points = f"object points ({_POINTS[better['of']]})" if "of" in better else ""
+    for key, text in (("points", points), ("orientation", "orientation (on-line, final)")):
         if all(better.get(key) or [None]):
             low, high = min(better[key]), max(better[key])
             tiles.append(
@@ -137,6 +154,13 @@ def _tiles(result: dict[str, Any]) -> str:
     tiles.append((str(lost), "messages missing by their numbers", "bad" if lost else "good"))
     cells = (f'<div class="tile {c}"><b>{escape(v)}</b><span>{escape(t)}</span></div>' for v, t, c in tiles)
     return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _warnings(result: dict[str, Any]) -> str:
+    """What a reader must know before any figure: damage, and a flight that was not flown to its end."""
+    lines = [f"Damaged recording: {line}. The figures are of what is left." for line in result["damage"]]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in early_lines(result)]
+    return "".join(f'<div class="missing bad">{escape(line)}</div>' for line in lines)
 
 
 def _missing(lines: list[str]) -> str:
@@ -192,7 +216,7 @@ def _accuracy(result: dict[str, Any]) -> Iterable[str]:
                     row["n"],
                     [row["rmse_m"], row["mean_m"], row["max_m"], row.get("sigma_m")],
                     row.get("nees"),
-                    name == "adjusted",
+                    name == triangulated(result[key]),
                 )
                 for name, row in result[key].items()
             ]
@@ -201,8 +225,10 @@ def _accuracy(result: dict[str, Any]) -> Iterable[str]:
         yield (
             '<p class="note">σ stated: root mean of the variances the estimates came with. NEES: mean normalised error '
             "squared per component, 1 if the stated covariance is right; sensors state their noise only. Direct "
-            "georeferencing: intersection with the trajectory before triangulation. Orientations are compared on the "
-            "strips, over the time the final orientation covers; all intersections use the same rays."
+            "georeferencing: intersection with the trajectory before triangulation; intersected: the same rays with "
+            "the orientation of the adjustment, for the orientation's sake; adjusted: as published, the result. All "
+            "rows count points that have both. Control points count only under control points. "
+            "Orientations are compared on the strips, over the time the final orientation covers."
             f"{_left_out(result['poses_left_out'])}</p>"
         )
 
@@ -242,13 +268,16 @@ def _number(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1) -> str:
+def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1, wrapped: Sequence[int] = ()) -> str:
+    """``left`` columns are set to the left; text in those that are ``wrapped`` takes as many lines as it needs."""
+
+    def mark(i: int) -> str:
+        names = ["left"] * (i < left) + ["wrap"] * (i in wrapped)
+        return f' class="{" ".join(names)}"' if names else ""
+
     head = "".join(f"<th{' class=left' if i < left else ''}>{escape(h)}</th>" for i, h in enumerate(heads))
     body = "".join(
-        "<tr>"
-        + "".join(f"<td{' class=left' if i < left else ''}>{escape(str(v))}</td>" for i, v in enumerate(row))
-        + "</tr>"
-        for row in rows
+        "<tr>" + "".join(f"<td{mark(i)}>{escape(str(v))}</td>" for i, v in enumerate(row)) + "</tr>" for row in rows
     )
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
@@ -282,25 +311,39 @@ def _parameters(result: dict[str, Any]) -> str:
         if unit.startswith("rad"):
             unit, scale = "mdeg" + unit[3:], figures.MDEG
         value, sigma = (None if p[k] is None else scale * p[k] for k in ("value", "sigma"))
-        rows.append((p["name"], unit, p["status"], _figures(value), _figures(sigma), _number(p["t"], 1)))
-    return _table(("parameter", "unit", "status", "value", "sigma", "t"), rows, left=3) if rows else ""
+        status = _OVER.get(p["status"], p["status"])
+        numbers = _figures(value), _figures(sigma), _number(p["t"], 1)
+        rows.append((p["name"], unit, status, p["reason"] or "–", *numbers))
+    heads = ("parameter", "unit", "status", "why", "value", "sigma", "t")
+    return _table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
 
 
 def _figures(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 
 
+def _count(value: int | None) -> str:
+    return "–" if value is None else str(value)
+
+
 def _operation(result: dict[str, Any]) -> Iterable[str]:
-    yield _table(
-        ("topic", "messages", "rate [Hz]", "missing numbers", "unusable"),
-        ((n, t["messages"], _number(t["rate_hz"], 1), t["gaps"], t["unusable"]) for n, t in result["topics"].items()),
+    rows = [
+        (name, t["messages"], _number(t["rate_hz"], 1), t["gaps"], _count(t["unusable"]))
+        for name, t in result["topics"].items()
+    ]
+    yield _table(("topic", "messages", "rate [1/s]", "missing numbers", "unusable"), rows)
+    yield (
+        '<p class="note">Rate: between the first and the last message of the topic. Image lines and inertial data are '
+        "counted, not looked at.</p>"
     )
     if result["nodes"]:
         rows = []
         for name, node in result["nodes"].items():
             counters = ", ".join(f"{key} {value}" for key, value in node["counters"].items() if value)
             rows.append((name, node["state"], counters or "–", node["last_problem"] or "–"))
-        yield "<h3>Nodes, newest status</h3>" + _table(("node", "state", "counters", "last problem"), rows, left=4)
+        yield "<h3>Nodes, newest status</h3>" + _table(
+            ("node", "state", "counters", "last problem"), rows, left=4, wrapped=(1, 2, 3)
+        )
     if result["events"]:
         rows = [(f"{e['time_s']:.2f}", e["level"], e["node"], e["text"]) for e in result["events"][-_SHOWN_EVENTS:]]
-        yield "<h3>Events</h3>" + _table(("time [s]", "level", "node", "event"), rows, left=4)
+        yield "<h3>Events</h3>" + _table(("time [s]", "level", "node", "event"), rows, left=4, wrapped=(3,))

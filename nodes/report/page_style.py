@@ -23,9 +23,10 @@ table { border-collapse: collapse; width: 100%; font-size: 13px; margin: 6px 0 4
 th, td { padding: 4px 5px; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { font-weight: 600; background: var(--tint); }
 tr:first-child > th:first-child, td:first-child, .left { text-align: left; }
-tr.main td { font-weight: 600; background: #edf7f1; } td.wrap { white-space: normal; }
+tr.main td { font-weight: 600; background: #edf7f1; } td.wrap { white-space: normal; overflow-wrap: break-word; }
 th.group { text-align: center; border-left: 1px solid var(--line); } .edge { border-left: 1px solid var(--line); }
 .missing { background: #fff6e5; border-left: 4px solid #e0a100; padding: 8px 14px; font-size: 13.5px; }
+.missing.bad { background: #fdecea; border-color: var(--bad); font-weight: 600; margin: 8px 0; }
 .missing ul { margin: 2px 0; padding-left: 18px; }
 footer { margin-top: 40px; color: var(--soft); font-size: 12.5px; }
 @media print { @page { size: A4; margin: 14mm; } body { font-size: 11.5px; } main { max-width: none; padding: 0; }

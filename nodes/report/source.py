@@ -8,6 +8,8 @@ from pathlib import Path
 from ...schemas.topics import TOPICS
 from ..node import Message
 from ..recording import RecordingReader
+from ..recording_summary import Holdings, holdings
+from .flight import Flight, collect
 
 #: Topics nothing is drawn or computed from here; they are most of the bytes.
 LEFT_OUT = frozenset({"sensor/imu", "sensor/lines/*"})
@@ -23,3 +25,19 @@ def messages_of(recording: str | Path) -> Iterator[Message]:
     FileNotFoundError : no such file
     """
     return RecordingReader(recording).sorted_messages(WANTED)
+
+
+def read(recording: str | Path) -> tuple[Flight, Holdings]:
+    """The flight in a recording, and what the recording holds; both count time from the same start.
+
+    Raises
+    ------
+    UserError : not a recording
+    FileNotFoundError : no such file
+    """
+    reader = RecordingReader(recording)
+    flight = collect(reader.sorted_messages(WANTED))
+    held = holdings(reader)
+    if held.span_ns:
+        flight.start_ns, flight.end_ns = held.span_ns
+    return flight, held
