@@ -27,7 +27,7 @@ def update(self, now_s):
     time.sleep(0.02)
     return plain(self, now_s)
 def linearise(self, theta, reweigh):
-    time.sleep(0.004 * len(self.rays) if self._slow() else 0.0)
+    time.sleep(0.008 * len(self.rays) if self._slow() else 0.0)
     return seen(self, theta, reweigh)
 batch.Batch._slow = lambda self: 18.0 < self.newest_s < 24.0
 batch.Batch.linearise = linearise
