@@ -94,7 +94,7 @@ class SlowErrors:
         offset and wander); the way it goes is not straight, so a part of it wanders, and faster than the rest.
 
         The position's error is still the slow one of the GNSS, but from second to second the filter takes more or less
-        of it for true: in the time it learns in, no more than the wander becomes another in it (see `joined`).
+        of it for true (`with_taken_back`).
 
         Parameters
         ----------
@@ -111,10 +111,8 @@ class SlowErrors:
             return (a, b, c)
 
         m, rad = excess[:3], excess[3:]
-        another = 1.0 - float(autocorrelation(self.wander_time_s, LEARNING_TIME_S)) ** 2
-        taken_back = another * np.square(self.wander_m)
-        wander_m, position_s = joined(self.wander_m, self.wander_time_s, taken_back, TAKEN_BACK_TIME_S)
-        wander_m, position_s = joined(wander_m, position_s, m, LEARNING_TIME_S)
+        inertial = self.with_taken_back()
+        wander_m, position_s = joined(inertial.wander_m, inertial.wander_time_s, m, LEARNING_TIME_S)
         return SlowErrors(
             more(self.offset_m, m),
             more(self.shift, rad),
@@ -124,6 +122,14 @@ class SlowErrors:
             position_s,
             self._learnt_s,
         )
+
+    def with_taken_back(self) -> SlowErrors:
+        """With what a filter that learns takes back of its positions from second to second beside their wander: in the
+        time it learns in, no more than the wander becomes another in it; see `joined`."""
+        another = 1.0 - float(autocorrelation(self.wander_time_s, LEARNING_TIME_S)) ** 2
+        taken_back = another * np.square(self.wander_m)
+        wander_m, position_s = joined(self.wander_m, self.wander_time_s, taken_back, TAKEN_BACK_TIME_S)
+        return replace(self, wander_m=wander_m, wander_time_s=position_s, attitude_time_s=float(self.wander_times_s[3]))
 
     @property
     def _learnt_s(self) -> float:
