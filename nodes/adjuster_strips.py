@@ -96,12 +96,15 @@ class StripDesk:
         """Where the trajectory becomes clearly less certain in the middle of a strip, or certain again, the wander does
         too: while GNSS is out, after the navigator has started again, be that when the strip is over but not final."""
         another, left_out_s = self.poses.started_anew(), -np.inf
+        anew = window.slow
+        if another and (self.poses.learning or anew.grown(covariance) is not anew):
+            anew = anew.with_taken_back()
         for id, (first, now) in list(self._stated.items()):
             strip = window.strips[id]
             if strip.final_to_s >= strip.end_s:
                 del self._stated[id]
                 continue
-            model, slow = strip.model, (window.slow if another else first).grown(covariance)
+            model, slow = strip.model, (anew if another else first).grown(covariance)
             changed = another or (time_s <= strip.end_s and now.differs(slow))
             if not isinstance(model, Wander) or not changed:
                 continue
@@ -111,7 +114,7 @@ class StripDesk:
             border_s = strip.restate(used_s, slow, another)
             if another:  # of the new filter, what the model still takes for the old one's error is no use
                 left_out_s = max(left_out_s, min(border_s, model.extent.end_s, strip.end_s + NEAR_START_S))
-                first = window.slow
+                first = anew
             self._stated[id] = first, slow
             if np.isfinite(border_s):
                 self._slow.add(border_s, slow)

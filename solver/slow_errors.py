@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .wander import damping_rate
+from .wander import autocorrelation, damping_rate
 
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
@@ -24,6 +24,9 @@ WANDERING_SHARE = 1.0
 #: where a turn right after a strip shows the heading at once, the last seconds of smoothed poses change by more than
 #: that, and single flights are several sigma off in kappa there.
 LEARNING_TIME_S = 6.0
+#: Correlation time of what a smoother takes back of a position, s: a random walk from one smoothing to the next, each
+#: second, over a lag of 5 s; a process with a continuous slope that varies as much from second to second has this one.
+TAKEN_BACK_TIME_S = 4.0
 
 #: No pose has less white noise than this, m and rad.
 LEAST_NOISE = (1e-3, 1e-6)
@@ -38,7 +41,8 @@ class SlowErrors:
     offset_m, shift : constant over a strip
     drift : change of omega, phi, kappa from the first line of a strip to the last
     wander_m, wander : wander of position and attitude
-    wander_time_s : correlation time of both (see `wander`)
+    wander_time_s : correlation time of the wander (see `wander`)
+    attitude_time_s : of the attitude's, where it is another one; 0 = the same
     """
 
     offset_m: Three = _NONE
@@ -47,6 +51,7 @@ class SlowErrors:
     wander_m: Three = _NONE
     wander: Three = _NONE
     wander_time_s: float = 60.0
+    attitude_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -54,6 +59,16 @@ class SlowErrors:
                 raise ValueError(f"{name}: wanted sigmas not below 0, got {value}")
         if not self.wander_time_s > 0:
             raise ValueError(f"wander_time_s: wanted more than 0 s, got {self.wander_time_s}")
+
+    @property
+    def wander_times_s(self) -> Array:
+        """(6,) correlation times of the wander."""
+        return np.repeat([self.wander_time_s, self.attitude_time_s or self.wander_time_s], 3)
+
+    @property
+    def alike(self) -> SlowErrors:
+        """With one correlation time, the shorter one: for models that have no other."""
+        return replace(self, wander_time_s=float(self.wander_times_s.min()), attitude_time_s=0.0)
 
     @property
     def attitude_sigma(self) -> Array:
@@ -68,7 +83,7 @@ class SlowErrors:
     @property
     def wander_density(self) -> Array:
         """(6,) ``s`` of the wander's spectral density ``s / w^4`` at frequencies high against its correlation time."""
-        b = damping_rate(self.wander_time_s)
+        b = np.array([damping_rate(time_s) for time_s in self.wander_times_s.tolist()])
         return 4.0 * b**3 * np.square([*self.wander_m, *self.wander])
 
     def widened(self, covariance: Array, learning: bool = False) -> SlowErrors:
@@ -78,9 +93,12 @@ class SlowErrors:
         when the strip ends, since the filter learns on the way, so the excess is the drift's too (the position's is in
         offset and wander); the way it goes is not straight, so a part of it wanders, and faster than the rest.
 
+        The position's error is still the slow one of the GNSS, but from second to second the filter takes more or less
+        of it for true (`with_taken_back`).
+
         Parameters
         ----------
-        learning : the filter still learns, whatever its covariance: all wander is as fast as that
+        learning : the filter still learns, whatever its covariance: the attitude's wander is as fast as that
         """
         variance = np.diagonal(np.asarray(covariance, dtype=float))
         told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
@@ -93,14 +111,30 @@ class SlowErrors:
             return (a, b, c)
 
         m, rad = excess[:3], excess[3:]
+        inertial = self.with_taken_back()
+        wander_m, position_s = joined(inertial.wander_m, inertial.wander_time_s, m, LEARNING_TIME_S)
         return SlowErrors(
             more(self.offset_m, m),
             more(self.shift, rad),
             more(self.drift, rad),
-            more(self.wander_m, m, WANDERING_SHARE),
+            wander_m,
             more(self.wander, rad, WANDERING_SHARE),
-            min(self.wander_time_s, LEARNING_TIME_S),
+            position_s,
+            self._learnt_s,
         )
+
+    def with_taken_back(self) -> SlowErrors:
+        """With what a filter that learns takes back of its positions from second to second beside their wander: in the
+        time it learns in, no more than the wander becomes another in it; see `joined`."""
+        another = 1.0 - float(autocorrelation(self.wander_time_s, LEARNING_TIME_S)) ** 2
+        taken_back = another * np.square(self.wander_m)
+        wander_m, position_s = joined(self.wander_m, self.wander_time_s, taken_back, TAKEN_BACK_TIME_S)
+        return replace(self, wander_m=wander_m, wander_time_s=position_s, attitude_time_s=float(self.wander_times_s[3]))
+
+    @property
+    def _learnt_s(self) -> float:
+        """Correlation time of an attitude that is learnt."""
+        return min(float(self.wander_times_s[3]), LEARNING_TIME_S)
 
     def grown(self, covariance: Array) -> SlowErrors:
         """With what the covariance (6, 6) of a pose in the middle of a strip says more: of the wander alone.
@@ -112,12 +146,10 @@ class SlowErrors:
         excess = np.where(variance > CLEARLY * told, variance - told, 0.0)
         if not excess.any():
             return self
-        wander = np.sqrt(np.square([*self.wander_m, *self.wander]) + excess).tolist()
+        a, b, c = np.sqrt(np.square(self.wander) + excess[3:]).tolist()
+        wander_m, position_s = joined(self.wander_m, self.wander_time_s, excess[:3], LEARNING_TIME_S)
         return replace(
-            self,
-            wander_m=(wander[0], wander[1], wander[2]),
-            wander=(wander[3], wander[4], wander[5]),
-            wander_time_s=min(self.wander_time_s, LEARNING_TIME_S),
+            self, wander_m=wander_m, wander=(a, b, c), wander_time_s=position_s, attitude_time_s=self._learnt_s
         )
 
     def differs(self, other: SlowErrors) -> bool:
@@ -142,3 +174,27 @@ class SlowErrors:
         off = too_small[..., :, None] | too_small[..., None, :]
         rest[off & ~np.eye(6, dtype=bool)] = 0.0
         return rest
+
+
+def joined(sigma: Three, time_s: float, fast: Array, fast_s: float) -> tuple[Three, float]:
+    """Standard deviations and correlation time of one wander in place of two, a slow and a fast one.
+
+    It has the spectral density of both together at low frequencies (the variance times the correlation time), so that
+    no mean over a long strip and no trend is stated too certain, and at high ones (`SlowErrors.wander_density`), so
+    that it can go wherever they go; its variance is larger than theirs. As fast as the component needs that has most of
+    the fast one.
+
+    Parameters
+    ----------
+    sigma, time_s : of the slow one
+    fast, fast_s : (3,) variances of the fast one, and its correlation time
+    """
+    slow = np.square(sigma)
+    if not (fast > 0.0).any() or time_s <= fast_s:
+        a, b, c = np.sqrt(slow + fast).tolist()
+        return (a, b, c), time_s
+    low = slow * time_s + fast * fast_s
+    high = slow / time_s**3 + fast / fast_s**3
+    joined_s = float((low[fast > 0.0] / high[fast > 0.0]).min() ** 0.25)
+    a, b, c = np.sqrt(low / joined_s).tolist()
+    return (a, b, c), joined_s

@@ -38,8 +38,8 @@ def test_a_less_certain_pose_makes_its_components_less_certain_and_none_more():
     slow = TOLD.widened(P)
     assert slow.shift[2] == pytest.approx(np.sqrt(0.02**2 + TOLD.shift[2] ** 2 - TOLD.attitude_sigma[2] ** 2))
     assert slow.attitude_sigma[2] > 0.02 and slow.drift[2] > 0.019
-    assert slow.shift[:2] == TOLD.shift[:2] and slow.offset_m == TOLD.offset_m and slow.wander_m == TOLD.wander_m
-    assert slow.wander_time_s < TOLD.wander_time_s
+    assert slow.shift[:2] == TOLD.shift[:2] and slow.offset_m == TOLD.offset_m and slow.wander[:2] == TOLD.wander[:2]
+    assert slow.attitude_time_s < slow.wander_time_s < TOLD.wander_time_s
     for name in ("offset_m", "shift", "drift", "wander_m", "wander"):
         assert (np.array(getattr(TOLD.widened(covariance(3.0, 5.0)), name)) >= getattr(TOLD, name)).all()
     # all of the pose's covariance is slow then: no white noise is left of it
@@ -68,7 +68,8 @@ def test_what_is_left_of_a_covariance_is_one():
 def test_in_the_middle_of_a_strip_only_the_wander_grows_and_shrinks_again():
     slow = TOLD.grown(covariance(4.0, 1.0))
     assert slow.offset_m == TOLD.offset_m and slow.wander == TOLD.wander and slow.wander_time_s < TOLD.wander_time_s
-    assert slow.position_sigma == pytest.approx(4.0 * TOLD.position_sigma)
+    assert slow.position_sigma == pytest.approx(4.0 * TOLD.position_sigma, rel=0.08)  # more: see `joined`
+    assert (slow.position_sigma > 4.0 * TOLD.position_sigma).all()
     assert TOLD.differs(slow) and slow.differs(TOLD) and not TOLD.differs(TOLD)
     assert TOLD.grown(covariance(1.1, 1.1)) is TOLD
 

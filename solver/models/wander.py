@@ -57,7 +57,7 @@ class WanderOptions(ModelOptions):
     Attributes
     ----------
     slow : a-priori sigmas of offset, shift, drift and wander
-    segment_s : longest time between borders; 0 = `SEGMENT_SHARE` of the correlation time
+    segment_s : longest time between borders; 0 = `SEGMENT_SHARE` of the shortest correlation time
     left_out_m, left_out : segments of a component may be longer, whole numbers of these, where interpolation then
         leaves out no more than so much of its wander, m and rad
     """
@@ -104,7 +104,7 @@ class Wander(CorrectionModel):
         self.extent = extent
         self.options = options
         slow = options.slow
-        self.step_s = options.segment_s or SEGMENT_SHARE * slow.wander_time_s
+        self.step_s = options.segment_s or SEGMENT_SHARE * float(slow.wander_times_s.min())
         segments = max(1, int(np.ceil((extent.end_s - extent.start_s) / self.step_s - 1e-9)))
         self.borders = extent.start_s + self.step_s * np.arange(segments + 1)
         kinds = ["offset"] * 3 + ["shift"] * 3 + ["drift"] * 3
@@ -118,9 +118,9 @@ class Wander(CorrectionModel):
         self.unknown_names = tuple(names)
         self.notes = ("drift is the change over the strip: s = (t - start) / (end - start)",)
         self._sigma = np.tile(np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING), (segments + 1, 1))
-        self._time_s = np.full(segments + 1, slow.wander_time_s)
+        self._time_s = np.tile(slow.wander_times_s, (segments + 1, 1))
         self._another = np.zeros(segments + 1, dtype=bool)
-        self.used = self._spaced(0, self._sigma[0], slow.wander_time_s)
+        self.used = self._spaced(0, self._sigma[0], self._time_s[0])
         self._observations = self._stated()
 
     def design(self, time_s: ArrayLike) -> Design:
@@ -133,23 +133,23 @@ class Wander(CorrectionModel):
         coefficients = np.empty(columns.shape[:2])
         coefficients[:, 0], coefficients[:, 1] = 1.0, share
         value_and_slope = GLOBALS + 6 * np.arange(2)[:, None]
-        places = [self._inside(t, int(components[0])) for components in alike]
-        begin, end, after = (np.stack(each, axis=1) for each in zip(*places, strict=True))
-        _, part = self._between(after, self.options.slow.wander_time_s, end - begin)
+        first = [int(components[0]) for components in alike]
+        begin, end, after = (np.stack(e, axis=1) for e in zip(*(self._inside(t, c) for c in first), strict=True))
+        _, part = self._between(after, self.options.slow.wander_times_s[first], end - begin)
         coefficients[:, 2:] = part.reshape(len(t), -1)
         for g, components in enumerate(alike):
-            first, own = 2 + 4 * g, value_and_slope + components
-            columns[:, first : first + 2, components] = 12 * begin[:, g, None, None] + own
-            columns[:, first + 2 : first + 4, components] = 12 * end[:, g, None, None] + own
+            place, own = 2 + 4 * g, value_and_slope + components
+            columns[:, place : place + 2, components] = 12 * begin[:, g, None, None] + own
+            columns[:, place + 2 : place + 4, components] = 12 * end[:, g, None, None] + own
         return Design(columns, coefficients)
 
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
         t = np.asarray(time_s, dtype=float)
         out, alike = np.empty((len(t), 6)), self._alike()
-        places = [self._inside(t, int(components[0])) for components in alike]
-        begin, end, inside = (np.stack(each, axis=1) for each in zip(*places, strict=True))
-        variance, _ = self._between(inside, self._time_s[end], end - begin)
+        first = [int(components[0]) for components in alike]
+        begin, end, inside = (np.stack(e, axis=1) for e in zip(*(self._inside(t, c) for c in first), strict=True))
+        variance, _ = self._between(inside, self._time_s[end, first], end - begin)
         part = inside / (self.step_s * (end - begin))
         jump = np.clip(part * (1.0 - part), 0.0, 0.25)  # where a wander becomes another can be anywhere between
         for g, components in enumerate(alike):
@@ -158,7 +158,7 @@ class Wander(CorrectionModel):
             out[:, components] = variance[:, g, None] * np.maximum(before, after) ** 2 + jump[:, g, None] * size
         return out
 
-    def restate(self, from_s: float, sigma: ArrayLike, time_s: float, another: bool = False) -> float:
+    def restate(self, from_s: float, sigma: ArrayLike, time_s: ArrayLike, another: bool = False) -> float:
         """Another wander from a border on, the second one after a time, so that the segment there and its borders stay.
 
         The arrays that `pseudo_observations` gave change for the segments concerned, and so may the borders in use; who
@@ -168,7 +168,7 @@ class Wander(CorrectionModel):
         ----------
         from_s : up to here the model has been in use
         sigma : (6,) standard deviations, metres and radians
-        time_s : correlation time
+        time_s : correlation time, or (6,) of each component
         another : it is another error altogether, however large
 
         Returns
@@ -177,6 +177,7 @@ class Wander(CorrectionModel):
         """
         place, last = int(np.floor((from_s - self.borders[0]) / self.step_s + 0.1)), len(self.borders) - 1
         sigma = np.maximum(np.asarray(sigma, dtype=float), NOTHING)
+        time_s = np.broadcast_to(np.asarray(time_s, dtype=float), 6)
         if place < -1:
             first, self.used = 0, self._spaced(0, sigma, time_s)
         else:
@@ -197,21 +198,22 @@ class Wander(CorrectionModel):
         self._observations.sigma[...] = changed.sigma
         return float(self.borders[first])
 
-    def _spaced(self, first: int, sigma: Array, time_s: float) -> list[IntArray]:
-        """Borders in use of each component from one to the last, as far apart as a wander (6,) allows."""
+    def _spaced(self, first: int, sigma: Array, time_s: Array) -> list[IntArray]:
+        """Borders in use of each component from one to the last, as far apart as a wander (6,), (6,) allows."""
         o, last = self.options, len(self.borders) - 1
         allowed = np.repeat([o.left_out_m, o.left_out], 3)
         lengths = np.ones(6, dtype=np.int64)
         for longer in LENGTHS if allowed.any() else ():
-            out = np.sqrt(self._between(np.array(0.5 * longer * self.step_s), time_s, np.array(longer))[0])
+            out = np.sqrt(self._between(np.full(6, 0.5 * longer * self.step_s), time_s, np.full(6, longer))[0])
             lengths[out * sigma <= allowed] = longer
         return [np.append(np.arange(first, last, length), last) for length in lengths.tolist()]
 
     def _alike(self) -> list[IntArray]:
-        """Components by the borders they use."""
+        """Components by the borders they use and their correlation times."""
         found: dict[bytes, list[int]] = {}
-        for component, used in enumerate(self.used):
-            found.setdefault(used.tobytes(), []).append(component)
+        stated = self.options.slow.wander_times_s
+        for component, (used, time_s) in enumerate(zip(self.used, self._time_s.T, strict=True)):
+            found.setdefault(used.tobytes() + stated[component].tobytes() + time_s.tobytes(), []).append(component)
         return [np.array(components) for components in found.values()]
 
     def _inside(self, t: Array, component: int) -> tuple[IntArray, IntArray, Array]:
@@ -254,7 +256,7 @@ class Wander(CorrectionModel):
         slow = self.options.slow
         sigma = np.concatenate([slow.offset_m, slow.shift, slow.drift])
         start = GLOBALS + np.arange(12)
-        slope_sigma = self._sigma[0] * damping_rate(float(self._time_s[0]))
+        slope_sigma = self._sigma[0] * _damping_rates(self._time_s[0])
         direct = direct_observations(
             np.concatenate([np.maximum(sigma, NOTHING), self._sigma[0], slope_sigma]),
             self.unknown_names[: GLOBALS + 12],
@@ -275,13 +277,14 @@ class Wander(CorrectionModel):
             begin, end = self.used[c[0]][:-1], self.used[c[0]][1:]
             before[np.ix_(end - 1, c)] = begin[:, None]
             sigma[np.ix_(end - 1, c)] = self._sigma[np.ix_(end, c)]
-            for time_s, length in {*zip(self._time_s[end].tolist(), (end - begin).tolist(), strict=True)}:
-                chosen = (self._time_s[end] == time_s) & (end - begin == length)
+            times = self._time_s[:, c[0]]
+            for time_s, length in {*zip(times[end].tolist(), (end - begin).tolist(), strict=True)}:
+                chosen = (times[end] == time_s) & (end - begin == length)
                 a, b = begin[chosen], end[chosen]
                 F, Q, P0 = second_order_gauss_markov(1.0, time_s, self.step_s * length)
                 G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
                 ratio = (self._sigma[b] / self._sigma[a])[:, c]
-                rate = np.sqrt(P0[1, 1]) / np.array([damping_rate(float(t)) for t in self._time_s[a]])
+                rate = np.sqrt(P0[1, 1]) / _damping_rates(times[a])
                 D = np.zeros((*ratio.shape, 2, 2))
                 D[..., 0, 0], D[..., 1, 1] = ratio, ratio * rate[:, None]
                 falls = ((ratio < 1.0 - 1e-9) | self._another[b][:, None])[..., None, None]
@@ -321,3 +324,7 @@ class Wander(CorrectionModel):
             borders.append(one)
         result["borders"] = borders
         return result
+
+
+def _damping_rates(time_s: NDArray[np.floating]) -> Array:
+    return np.array([damping_rate(t) for t in time_s.tolist()])

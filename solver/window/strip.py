@@ -30,7 +30,7 @@ LEFT_OUT_M, LEFT_OUT = 0.035, 1.5e-5
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
     """Longest segment, s."""
-    return options.segment_s or SEGMENT_SHARE * slow.wander_time_s
+    return options.segment_s or SEGMENT_SHARE * float(slow.wander_times_s.min())
 
 
 def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
@@ -45,7 +45,7 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
     step = segment_length(slow, options)
     pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
     if options.model == "wander":
-        if slow.wander_time_s > LEARNING_TIME_S or options.segment_s:
+        if slow.wander_times_s.min() > LEARNING_TIME_S or options.segment_s:
             return WanderOptions(slow, step)
         return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
@@ -53,9 +53,9 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
         degrees = np.degrees(slow.wander)
         return DgrOptions(offset, shift, drift, slow.wander_m, (degrees[0], degrees[1], degrees[2]))
     if options.model == "lim":
-        return LimOptions(max(pieces + 1, 4), False, slow=slow)
+        return LimOptions(max(pieces + 1, 4), False, slow=slow.alike)
     if options.model == "ppm":
-        return PpmOptions(segments=pieces, slow=slow)
+        return PpmOptions(segments=pieces, slow=slow.alike)
     raise ValueError(f"unknown trajectory model {options.model!r}; known: {', '.join(MODELS)}")
 
 
@@ -115,7 +115,7 @@ class WindowStrip:
     def restate(self, from_s: float, slow: SlowErrors, another: bool = False) -> float:
         """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""
         assert isinstance(self.model, Wander)
-        border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_time_s, another)
+        border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_times_s, another)
         if np.isfinite(border_s):
             self._look_up_uses()
         return border_s
