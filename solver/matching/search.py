@@ -27,8 +27,9 @@ LARGEST_UNEVENNESS = float(np.log(1.8))
 LEAST_TEMPLATE, LEAST_SEARCH = 0.7, 0.4
 #: Share of a template's weight in least squares that must have been measured in both images.
 LEAST_MEASURED = 0.6
-#: Iterations of least squares, the first time and with a patch from where that found it; furthest way of both, px.
-FIRST_ITERATIONS, ITERATIONS, FURTHEST = 4, 8, 2.0
+#: So often the searched patch is taken anew from where least squares found it; iterations of least squares before, and
+#: with the last patch; the furthest that all of them go, px.
+AGAIN, FIRST_ITERATIONS, ITERATIONS, FURTHEST = 2, 4, 8, 2.0
 #: The template of least squares in a patch with its margin.
 INNER = slice(MARGIN, MARGIN + 2 * LEAST_SQUARES_HALF + 1)
 #: Along a row of a grid every so many pixels are computed exactly; a patch covers at most so many times its size.
@@ -270,8 +271,8 @@ def _refine(
         start = shift[index]
         lost, gone = np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
         # interpolating what is interpolated already pulls places towards its pixels, all those alike that are expected
-        # wrong by the same part of a pixel: the patch is taken anew from where it was found
-        for last in (False, True):
+        # wrong by the same part of a pixel: the patch is taken anew from where it was found, which leaves a third of it
+        for last in (False,) * AGAIN + (True,):
             begin = start + way
             s = other.patches(here.moved(begin), other_line[alive] + begin[:, 0] * per_row, wide, 1)
             for part, holes in _by_holes(t, s):
