@@ -57,7 +57,7 @@ def test_constants_of_the_covariance_are_those_of_the_resampling(monkeypatch):
     s2, s3 = a * a, a**3
     taps = 0.5 * np.array([2 * s2 - s3 - a, 3 * s3 - 5 * s2 + 2, 4 * s2 - 3 * s3 + a, s3 - s2])
     once = float((taps**2).sum(axis=0).mean()) ** 2
-    assert 0.5 * (once + once**2) == pytest.approx(least_squares.SMOOTHED, abs=0.02)
+    assert 0.5 * (once + once**0.5) == pytest.approx(least_squares.SMOOTHED, abs=0.02)
     kept = {}
     shown = least_squares._shift_covariance
 

@@ -267,24 +267,28 @@ def _refine(
     if alive.any():
         here, index = ground.select(alive), np.flatnonzero(alive)
         t = master.select(alive).patches(here, master_line[alive], wide, 1)
-        way, per_row = np.zeros((len(index), 2)), ground.spacing_m / other.line_m
-        start = shift[index]
-        lost, gone = np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
+        start, per_row = shift[index], ground.spacing_m / other.line_m
+
+        def searched(way: Array) -> Patches:
+            begin = start + way
+            return other.patches(here.moved(begin), other_line[alive] + begin[:, 0] * per_row, wide, 1)
+
         # interpolating what is interpolated already pulls places towards its pixels, all those alike that are expected
         # wrong by the same part of a pixel: the patch is taken anew from where it was found, which leaves a third of it
-        for last in (False,) * AGAIN + (True,):
-            begin = start + way
-            s = other.patches(here.moved(begin), other_line[alive] + begin[:, 0] * per_row, wide, 1)
+        way, s = np.zeros((len(index), 2)), searched(np.zeros((len(index), 2)))
+        for _ in range(AGAIN):
             for part, holes in _by_holes(t, s):
-                there = _there(t.values[part], s.values[part], holes, ITERATIONS if last else FIRST_ITERATIONS)
-                step = there.shift if last else np.clip(there.shift, -FURTHEST, FURTHEST)
-                way[part] += step
-                if not last:
-                    continue
-                covariance[index[part]], score[index[part]] = there.covariance, there.score
-                closing[index[part]] = np.hypot(*_back(t.values[part], s.values[part], holes, there).shift.T)
-                lost[part] = ~there.converged
-                gone[part] = there.measured < LEAST_MEASURED
+                there = _there(t.values[part], s.values[part], holes, FIRST_ITERATIONS)
+                way[part] += np.clip(there.shift, -FURTHEST, FURTHEST)
+            s = searched(way)
+        lost, gone = np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
+        for part, holes in _by_holes(t, s):
+            there = _there(t.values[part], s.values[part], holes, ITERATIONS)
+            back = _back(t.values[part], s.values[part], holes, there)
+            way[part] += there.shift
+            covariance[index[part]], score[index[part]] = there.covariance, there.score
+            closing[index[part]] = np.hypot(*back.shift.T)
+            lost[part], gone[part] = ~there.converged, there.measured < LEAST_MEASURED
         lost |= (np.abs(way) > FURTHEST).any(axis=1)
         shift[index] += way
         reason[index[(np.minimum(t.known, s.known) < 1.0) | gone]] = "no lines"
