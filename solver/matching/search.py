@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .correlation import best_place, correlate
-from .least_squares import PatchMatch, match_patches
+from .least_squares import PatchMatch, match_patches, shifts
 from .line_scan import LineScan
 from .line_store import LineRing
 from .patches import MOST_HOLE, Windows, holes_at, interpolate_stack
@@ -278,12 +278,12 @@ def _refine(
         way, s = np.zeros((len(index), 2)), searched(np.zeros((len(index), 2)))
         for _ in range(AGAIN):
             for part, holes in _by_holes(t, s):
-                there = _there(t.values[part], s.values[part], holes, FIRST_ITERATIONS)
-                way[part] += np.clip(there.shift, -FURTHEST, FURTHEST)
+                step = shifts(*_middle(t.values[part], s.values[part], FIRST_ITERATIONS, holes))
+                way[part] += np.clip(step, -FURTHEST, FURTHEST)
             s = searched(way)
         lost, gone = np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
         for part, holes in _by_holes(t, s):
-            there = _there(t.values[part], s.values[part], holes, ITERATIONS)
+            there = match_patches(*_middle(t.values[part], s.values[part], ITERATIONS, holes))
             back = _back(t.values[part], s.values[part], holes, there)
             way[part] += there.shift
             covariance[index[part]], score[index[part]] = there.covariance, there.score
@@ -318,13 +318,12 @@ def _by_holes(t: Patches, s: Patches) -> list[tuple[NDArray[np.intp] | slice, tu
     return parts
 
 
-def _there(
-    template: NDArray[np.floating], search: NDArray[np.floating], holes: tuple[Mask, Mask] | None, iterations: int
-) -> PatchMatch:
-    """The middles of templates matched."""
-    middle, none = np.ascontiguousarray(template[:, INNER, INNER]), np.zeros((len(template), 2))
+def _middle(
+    template: NDArray[np.floating], search: NDArray[np.floating], iterations: int, holes: tuple[Mask, Mask] | None
+) -> tuple[NDArray[np.floating], NDArray[np.floating], Array, int, tuple[Mask, Mask] | None]:
+    """What least squares want to find the middles of templates."""
     beside = None if holes is None else (holes[0][:, INNER, INNER], holes[1])
-    return match_patches(middle, search, none, iterations, beside)
+    return np.ascontiguousarray(template[:, INNER, INNER]), search, np.zeros((len(template), 2)), iterations, beside
 
 
 def _back(
