@@ -276,7 +276,8 @@ def test_what_was_not_measured_does_not_matter_whatever_its_grey_values():
         np.einsum("ki,kij,kj->k", x.shift - shift, np.linalg.inv(x.covariance), x.shift - shift).mean()
         for x in (a, whole)
     ]
-    assert 0.8 < normalised[0] / normalised[1] < 1.25 and 1.0 < normalised[1] < 3.0
+    # 2, and what shifts lean by until a patch is taken anew from where it was found
+    assert 0.8 < normalised[0] / normalised[1] < 1.25 and 1.0 < normalised[1] < 4.5
     assert 1.05 < np.median(a.covariance[:, 0, 0] / whole.covariance[:, 0, 0]) < 2.5
     # without the holes the same patches are spoilt
     blind = match_patches(spoilt, between.astype(np.float32), np.zeros((k, 2)))

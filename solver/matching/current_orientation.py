@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..measured_trajectory import GrowingTrajectory
 from ..rotation import corrected_angles, matrix_from_angles
 from .pose_smoothing import PoseSmoother
+from .steady_positions import SteadyPositions
 
 Array = NDArray[np.floating]
 
@@ -25,7 +26,7 @@ class CurrentOrientation:
 
     def __init__(self) -> None:
         self._poses = GrowingTrajectory()
-        self._smoother = PoseSmoother()
+        self._smoother, self._steady = PoseSmoother(), SteadyPositions()
         self._last_s = -np.inf
         self._knots: dict[int, list[Array | int]] = {}
         self._covariance: dict[int, Array] = {}
@@ -50,6 +51,7 @@ class CurrentOrientation:
         if time_s <= self._last_s:
             return False
         self._last_s = time_s
+        self._steady.add(time_s, position_l)
         known = self._smoother.push(time_s, position_l, quaternion, covariance)
         if known is None:
             return True
@@ -83,7 +85,7 @@ class CurrentOrientation:
         """Perspective centres (n, 3) and rotations ``R_lc`` (n, 3, 3) at times (n,) inside the poses."""
         t = np.asarray(time_s, dtype=float)
         poses = self._poses.at(t)
-        position, angles = poses.position_l, poses.angles
+        position, angles = self._steady.at(t, poses.position_l), poses.angles
         if self._knots:
             numbers = sorted(self._knots)
             middle = (np.array(numbers) + 0.5) * KNOT_S

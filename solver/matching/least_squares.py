@@ -24,9 +24,10 @@ BOX = 7
 #: 1 / 1.7 of what it does (derived by `tests/test_least_squares_matching.py`).
 SHORTFALL = 1.7
 #: Share of white noise's variance that is left in residuals of patches that were resampled: bicubic values keep 0.81
-#: along and 0.81 across (mean of the squared weights over all phases), the searched patch is interpolated twice:
-#: (0.66 + 0.44) / 2. What moves a patch, the low frequencies of the noise, stays.
-SMOOTHED = 0.55
+#: along and 0.81 across (mean of the squared weights over all phases). The searched patch is taken from where it was
+#: found, so that interpolating it again changes nothing; of the master, whose samples are those of the grid, only the
+#: lines are interpolated: (0.66 + 0.81) / 2. What moves a patch, the low frequencies of the noise, stays.
+SMOOTHED = 0.73
 #: Difference of bicubic values half a pixel to either side.
 GRADIENT_TAPS = np.array([-1.0, 10.0, 0.0, -10.0, 1.0]) / 16.0
 #: Scale and shear stay within this of none.
@@ -74,12 +75,36 @@ def match_patches(
     ``holes`` are the pixels of both that were not measured: they have no weight, whatever their grey values.
     """
     k, t, _ = template.shape
-    window = _Window(t)
-    wanted = template.reshape(k, -1).astype(float)
+    window, wanted = _Window(t), template.reshape(len(template), -1).astype(float)
+    shift, affine, weight, moved = _settled(window, wanted, search, start, iterations, holes)
+    design, residual, found = window.linearise(search, wanted, shift, affine, weight)
+    covariance = _shift_covariance(design, weight, residual, t)
+    measured = np.broadcast_to(weight.sum(axis=1) / window.weight.sum(), k)
+    return PatchMatch(shift, covariance, affine, _score(found, wanted, weight), moved < 0.05, measured)
+
+
+def shifts(
+    template: NDArray[np.floating],
+    search: NDArray[np.floating],
+    start: Array,
+    iterations: int,
+    holes: tuple[Mask, Mask] | None = None,
+) -> Array:
+    """Only the shifts (k, 2) of `match_patches`."""
+    wanted = template.reshape(len(template), -1).astype(float)
+    return _settled(_Window(template.shape[1]), wanted, search, start, iterations, holes)[0]
+
+
+def _settled(
+    window: _Window, wanted: Array, search: NDArray[np.floating], start: Array, iterations: int,
+    holes: tuple[Mask, Mask] | None,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Shifts (k, 2), affine (k, 2, 2), weights (k or 1, p) and the last steps (k,) of Gauss-Newton."""
+    k = len(wanted)
     shift, affine = np.array(start, dtype=float), np.repeat(np.eye(2)[None], k, axis=0)
     moved = np.full(k, np.inf)
     # of each pixel, the same for all patches unless some have holes
-    weight = np.broadcast_to(window.weight, (1 if holes is None else k, t * t))
+    weight = np.broadcast_to(window.weight, (1 if holes is None else k, wanted.shape[1]))
     for turn in range(iterations):
         on = np.flatnonzero(moved >= CONVERGED_PX)
         if not len(on):
@@ -96,10 +121,7 @@ def match_patches(
         change = np.clip(step[:, [[1, 2], [4, 5]]], -0.1, 0.1)
         affine[on] = np.eye(2) + np.clip(affine[on] + change - np.eye(2), -LARGEST_SHEAR, LARGEST_SHEAR)
         moved[on] = np.abs(step[:, [0, 3]]).max(axis=1)
-    design, residual, found = window.linearise(search, wanted, shift, affine, weight)
-    covariance = _shift_covariance(design, weight, residual, t)
-    measured = np.broadcast_to(weight.sum(axis=1) / window.weight.sum(), k)
-    return PatchMatch(shift, covariance, affine, _score(found, wanted, weight), moved < 0.05, measured)
+    return shift, affine, weight, moved
 
 
 class _Window:

@@ -46,7 +46,7 @@ class MatchingOptions:
     least_reach_px: float = 40.0
     largest_reach_px: float = 80.0
     relief_sigma_m: float = 60.0
-    image_sigma_px: float = 0.025
+    image_sigma_px: float = 0.017
     least_rays: int = 3
     budget_mb: float = 1024.0
     chips_mb: float = 64.0

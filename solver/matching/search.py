@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .correlation import best_place, correlate
-from .least_squares import PatchMatch, match_patches
+from .least_squares import PatchMatch, match_patches, shifts
 from .line_scan import LineScan
 from .line_store import LineRing
 from .patches import MOST_HOLE, Windows, holes_at, interpolate_stack
@@ -27,6 +27,11 @@ LARGEST_UNEVENNESS = float(np.log(1.8))
 LEAST_TEMPLATE, LEAST_SEARCH = 0.7, 0.4
 #: Share of a template's weight in least squares that must have been measured in both images.
 LEAST_MEASURED = 0.6
+#: So often the searched patch is taken anew from where least squares found it; iterations of least squares before, and
+#: with the last patch; the furthest that all of them go, px.
+AGAIN, FIRST_ITERATIONS, ITERATIONS, FURTHEST = 2, 4, 8, 2.0
+#: The template of least squares in a patch with its margin.
+INNER = slice(MARGIN, MARGIN + 2 * LEAST_SQUARES_HALF + 1)
 #: Along a row of a grid every so many pixels are computed exactly; a patch covers at most so many times its size.
 NODE_PX, MOST_STRETCH = 4, 2.0
 
@@ -260,19 +265,32 @@ def _refine(
     covariance, score, closing = np.full((k, 2, 2), np.inf), np.zeros(k), np.full(k, np.inf)
     wide = half + MARGIN
     if alive.any():
-        here, moved = ground.select(alive), ground.select(alive).moved(shift[alive])
+        here, index = ground.select(alive), np.flatnonzero(alive)
         t = master.select(alive).patches(here, master_line[alive], wide, 1)
-        at = other_line[alive] + shift[alive, 0] * ground.spacing_m / other.line_m
-        s = other.patches(moved, at, wide, 1)
-        index = np.flatnonzero(alive)
-        step, lost, gone = np.zeros((len(index), 2)), np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
+        start, per_row = shift[index], ground.spacing_m / other.line_m
+
+        def searched(way: Array) -> Patches:
+            begin = start + way
+            return other.patches(here.moved(begin), other_line[alive] + begin[:, 0] * per_row, wide, 1)
+
+        # interpolating what is interpolated already pulls places towards its pixels, all those alike that are expected
+        # wrong by the same part of a pixel: the patch is taken anew from where it was found, which leaves a third of it
+        way, s = np.zeros((len(index), 2)), searched(np.zeros((len(index), 2)))
+        for _ in range(AGAIN):
+            for part, holes in _by_holes(t, s):
+                step = shifts(*_middle(t.values[part], s.values[part], FIRST_ITERATIONS, holes))
+                way[part] += np.clip(step, -FURTHEST, FURTHEST)
+            s = searched(way)
+        lost, gone = np.zeros(len(index), dtype=bool), np.zeros(len(index), dtype=bool)
         for part, holes in _by_holes(t, s):
-            there, back = _there_and_back(t.values[part], s.values[part], holes)
-            step[part], covariance[index[part]], score[index[part]] = there.shift, there.covariance, there.score
+            there = match_patches(*_middle(t.values[part], s.values[part], ITERATIONS, holes))
+            back = _back(t.values[part], s.values[part], holes, there)
+            way[part] += there.shift
+            covariance[index[part]], score[index[part]] = there.covariance, there.score
             closing[index[part]] = np.hypot(*back.shift.T)
-            lost[part] = ~there.converged | (np.abs(there.shift) > 2.0).any(axis=1)
-            gone[part] = there.measured < LEAST_MEASURED
-        shift[index] += step
+            lost[part], gone[part] = ~there.converged, there.measured < LEAST_MEASURED
+        lost |= (np.abs(way) > FURTHEST).any(axis=1)
+        shift[index] += way
         reason[index[(np.minimum(t.known, s.known) < 1.0) | gone]] = "no lines"
         shaken = np.maximum(t.uneven, s.uneven) > LARGEST_UNEVENNESS
         reason[index[shaken & (reason[index] == "")]] = "shaken"
@@ -300,16 +318,21 @@ def _by_holes(t: Patches, s: Patches) -> list[tuple[NDArray[np.intp] | slice, tu
     return parts
 
 
-def _there_and_back(
-    template: NDArray[np.floating], search: NDArray[np.floating], holes: tuple[Mask, Mask] | None
-) -> tuple[PatchMatch, PatchMatch]:
-    """The middles of templates matched, and the patches that were found matched in the master: their shift is none."""
-    inner, none = slice(MARGIN, MARGIN + 2 * LEAST_SQUARES_HALF + 1), np.zeros((len(template), 2))
-    middle = np.ascontiguousarray(template[:, inner, inner])
-    there = match_patches(middle, search, none, holes=None if holes is None else (holes[0][:, inner, inner], holes[1]))
+def _middle(
+    template: NDArray[np.floating], search: NDArray[np.floating], iterations: int, holes: tuple[Mask, Mask] | None
+) -> tuple[NDArray[np.floating], NDArray[np.floating], Array, int, tuple[Mask, Mask] | None]:
+    """What least squares want to find the middles of templates."""
+    beside = None if holes is None else (holes[0][:, INNER, INNER], holes[1])
+    return np.ascontiguousarray(template[:, INNER, INNER]), search, np.zeros((len(template), 2)), iterations, beside
+
+
+def _back(
+    template: NDArray[np.floating], search: NDArray[np.floating], holes: tuple[Mask, Mask] | None, there: PatchMatch
+) -> PatchMatch:
+    """The patches that were found matched in the master: their shift is none."""
     r = np.arange(2 * LEAST_SQUARES_HALF + 1) - LEAST_SQUARES_HALF + 0.5 * (search.shape[1] - 1)
     y, x = np.meshgrid(r, r, indexing="ij")
     at = y + there.shift[:, 0, None, None], x + there.shift[:, 1, None, None]
-    found = interpolate_stack(search, *at)
+    found, none = interpolate_stack(search, *at), np.zeros((len(template), 2))
     turned = None if holes is None else (holes_at(holes[1], *at) > MOST_HOLE, holes[0])
-    return there, match_patches(found, template, none, iterations=5, holes=turned)
+    return match_patches(found, template, none, iterations=5, holes=turned)
