@@ -25,6 +25,10 @@ FLUSH_S = 0.3
 WAITING_BYTES = 256 << 20
 #: What comes in this time after the start is sorted: configuration and control to the head of the file.
 HEAD_S = 0.4
+#: When it is told to stop, a recorder takes what is still on its way until nothing has come for so long, s ...
+QUIET_S = 0.3
+#: ... but no longer than this: sensors may go on.
+LAST_WORDS_S = 2.0
 #: A full disk is tried again after so long.
 RETRY_S = 2.0
 
@@ -277,6 +281,17 @@ def run(options: ProgramOptions) -> int:
     return 1 if recorder.counters["disk"] else 0
 
 
+def _take_last_words(recorder: Recorder, backlog: _Backlog) -> None:
+    """What is still on its way when the recorder is told to stop: until nothing comes for a while."""
+    begun = heard = time.monotonic()
+    while (now := time.monotonic()) - heard < QUIET_S and now - begun < LAST_WORDS_S:
+        raws = backlog.take(0.05)
+        if raws:
+            recorder.take(raws)
+            heard = time.monotonic()
+        recorder.tend()
+
+
 def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     """Feed a recorder from the bus until ``options.stop`` is set."""
     backlog = _Backlog()
@@ -313,6 +328,6 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
             options.report(f"recorder: {problem}")
         if status.due():
             status.publish(recorder.state(), dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
-    recorder.take(backlog.take(0.0))
+    _take_last_words(recorder, backlog)
     status.publish("stopping", dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
     backlog.close()

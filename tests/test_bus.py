@@ -405,6 +405,21 @@ def test_a_stop_under_load_is_clean(rig, number, tmp_path):
     assert triline("check", tmp_path / "a.mcap").returncode == 0
 
 
+def test_a_recorder_that_is_stopped_takes_what_is_on_its_way(rig, tmp_path):
+    recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
+    with Bus(port=rig.port, source="last") as bus:
+        wait_for(lambda: "recorder" in bus.alive(), 20, "the recorder")
+        bus.prepare(["sensor/gnss"])
+        time.sleep(0.5)
+        for number in range(40):
+            bus.publish(sample.message("sensor/gnss", number, source="last"))
+            if number == 20:
+                recorder.send_signal(signal.SIGTERM)
+            time.sleep(0.02)
+        assert recorder.wait(10) == 0
+    assert len(payloads(tmp_path / "a.mcap", "sensor/gnss")) == 40
+
+
 def test_a_zenoh_configuration_file_is_accepted(tmp_path):
     port = free_port()
     good = tmp_path / "bus.json5"
