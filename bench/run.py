@@ -20,6 +20,7 @@ BENCHMARKS = {
     "sliding window: latency of updates": ["window.py", "latency", "--selfcal"],
     "sliding window beside GTSAM and Ceres": ["window_peers.py"],
     "tie point to orientation over the bus": ["tie_latency.py"],
+    "the same with self-calibration and small batches": ["tie_latency.py", "--selfcal", "tls18", "--update-rays", "12"],
     "an hour through process, pace for throughput": ["process_hour.py", "--imu", "--pace", "throughput"],
     "a tenth of it at the pace of a live flight": ["process_hour.py", "--imu", "--share", "0.1"],
     "memory and latency over hours": ["long_flight.py", "--hours", "0.25"],

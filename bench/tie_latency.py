@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument("--window", type=float, default=40.0, help="s")
     parser.add_argument("--seconds", type=float, default=75.0, help="of the strip")
     parser.add_argument("--selfcal", default="none", help="set of additional parameters")
+    parser.add_argument("--update-rays", type=int, default=16, help="an update as soon as so many wait")
     parser.add_argument("--port", type=int, default=17621)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -99,7 +100,12 @@ def main() -> None:
         recording = prepare(folder, args)
         ears = Ears()
         with NodeGroup(folder, "bench", args.port) as group, Bus("bench", source="bench", port=args.port) as bus:
-            group.start("adjuster", "--set", f"window_s={args.window}", "--set", f'self_calibration="{args.selfcal}"')
+            settings = (
+                f"window_s={args.window}",
+                f'self_calibration="{args.selfcal}"',
+                f"update_rays={args.update_rays}",
+            )
+            group.start("adjuster", *(word for setting in settings for word in ("--set", setting)))
             while "adjuster" not in bus.alive():
                 time.sleep(0.1)
             bus.subscribe("point/object", ears.point)
