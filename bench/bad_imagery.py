@@ -19,18 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triline.nodes.flight_settings import simulated_flight
-from triline.solver.matching.options import MatchedTie
-from triline.solver.matching.tie_matcher import TieMatcher
-from triline.solver.rotation import matrix_from_angles, quaternion_from_matrix
-from triline.solver.simulation.flight import Flight
-from triline.solver.simulation.observations import find_looks
+from triline.solver.simulation.matching_study import match_strip, tie_errors
 
 Images = list[NDArray[np.unsignedinteger]]
 #: Lost lines: number of the CCD line, number of the line.
 Lost = list[NDArray[np.bool_]]
 Spoil = Callable[[Images, Lost, np.random.Generator, float], None]
 
-BLOCK, FULL = 8, 4095
+FULL = 4095
 
 
 def runs(n: int, long: int, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -110,60 +106,6 @@ FAULTS: dict[str, Spoil] = {
 }
 
 
-def matched(
-    flight: Flight, images: Images, lost: Lost, seed: int
-) -> tuple[list[MatchedTie], float, TieMatcher, list[str]]:
-    """Ties of the first strip, with slow attitude errors (0.02 deg); longest pause without any, s; what was told."""
-    strip, camera = flight.strips[0], flight.camera
-    matcher = TieMatcher(camera)
-    matcher.begin_strip(strip.id, strip.first_line_time_s, strip.line_rate_hz)
-    time_s = np.arange(0.0, flight.truth.end_s, 0.005)
-    truth = flight.truth.at(time_s)
-    rng = np.random.default_rng(seed)
-    angles = truth.angles + np.radians(0.02) * rng.standard_normal(3)
-    angles += np.radians(0.01) * np.sin(time_s[:, None] / 5.0 + rng.uniform(0, 6, 3))
-    quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
-    covariance = np.diag([1.0] * 3 + [np.radians(0.03)] * 3) ** 2
-    ties, told, poses, pause_s, since_s = [], [], 0, 0.0, 0.0
-    for first in range(0, strip.lines, BLOCK):
-        end = min(first + BLOCK, strip.lines)
-        end_s = float(strip.time_of(end - 1))
-        while poses < len(time_s) and time_s[poses] <= end_s:
-            matcher.orientation.add_pose(time_s[poses], truth.position_l[poses], quaternion[poses], covariance)
-            poses += 1
-        for image, gone, line in zip(images, lost, camera.lines, strict=True):
-            there = first + np.flatnonzero(~gone[first:end])
-            for part in np.split(there, np.flatnonzero(np.diff(there) > 1) + 1):
-                if len(part):
-                    matcher.add_lines(line.id, int(part[0]), image[part])
-        new = matcher.match()
-        if new or end == strip.lines:
-            pause_s, since_s = max(pause_s, end_s - since_s if ties else 0.0), end_s
-        ties += new
-        told += matcher.take_events()
-    return ties, pause_s, matcher, told
-
-
-def errors(flight: Flight, ties: list[MatchedTie]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """(rays, 2) line and sample against the truth of the place of the first ray, and their sigma (rays, 2)."""
-    camera, strip = flight.camera, flight.strips[0]
-    index = camera.line_index
-    ccd = np.array([index[tie.rays[0].ccd] for tie in ties], dtype=int)
-    line, sample = np.array([[tie.rays[0].line, tie.rays[0].sample] for tie in ties]).reshape(-1, 2).T
-    poses = flight.truth.at(strip.time_of(line))
-    xy = camera.image_coordinates(ccd, sample)[0]
-    ray = np.einsum("nij,nj->ni", poses.R_lc, np.column_stack([xy, -camera.focal_length_mm[ccd]]))
-    looks = find_looks(flight.terrain.intersect(poses.position_l, ray), flight.strips, camera)
-    true = {(p, c): uv for p, c, *uv in zip(looks.point, looks.ccd, looks.line, looks.sample, strict=True)}
-    rows = [
-        (r.line - true[i, index[r.ccd]][0], r.sample - true[i, index[r.ccd]][1],
-         np.hypot(r.sigma_line, tie.rays[0].sigma_line), np.hypot(r.sigma_sample, tie.rays[0].sigma_sample))
-        for i, tie in enumerate(ties) for r in tie.rays[1:] if (i, index[r.ccd]) in true
-    ]  # fmt: skip
-    table = np.array(rows).reshape(-1, 4)
-    return table[:, :2], table[:, 2:]
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
@@ -188,17 +130,19 @@ def main() -> int:
             images, lost = [image.copy() for image in good], [np.zeros(strip.lines, dtype=bool) for _ in good]
             spoil(images, lost, np.random.default_rng([seed, 5]), strip.line_rate_hz)
             begun = time.process_time()
-            ties, pause_s, matcher, told = matched(flight, images, lost, seed)
+            found = match_strip(flight, images, seed, lost=lost)
             spent = time.process_time() - begun
-            error, sigma = errors(flight, ties)
+            ties, matcher = found.ties, found.matcher
+            pause_s = np.diff([*np.unique(found.came_line), strip.lines]).max() / strip.line_rate_hz
+            error, sigma = tie_errors(flight, ties)
             digest = hashlib.sha256(repr([(t.name, t.rays) for t in ties]).encode()).hexdigest()[:8]
             rows[name].append((len(ties), error, sigma, spent, pause_s, digest))
             if args.told:
-                print(f"{name}, seed {seed}:", *told, dict(matcher.counters), sep="\n    ")
+                print(f"{name}, seed {seed}:", *found.told, dict(matcher.counters), sep="\n    ")
     print(f"{'lines':<32}  ties  in 0.3 px  over 2 px     sigma   normalised squared   ms a tie   longest pause")
-    for name, found in rows.items():
-        ties = sum(row[0] for row in found)
-        error, sigma = (np.concatenate([row[i] for row in found]) for i in (1, 2))
+    for name, results in rows.items():
+        ties = sum(row[0] for row in results)
+        error, sigma = (np.concatenate([row[i] for row in results]) for i in (1, 2))
         if not len(error):
             print(f"  {name:<30}{ties:6d}")
             continue
@@ -206,10 +150,10 @@ def main() -> int:
         normalised = ((error / sigma)[length <= 2.0] ** 2).mean(axis=0)
         good, wrong = 100 * (length < 0.3).mean(), 100 * (length > 2.0).mean()
         sigma_px = 1.4826 * np.median(np.abs(error[length < 0.3]))
-        ms, pause_s = 1000 * sum(row[3] for row in found) / max(ties, 1), max(row[4] for row in found)
+        ms, pause_s = 1000 * sum(row[3] for row in results) / max(ties, 1), max(row[4] for row in results)
         print(
             f"  {name:<30}{ties:6d} {good:8.1f} % {wrong:8.2f} % {sigma_px:6.3f} px   {normalised[0]:6.2f}"
-            f" {normalised[1]:6.2f}      {ms:7.1f}   {pause_s:6.1f} s   {' '.join(row[5] for row in found)}",
+            f" {normalised[1]:6.2f}      {ms:7.1f}   {pause_s:6.1f} s   {' '.join(row[5] for row in results)}",
             flush=True,
         )
     return 0

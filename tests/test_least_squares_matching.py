@@ -124,3 +124,57 @@ def test_poses_lose_their_noise_and_keep_their_motion():
         shake = quaternion_from_vector(np.array([1e-3 * np.sin(2 * np.pi * 20 * time_s[i]), 0, 0]))
         shaking.push(time_s[i], position[i], quaternion_multiply(noisy[i], shake), np.eye(6))
     assert shaking.reach[1] < 8
+
+
+def test_least_squares_matching_finds_shifts():
+    rng = np.random.default_rng(2)
+    n, k = 27, 150
+    f = np.hypot(np.fft.fftfreq(64)[:, None], np.fft.fftfreq(64)[None, :])
+    spectrum = np.fft.fft2(rng.standard_normal((k, 64, 64))) * np.exp(-0.5 * (f / 0.2) ** 2)
+    shift = rng.uniform(-0.8, 0.8, (k, 2))
+    phase = np.exp(-2j * np.pi * (np.fft.fftfreq(64)[:, None] * shift[:, 0, None, None]
+                                  + np.fft.fftfreq(64)[None, :] * shift[:, 1, None, None]))  # fmt: skip
+    first, second = (np.fft.ifft2(s).real[:, :n, :n] * 800 for s in (spectrum, spectrum * phase))
+    first, second = (a + 15 * rng.standard_normal(a.shape) for a in (first, 0.8 * second + 100))
+    found = match_patches(first[:, 4:-4, 4:-4].astype(np.float32), second.astype(np.float32), np.zeros((k, 2)))
+    error = found.shift - shift
+    assert found.converged.all() and np.abs(error.mean(axis=0)).max() < 0.01
+    assert np.sqrt((error**2).mean()) < 0.08
+    assert (found.score > 0.9).mean() > 0.9
+
+
+def test_what_was_not_measured_does_not_matter_whatever_its_grey_values():
+    rng = np.random.default_rng(5)
+    k, t, s = 300, 19, 27
+    f = np.hypot(np.fft.fftfreq(64)[:, None], np.fft.fftfreq(64)[None, :])
+    spectrum = np.fft.fft2(rng.standard_normal((k, 64, 64))) * np.exp(-0.5 * (f / 0.12) ** 2)
+    shift = rng.uniform(-0.4, 0.4, (k, 2))
+    phase = np.exp(-2j * np.pi * (np.fft.fftfreq(64)[:, None] * shift[:, 0, None, None]
+                                  + np.fft.fftfreq(64)[None, :] * shift[:, 1, None, None]))  # fmt: skip
+    first, second = (np.fft.ifft2(a).real[:, :s, :s] * 1500 for a in (spectrum, spectrum * phase))
+    template, search = (a + 1000 + 40 * rng.standard_normal(a.shape) for a in (first, second))
+    template = template[:, 4:-4, 4:-4].astype(np.float32)
+    holes = np.zeros((k, t, t), bool), np.zeros((k, s, s), bool)
+    holes[0][:, 4:7], holes[1][:, :, 15:17] = True, True
+    between = search.copy()
+    for i, share in ((15, 1 / 3), (16, 2 / 3)):  # as a mended patch has them
+        between[:, :, i] = (1 - share) * search[:, :, 14] + share * search[:, :, 17]
+    a = match_patches(template, between.astype(np.float32), np.zeros((k, 2)), holes=holes)
+    spoilt = np.where(holes[0], 4095, template).astype(np.float32)
+    b = match_patches(spoilt, between.astype(np.float32), np.zeros((k, 2)), holes=holes)
+    np.testing.assert_allclose(a.shift, b.shift, atol=1e-9)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6)
+    assert ((a.measured > 0.6) & (a.measured < 0.8)).all() and a.converged.all()
+    # and the covariance tells what is left, as that of whole patches does
+    whole = match_patches(template, search.astype(np.float32), np.zeros((k, 2)))
+    error = a.shift - shift
+    normalised = [
+        np.einsum("ki,kij,kj->k", x.shift - shift, np.linalg.inv(x.covariance), x.shift - shift).mean()
+        for x in (a, whole)
+    ]
+    # 2, and what shifts lean by until a patch is taken anew from where it was found
+    assert 0.8 < normalised[0] / normalised[1] < 1.25 and 1.0 < normalised[1] < 4.5
+    assert 1.05 < np.median(a.covariance[:, 0, 0] / whole.covariance[:, 0, 0]) < 2.5
+    # without the holes the same patches are spoilt
+    blind = match_patches(spoilt, between.astype(np.float32), np.zeros((k, 2)))
+    assert np.abs(blind.shift - shift).mean() > 2 * np.abs(error).mean()

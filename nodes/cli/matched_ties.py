@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.simulation.flight import Flight
-from ...solver.simulation.observations import find_looks
+from ...solver.simulation.matching_study import looks_under
 from ..matcher import Matcher
 from ..node import Message
 
@@ -74,19 +74,13 @@ def true_rays(
     flight: Flight, ties: list[Any]
 ) -> tuple[dict[tuple[int, int, int], tuple[float, float]], dict[str, int]]:
     """True line and sample by (point, strip, CCD line) of the ground under each point's first ray; points by name."""
-    camera, strips = flight.camera, flight.strips
-    number = {strip.id: i for i, strip in enumerate(strips)}
+    number = {strip.id: i for i, strip in enumerate(flight.strips)}
     first: dict[str, Any] = {}
     for tie in ties:
         first.setdefault(tie.point, tie.images[0])
-    point_l = np.empty((len(first), 3))
-    for i, ray in enumerate(first.values()):
-        ccd = camera.line_index[ray.ccd]
-        pose = flight.truth.at(np.atleast_1d(strips[number[ray.strip]].time_of(ray.line)))
-        xy = camera.image_coordinates(np.array([ccd]), np.array([ray.sample]))[0][0]
-        direction = pose.R_lc[0] @ np.array([*xy, -camera.focal_length_mm[ccd]])
-        point_l[i] = flight.terrain.intersect(pose.position_l, direction[None])[0]
-    looks = find_looks(point_l, strips, camera)
+    rays = [(number[ray.strip], flight.camera.line_index[ray.ccd], ray.line, ray.sample) for ray in first.values()]
+    strip, ccd, line, sample = np.array(rays, dtype=float).reshape(-1, 4).T
+    looks = looks_under(flight, strip.astype(int), ccd.astype(int), line, sample)
     columns = looks.point, looks.strip, looks.ccd, looks.line, looks.sample
     true = {(p, s, c): (u, v) for p, s, c, u, v in zip(*(a.tolist() for a in columns), strict=True)}
     return true, {name: i for i, name in enumerate(first)}
