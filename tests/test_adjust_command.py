@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from recording_file import write_recording
 
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
 from triline.nodes.formats.block_messages import block_messages
-from triline.nodes.recording import RecordingWriter
 from triline.solver.frames import LocalFrame
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
@@ -208,9 +208,7 @@ def test_adjusted_trajectory_is_better_than_the_measured_one(tmp_path):
 
 def test_recording_gives_what_the_folder_gives(folder, tmp_path):
     recording = tmp_path / "block.mcap"
-    with RecordingWriter(recording) as writer:
-        for message in block_messages(read_input(folder)):
-            writer.write(message)
+    write_recording(recording, block_messages(read_input(folder)))
     for source, name in ((folder, "a"), (recording, "b")):
         assert adjust(source, "-q", "--selfcal", "tls12", "-o", tmp_path / name) == 0
     one, other = result_in(tmp_path / "a"), result_in(tmp_path / "b")

@@ -9,11 +9,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from recording_file import write_recording
 from synthetic_flight import flight_messages, spoilt_copy
 
 from triline.nodes import convert
 from triline.nodes.cli import main
-from triline.nodes.recording import RecordingWriter
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses, orientation_errors
 from triline.nodes.report.figures import errors
@@ -31,18 +31,13 @@ def messages():
 @pytest.fixture(scope="module")
 def recording(messages, tmp_path_factory):
     path = tmp_path_factory.mktemp("analyze") / "flight.mcap"
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
+    return write_recording(path, messages)
 
 
 def analysed(messages, folder):
     """Flight and analysis of messages, by way of a recording of them."""
     path = folder / "flight.mcap"
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
+    write_recording(path, messages)
     flight, held = read(path)
     return flight, analyse(flight, held)
 

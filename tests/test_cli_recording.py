@@ -14,6 +14,7 @@ import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
+from recording_file import write_recording
 
 import triline
 from triline.nodes.bus import Bus
@@ -39,16 +40,9 @@ def run(capsys, *arguments):
     return code, out, err
 
 
-def write(path, messages):
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
-
-
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("cli") / "flight.mcap", sample.flight(3.0, lines=True))
+    return write_recording(tmp_path_factory.mktemp("cli") / "flight.mcap", sample.flight(3.0, lines=True))
 
 
 # ---- info, check, recover
@@ -101,9 +95,7 @@ def test_check_names_gaps(capsys, tmp_path):
 
 def test_recover(capsys, flight, tmp_path):
     path, out_path = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
-    with RecordingWriter(tmp_path / "small.mcap", chunk_size=8192) as writer:
-        for message in sample.flight(3.0, lines=True):
-            writer.write(message)
+    write_recording(tmp_path / "small.mcap", sample.flight(3.0, lines=True), chunk_size=8192)
     data = (tmp_path / "small.mcap").read_bytes()
     path.write_bytes(data[: len(data) // 2])
     code, out, _ = run(capsys, "recover", path, "-o", out_path)
@@ -151,7 +143,7 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         writer.finish()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[:-100])
-    configured = write(tmp_path / "configured.mcap", [sample.message("configuration/camera")])
+    configured = write_recording(tmp_path / "configured.mcap", [sample.message("configuration/camera")])
     bad = tmp_path / "bad.toml"
     bad.write_text("[navigator]\nwings = 2\n")
     for arguments, text in (
@@ -201,7 +193,7 @@ def test_nodes_may_take_and_give_image_lines(tmp_path):
             block = message.body
             return [Message("sensor/lines/X", message.stamp_ns, replace(block, pixels=4095 - block.pixels, ccd="X"))]
 
-    path = write(tmp_path / "a.mcap", [sample.message("sensor/lines/F", i) for i in range(3)])
+    path = write_recording(tmp_path / "a.mcap", [sample.message("sensor/lines/F", i) for i in range(3)])
     out: list[Message] = []
     driver = StepDriver(Negative(), time.perf_counter)
     for message in RecordingReader(path).messages():
@@ -225,7 +217,7 @@ def test_only_nodes_with_something_to_work_on_run():
 
 def test_replay_keeps_its_time(tmp_path):
     """Rate 1: nothing early, no falling behind; how exact on an idle machine, `bench/replay_timing.py` measures."""
-    path = write(tmp_path / "a.mcap", sample.flight(2.0))
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0))
     reader = RecordingReader(path)
     got: list[tuple[int, float]] = []
 
@@ -242,7 +234,7 @@ def test_replay_keeps_its_time(tmp_path):
 
 
 def test_replay_from_to_and_loop(tmp_path):
-    path = write(tmp_path / "a.mcap", sample.flight(2.0))
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0))
     reader = RecordingReader(path)
     stop, out = threading.Event(), []
 
@@ -284,11 +276,11 @@ def test_times():
 def test_replay_leaves_out_what_nodes_make_anew(tmp_path):
     messages = [*sample.flight(1.0), *(sample.message("trajectory/filtered", i) for i in range(5))]
     messages.append(sample.message("status/navigator"))
-    reader = RecordingReader(write(tmp_path / "a.mcap", messages))
+    reader = RecordingReader(write_recording(tmp_path / "a.mcap", messages))
     result = play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0)
     assert result.left_out == {"trajectory/filtered": 5, "status/navigator": 1}
     # a trajectory that nobody can make anew is an input
-    reader = RecordingReader(write(tmp_path / "b.mcap", messages[-6:-1]))
+    reader = RecordingReader(write_recording(tmp_path / "b.mcap", messages[-6:-1]))
     assert play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0).counts == {"trajectory/filtered": 5}
 
 
@@ -372,7 +364,7 @@ def test_a_recording_as_tables_and_arrays(flight):
 
 
 def test_poses_as_arrays(tmp_path):
-    path = write(tmp_path / "a.mcap", [sample.message("orientation/final", i) for i in range(4)])
+    path = write_recording(tmp_path / "a.mcap", [sample.message("orientation/final", i) for i in range(4)])
     poses = triline.open(path).poses()
     assert poses.position_l.shape == (4, 3) and poses.covariance.shape == (4, 6, 6)
     np.testing.assert_allclose(poses.angles, np.tile((0.1, 0.2, 0.3), (4, 1)), atol=1e-12)
@@ -391,6 +383,6 @@ def test_access_says_what_is_wrong(flight, tmp_path):
             call()
     assert len(recording.poses("orientation/final").time_ns) == 0
     assert recording.table("orientation/final").empty
-    empty = triline.open(write(tmp_path / "a.mcap", [sample.message("sensor/gnss")]))
+    empty = triline.open(write_recording(tmp_path / "a.mcap", [sample.message("sensor/gnss")]))
     with pytest.raises(UserError, match="no configuration/camera in it"):
         empty.camera()

@@ -10,6 +10,7 @@ from datetime import date
 import numpy as np
 import pandas as pd
 import pytest
+from recording_file import write_recording
 from small_block import simulated_block
 
 from triline.nodes.cli import main
@@ -73,10 +74,7 @@ def recording(tmp_path_factory):
     lines = LineBlock(np.zeros((4, 10), dtype="<u2"), "F", "S1", 100, START, 2_000_000)
     messages.append(Message("sensor/lines/F", START + 10**7, lines, "camera"))
     messages.sort(key=lambda message: message.stamp_ns)
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
+    return write_recording(path, messages)
 
 
 def _csv(recording, tmp_path, topic: str, *more: str) -> pd.DataFrame:
@@ -161,9 +159,7 @@ def test_parquet_has_the_same_table(recording, tmp_path):
 def test_csv_gives_the_numbers_back_to_the_last_bit(tmp_path):
     block = simulated_block()
     path = tmp_path / "b.mcap"
-    with RecordingWriter(path) as writer:
-        for message in block_messages(block):
-            writer.write(message)
+    write_recording(path, block_messages(block))
     table = _csv(path, tmp_path, "observation/tie")
     assert len(table) == len(block.image)
     got = sorted(zip(table["point"], table["images.strip"], table["images.ccd"], table["images.line"], strict=True))
@@ -247,9 +243,7 @@ def test_sbet_comes_back_as_the_track_it_was(tmp_path):
     rpy = np.radians(np.column_stack([np.sin(t), np.cos(t), 350 + 4 * t]))
     track = NavigationTrack("t", START + np.rint(t * 1e9).astype(np.int64), geodetic, rpy)
     path, sbet = tmp_path / "t.mcap", tmp_path / "t.sbet"
-    with RecordingWriter(path) as writer:
-        for message in track_messages(track, "x", Mounting(boresight_deg=(0.5, -0.3, 90.0))):
-            writer.write(message)
+    write_recording(path, track_messages(track, "x", Mounting(boresight_deg=(0.5, -0.3, 90.0))))
     assert main(["export", str(path), "--topic", "trajectory/smoothed", "--sbet", str(sbet), "-q"]) == 0
     values = np.fromfile(sbet, "<f8").reshape(-1, 17)
     speed = np.linalg.norm(values[5:-5, 4:6], axis=1)

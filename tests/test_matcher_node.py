@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_file import write_recording
 
 from triline.nodes.adjuster import Adjuster
 from triline.nodes.flight_settings import simulated_flight
@@ -40,9 +41,7 @@ def messages():
 def run(tmp_path, messages, points_per_s=4.0):
     """Process messages with navigator, matcher and adjuster; returns summary, ties and what was told."""
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
-    with RecordingWriter(flight) as writer:
-        for message in messages:
-            writer.write(message)
+    write_recording(flight, messages)
     with RecordingWriter(out) as writer:
         nodes = [Navigator(), Matcher(points_per_s=points_per_s), Adjuster()]
         summary = process(RecordingReader(flight), nodes, writer.write_raw)

@@ -11,6 +11,7 @@ import sample_messages as sample
 from google.protobuf.message import DecodeError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from recording_file import write_recording
 
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
@@ -23,13 +24,6 @@ from triline.schemas.envelope import Envelope, RawMessage, pack, unpack
 from triline.schemas.image_lines import LineBlock, decode
 
 
-def write(path, messages, **options):
-    with RecordingWriter(path, **options) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
-
-
 def keys(reader, numbers=None):
     raws = [reader.raw(int(n)) for n in (reader.select() if numbers is None else numbers)]
     return [(raw.topic, raw.envelope, bytes(raw.data)) for raw in raws]
@@ -38,7 +32,7 @@ def keys(reader, numbers=None):
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 def test_what_is_written_comes_back(tmp_path, compression):
     messages = sample.flight(lines=True)
-    path = write(tmp_path / "a.mcap", messages, compression=compression)
+    path = write_recording(tmp_path / "a.mcap", messages, compression=compression)
     reader = RecordingReader(path)
     assert findings(reader) == []
     back = list(reader.messages())
@@ -50,13 +44,15 @@ def test_what_is_written_comes_back(tmp_path, compression):
 
 
 def test_the_same_messages_give_the_same_bytes(tmp_path):
-    one, two = (write(tmp_path / name, sample.flight(lines=True)).read_bytes() for name in ("1.mcap", "2.mcap"))
+    one, two = (
+        write_recording(tmp_path / name, sample.flight(lines=True)).read_bytes() for name in ("1.mcap", "2.mcap")
+    )
     assert one == two
 
 
 def test_other_programs_read_a_recording_as_it_is(tmp_path):
     """The MCAP library with the general protobuf decoder, which knows only what is in the file."""
-    path = write(tmp_path / "a.mcap", sample.flight(0.1))
+    path = write_recording(tmp_path / "a.mcap", sample.flight(0.1))
     with open(path, "rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
         decoded = [(c.topic, s.name, d, c.metadata) for s, c, _, d in reader.iter_decoded_messages()]
@@ -69,7 +65,7 @@ def test_other_programs_read_a_recording_as_it_is(tmp_path):
 def test_sorted_messages_are_sorted_and_all_there(tmp_path):
     messages = [Message(a.topic, a.stamp_ns, a.body, a.source, i) for i, a in enumerate(sample.flight(1.0, lines=True))]
     random.Random(3).shuffle(messages)
-    reader = RecordingReader(write(tmp_path / "a.mcap", messages))
+    reader = RecordingReader(write_recording(tmp_path / "a.mcap", messages))
     back = [(b.topic, Envelope(b.stamp_ns, b.source, b.sequence)) for b in reader.sorted_messages()]
     assert back == sorted(back, key=lambda k: order_key(*k))
     assert {e.sequence for _, e in back} == set(range(len(messages)))
@@ -78,7 +74,7 @@ def test_sorted_messages_are_sorted_and_all_there(tmp_path):
 def test_select_understands_wildcards(tmp_path):
     messages = [sample.message("sensor/lines/F"), sample.message("sensor/gnss")]
     messages.append(Message("sensor/lines/B", sample.EPOCH_NS, sample.line_block(), "test"))
-    reader = RecordingReader(write(tmp_path / "a.mcap", messages))
+    reader = RecordingReader(write_recording(tmp_path / "a.mcap", messages))
     assert [b.topic for b in reader.messages(["sensor/lines/*"])] == ["sensor/lines/F", "sensor/lines/B"]
 
 
@@ -118,7 +114,7 @@ def test_bad_payloads_are_skipped_and_counted(tmp_path):
 def long_recording(tmp_path_factory):
     """About 40 chunks: bytes of the file, and the chunk of each message."""
     path = tmp_path_factory.mktemp("damage") / "long.mcap"
-    write(path, sample.flight(6.0, lines=True), chunk_size=8192)
+    write_recording(path, sample.flight(6.0, lines=True), chunk_size=8192)
     reader = RecordingReader(path)
     assert reader.n_chunks > 20
     return path.read_bytes(), keys(reader), reader.index.chunk.tolist(), [c.offset for c in reader._chunks]
@@ -158,7 +154,7 @@ def test_a_flipped_bit_is_found_wherever_it_is(long_recording, tmp_path):
 
 
 def test_configuration_stands_twice_and_is_read_once(tmp_path):
-    path = write(tmp_path / "a.mcap", sample.flight(lines=True))
+    path = write_recording(tmp_path / "a.mcap", sample.flight(lines=True))
     reader = RecordingReader(path)
     topics = [b.topic for b in reader.messages()]
     head = [t for t in topics if t.startswith("configuration/")]

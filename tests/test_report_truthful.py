@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from recording_file import write_recording
 from synthetic_flight import flight_messages
 
 from triline.nodes import convert
 from triline.nodes.adjuster_pace import Pacing, pace_message
 from triline.nodes.cli import main
-from triline.nodes.recording import RecordingWriter
 from triline.nodes.report.accuracy_table import accuracy_lines
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate_flight
@@ -31,16 +31,9 @@ def messages():
     return flight_messages(seconds=30.0, points=120)
 
 
-def write(path, messages):
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
-
-
 @pytest.fixture(scope="module")
 def recording(messages, tmp_path_factory):
-    return write(tmp_path_factory.mktemp("truthful") / "flight.mcap", messages)
+    return write_recording(tmp_path_factory.mktemp("truthful") / "flight.mcap", messages)
 
 
 # ---- damage
@@ -64,7 +57,7 @@ def test_damage_is_named_on_the_terminal_in_the_json_and_at_the_top_of_the_repor
 
 def test_nothing_but_configuration_is_said_to_be_too_little(messages, tmp_path, capsys):
     kept = [x for x in messages if x.topic.startswith(("configuration/", "observation/control"))]
-    path = write(tmp_path / "head.mcap", kept)
+    path = write_recording(tmp_path / "head.mcap", kept)
     assert main(["analyze", str(path), "-o", str(tmp_path / "r.html")]) == 1
     said = capsys.readouterr()
     assert "no measurement and no result in it, only configuration/project" in said.err and said.out == ""
@@ -72,7 +65,9 @@ def test_nothing_but_configuration_is_said_to_be_too_little(messages, tmp_path, 
 
 
 def test_sensors_alone_give_what_is_missing_instead_of_an_empty_line(messages, tmp_path, capsys):
-    path = write(tmp_path / "raw.mcap", [x for x in messages if x.topic.startswith(("configuration/", "sensor/"))])
+    path = write_recording(
+        tmp_path / "raw.mcap", [x for x in messages if x.topic.startswith(("configuration/", "sensor/"))]
+    )
     assert main(["analyze", str(path), "-o", str(tmp_path / "r.html")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(lines) and any(line.startswith("not in this recording: orientation/final") for line in lines)
@@ -139,7 +134,7 @@ def test_points_that_only_one_of_both_has_are_not_compared(messages):
 
 
 def test_without_truth_the_table_is_of_check_points(messages, tmp_path):
-    path = write(tmp_path / "real.mcap", [x for x in messages if not x.topic.startswith("truth/")])
+    path = write_recording(tmp_path / "real.mcap", [x for x in messages if not x.topic.startswith("truth/")])
     flight, held = read(path)
     result = analyse(flight, held)
     lines = accuracy_lines(result)
@@ -158,13 +153,13 @@ def test_a_flight_that_ended_early_is_named(messages, tmp_path):
             body.lines, body.ended = 2 * body.lines, False
             x = replace(x, body=body)
         longer.append(x)
-    flight, held = read(write(tmp_path / "early.mcap", longer))
+    flight, held = read(write_recording(tmp_path / "early.mcap", longer))
     result = analyse(flight, held)
     (early,) = result["ended_early"]
     assert early["planned_s"] == pytest.approx(52.0, abs=0.1) and early["flown_s"] == pytest.approx(28.0, abs=0.1)
     said = "light ended early: strip S1 after 28.0 s of 52.0 s planned"
     assert f"f{said}" in accuracy_lines(result) and f"F{said}" in page(flight, result)
-    flight, held = read(write(tmp_path / "whole.mcap", messages))
+    flight, held = read(write_recording(tmp_path / "whole.mcap", messages))
     assert analyse(flight, held)["ended_early"] == []
 
 
@@ -176,7 +171,7 @@ def test_info_and_report_say_the_same_of_messages_rates_and_duration(messages, t
     image = m.RawImage(width=4, height=1, encoding="mono8", step=4, data=b"1234")
     convert.set_time(image.timestamp, stamp)
     lines = [replace(messages[0], topic="sensor/lines/N", body=image, stamp_ns=stamp, sequence=i) for i in range(3)]
-    path = write(tmp_path / "flight.mcap", [*messages, *lines])
+    path = write_recording(tmp_path / "flight.mcap", [*messages, *lines])
     assert main(["info", str(path), "--json"]) == 0
     info = json.loads(capsys.readouterr().out)
     assert main(["analyze", str(path), "-o", str(tmp_path / "r.html"), "--json"]) == 0
@@ -195,7 +190,7 @@ def test_the_duration_is_of_the_flight_not_of_what_was_known_before(messages, tm
         replace(x, stamp_ns=x.stamp_ns - 20 * 10**9) if x.topic in ("observation/control", "truth/point") else x
         for x in messages
     ]
-    _, held = read(write(tmp_path / "flight.mcap", early))
+    _, held = read(write_recording(tmp_path / "flight.mcap", early))
     assert held.duration_s == pytest.approx(37.0, abs=3.0)
 
 
@@ -261,7 +256,7 @@ def test_parameters_are_said_to_be_undetermined_for_good_with_the_criterion(mess
             body.parameters[0].reason = "its sigma is 0.93 of the a-priori one"
             x = replace(x, body=body)
         changed.append(x)
-    flight, held = read(write(tmp_path / "flight.mcap", changed))
+    flight, held = read(write_recording(tmp_path / "flight.mcap", changed))
     text = page(flight, analyse(flight, held))
     assert "not determined by this flight</td>" in text and "its sigma is 0.93 of the a-priori one</td>" in text
     assert "not yet" not in text and "at most 0.7 of the a-priori one" in text
@@ -272,7 +267,7 @@ def test_long_counters_wrap(messages, tmp_path):
     body = type(status.body).FromString(status.body.SerializeToString())
     for i in range(40):
         body.counters.append(m.Counter(name=f"reason number {i}", value=i + 1))
-    flight, held = read(write(tmp_path / "flight.mcap", [*messages[:-1], replace(status, body=body)]))
+    flight, held = read(write_recording(tmp_path / "flight.mcap", [*messages[:-1], replace(status, body=body)]))
     cell = re.search(r"<td([^>]*)>[^<]*reason number 39", page(flight, analyse(flight, held)))
     assert cell is not None and "wrap" in cell.group(1)
 

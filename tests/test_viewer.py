@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from notebook import Notebook
+from recording_file import write_recording
 from synthetic_flight import START_NS, flight_messages, spoilt_copy
 
 from triline.nodes import scene
@@ -23,7 +24,6 @@ from triline.nodes.canvas import NullCanvas
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
-from triline.nodes.recording import RecordingWriter
 from triline.nodes.rerun_scene import open_canvas
 from triline.nodes.viewer import Viewer
 from triline.nodes.viewer_process import ViewerProcess, _private_folder, viewer_binary
@@ -37,10 +37,7 @@ def messages():
 @pytest.fixture(scope="module")
 def recording(messages, tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "flight.mcap"
-    with RecordingWriter(path) as writer:
-        for message in messages:
-            writer.write(message)
-    return path
+    return write_recording(path, messages)
 
 
 # ---- the node
