@@ -18,11 +18,11 @@ from functools import partial
 import numpy as np
 
 from triline.solver.adjustment.batch import BatchResult, Job, run
-from triline.solver.adjustment.network import Control, Measurements, Network, Strip, build_network
 from triline.solver.adjustment.refined_orientation import corrections_at
 from triline.solver.models.wander import WanderOptions
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.flight_network import network_of
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import (
     OnlineResult,
@@ -32,34 +32,11 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     slow_errors_of,
 )
-from triline.solver.trajectory import Trajectory
 from triline.solver.window.results import WindowOptions
 
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
 PLAN = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
 Rays = set[tuple[str, str]]
-
-
-def network_of(simulation: Simulation, poses: list[TimedPose]) -> Network:
-    """The network a batch adjustment gets: smoothed poses with their white noise, all rays, control points."""
-    smoothed = [p.pose for p in poses if p.pose.smoothed]
-    noise = slow_errors_of(simulation.errors).without(np.array([p.covariance for p in smoothed]))
-    measured = Trajectory(
-        [p.time_s for p in smoothed], [p.position_l for p in smoothed], [p.quaternion for p in smoothed]
-    )
-    strips = [
-        Strip(s.id, measured, s.first_line_time_s, s.line_rate_hz, s.lines, noise=noise)
-        for s in simulation.flight.strips
-    ]
-    images, looks, points = simulation.images, simulation.images.looks, simulation.points
-    sigma = np.full(len(looks), simulation.observation_plan.image_sigma_px)
-    known = np.flatnonzero(points.role == "control")
-    control_sigma = np.tile(simulation.observation_plan.control_sigma_m, (len(known), 1))
-    return build_network(
-        simulation.flight.camera, strips, [str(id) for id in points.id],
-        Measurements(looks.point, looks.strip, looks.ccd, images.line, images.sample, sigma, sigma),
-        Control(known, simulation.surveyed_l[known], control_sigma),
-    )  # fmt: skip
 
 
 def batch(simulation: Simulation, poses: list[TimedPose], snoop: bool) -> BatchResult:

@@ -1,8 +1,10 @@
 """Additional parameters of self-calibration: TLS-18 [K 4.43], PRISM-30 [K 4.44], lens set [P].
 
-``Dx, Dy`` are added to the projection: residual = measured - (projection + D). They are evaluated at the measured image
-coordinates, reduced to the principal point, and so are linear in the unknowns with constant coefficients. Units:
-millimetres for lengths, radians for angles, powers of mm for distortion.
+``Dx, Dy`` are added to the projection: residual = measured - (projection + D). They are functions of the image
+coordinates, reduced to the principal point, and linear in the unknowns. Measured coordinates carry noise, on which the
+parameters must not act: an adjustment takes them where the ray meets its CCD line by what is known of it
+(`adjustment.linearisation.fitted_coordinates`). Units: millimetres for lengths, radians for angles, powers of mm for
+distortion.
 """
 
 from __future__ import annotations
@@ -56,16 +58,28 @@ class CameraDesign:
     pattern : (n,) which row of `columns` a ray uses
     columns : (patterns, slots) int32 index of the parameter; -1 where it is not estimated
     coefficients : (2, slots, n) mm per unit of the parameter
+    kinds : (slots) of parameter
+    focal_length_mm : (n,)
     """
 
     pattern: NDArray[np.int64]
     columns: NDArray[np.int32]
     coefficients: Array
+    kinds: tuple[str, ...] = field(repr=False)
+    focal_length_mm: Array = field(repr=False)
 
     def evaluate(self, values: Array, rays: slice = slice(None)) -> Array:
         """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
+        return self.combine(self.coefficients[:, :, rays], values, rays)
+
+    def combine(self, coefficients: Array, values: Array, rays: slice = slice(None)) -> Array:
+        """The same with other coefficients (2, slots, m) of the rays."""
         of_slot = np.append(values, 0.0)[self.columns].T  # (slots, patterns)
-        return np.einsum("csn,sn->cn", self.coefficients[:, :, rays], of_slot[:, self.pattern[rays]])
+        return np.einsum("csn,sn->cn", coefficients, of_slot[:, self.pattern[rays]])
+
+    def coefficients_at(self, xy_mm: Array, rays: slice = slice(None)) -> Array:
+        """Coefficients (2, slots, m) where the rays have image coordinates (2, m), mm."""
+        return _coefficients(self.kinds, xy_mm, self.focal_length_mm[rays])
 
 
 @dataclass(frozen=True)
@@ -150,14 +164,10 @@ class SelfCalibration:
             if len(chips) > 1:
                 mine = ccd == k
                 pattern[mine] += np.searchsorted(chips, sample[mine] + 0.5, side="right") - 1
-        x, y = xy_mm.T
-        coefficients = np.empty((2, len(self.slots), len(x)))
-        r2 = x * x + y * y
-        for s, kind in enumerate(self.slots):
-            coefficients[0, s], coefficients[1, s] = _EFFECT[kind](x, y, r2, focal_length_mm)
+        coefficients = _coefficients(self.slots, xy_mm.T, focal_length_mm)
         unknown = np.where(self.estimated, np.cumsum(self.estimated) - 1, -1)
         columns = np.append(unknown, -1)[self.columns].astype(np.int32)
-        return CameraDesign(pattern, columns, coefficients)
+        return CameraDesign(pattern, columns, coefficients, self.slots, focal_length_mm)
 
     def expand(self, values: Array, fill: float = 0.0) -> Array:
         """Values of the estimated parameters (n_unknowns,) put in their places among all (m,)."""
@@ -189,6 +199,16 @@ _EFFECT: dict[str, _Effect] = {
     "b": lambda x, y, r2, c: (y * r2, 0.0),
     "s": lambda x, y, r2, c: (0.0, y),
 }
+
+
+def _coefficients(kinds: tuple[str, ...], xy_mm: Array, focal_length_mm: Array) -> Array:
+    """Displacement (2, kinds, n) in mm per unit of each kind, at image coordinates (2, n)."""
+    x, y = xy_mm
+    coefficients = np.empty((2, len(kinds), len(x)))
+    r2 = x * x + y * y
+    for s, kind in enumerate(kinds):
+        coefficients[0, s], coefficients[1, s] = _EFFECT[kind](x, y, r2, focal_length_mm)
+    return coefficients
 
 
 def tls(camera: LineCamera, parameters: int = 18) -> SelfCalibration:

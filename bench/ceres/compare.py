@@ -153,7 +153,7 @@ def compare(name: str, peer: Path | None, folder: Path, repeat: int) -> dict:
     if peer is None:
         return row
     path = folder / "problem.bin"
-    write_problem(path, problem, solution.whitening)
+    write_problem(path, solution.problem, solution.whitening)  # additional parameters where the solution has them
     theirs = []
     for library in ("suite", "eigen"):  # whichever sparse factorisation is faster on this machine
         for _ in range(repeat):

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from ..models.base import ModelOptions
 from .adjustment import Problem, State, pose_problem
-from .linearisation import linearise, pitch_covariance, refresh_weights, whiten
+from .linearisation import linearise_and_weigh
 from .network import Network
 
 Array = NDArray[np.floating]
@@ -48,11 +48,9 @@ def georeference(network: Network, model: ModelOptions, ray_weight: Array | None
     weight = np.ones(len(network.rays)) if ray_weight is None else ray_weight
     p = network.rays.point
     count = network.n_points
-    rays, whitening = network.rays, whiten(pitch_covariance(network.rays))
     lin, inverse, known = None, np.empty((count, 3, 3)), np.zeros(count, dtype=bool)
     for _ in range(4):
-        lin = linearise(rays, problem.layout, whitening, state.theta, state.points_l)
-        whitening, lin = refresh_weights(rays, whitening, lin)
+        _, lin, _ = linearise_and_weigh(network.rays, problem.layout, state.theta, state.points_l)
         lin = lin.reweighted(weight)
         J = np.moveaxis(lin.point, 2, 0)  # (n, 2, 3)
         normal = _per_point(np.einsum("nij,nik->njk", J, J), p, count)

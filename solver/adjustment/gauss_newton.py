@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .linearisation import (
     Linearisation,
-    Whitening,
+    Weighed,
     linearise,
     linearise_and_weigh,
     pitch_covariance,
@@ -37,20 +39,18 @@ class Descent:
         self, problem: Problem, start: Solution | State | Array | None, given: Array, options: AdjustmentOptions
     ):
         self.problem, self.given, self.options = problem, given, options
-        rays, layout = problem.network.rays, problem.layout
+        self.keep_weights = options.weights == "pitch"
         if isinstance(start, Solution):
             self.state, self.whitening, self.lin = start.state, start.whitening, start.linearisation
-            self.fresh_weights = 0  # how often they may still be taken anew
+            self.layout = start.layout
+            self.fresh_weights = 0  # how often they may still be taken anew, and where additional parameters act
         else:
             self.state = start if isinstance(start, State) else start_state(problem, start)
+            self.layout, rays = problem.layout, problem.network.rays
             at = self.state.theta, self.state.points_l
-            if options.weights == "motion":
-                self.whitening, self.lin = linearise_and_weigh(rays, layout, *at)
-                self.fresh_weights = 8
-            else:
-                self.whitening = whiten(pitch_covariance(rays))
-                self.lin = linearise(rays, layout, self.whitening, *at)
-                self.fresh_weights = 0
+            given_weights = whiten(pitch_covariance(rays)) if self.keep_weights else None
+            self.whitening, self.lin, self.layout = linearise_and_weigh(rays, self.layout, *at, given_weights)
+            self.fresh_weights = 8
         self.history: list[Iteration] = []
         self.taken = 0
         self.damping, self.least_damping, self.last_drop = 0.0, 0.0, np.inf
@@ -67,7 +67,7 @@ class Descent:
         p = self.problem
         self.normals = reduce_normals(
             self.active,
-            p.layout,
+            self.layout,
             p.elimination,
             p.prior,
             p.control,
@@ -85,10 +85,10 @@ class Descent:
     def step(self) -> None:
         """Try the step; take it if it lowers the cost, otherwise damp the next one."""
         p = self.problem
-        d_points = back_substitute(self.active, p.layout, p.elimination, self.normals.points, self.d_theta)
+        d_points = back_substitute(self.active, self.layout, p.elimination, self.normals.points, self.d_theta)
         trial = State(self.state.theta + self.d_theta, self.state.points_l + d_points)
         with np.errstate(all="ignore"):
-            whitening, lin, active, cost = self._linearise(trial)
+            (whitening, lin, layout), active, cost = self._linearise(trial)
         accepted = bool(cost <= self.cost * (1.0 + 1e-13))
         self.history.append(Iteration(len(self.history) + 1, self.cost, cost, self.damping, accepted))
         if not accepted:
@@ -102,34 +102,38 @@ class Descent:
         self.converged = 0.0 < self.damping <= self.least_damping and 0.05 * self.last_drop < drop < INSIGNIFICANT
         self.damping, self.last_drop = max(self.damping / 10.0, self.least_damping), drop
         self.taken += 1
-        weighed = whitening is not self.whitening
+        weighed = layout is not self.layout or whitening is not self.whitening
         self.state, self.whitening, self.lin, self.active, self.cost = trial, whitening, lin, active, cost
+        self.layout = layout
         if weighed:
             self.fresh_weights -= 1
         elif self.fresh_weights and drop > WEIGHTS_CHANGE * cost:
-            self.whitening, self.lin = refresh_weights(p.network.rays, whitening, lin)
+            self.whitening, self.lin, self.layout = refresh_weights(
+                p.network.rays, layout, whitening, lin, trial.theta, self.keep_weights
+            )
             self.fresh_weights -= 1
             self._reweigh()
             return
         if self.options.robust is not None:
             self._reweigh()
 
-    def _linearise(self, trial: State) -> tuple[Whitening, Linearisation, Linearisation, float]:
-        """Weights, equations, equations with ray weights, and cost at trial values.
+    def _linearise(self, trial: State) -> tuple[Weighed, Linearisation, float]:
+        """Weights and equations, equations with ray weights, and cost at trial values.
 
         From far away the weights are taken anew at once: that changes the cost by far less than the step does.
         Otherwise, and where the step does not lower the cost clearly, the weights stay as they were.
         """
         p, at = self.problem, (trial.theta, trial.points_l)
         if self.fresh_weights and self.gain > 0.5:
-            whitening, lin = linearise_and_weigh(p.network.rays, p.layout, *at)
-            active = _weighted(lin, self.weight)
+            kept = self.whitening if self.keep_weights else None
+            fresh = linearise_and_weigh(p.network.rays, self.layout, *at, kept)
+            active = _weighted(fresh.linearisation, self.weight)
             cost = cost_of(p, trial, active)
             if cost < 0.75 * self.cost:
-                return whitening, lin, active, cost
-        lin = linearise(p.network.rays, p.layout, self.whitening, *at, self.lin.camera)
+                return fresh, active, cost
+        lin = linearise(p.network.rays, self.layout, self.whitening, *at, self.lin.camera)
         active = _weighted(lin, self.weight)
-        return self.whitening, lin, active, cost_of(p, trial, active)
+        return Weighed(self.whitening, lin, self.layout), active, cost_of(p, trial, active)
 
     def _reweigh(self) -> None:
         """Robust weights here, for the first half of the iterations; equations and cost with them."""
@@ -147,9 +151,9 @@ class Descent:
             self.converged = converged
         points = self.normals.points
         n = 2 * int((self.weight > 0).sum()) + p.prior.n_observations + p.control.n_observations
-        u = p.layout.n_unknowns - len(self.factor.undetermined) + int(points.rank.sum())
+        u = self.layout.n_unknowns - len(self.factor.undetermined) + int(points.rank.sum())
         return Solution(
-            p,
+            replace(p, layout=self.layout),
             self.state,
             self.whitening,
             self.weight,

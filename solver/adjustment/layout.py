@@ -55,7 +55,8 @@ class Layout:
     node, component : (T,) of the terms
     columns : (T, n) int32; -1 where a ray has no such term
     coefficients : (K, n)
-    camera : effect of the additional parameters; columns counted from `n_model`; None without self-calibration
+    camera : effect of the additional parameters, where they act on the rays (`linearisation.fitted_coordinates`; before
+        there is a solution, at the measured coordinates); columns counted from `n_model`; None without self-calibration
     n_model, n_camera : numbers of unknowns
     names : (n_model + n_camera,) in words
     prior : a-priori knowledge of all unknowns
@@ -96,6 +97,16 @@ class Layout:
     def displacement(self, theta: Array, rays: slice = slice(None)) -> Array | float:
         """Image displacement (2, n) in mm by the additional parameters; 0.0 without self-calibration."""
         return self.camera.evaluate(theta[self.n_model :], rays) if self.camera else 0.0
+
+    def change_of_displacement(self, coefficients: Array, theta: Array, rays: slice = slice(None)) -> Array:
+        """What the residuals (2, m) of rays gain, mm, with other coefficients (2, slots, m) in place of `camera`'s."""
+        assert self.camera is not None
+        values = theta[self.n_model :]
+        return self.camera.evaluate(values, rays) - self.camera.combine(coefficients, values, rays)
+
+    def with_camera(self, coefficients: Array) -> Layout:
+        """The same unknowns, additional parameters with coefficients (2, slots, n)."""
+        return self if self.camera is None else replace(self, camera=replace(self.camera, coefficients=coefficients))
 
 
 def build_layout(network: Network, options: ModelOptions, self_calibration: SelfCalibration | None = None) -> Layout:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ Array = NDArray[np.floating]
 
 #: Rays worked on at a time: so many that a call's overhead is small, so few that the arrays stay in the cache.
 CHUNK = 4096
+#: Samples by which a fitted image coordinate may differ from the measured one: blunders and bad starts go no further.
+MOST_SAMPLES = 200.0
 
 
 @dataclass(frozen=True)
@@ -76,8 +79,7 @@ def residual_covariance(rays: Rays, d_orientation: Array, attitude_rate: bool = 
 
     The white noise of the orientation, where it is known, goes the same way: `orientation_noise`.
     """
-    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T if attitude_rate else np.zeros((3, len(rays)))])
-    u = np.einsum("ckn,kn->cn", d_orientation, rates) * (rays.line_period_s * rays.sigma_line_px)
+    u = _image_motion(rays, d_orientation, attitude_rate) * (rays.line_period_s * rays.sigma_line_px)
     v = rays.pitch_mm.T * rays.sigma_sample_px
     return _outer(u) + _outer(v) + orientation_noise(rays, d_orientation)
 
@@ -129,7 +131,7 @@ def linearise(
     whitening : weights
     theta : (n_unknowns,) of the reduced system
     points_l : (p, 3)
-    camera : (2, slots, n) of another linearisation with the same weights; it does not depend on the values
+    camera : (2, slots, n) of another linearisation with the same weights and layout; it does not depend on the values
     """
     n = len(rays)
     result = Linearisation(
@@ -146,18 +148,68 @@ def linearise(
     return result
 
 
-def linearise_and_weigh(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> tuple[Whitening, Linearisation]:
-    """Weights from the image motion at the given values, and the observation equations with them; see `linearise`."""
-    n = len(rays)
-    whitening, camera = Whitening(np.empty((3, n))), _camera(layout, n)
+class Weighed(NamedTuple):
+    """Weights, the observation equations with them, and the layout with additional parameters where they act now."""
+
+    whitening: Whitening
+    linearisation: Linearisation
+    layout: Layout
+
+
+def linearise_and_weigh(
+    rays: Rays, layout: Layout, theta: Array, points_l: Array, whitening: Whitening | None = None
+) -> Weighed:
+    """Weights from the image motion at the given values, and the observation equations with them; see `linearise`.
+
+    Additional parameters are evaluated anew at the fitted image coordinates (`fitted_coordinates`).
+
+    Parameters
+    ----------
+    whitening : weights to be kept
+    """
+    n, kept = len(rays), whitening is not None
+    camera = np.empty_like(_camera(layout, n))
+    whitening = whitening or Whitening(np.empty((3, n)))
     result = Linearisation(np.empty((2, n)), np.empty((2, 6, n)), np.empty(camera.shape), np.empty((2, 3, n)))
     for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
-        g = whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
+        if layout.camera is not None:
+            fitted = fitted_coordinates(own, residual, _image_motion(own, d_orientation), own.pitch_mm.T)
+            camera[:, :, part] = layout.camera.coefficients_at(fitted, part)
+            residual += layout.change_of_displacement(camera[:, :, part], theta, part)
+        if not kept:
+            whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
+        g = whitening.g[:, part]
         _whiten_into(result.residual, residual, g, part)
         _whiten_into(result.orientation, d_orientation, g, part)
         _whiten_into(result.point, d_point, g, part)
         _whiten_into(result.camera, camera[:, :, part], g, part)
-    return whitening, result
+    return Weighed(whitening, result, layout.with_camera(camera))
+
+
+def fitted_coordinates(rays: Rays, residual: Array, motion: Array, pitch: Array) -> Array:
+    """Image coordinates (2, n) in mm without the residual along the CCD line, where additional parameters act.
+
+    A ray meets its CCD line at the measured sample less its error. Taken at the measured sample, the parameters would
+    act on the noise, too: it is smallest in the smallest image, and many rays that know the scale of the image by the
+    jitter of the attitude alone would make it small. Adjusted coordinates are not correlated with the residuals.
+
+    Parameters
+    ----------
+    residual : (2, n), mm or whitened
+    motion, pitch : (2, n) change of the image coordinates with lines (of any length) and with samples, likewise
+    """
+    across = motion[0] * pitch[1] - motion[1] * pitch[0]
+    along = motion[0] * residual[1] - motion[1] * residual[0]
+    # image motion along the CCD line: lines and samples are not to be told apart
+    least = 1e-3 * np.hypot(*motion) * np.hypot(*pitch)
+    samples = np.where(np.abs(across) > least, along / np.where(across == 0.0, 1.0, across), 0.0)
+    return (rays.xy_mm - rays.pitch_mm * np.clip(samples, -MOST_SAMPLES, MOST_SAMPLES)[:, None]).T
+
+
+def _image_motion(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:
+    """Image motion (2, n) in mm/s by velocity and attitude rate of the platform; whitened if `d_orientation` is."""
+    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T if attitude_rate else np.zeros((3, len(rays)))])
+    return np.einsum("ckn,kn->cn", d_orientation, rates)
 
 
 def _camera(layout: Layout, n: int) -> Array:
@@ -199,20 +251,32 @@ def _whiten_into(target: Array, raw: Array, g: Array, part: slice) -> None:
     target[1, ..., part] += raw[0] * g[1]
 
 
-def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tuple[Whitening, Linearisation]:
-    """Weights from the image motion at the linearisation, and the same equations with these weights."""
-    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
-    u = np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)
-    v = whitening.apply(rays.pitch_mm.T * rays.sigma_sample_px)
-    turn = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation))
-    a, b, c = turn.g
-    g = whitening.g
-    fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))
-    arrays = []
-    for old in (lin.residual, lin.orientation, lin.camera, lin.point):
-        new = np.empty_like(old)
-        np.multiply(old[0], a, out=new[0])
-        np.multiply(old[1], c, out=new[1])
-        new[1] += old[0] * b
-        arrays.append(new)
-    return fresh, Linearisation(*arrays)
+def refresh_weights(
+    rays: Rays, layout: Layout, whitening: Whitening, lin: Linearisation, theta: Array, keep: bool = False
+) -> Weighed:
+    """As `linearise_and_weigh`, from the linearisation at the same values with older weights.
+
+    Parameters
+    ----------
+    keep : the weights stay; additional parameters alone are evaluated anew
+    """
+    motion, pitch = _image_motion(rays, lin.orientation), whitening.apply(rays.pitch_mm.T)
+    fresh, turned = whitening, lin
+    if not keep:
+        u, v = motion * (rays.line_period_s * rays.sigma_line_px), pitch * rays.sigma_sample_px
+        a, b, c = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation)).g
+        g = whitening.g
+        fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))
+        arrays = []
+        for old in (lin.residual, lin.orientation, lin.camera, lin.point):
+            new = np.empty_like(old)
+            np.multiply(old[0], a, out=new[0])
+            np.multiply(old[1], c, out=new[1])
+            new[1] += old[0] * b
+            arrays.append(new)
+        turned = Linearisation(*arrays)
+    if layout.camera is None:
+        return Weighed(fresh, turned, layout)
+    camera = layout.camera.coefficients_at(fitted_coordinates(rays, lin.residual, motion, pitch))
+    residual = turned.residual + fresh.apply(layout.change_of_displacement(camera, theta))
+    return Weighed(fresh, replace(turned, residual=residual, camera=fresh.apply(camera)), layout.with_camera(camera))

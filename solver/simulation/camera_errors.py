@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..selfcalibration import SelfCalibration
 from .error_models import ErrorModel
 from .flight import FlightPlan
@@ -21,7 +24,12 @@ def simulate_with_camera_errors(
     ----------
     stated : parameters and the sigmas that their true values are drawn with
     """
-    drawn = stream(seed, "camera").standard_normal(stated.n_unknowns) * stated.apriori_sigma
+    drawn = drawn_parameters(seed, stated)
     true = disturb_camera(plan.camera, stated, dict(zip(stated.unknown_names, drawn.tolist(), strict=True)))
     flown = simulate(replace(plan, camera=true), seed, errors, observation_plan)
     return replace(flown, flight=replace(flown.flight, camera=plan.camera))
+
+
+def drawn_parameters(seed: int, stated: SelfCalibration) -> NDArray[np.floating]:
+    """True values (n_unknowns,) of the parameters of the flight of a seed."""
+    return stream(seed, "camera").standard_normal(stated.n_unknowns) * stated.apriori_sigma

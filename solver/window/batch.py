@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from ..adjustment.covariance import Cofactors
 from ..adjustment.layout import Layout
-from ..adjustment.linearisation import Linearisation, Whitening, corrected, linearise, residual_covariance, whiten
+from ..adjustment.linearisation import Linearisation, Whitening, linearise, linearise_and_weigh
 from ..adjustment.network import Rays
 from ..adjustment.normal_equations import ControlWeights, PointNormals, point_normals
 from ..adjustment.ray_statistics import RayStatistics, ray_statistics, residuals_px
-from ..collinearity import collinearity
 from ..models.base import Design, PseudoObservations
 from ..selfcalibration import SelfCalibration
 
@@ -69,7 +68,6 @@ class Batch:
     points_l : (p, 3)
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
     ties : what earlier strips say of the points
-    self_calibration : additional parameters that are estimated
     noise_version : of what is left of the noise of poses, which the weights are for (`pose_noise`)
     counted : whether its rays are counted there
     tested : number of the update that tested it last
@@ -88,7 +86,6 @@ class Batch:
     points_l: Array
     provisional: bool
     ties: PointTies | None = None
-    self_calibration: SelfCalibration | None = None
     noise_version: int = 0
     counted: bool = False
     tested: int = -1
@@ -123,42 +120,11 @@ class Batch:
         """Linearise at values (u,) of the unknowns and the present points; ``reweigh`` renews the rays' weights."""
         self.theta, self.origin_l = theta, self.points_l
         if reweigh:
-            self.whitening = self._weigh(theta)
-        self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+            rays = replace(self.rays, orientation_noise=self.pose_covariance)
+            self.whitening, self.lin, self.layout = linearise_and_weigh(rays, self.layout, theta, self.points_l)
+        else:
+            self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
         self.eliminate()
-
-    def _weigh(self, theta: Array) -> Whitening:
-        position, angles = corrected(self.rays, self.layout, self.layout.corrections(theta))
-        points = self.points_l[self.rays.point].T
-        projected, d_orientation, _, _ = collinearity(position, angles, points, self.rays.focal_length_mm)
-        if self.self_calibration is not None:
-            fitted = self._fitted(projected + self.layout.displacement(theta), d_orientation)
-            r = self.rays
-            camera = self.self_calibration.design(r.ccd, r.sample, fitted, r.focal_length_mm)
-            self.layout = replace(self.layout, camera=camera)
-        covariance = residual_covariance(self.rays, d_orientation)
-        through = np.einsum("akn,nkl->anl", d_orientation, self.pose_covariance)
-        pose = np.einsum("anl,bln->abn", through, d_orientation)
-        return whiten(covariance + np.stack([pose[0, 0], pose[0, 1], pose[1, 1]]))
-
-    def _fitted(self, computed: Array, d_orientation: Array) -> Array:
-        """Image coordinates (n, 2) without the residual along the CCD line, where additional parameters act.
-
-        Taken where they were measured, they would act on the noise, too: it is smallest in the smallest image, and many
-        rays that know the scale of the image by the jitter of the attitude alone would make it small.
-
-        Parameters
-        ----------
-        computed : (2, n) mm
-        """
-        rates = np.concatenate([self.rays.velocity_l.T, self.rays.angle_rate.T])
-        motion, pitch = np.einsum("ckn,kn->cn", d_orientation, rates), self.rays.pitch_mm.T
-        residual = self.rays.xy_mm.T - computed
-        across = motion[0] * pitch[1] - motion[1] * pitch[0]
-        along = motion[0] * residual[1] - motion[1] * residual[0]
-        least = 1e-3 * np.linalg.norm(motion, axis=0) * np.linalg.norm(pitch, axis=0)
-        samples = np.where(np.abs(across) > least, along / np.where(across == 0.0, 1.0, across), 0.0)
-        return (self.rays.xy_mm.T - pitch * samples).T
 
     def eliminate(self) -> None:
         """Information about the orientation, with the points eliminated, at the present linearisation and weights."""

@@ -197,8 +197,7 @@ class BatchMaker:
             rest = Draft([names[i] for i in good], [points[i] for i in good], earlier)
             return self.make_each([rest], known)[0][0], lost
         batch = Batch(
-            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties,
-            self.self_calibration,
+            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties
         )  # fmt: skip
         batch.noise_version = self.pose_noise.version
         batch.linearise(theta, reweigh=True)
