@@ -98,7 +98,8 @@ def report(
         returned_total=returned_total,
         parameters=[
             m.ParameterEstimate(
-                name=p.name, unit=p.unit, value=p.value, sigma=p.sigma, t=p.t, status=p.status, reason=p.reason
+                name=p.name, unit=p.unit, value=p.value, sigma=p.sigma, t=p.t, status=p.status, reason=p.reason,
+                correlation=p.correlation, partner=p.partner,
             )
             for p in figures.parameters
         ],

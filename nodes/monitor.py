@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ..schemas import messages as m
+from ..solver.window.determinability import ESTIMATED
 from . import convert
 from .config import build
 from .node import Message, Node
@@ -28,10 +29,22 @@ class Overview:
 
     nodes: dict[str, Any] = field(default_factory=dict)  # node -> NodeStatus
     report: Any = None  # newest AdjustmentReport
+    parameters: Any = ()  # of the newest report that has any
     updates: int = 0
     rejected: int = 0
     final_until_ns: int = 0
     events: deque[tuple[int, str, str]] = field(default_factory=lambda: deque(maxlen=5))  # stamp, level, text
+
+    @property
+    def estimated(self) -> int:
+        """Number of parameters that the network sees by now."""
+        return sum(p.status == ESTIMATED for p in self.parameters)
+
+    def not_yet(self, most: int) -> str:
+        """Parameters that the network does not see yet, each with what it goes with: the strongest first."""
+        rest = sorted((p for p in self.parameters if p.status != ESTIMATED), key=lambda p: -abs(p.correlation))
+        told = [f"{p.name} ({p.correlation:+.2f} {p.partner})" if p.partner else p.name for p in rest[:most]]
+        return ", ".join(told) + (f", {len(rest) - most} more" if len(rest) > most else "")
 
     def topic_rates(self) -> dict[str, float]:
         """Messages a second of every topic, as the node that receives most of it counts them."""
@@ -64,6 +77,8 @@ class Overview:
                 f"update {1e3 * r.compute_s:.0f} ms",
             ]
         lag = max((status.lag_s for status in self.nodes.values()), default=0.0)
+        if self.parameters:
+            parts.append(f"{self.estimated} of {len(self.parameters)} parameters estimated")
         parts.append(f"lag {lag:.2f} s")
         lost = {kind: n for kind, n in self.losses().items() if n}
         if lost:
@@ -88,6 +103,7 @@ class Monitor(Node):
             view.nodes[body.node] = body
         elif message.topic == "adjustment/report":
             view.report = body
+            view.parameters = body.parameters or view.parameters
             view.updates += 1
             view.rejected = max(view.rejected, body.rejected_total)
             view.final_until_ns = max(view.final_until_ns, body.window_start_ns)
@@ -136,6 +152,10 @@ def screen(overview: Overview, title: str) -> Any:
                 f"   rejected {overview.rejected}   update {1e3 * r.compute_s:.0f} ms",
             )
         )
+    if overview.parameters:
+        text = f"parameters: {overview.estimated} of {len(overview.parameters)} estimated"
+        rest = overview.not_yet(3)
+        lines.append(Text(text + (f"; not yet {rest}" if rest else ""), no_wrap=True, overflow="ellipsis"))
     lines += [Text(text, style="red" if level in ("error", "fatal") else "dim") for _, level, text in overview.events]
     return Panel(Group(*lines), title=title, title_align="left")
 

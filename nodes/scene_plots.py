@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..solver.accuracy import angle_difference
+from ..solver.window.determinability import ESTIMATED
 from . import convert
 from .canvas import Canvas, Color, Series
 from .convert import PoseSample
@@ -136,17 +137,29 @@ class PlotsPart(Part):
                     series = Series(f"{name}, {kind}", AXES[axis] if width > 1 else faded(AXES[axis], 0.5), width)
                     self._add(f"integrity/{group}/{name}_{kind}", t, scale * value, series)
         for k, parameter in enumerate(report.parameters):
-            if parameter.status != "not yet determined" or parameter.sigma > 0:
-                self._parameter(t, k, parameter)
+            self._parameter(t, k, parameter)
+        if report.parameters:
+            estimated = sum(p.status == ESTIMATED for p in report.parameters)
+            self._of_unit("determined")
+            self._add("parameters/determined/estimated", t, estimated, Series("estimated", FINAL, 2.0))
+            self._add("parameters/determined/all", t, len(report.parameters), Series("all", _GREY, 1.0))
 
     def _parameter(self, t: float, k: int, parameter: Any) -> None:
+        """The value; faint as long as the network cannot see it."""
         unit, scale = parameter.unit or "1", 1.0
         if unit.startswith("rad"):
             unit, scale = "mdeg" + unit[3:], _MDEG
+        self._of_unit(unit)
+        entity = f"parameters/{entity_name(unit)}/{entity_name(parameter.name)}"
+        series = Series(parameter.name, _palette(k), 1.5)
+        if parameter.status != ESTIMATED:
+            entity, series = f"{entity}_open", Series(f"{parameter.name}, open", faded(_palette(k), 0.4), 1.0)
+        self._add(entity, t, scale * parameter.value, series)
+
+    def _of_unit(self, unit: str) -> None:
+        """There is a plot of this unit."""
         if unit not in self.state.units:
             self.state.units.append(unit)
-        entity = f"parameters/{entity_name(unit)}/{entity_name(parameter.name)}"
-        self._add(entity, t, scale * parameter.value, Series(parameter.name, _palette(k), 1.5))
 
     def _add(self, entity: str, t: float, value: float, style: Series) -> None:
         if not np.isfinite(value):

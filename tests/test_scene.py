@@ -145,7 +145,7 @@ def test_curves_hold_what_the_messages_say(notes, messages):
     error = {n: np.mean(notes.curves[f"plots/errors/position/{n}"][1]) for n in ("filtered", "live", "final")}
     assert error["final"] < error["live"] < error["filtered"]
     assert notes.curves["plots/parameters/mdeg/domega"][1][-1] == pytest.approx(np.degrees(9e-5) * 1000)
-    assert {"m", "mdeg"} == set(notes.layouts[-1].units)
+    assert {"m", "mdeg", "determined"} == set(notes.layouts[-1].units)
     assert ("navigator: GNSS outage of 1.4 s, coasting", "WARN") in notes.events
 
 

@@ -9,6 +9,7 @@ from statistics import median
 from typing import Any
 
 from ...schemas import topics
+from ...solver.window.determinability import ESTIMATED
 from .. import convert
 from ..recording_summary import Holdings, TopicSummary
 from .evaluation import evaluate_flight
@@ -45,7 +46,8 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     }
     result["nodes"] = {name: _node(status) for name, status in sorted(flight.status.items())}
     newest = next((r for _, r in reversed(flight.reports) if r.parameters), None)
-    result["parameters"] = [] if newest is None else [_parameter(p) for p in newest.parameters]
+    since = _estimated_since(flight)
+    result["parameters"] = [] if newest is None else [_parameter(p, since.get(p.name)) for p in newest.parameters]
     ranked = sorted(flight.rejected, key=lambda r: (-abs(r.w), r.point, r.ccd))
     result["rejected_observations"] = [_rejected(r) for r in ranked[:_LARGEST_REJECTED]]
     reports = [r for _, r in flight.reports]
@@ -97,9 +99,23 @@ def _node(status: Any) -> dict[str, Any]:
     return {"state": status.state, "counters": counters | losses, "last_problem": status.last_problem}
 
 
-def _parameter(p: Any) -> dict[str, Any]:
-    names = ("name", "unit", "value", "sigma", "t", "status", "reason")
-    return {name: getattr(p, name) for name in names}
+def _parameter(p: Any, since_s: float | None) -> dict[str, Any]:
+    names = ("name", "unit", "value", "sigma", "t", "status", "reason", "correlation", "partner")
+    return {name: getattr(p, name) for name in names} | {"estimated_since_s": since_s}
+
+
+def _estimated_since(flight: Flight) -> dict[str, float]:
+    """From which time of the flight on every parameter has been estimated until the end, s; those that are not are not
+    there."""
+    since: dict[str, float] = {}
+    over: set[str] = set()
+    for stamp, report in reversed(flight.reports):
+        for p in report.parameters:
+            if p.status != ESTIMATED:
+                over.add(p.name)
+            elif p.name not in over:
+                since[p.name] = float(flight.seconds(stamp))
+    return since
 
 
 def _rejected(r: Any) -> dict[str, Any]:

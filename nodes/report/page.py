@@ -36,8 +36,9 @@ _POINTS = {
 _OVER = {NOT_YET: "not determined by this flight"}
 _PARAMETERS_NOTE = (
     f'<p class="note">Estimated: the sigma is at most {BETTER:g} of the a-priori one (of the camera: '
-    f"{LEFT_OF_PRIOR**0.5:g}, and the tests of significance and correlation are passed). What is not determined is in "
-    "the sigmas of all results.</p>"
+    f"{LEFT_OF_PRIOR**0.5:g}, if those that are not determined were known, and the tests of significance and "
+    "correlation are passed), since the time in the flight that is given. What is not determined is in the sigmas of "
+    "all results. The correlation is with another parameter of this table.</p>"
 )
 _SHOWN_REJECTED = 40
 _SHOWN_EVENTS = 60
@@ -312,9 +313,11 @@ def _parameters(result: dict[str, Any]) -> str:
             unit, scale = "mdeg" + unit[3:], figures.MDEG
         value, sigma = (None if p[k] is None else scale * p[k] for k in ("value", "sigma"))
         status = _OVER.get(p["status"], p["status"])
-        numbers = _figures(value), _figures(sigma), _number(p["t"], 1)
+        since = "–" if p["estimated_since_s"] is None else f"{p['estimated_since_s']:.0f}"
+        goes_with = f"{p['correlation']:+.2f} {p['partner']}" if p["partner"] else "–"
+        numbers = since, _figures(value), _figures(sigma), _number(p["t"], 1), goes_with
         rows.append((p["name"], unit, status, p["reason"] or "–", *numbers))
-    heads = ("parameter", "unit", "status", "why", "value", "sigma", "t")
+    heads = ("parameter", "unit", "status", "why", "since [s]", "value", "sigma", "t", "strongest correlation")
     return _table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
 
 

@@ -151,7 +151,11 @@ def parameters(
     numbers = np.array([number for _, _, number in names], dtype=np.int64)
     if not len(numbers) or (state.places(numbers) < 0).any():
         return ()
-    sigma = np.sqrt(np.diagonal(state.covariance(numbers)))
+    covariance = state.covariance(numbers)
+    sigma = np.sqrt(np.diagonal(covariance))
+    correlation = np.clip(covariance / np.outer(sigma, sigma), -1.0, 1.0)
+    np.fill_diagonal(correlation, 0.0)
+    strongest = np.argmax(np.abs(correlation), axis=1).tolist()
     values = state.values(numbers)
     of_strip = len(names) - len(camera_columns)
     result = []
@@ -161,5 +165,9 @@ def parameters(
             known = standing[i - of_strip]
         elif i < of_strip and s > BETTER * apriori[i]:
             known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
-        result.append(Parameter(name, unit, float(v), float(s), known.status, known.reason))
+        k = strongest[i]
+        partner = names[k][0] if correlation[i, k] else ""
+        result.append(
+            Parameter(name, unit, float(v), float(s), known.status, known.reason, float(correlation[i, k]), partner)
+        )
     return tuple(result)

@@ -149,7 +149,10 @@ class AdjustedPoint:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the present strip or of the camera; status "estimated" or "not yet determined", and why."""
+    """A parameter of the present strip or of the camera; status "estimated" or "not yet determined", and why.
+
+    ``correlation`` is the strongest one with another of these parameters, ``partner`` that one's name.
+    """
 
     name: str
     unit: str
@@ -157,6 +160,8 @@ class Parameter:
     sigma: float
     status: str = "estimated"
     reason: str = ""
+    correlation: float = 0.0
+    partner: str = ""
 
     @property
     def t(self) -> float:
