@@ -1,15 +1,18 @@
 """Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
 
     python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough] [--camera 0.03]
+    python bench/consistency.py held [--seeds 20] [--camera 0.03]
     python bench/consistency.py control [--seeds 100]
     python bench/consistency.py drift [--minutes 120]
 
 *seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. With *camera*,
 the true camera has TLS-12 parameters drawn from that share of their usual a-priori sigmas, and they are estimated;
-without wander (*--constant*) the errors are those that "dgr" describes. *control*: one coordinate of a control point is
-wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level (0.1 % allowed), and beyond 3.29
-sigma. *drift*: strips
-one after the other, each tied to the one before by its side lap; the ratio in quarters of the flight, and what is kept.
+without wander (*--constant*) the errors are those that "dgr" describes. *held*: live orientation with such a camera,
+three ways: as it is, all parameters in the state from the start; with those that are not determined by then held at
+zero; and these held, but with what they leave open in the covariance ("considered", after Schmidt). *control*: one
+coordinate of a control point is wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level
+(0.1 % allowed), and beyond 3.29 sigma. *drift*: strips one after the other, each tied to the one before by its side lap;
+the ratio in quarters of the flight, and what is kept.
 Set OPENBLAS_NUM_THREADS=1.
 """
 
@@ -30,10 +33,13 @@ from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.window.determinability import ESTIMATED
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.window import Window
 
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
 CONSTANT = replace(ERRORS, wander_sigma_m=(0.0, 0.0, 0.0), wander_sigma_deg=(0.0, 0.0, 0.0))
+WAYS = ("estimated", "held", "considered")
 KINDS = ("live", "final", "whole", "live points", "final points", "whole points")
 
 
@@ -62,6 +68,57 @@ def seeds(args: argparse.Namespace) -> None:
     band = 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
     for name, mean, b in zip(KINDS, rows.mean(axis=0), band, strict=True):
         print(f"{name:14} {mean:.3f} +- {b:.3f}  {'in the band' if abs(mean - 1.0) <= b else 'outside'}")
+
+
+def one_held(seed: int, camera: float) -> dict[str, np.ndarray]:
+    """Sums of squared errors (6,) and of NEES, and the number of orientations, of the three ways."""
+    plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
+    stated = tls(plan.camera, 12).scaled(camera)
+    simulation = simulate_with_camera_errors(plan, seed, stated, ERRORS, ObservationPlan(tie_points_per_s=5.0))
+    sums = {way: np.zeros(8) for way in WAYS}
+
+    def watch(now: float, window: Window) -> None:
+        live, found = window.live(now), window._watch.last
+        if live is None or found is None or not found.standing:
+            return
+        design = window.strips[live.strip].design(live.time_s)
+        columns = np.unique(design.columns[design.columns >= 0]).astype(np.int64)
+        held = window._camera_columns[[s.status != ESTIMATED for s in found.standing]]
+        A = np.zeros((6, len(columns)))
+        node, component = np.nonzero(design.columns[0] >= 0)
+        place = np.searchsorted(columns, design.columns[0, node, component])
+        np.add.at(A, (component, place), design.coefficients[0, node])
+        Q = window.state.covariance(np.concatenate([columns, held]))
+        u = len(columns)
+        gain = A @ np.linalg.solve(Q[u:, u:], Q[u:, :u]).T
+        open_ = gain * stated.apriori_sigma[np.isin(window._camera_columns, held)]
+        error = orientation_errors(simulation, [live]).error[0]
+        less = error - gain @ window.state.values(held)
+        known = live.covariance[0] - gain @ Q[u:, u:] @ gain.T
+        for way, e, C in zip(
+            WAYS, (error, less, less), (live.covariance[0], known, known + open_ @ open_.T), strict=True
+        ):
+            sums[way] += [*e**2, e @ np.linalg.solve(C, e) / 6.0, 1.0]
+
+    adjust_online(
+        simulation, navigate(simulation), WindowOptions(grid_hz=1.0), stated, live=False, watch=watch, update_s=0.5
+    )
+    return sums
+
+
+def held(args: argparse.Namespace) -> None:
+    with ProcessPoolExecutor(2) as pool:
+        flights = list(pool.map(partial(one_held, camera=args.camera or 0.03), range(1, args.seeds + 1)))
+    rmse = {}
+    for way in WAYS:
+        each = np.array([f[way][6] / f[way][7] for f in flights])
+        rmse[way] = np.sqrt(np.sum([f[way][:6] for f in flights], axis=0) / np.sum([f[way][7] for f in flights]))
+        ratio = rmse[way] / rmse[WAYS[0]]
+        band = 1.96 * each.std(ddof=1) / np.sqrt(len(each))
+        print(
+            f"{way:11} NEES {each.mean():6.2f} +- {band:.2f}, largest flight {each.max():6.1f}; RMSE over that of "
+            f"{WAYS[0]}: mean {ratio.mean():.3f}, worst component {ratio.max():.3f}"
+        )
 
 
 def one_wrong_control(seed: int) -> dict[str, tuple[int, int, int]]:
@@ -134,7 +191,7 @@ def drift(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("seeds", "control", "drift"))
+    parser.add_argument("what", choices=("seeds", "held", "control", "drift"))
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--model", default="wander")
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
@@ -142,7 +199,7 @@ def main() -> None:
     parser.add_argument("--constant", action="store_true", help="no wander")
     parser.add_argument("--minutes", type=float, default=120.0)
     args = parser.parse_args()
-    {"seeds": seeds, "control": control, "drift": drift}[args.what](args)
+    {"seeds": seeds, "held": held, "control": control, "drift": drift}[args.what](args)
 
 
 if __name__ == "__main__":
