@@ -11,8 +11,8 @@ without wander (*--constant*) the errors are those that "dgr" describes. *held*:
 three ways: as it is, all parameters in the state from the start; with those that are not determined by then held at
 zero; and these held, but with what they leave open in the covariance ("considered", after Schmidt). *control*: one
 coordinate of a control point is wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level
-(0.1 % allowed), and beyond 3.29 sigma. *drift*: strips one after the other, each tied to the one before by its side lap;
-the ratio in quarters of the flight, and what is kept.
+(0.1 % allowed), and beyond 3.29 sigma. *drift*: strips one after the other, each tied to the one before by its side
+lap; the ratio in quarters of the flight, and what is kept.
 Set OPENBLAS_NUM_THREADS=1.
 """
 

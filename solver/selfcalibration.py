@@ -3,8 +3,7 @@
 ``Dx, Dy`` are added to the projection: residual = measured - (projection + D). They are functions of the image
 coordinates, reduced to the principal point, and linear in the unknowns. Measured coordinates carry noise, on which the
 parameters must not act: an adjustment takes them where the ray meets its CCD line by what is known of it
-(`adjustment.linearisation.fitted_coordinates`). Units: millimetres for lengths, radians for angles, powers of mm for
-distortion.
+(`adjustment.linearisation.fit_rays`). Units: millimetres for lengths, radians for angles, powers of mm for distortion.
 """
 
 from __future__ import annotations
@@ -70,16 +69,12 @@ class CameraDesign:
 
     def evaluate(self, values: Array, rays: slice = slice(None)) -> Array:
         """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
-        return self.combine(self.coefficients[:, :, rays], values, rays)
-
-    def combine(self, coefficients: Array, values: Array, rays: slice = slice(None)) -> Array:
-        """The same with other coefficients (2, slots, m) of the rays."""
         of_slot = np.append(values, 0.0)[self.columns].T  # (slots, patterns)
-        return np.einsum("csn,sn->cn", coefficients, of_slot[:, self.pattern[rays]])
+        return np.einsum("csn,sn->cn", self.coefficients[:, :, rays], of_slot[:, self.pattern[rays]])
 
-    def coefficients_at(self, xy_mm: Array, rays: slice = slice(None)) -> Array:
-        """Coefficients (2, slots, m) where the rays have image coordinates (2, m), mm."""
-        return _coefficients(self.kinds, xy_mm, self.focal_length_mm[rays])
+    def coefficients_at(self, xy_mm: Array) -> Array:
+        """Coefficients (2, slots, n) where the rays have image coordinates (2, n), mm."""
+        return _coefficients(self.kinds, xy_mm, self.focal_length_mm)
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ def block(model, with_aps, seed=1, **more):
 def independent_residuals(solution):
     """All whitened residuals as a function of (theta, points), written down once more from the formulas.
 
-    Additional parameters act where the ray meets its CCD line, at the measured coordinates less the residual along it,
-    which is found for every value of the unknowns.
+    With additional parameters they are those of the line and the sample with which the ray meets its CCD line exactly,
+    found for every value of the unknowns.
     """
     network, layout = solution.network, solution.layout
     rays, p = network.rays, network.n_points
@@ -57,14 +57,14 @@ def independent_residuals(solution):
         for s, item in enumerate(layout.sets):
             mine = layout.set_of_ray == s
             eo[mine] = item.model.evaluate(theta[item.columns], rays.time_s[mine])
-        position = rays.position_l + eo[:, :3] + later_s * rays.velocity_l
-        return position, rays.angles + eo[:, 3:] + later_s * rays.angle_rate
+        later = np.broadcast_to(later_s, len(rays))[:, None]
+        return rays.position_l + eo[:, :3] + later * rays.velocity_l, rays.angles + eo[:, 3:] + later * rays.angle_rate
 
     def image_at(theta, points, later_s=0.0):
         return project(*oriented(theta, later_s), points[rays.point], rays.focal_length_mm).xy_mm
 
     here, step = (solution.state.theta, solution.state.points_l), 1e-4
-    motion = image_at(*here, step) - image_at(*here, -step)
+    motion = (image_at(*here, step) - image_at(*here, -step)) / (2 * step)
     basis = np.stack([motion, rays.pitch_mm], axis=2)
 
     def displacement(ap, xy):
@@ -78,11 +78,12 @@ def independent_residuals(solution):
         return np.stack([dx, dy], axis=1)
 
     def residuals(theta, points):
-        off = rays.xy_mm - image_at(theta, points)
-        r = off
-        for _ in range(6 if names else 0):
-            samples = np.linalg.solve(basis, r[:, :, None])[:, 1]
-            r = off - displacement(theta[layout.n_model :], rays.xy_mm - samples * rays.pitch_mm)
+        r = rays.xy_mm - image_at(theta, points)
+        for _ in range(4 if names else 0):
+            later, samples = np.linalg.solve(basis, r[:, :, None])[:, :, 0].T
+            there = rays.xy_mm - samples[:, None] * rays.pitch_mm
+            r = rays.xy_mm - displacement(theta[layout.n_model :], there) - image_at(theta, points, later)
+            r += later[:, None] * motion
         white = np.stack([C[0] * r[:, 0], C[1] * r[:, 0] + C[2] * r[:, 1]])
         parts = [white.ravel()]
         for item in layout.sets:

@@ -43,7 +43,7 @@ class Descent:
         if isinstance(start, Solution):
             self.state, self.whitening, self.lin = start.state, start.whitening, start.linearisation
             self.layout = start.layout
-            self.fresh_weights = 0  # how often they may still be taken anew, and where additional parameters act
+            self.fresh_weights = 0  # how often they may still be taken anew
         else:
             self.state = start if isinstance(start, State) else start_state(problem, start)
             self.layout, rays = problem.layout, problem.network.rays
@@ -108,14 +108,22 @@ class Descent:
         if weighed:
             self.fresh_weights -= 1
         elif self.fresh_weights and drop > WEIGHTS_CHANGE * cost:
-            self.whitening, self.lin, self.layout = refresh_weights(
-                p.network.rays, layout, whitening, lin, trial.theta, self.keep_weights
-            )
+            self._renew(trial)
             self.fresh_weights -= 1
             self._reweigh()
             return
         if self.options.robust is not None:
             self._reweigh()
+
+    def _renew(self, at: State) -> None:
+        """Weights anew, and with additional parameters the places of the rays."""
+        rays = self.problem.network.rays
+        if self.layout.camera is not None:
+            kept = self.whitening if self.keep_weights else None
+            fresh = linearise_and_weigh(rays, self.layout, at.theta, at.points_l, kept)
+            self.whitening, self.lin, self.layout = fresh
+        elif not self.keep_weights:
+            self.whitening, self.lin = refresh_weights(rays, self.whitening, self.lin)
 
     def _linearise(self, trial: State) -> tuple[Weighed, Linearisation, float]:
         """Weights and equations, equations with ray weights, and cost at trial values.

@@ -42,6 +42,20 @@ class CorrectionSet:
 
 
 @dataclass(frozen=True)
+class RayShift:
+    """Where rays are by what is known of them, less where they were measured; n rays.
+
+    Attributes
+    ----------
+    orientation : (n, 6) of another line, and of less noise, m and rad
+    image_mm : (2, n) by how much the image moves with it
+    """
+
+    orientation: Array
+    image_mm: Array
+
+
+@dataclass(frozen=True)
 class Layout:
     """Unknowns of the reduced system (all but the object points) and what each ray has to do with them; n rays.
 
@@ -55,12 +69,13 @@ class Layout:
     node, component : (T,) of the terms
     columns : (T, n) int32; -1 where a ray has no such term
     coefficients : (K, n)
-    camera : effect of the additional parameters, where they act on the rays (`linearisation.fitted_coordinates`; before
-        there is a solution, at the measured coordinates); columns counted from `n_model`; None without self-calibration
+    camera : effect of the additional parameters, where they act on the rays (`linearisation.fit_rays`; before there is
+        a solution, at the measured coordinates); columns counted from `n_model`; None without self-calibration
     n_model, n_camera : numbers of unknowns
     names : (n_model + n_camera,) in words
     prior : a-priori knowledge of all unknowns
     heading : kappa's correction is one of heading, about the vertical: it turns the measured omega and phi as well
+    shift : of the rays to where they are linearised; None if that is where they were measured
     """
 
     sets: tuple[CorrectionSet, ...]
@@ -75,6 +90,7 @@ class Layout:
     names: tuple[str, ...]
     prior: PseudoObservations
     heading: bool = False
+    shift: RayShift | None = None
 
     @property
     def n_unknowns(self) -> int:
@@ -98,15 +114,10 @@ class Layout:
         """Image displacement (2, n) in mm by the additional parameters; 0.0 without self-calibration."""
         return self.camera.evaluate(theta[self.n_model :], rays) if self.camera else 0.0
 
-    def change_of_displacement(self, coefficients: Array, theta: Array, rays: slice = slice(None)) -> Array:
-        """What the residuals (2, m) of rays gain, mm, with other coefficients (2, slots, m) in place of `camera`'s."""
+    def fitted(self, coefficients: Array, shift: RayShift) -> Layout:
+        """The same unknowns, additional parameters with coefficients (2, slots, n), and rays elsewhere."""
         assert self.camera is not None
-        values = theta[self.n_model :]
-        return self.camera.evaluate(values, rays) - self.camera.combine(coefficients, values, rays)
-
-    def with_camera(self, coefficients: Array) -> Layout:
-        """The same unknowns, additional parameters with coefficients (2, slots, n)."""
-        return self if self.camera is None else replace(self, camera=replace(self.camera, coefficients=coefficients))
+        return replace(self, camera=replace(self.camera, coefficients=coefficients), shift=shift)
 
 
 def build_layout(network: Network, options: ModelOptions, self_calibration: SelfCalibration | None = None) -> Layout:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from ..collinearity import collinearity
 from ..rotation import corrected_angles
-from .layout import Layout
+from .layout import Layout, RayShift
 from .network import Rays
 
 Array = NDArray[np.floating]
 
 #: Rays worked on at a time: so many that a call's overhead is small, so few that the arrays stay in the cache.
 CHUNK = 4096
-#: Samples by which a fitted image coordinate may differ from the measured one: blunders and bad starts go no further.
-MOST_SAMPLES = 200.0
+#: Lines and samples by which a ray may be fitted elsewhere than measured: blunders and bad starts go no further.
+MOST_PIXELS = 200.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def linearise(
 
 
 class Weighed(NamedTuple):
-    """Weights, the observation equations with them, and the layout with additional parameters where they act now."""
+    """Weights, the observation equations with them, and the layout, in which the rays are where they are fitted now."""
 
     whitening: Whitening
     linearisation: Linearisation
@@ -161,21 +161,18 @@ def linearise_and_weigh(
 ) -> Weighed:
     """Weights from the image motion at the given values, and the observation equations with them; see `linearise`.
 
-    Additional parameters are evaluated anew at the fitted image coordinates (`fitted_coordinates`).
+    With additional parameters the rays are fitted anew before that; see `fit_rays`.
 
     Parameters
     ----------
     whitening : weights to be kept
     """
     n, kept = len(rays), whitening is not None
-    camera = np.empty_like(_camera(layout, n))
+    layout = fit_rays(rays, layout, theta, points_l)
+    camera = _camera(layout, n)
     whitening = whitening or Whitening(np.empty((3, n)))
     result = Linearisation(np.empty((2, n)), np.empty((2, 6, n)), np.empty(camera.shape), np.empty((2, 3, n)))
     for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
-        if layout.camera is not None:
-            fitted = fitted_coordinates(own, residual, _image_motion(own, d_orientation), own.pitch_mm.T)
-            camera[:, :, part] = layout.camera.coefficients_at(fitted, part)
-            residual += layout.change_of_displacement(camera[:, :, part], theta, part)
         if not kept:
             whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
         g = whitening.g[:, part]
@@ -183,27 +180,43 @@ def linearise_and_weigh(
         _whiten_into(result.orientation, d_orientation, g, part)
         _whiten_into(result.point, d_point, g, part)
         _whiten_into(result.camera, camera[:, :, part], g, part)
-    return Weighed(whitening, result, layout.with_camera(camera))
+    return Weighed(whitening, result, layout)
 
 
-def fitted_coordinates(rays: Rays, residual: Array, motion: Array, pitch: Array) -> Array:
-    """Image coordinates (2, n) in mm without the residual along the CCD line, where additional parameters act.
+def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layout:
+    """The layout with every ray where it is by what is known of it: line, sample and orientation less their residuals.
 
-    A ray meets its CCD line at the measured sample less its error. Taken at the measured sample, the parameters would
-    act on the noise, too: it is smallest in the smallest image, and many rays that know the scale of the image by the
-    jitter of the attitude alone would make it small. Adjusted coordinates are not correlated with the residuals.
+    What is linearised at measured values has their noise in its derivatives as well as in its residuals, and the
+    product of both does not vanish on average: noise of lines and samples is smallest in the smallest image, that of
+    the orientation in the largest. Where many rays know the scale of the image by the jitter of the attitude or by
+    parallaxes along the flight alone, it decides the scale. Observations less their residuals are not correlated with
+    these. Without additional parameters the scale is known otherwise, and rays stay where they were measured.
 
-    Parameters
-    ----------
-    residual : (2, n), mm or whitened
-    motion, pitch : (2, n) change of the image coordinates with lines (of any length) and with samples, likewise
+    A residual ``r`` of covariance ``C`` is made up of ``S J^T C^-1 r`` of observations of covariance ``S`` that act on
+    it by ``J``: lines and samples, and the orientation where its noise is known.
+
+    Source: A. J. Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972.
     """
-    across = motion[0] * pitch[1] - motion[1] * pitch[0]
-    along = motion[0] * residual[1] - motion[1] * residual[0]
-    # image motion along the CCD line: lines and samples are not to be told apart
-    least = 1e-3 * np.hypot(*motion) * np.hypot(*pitch)
-    samples = np.where(np.abs(across) > least, along / np.where(across == 0.0, 1.0, across), 0.0)
-    return (rays.xy_mm - rays.pitch_mm * np.clip(samples, -MOST_SAMPLES, MOST_SAMPLES)[:, None]).T
+    if layout.camera is None:
+        return layout
+    n = len(rays)
+    fitted, moved, image = np.empty((2, n)), np.empty((n, 6)), np.empty((2, n))
+    for part, own, residual, d_orientation, _, _ in _by_chunks(rays, layout, theta, points_l):
+        white = whiten(residual_covariance(own, d_orientation))
+        a = white.apply(residual)
+        multiplier = np.stack([white.g[0] * a[0] + white.g[1] * a[1], white.g[2] * a[1]])  # C^-1 r
+        motion, pitch = _image_motion(own, d_orientation), own.pitch_mm.T
+        later_s = (own.line_period_s * own.sigma_line_px) ** 2 * (motion * multiplier).sum(axis=0)
+        samples = own.sigma_sample_px**2 * (pitch * multiplier).sum(axis=0)
+        far = np.maximum(np.abs(later_s) / (MOST_PIXELS * own.line_period_s), np.abs(samples) / MOST_PIXELS)
+        share = 1.0 / np.maximum(far, 1.0)
+        change = later_s[:, None] * np.hstack([own.velocity_l, own.angle_rate])
+        if own.orientation_noise is not None:
+            change += np.einsum("nkl,cln,cn->nk", own.orientation_noise, d_orientation, multiplier, optimize=True)
+        moved[part] = share[:, None] * change
+        image[:, part] = np.einsum("ckn,nk->cn", d_orientation, moved[part])
+        fitted[:, part] = own.xy_mm.T - share * samples * pitch
+    return layout.fitted(layout.camera.coefficients_at(fitted), RayShift(moved, image))
 
 
 def _image_motion(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:
@@ -224,6 +237,11 @@ def _by_chunks(
     for low in range(0, len(rays), CHUNK):
         part = slice(low, min(low + CHUNK, len(rays)))
         own = rays.part(part)
+        xy_mm = own.xy_mm.T
+        if layout.shift is not None:
+            position_l = own.position_l + layout.shift.orientation[part, :3]
+            angles = own.angles + layout.shift.orientation[part, 3:]
+            own, xy_mm = replace(own, position_l=position_l, angles=angles), xy_mm + layout.shift.image_mm[:, part]
         correction = layout.corrections(theta, part)
         position, angles = corrected(own, layout, correction)
         xy, d_orientation, d_point, depth = collinearity(
@@ -232,7 +250,7 @@ def _by_chunks(
         if layout.heading:  # kappa's correction has turned the tilt
             omega, phi = angles[:2] - correction[3:5]
             d_orientation[:, 5] += omega * d_orientation[:, 4] - phi * d_orientation[:, 3]
-        residual = own.xy_mm.T - layout.displacement(theta, part) - xy
+        residual = xy_mm - layout.displacement(theta, part) - xy
         yield part, own, residual, d_orientation, d_point, depth
 
 
@@ -251,32 +269,19 @@ def _whiten_into(target: Array, raw: Array, g: Array, part: slice) -> None:
     target[1, ..., part] += raw[0] * g[1]
 
 
-def refresh_weights(
-    rays: Rays, layout: Layout, whitening: Whitening, lin: Linearisation, theta: Array, keep: bool = False
-) -> Weighed:
-    """As `linearise_and_weigh`, from the linearisation at the same values with older weights.
-
-    Parameters
-    ----------
-    keep : the weights stay; additional parameters alone are evaluated anew
-    """
-    motion, pitch = _image_motion(rays, lin.orientation), whitening.apply(rays.pitch_mm.T)
-    fresh, turned = whitening, lin
-    if not keep:
-        u, v = motion * (rays.line_period_s * rays.sigma_line_px), pitch * rays.sigma_sample_px
-        a, b, c = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation)).g
-        g = whitening.g
-        fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))
-        arrays = []
-        for old in (lin.residual, lin.orientation, lin.camera, lin.point):
-            new = np.empty_like(old)
-            np.multiply(old[0], a, out=new[0])
-            np.multiply(old[1], c, out=new[1])
-            new[1] += old[0] * b
-            arrays.append(new)
-        turned = Linearisation(*arrays)
-    if layout.camera is None:
-        return Weighed(fresh, turned, layout)
-    camera = layout.camera.coefficients_at(fitted_coordinates(rays, lin.residual, motion, pitch))
-    residual = turned.residual + fresh.apply(layout.change_of_displacement(camera, theta))
-    return Weighed(fresh, replace(turned, residual=residual, camera=fresh.apply(camera)), layout.with_camera(camera))
+def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tuple[Whitening, Linearisation]:
+    """Weights from the image motion at the linearisation, and the same equations with these weights."""
+    u = _image_motion(rays, lin.orientation) * (rays.line_period_s * rays.sigma_line_px)
+    v = whitening.apply(rays.pitch_mm.T * rays.sigma_sample_px)
+    turn = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation))
+    a, b, c = turn.g
+    g = whitening.g
+    fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))
+    arrays = []
+    for old in (lin.residual, lin.orientation, lin.camera, lin.point):
+        new = np.empty_like(old)
+        np.multiply(old[0], a, out=new[0])
+        np.multiply(old[1], c, out=new[1])
+        new[1] += old[0] * b
+        arrays.append(new)
+    return fresh, Linearisation(*arrays)
