@@ -28,6 +28,7 @@ BENCHMARKS = {
     "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
     "sliding window: normalised errors": ["consistency.py", "seeds"],
     "the same as time goes on": ["drift.py", "--minutes", "12"],
+    "self-calibration with dense rays, batch and window": ["self_calibration.py", "--ties", "100", "--seeds", "6"],
     "protection levels with wrong control": ["consistency.py", "control", "--seeds", "20"],
     "data snooping against the batch adjustment's": ["outliers.py", "--seeds", "6"],
     "orthoimage": ["orthoimage.py"],

@@ -1,8 +1,10 @@
 """Is self-calibration honest where rays are dense? Batch adjustment and window of the same flights, errors over sigmas.
 
     python bench/self_calibration.py [--seeds 12] [--ties 8] [--parameters 18] [--share 0.1] [--control 6] [--no-window]
+                                       [--px 0.3] [--seconds 40] [--exact]
 
-One strip of 40 s a seed, by a camera whose TLS parameters are drawn from a share of their usual a-priori sigmas.
+One strip a seed, by a camera whose TLS parameters are drawn from a share of their usual a-priori sigmas; with *exact*
+it is as calibrated, and the sigmas say nothing of that.
 *batch* is what `triline adjust` runs, *final* and *whole* are the window's. NEES: mean normalised error squared of
 orientation on a grid of 5 Hz, object points and additional parameters (1 expected), with the 95 % band from the
 scatter of the flights. *Z*: mean error of Z over the strip in units of its mean sigma, root of the mean square over the
@@ -25,7 +27,7 @@ from triline.solver.simulation.camera_errors import drawn_parameters, simulate_w
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.flight_network import network_of
-from triline.solver.simulation.scenario import ObservationPlan, Simulation
+from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import (
     Errors,
     OnlineResult,
@@ -85,24 +87,29 @@ def off_in_z(errors: Errors) -> float:
     return float(errors.error[:, 2].mean() / np.sqrt(errors.covariance[:, 2, 2]).mean())
 
 
-def one_flight(seed: int, ties: float, parameters: int, share: float, control: int, window: bool) -> Figures:
-    plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
-    stated = tls(plan.camera, parameters).scaled(share)
-    observed = ObservationPlan(tie_points_per_s=ties, control=control)
-    simulation = simulate_with_camera_errors(plan, seed, stated, ERRORS, observed)
+def one_flight(seed: int, args: argparse.Namespace) -> Figures:
+    plan = FlightPlan(strip_s=args.seconds, lead_in_s=3.0, lead_out_s=2.0)
+    stated = tls(plan.camera, args.parameters).scaled(args.share)
+    observed = ObservationPlan(tie_points_per_s=args.ties, control=args.control, image_sigma_px=args.px)
+    true = drawn_parameters(seed, stated)
+    if args.exact:
+        true = np.zeros(stated.n_unknowns)
+        simulation = simulate(plan, seed, ERRORS, observed)
+    else:
+        simulation = simulate_with_camera_errors(plan, seed, stated, ERRORS, observed)
     poses = navigate(simulation)
     strip = simulation.flight.strips[0]
     times = np.arange(strip.first_line_time_s + 0.2, float(strip.time_of(strip.lines - 1)) - 0.2, 0.2)
     found = adjust_batch(simulation, poses, stated)
     orientation, points, names = of_batch(simulation, found, times)
     columns = np.arange(found.solution.layout.n_model, found.solution.layout.n_unknowns)
-    off = found.solution.camera_parameters - drawn_parameters(seed, stated)
+    off = found.solution.camera_parameters - true
     result = {
         "batch orientation": orientation.nees.mean(), "batch points": points.nees.mean(),
         "batch parameters": normalised(off, found.solution.factor.cofactors(columns)),
         "batch Z": off_in_z(orientation),
     }  # fmt: skip
-    if window:
+    if args.window:
         online = adjust_online(simulation, poses, WindowOptions(grid_hz=5.0), stated, live=False, update_s=0.5)
         result |= of_window(simulation, online)
         both = [i for i, n in enumerate(names) if n in online.whole_points and online.whole_points[n].rays >= 2]
@@ -134,14 +141,13 @@ def main() -> None:
     parser.add_argument("--parameters", type=int, default=18, choices=(12, 16, 18), help="TLS set")
     parser.add_argument("--share", type=float, default=0.1, help="of the usual a-priori sigmas")
     parser.add_argument("--control", type=int, default=6)
+    parser.add_argument("--px", type=float, default=0.3, help="noise of lines and samples")
+    parser.add_argument("--seconds", type=float, default=40.0, help="length of the strip")
+    parser.add_argument("--exact", action="store_true", help="the camera is as calibrated")
     parser.add_argument("--no-window", dest="window", action="store_false", help="the batch adjustment alone")
     args = parser.parse_args()
-    work = partial(
-        one_flight, ties=args.ties, parameters=args.parameters, share=args.share, control=args.control,
-        window=args.window,
-    )  # fmt: skip
     with ProcessPoolExecutor(2) as pool:
-        flights = list(pool.map(work, range(1, args.seeds + 1)))
+        flights = list(pool.map(partial(one_flight, args=args), range(1, args.seeds + 1)))
     for key in flights[0]:
         values = np.array([f[key] for f in flights])
         if key.endswith(" Z") and key.split()[0] in ("batch", "final", "whole"):
