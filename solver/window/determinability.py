@@ -4,7 +4,7 @@ All parameters are in the state from the start with what is known of them before
 What the network cannot see yet stays near zero by its a-priori sigma, and what that sigma leaves open is in the
 covariance of all results. A parameter held at zero until a test lets it in would leave that out, and good rays would be
 refused for the camera's fault; with what it leaves open in the covariance (considered) sigmas would be right, and the
-results a third to four fifths worse: parameters that fail a test alone are known in combinations
+results 31 to 86 % worse: parameters that fail a test alone are known in combinations
 (`bench/consistency.py held`).
 
 The stepwise test of the batch adjustment (`determinability.examine`) runs on the normal equations of the window, one
