@@ -2,13 +2,18 @@
 
     python bench/efficiency.py table [--seeds 20]          one strip: models, mounts, with and without self-calibration
     python bench/efficiency.py block [--seeds 20] [--model wander]     six strips and two cross strips
+    python bench/efficiency.py adjust [--seeds 20]         whole strips and a block against `triline adjust`'s estimator
 
 *final / causal*: what became final against a batch adjustment, from scratch, of just the data that had arrived then, at
 some times of each strip. *whole / batch*: after the backward pass, against the batch adjustment of all data. *final /
 batch*: what being on line costs. Each figure is the quotient of two RMSE over all seeds, of the same times and points;
 of X, Y, Z, omega, phi, kappa (points: X, Y, Z) the mean and the worst. Rows with TLS-12 fly a camera whose parameters
-are drawn from their a-priori sigmas; rows of DGR fly without wander, which DGR has no place for. Set
-OPENBLAS_NUM_THREADS=1.
+are drawn from their a-priori sigmas; rows of DGR fly without wander, which DGR has no place for.
+
+These batches are the window with all data in one update. ``adjust`` compares with the other estimator instead, that of
+``triline adjust``: another network, other normal equations, another covariance; the same models and a-priori sigmas.
+Beside the quotients of RMSE: the largest difference of two results in units of the sigma, and the quotient of sigmas.
+Set OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -22,11 +27,14 @@ from functools import partial
 
 import numpy as np
 
+from triline.solver.adjustment.batch import Job
+from triline.solver.adjustment.batch import run as run_batch
 from triline.solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
 from triline.solver.sensors import preset
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.flight_network import batch_errors, network_of
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import (
     OnlineResult,
@@ -36,8 +44,10 @@ from triline.solver.simulation.window_study import (
     navigate,
     orientation_errors,
     point_errors,
+    slow_errors_of,
 )
 from triline.solver.window.results import AdjustedPoint, WindowOptions
+from triline.solver.window.strip import model_options
 
 #: Attitude at 100 Hz: half the work, and the window interpolates either.
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
@@ -142,6 +152,39 @@ def _causal(
     return {key: np.concatenate(parts) for key, parts in rows.items()}
 
 
+def one_adjustment(seed: int, case: Case) -> dict[str, np.ndarray]:
+    """Errors of a flight from the window, after the backward pass, and from the batch adjustment of its network."""
+    simulation = case.simulate(seed)
+    poses = navigate(simulation)
+    parameters, options = case.parameters, WindowOptions(model=case.model, snoop=False, grid_hz=5.0)
+    online = adjust_online(simulation, poses, options, parameters, live=False, update_s=0.5)
+    slow, strip = slow_errors_of(simulation.errors), simulation.flight.strips[0]
+    model = model_options(slow, options, strip.lines / strip.line_rate_hz)
+    found = run_batch(network_of(simulation, poses), Job(model, self_calibration=parameters, eliminate=False))
+    names = list(found.network.point_ids)
+    place = {name: i for i, name in enumerate(names)}
+    seen = {n: p for n, p in online.whole_points.items() if p.rays >= 3 and n in place}
+    truth = dict(zip(map(str, simulation.points.id), simulation.points.xyz_l, strict=True))
+    whole, batch, sigma = [], [], []
+    for strip in simulation.flight.strips:
+        parts = [o for o in online.whole if o.strip == strip.id]
+        time_s = np.concatenate([o.time_s for o in parts])
+        # the ends are extrapolated by either
+        inside = (time_s > strip.first_line_time_s + 1.0) & (time_s < strip.time_of(strip.lines - 1) - 1.0)
+        whole.append(orientation_errors(simulation, parts).error[inside])
+        batch.append(batch_errors(simulation, found, strip.id, time_s[inside]))
+        sigma.append(np.concatenate([np.sqrt(np.einsum("nii->ni", o.covariance)) for o in parts])[inside])
+    return {
+        "whole": np.concatenate(whole),
+        "adjusted": np.concatenate(batch),
+        "sigma": np.concatenate(sigma),
+        "points whole": np.array([p.xyz_l - truth[n] for n, p in seen.items()]),
+        "points adjusted": np.array([found.solution.state.points_l[place[n]] - truth[n] for n in seen]),
+        "points sigma": np.array([np.sqrt(np.diag(p.covariance)) for p in seen.values()]),
+        "points adjusted sigma": np.sqrt([np.diag(found.cofactors.points[place[n]]) for n in seen]),
+    }
+
+
 def run(case: Case, seeds: int) -> dict[str, object]:
     """A row of the table."""
     with ProcessPoolExecutor(2) as pool:
@@ -210,9 +253,33 @@ def block(args: argparse.Namespace) -> None:
     print(json.dumps({k: np.round(v, 3).tolist() for k, v in row.items() if k != "batch"}, indent=1))
 
 
+def adjust(args: argparse.Namespace) -> None:
+    print(f"{'':38}whole / adjusted, RMSE: mean, worst | largest difference")
+    print(f"{'':38}{'orientation':>13} | {'points':>13} | {'in sigmas: both':>15} | sigmas of points")
+    for model in ("dgr", "ppm", "lim", "wander"):
+        for selfcal in ("none", "tls12"):
+            name = f"{model}{', ' + selfcal if selfcal != 'none' else ''}"
+            cases = {f"{name}, one strip": Case(model, True, selfcal)}
+            cases[f"{name}, 6 strips, 2 cross strips"] = Case(
+                model, False, selfcal, 6, 2, args.strip_s, height_m=1000.0
+            )
+            for title, case in cases.items():
+                with ProcessPoolExecutor(2) as pool:
+                    flights = list(pool.map(partial(one_adjustment, case=case), range(1, args.seeds + 1)))
+                f = {key: np.concatenate([flight[key] for flight in flights]) for key in flights[0]}
+                cells, off = [], []
+                for part in ("", "points "):
+                    one, two, sigma = (f[part + key] for key in ("whole", "adjusted", "sigma"))
+                    ratio = np.sqrt(np.mean(one**2, axis=0) / np.mean(two**2, axis=0))
+                    cells.append(f"{ratio.mean():6.3f} {ratio.max():6.3f}")
+                    off.append(f"{np.abs((one - two) / sigma).max():6.2f}")
+                sigmas = (f["points sigma"] / f["points adjusted sigma"]).mean(axis=0).mean()
+                print(f"{title:38}{' | '.join(cells)} | {'  '.join(off):>15} | {sigmas:6.3f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("table", "block"))
+    parser.add_argument("what", choices=("table", "block", "adjust"))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--model", default="wander")
     parser.add_argument("--selfcal", default="none")
@@ -221,7 +288,7 @@ def main() -> None:
     parser.add_argument("--strip-s", type=float, default=30.0)
     parser.add_argument("--samples", type=int, default=1, help="causal batches for each strip of a block")
     args = parser.parse_args()
-    {"table": table, "block": block}[args.what](args)
+    {"table": table, "block": block, "adjust": adjust}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -18,11 +18,10 @@ from functools import partial
 import numpy as np
 
 from triline.solver.adjustment.batch import BatchResult, Job, run
-from triline.solver.adjustment.refined_orientation import corrections_at
 from triline.solver.models.wander import WanderOptions
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
-from triline.solver.simulation.flight_network import network_of
+from triline.solver.simulation.flight_network import batch_errors, network_of
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import (
     OnlineResult,
@@ -41,20 +40,7 @@ Rays = set[tuple[str, str]]
 
 def batch(simulation: Simulation, poses: list[TimedPose], snoop: bool) -> BatchResult:
     """The batch adjustment with the window's default model and segments."""
-    slow = slow_errors_of(simulation.errors)
-    strip = simulation.flight.strips[0]
-    inside = [p for p in poses if strip.first_line_time_s - 0.5 < p.pose.time_s < strip.time_of(strip.lines) + 0.5]
-    return run(network_of(simulation, inside), Job(WanderOptions(slow), snoop=snoop))
-
-
-def batch_errors(simulation: Simulation, found: BatchResult, times: np.ndarray) -> np.ndarray:
-    """(n, 6) of the orientation at times."""
-    strip = found.network.strips[0]
-    measured, truth = strip.trajectory.at(times), simulation.flight.truth.at(times)
-    off = np.hstack([measured.position_l - truth.position_l, measured.angles - truth.angles])
-    off += corrections_at(found.solution, 0, times)
-    off[:, 3:] = (off[:, 3:] + np.pi) % (2 * np.pi) - np.pi
-    return off
+    return run(network_of(simulation, poses), Job(WanderOptions(slow_errors_of(simulation.errors)), snoop=snoop))
 
 
 def batch_points(found: BatchResult) -> tuple[dict[str, np.ndarray], Rays]:
@@ -101,9 +87,9 @@ def one_flight(seed: int, share: float, px: tuple[float, float]) -> dict[str, np
     names = sorted(p for p, n in counts.items() if n >= 3 and all(p in s for s in sets.values()) and
                    simulation.points.role[place[p]] != "control")  # fmt: skip
     truth = simulation.points.xyz_l[[place[p] for p in names]]
-    times = np.concatenate([o.time_s for o in online["window"].whole])
+    strip, times = simulation.flight.strips[0].id, np.concatenate([o.time_s for o in online["window"].whole])
     result = {n: orientation_errors(simulation, r.whole).error for n, r in online.items()}
-    result |= {n: batch_errors(simulation, r, times) for n, r in at_once.items()}
+    result |= {n: batch_errors(simulation, r, strip, times) for n, r in at_once.items()}
     result["final"] = orientation_errors(simulation, online["window"].final).error
     result["final clean"] = orientation_errors(simulation, online["window clean"].final).error
     result |= {f"points {n}": np.array([xyz[p] for p in names]) - truth for n, (xyz, _) in found.items()}
