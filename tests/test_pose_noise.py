@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from triline.solver.adjustment.pose_noise import followed, share_left
 from triline.solver.navigation.kinematic_model import noise_time
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
-from triline.solver.window.pose_noise import followed, share_left
 from triline.solver.window.results import WindowOptions
 
 JERK_PSD, FIX_DENSITY = 1.0, 1.8e-4

@@ -148,7 +148,18 @@ def _strips_of(
         )
         noise = _noise_of(bodies, slow)
         lens = id.rpartition("/")[2] if "/" in id else None
-        strips.append(Strip(id, trajectory, first, rate, lines, lens=lens if lens in lenses else None, noise=noise))
+        strips.append(
+            Strip(
+                id,
+                trajectory,
+                first,
+                rate,
+                lines,
+                lens=lens if lens in lenses else None,
+                noise=noise,
+                noise_time_s=bodies[-1].noise_time_s,
+            )
+        )
     return tuple(strips)
 
 

@@ -20,6 +20,7 @@ from .normal_equations import reduce_normals
 from .normal_matrix import DenseMatrix
 from .parameter_elimination import eliminate, own_information
 from .point_consensus import Doubt, doubts
+from .pose_noise import with_noise_left
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
 from .robust import WeightFunction, huber
@@ -37,6 +38,9 @@ ROBUST_OUT = 0.02
 
 #: Share of the cost below which an adjustment that is followed by others is not worth another step.
 WARM_TOLERANCE = 1e-9
+
+#: Times that what is left of the noise of poses is looked at.
+NOISE_ROUNDS = 3
 
 #: Re-estimations of the image sigma, each followed by a new search for outliers.
 REWEIGHTINGS = 3
@@ -251,8 +255,20 @@ class _Stage:
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
             start = solve(problem, points, weight, replace(job.options, robust=huber()), tell)
         self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
+        if not before:
+            self._state_noise(network, model)
         if self.scales.factor["image"] != 1.0:
             self._keep(scaled(self.solution, {"image": self.scales.factor["image"]}, job.options))
+
+    def _state_noise(self, network: Network, model: ModelOptions) -> None:
+        """Weigh rays with what the corrections leave of the noise of poses: with less of it they follow more."""
+        for _ in range(NOISE_ROUNDS):
+            left = with_noise_left(network, self.solution)
+            if left is None:
+                return
+            problem = pose_problem(left, model, self.job.self_calibration)
+            options = replace(self.job.options, robust=self.job.robust)
+            self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
 
     def work(self, last: bool) -> None:
         """All steps after the first adjustment; elimination and variance components in the last stage only."""

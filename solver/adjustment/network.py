@@ -33,7 +33,8 @@ class Strip:
     lines : number of image lines; 0 when it is not known
     line_time_s : (lines,) times of the lines where a camera does not keep a constant rate; replaces the two above
     lens : lens of the camera this strip was taken through, where strips are given lens by lens
-    noise : (k, 6, 6) covariance of the white noise of the trajectory's k samples, m and rad; None where it is not known
+    noise : (k, 6, 6) covariance of the noise of the trajectory's k samples, m and rad; None where it is not known
+    noise_time_s : lag at which that of the positions is correlated by 1/e; 0 = white
     """
 
     id: str
@@ -44,6 +45,7 @@ class Strip:
     line_time_s: Array | None = field(default=None, repr=False)
     lens: str | None = None
     noise: Array | None = field(default=None, repr=False)
+    noise_time_s: float = 0.0
 
     def time_of(self, line: ArrayLike) -> Array:
         """Times of (fractional) image lines, seconds."""

@@ -109,6 +109,13 @@ class PointNormals:
         return np.einsum("kin,kjn->nij", rows, rows)
 
 
+def inverse_factors(normals: PointNormals) -> Array:
+    """``L^-1`` (p, 3, 3) of the points' normal matrices ``L L^T``."""
+    a, b, c, d, e, f = normals.inverse_factor
+    zero = np.zeros_like(a)
+    return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
+
+
 @dataclass(frozen=True)
 class Reduced:
     """The reduced system ``matrix @ d_theta = rhs`` and what leads back to the points."""

@@ -31,7 +31,17 @@ def network_of(simulation: Simulation, poses: list[TimedPose]) -> Network:
         own = [smoothed[i] for i in np.flatnonzero(inside)]
         measured = Trajectory([p.time_s for p in own], [p.position_l for p in own], [p.quaternion for p in own])
         noise = slow.without(np.array([p.covariance for p in own]))
-        strips.append(Strip(s.id, measured, s.first_line_time_s, s.line_rate_hz, s.lines, noise=noise))
+        strips.append(
+            Strip(
+                s.id,
+                measured,
+                s.first_line_time_s,
+                s.line_rate_hz,
+                s.lines,
+                noise=noise,
+                noise_time_s=own[-1].noise_time_s,
+            )
+        )
     images, looks, points = simulation.images, simulation.images.looks, simulation.points
     sigma = np.full(len(looks), simulation.observation_plan.image_sigma_px)
     known = np.flatnonzero(points.role == "control")

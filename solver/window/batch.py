@@ -17,7 +17,7 @@ from ..adjustment.covariance import Cofactors
 from ..adjustment.layout import Layout
 from ..adjustment.linearisation import Linearisation, Whitening, linearise, linearise_and_weigh
 from ..adjustment.network import Rays
-from ..adjustment.normal_equations import ControlWeights, PointNormals, point_normals
+from ..adjustment.normal_equations import ControlWeights, PointNormals, inverse_factors, point_normals
 from ..adjustment.ray_statistics import RayStatistics, ray_statistics, residuals_px
 from ..models.base import Design, PseudoObservations
 from ..selfcalibration import SelfCalibration
@@ -279,13 +279,6 @@ class Batch:
         shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
         moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
         return replace(self.lin, residual=self.lin.residual - moved)
-
-
-def inverse_factors(normals: PointNormals) -> Array:
-    """``L^-1`` (p, 3, 3) of the points' normal matrices ``L L^T``."""
-    a, b, c, d, e, f = normals.inverse_factor
-    zero = np.zeros_like(a)
-    return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True)

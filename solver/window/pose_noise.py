@@ -1,89 +1,20 @@
-"""What is left of the noise of smoothed positions once the corrections have followed it.
-
-A smoother averages the noise of the fixes over some tenths of a second, so that what is left of it is no white noise:
-its spectrum ends at the smoother's bandwidth ``w_s``. Where rays are dense the corrections follow the wander up to a
-bandwidth ``w_c``, and they cannot tell wander from noise: the part of the noise below ``w_c`` is corrected with it. To
-state all of the noise, in the weights of rays and beside the covariance of the corrections, is to state too much.
-
-With a wander of spectral density ``s / w^4`` and rays that see it with white noise of density ``1 / i``, the
-corrections are the wander through ``H = 1 / (1 + (w / w_c)^4)``, ``w_c^4 = s i`` (the Wiener smoother of a twice
-integrated white noise). The noise of a smoother for white jerk has the spectrum ``1 / (1 + (w / w_s)^6)``. What is left
-of its variance is its integral times ``(1 - H)^2``. Position and attitude are corrected together; the directions in
-which each bandwidth holds are those in which information and wander are both diagonal. The information counted is that
-of the rays with the points eliminated, for corrections that differ from look to look.
-
-Source: Wiener smoother as in P. S. Maybeck, Stochastic Models, Estimation, and Control, vol. 1, 1979, section 4.
-"""
+"""What the window's corrections leave of the noise of smoothed poses, see `adjustment.pose_noise`, as rays come in."""
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from ..adjustment.pose_noise import PIECE_S, followed, information_by_pieces, left_of_noise, ray_information
 from ..measured_trajectory import MeasuredPoses, MeasuredTrajectory
-from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
-from .batch import Batch, inverse_factors
+from .batch import Batch
 
 Array = NDArray[np.floating]
 
-#: Bandwidths of corrections over that of the noise for which the share left is computed; linear between.
-_LOWEST, _HIGHEST, _STEPS = 1e-2, 1e2, 81
-#: Information is counted in pieces of so long, s, and kept so long.
-PIECE_S, KEPT_S = 2.0, 200.0
+#: Information is kept so long, s.
+KEPT_S = 200.0
 #: The noise that is left has to differ by so much of its standard deviation for rays to be weighted again.
 CLEARLY = 0.15
-
-
-@cache
-def _left() -> tuple[Array, Array]:
-    """Share of the noise variance that is left, by the logarithm of ``w_c / w_s``."""
-    ratio = np.linspace(np.log(_LOWEST), np.log(_HIGHEST), _STEPS)
-    w = np.linspace(0.0, 8.0, 4001)
-    spectrum = 1.0 / (1.0 + w**6)
-    w4 = (w[:, None] / np.exp(ratio)) ** 4
-    kept = (w4 / (1.0 + w4)) ** 2
-    return ratio, (spectrum @ kept) / spectrum.sum()
-
-
-def share_left(bandwidth: ArrayLike, noise_time_s: float) -> Array:
-    """Share of the noise variance that corrections of a bandwidth (...), rad/s, leave.
-
-    Parameters
-    ----------
-    noise_time_s : lag at which the noise is correlated by 1/e
-    """
-    x = np.asarray(bandwidth, dtype=float) * noise_time_s / NOISE_TIMES_BANDWIDTH
-    return np.interp(np.log(np.maximum(x, _LOWEST)), *_left())
-
-
-def followed(information: Array, density: Array, noise_time_s: float) -> Array:
-    """What corrections leave of the noise of a position: (6, 6), to be multiplied with a noise of pose.
-
-    Parameters
-    ----------
-    information : (6, 6) of the rays about the corrections, a second
-    density : (6,) of the wander, ``s`` of its spectral density ``s / w^4``; 0 where nothing wanders
-    noise_time_s : of the positions
-    """
-    left = np.eye(6)
-    root = np.sqrt(density)
-    if noise_time_s <= 0.0 or not (root[:3] > 0.0).all():
-        return left
-    value, vector = np.linalg.eigh(information * root[:, None] * root)
-    share = share_left(np.maximum(value, 0.0) ** 0.25, noise_time_s)
-    left[:, :3] = (root[:, None] * (vector * np.sqrt(share)) @ vector.T)[:, :3] / root[:3]
-    return left
-
-
-def ray_information(batch: Batch) -> Array:
-    """Information (n, 6, 6) of each ray of a batch about its own corrections, the points eliminated."""
-    point = batch.lin.point.transpose(2, 0, 1)
-    through = point @ np.swapaxes(inverse_factors(batch.normals), 1, 2)[batch.rays.point]
-    own = np.eye(2) - through @ np.swapaxes(through, 1, 2)
-    rows = batch.lin.orientation.transpose(2, 0, 1) * np.sqrt(batch.weight)[:, None, None]
-    return np.swapaxes(rows, 1, 2) @ own @ rows
 
 
 class PoseNoise:
@@ -103,10 +34,9 @@ class PoseNoise:
 
     def count(self, batch: Batch) -> None:
         """A batch has come."""
-        piece = np.floor(batch.rays.time_s / PIECE_S).astype(np.int64)
-        information = ray_information(batch)
-        for k in np.unique(piece).tolist():
-            self._pieces[k] = self._pieces.get(k, 0.0) + information[piece == k].sum(axis=0) / PIECE_S
+        information = ray_information(batch.lin, batch.normals, batch.rays.point, batch.weight)
+        for k, of_piece in information_by_pieces(batch.rays.time_s, information).items():
+            self._pieces[k] = self._pieces.get(k, 0.0) + of_piece
 
     def learn(self, density: Array, now_s: float) -> bool:
         """Look at all that has been counted; whether rays are to be weighted again.
@@ -149,5 +79,5 @@ def _size(left: Array) -> float:
 
 def _apply(measured: MeasuredPoses, left: Array) -> Array:
     """What is left of the noise of smoothed poses; filtered ones keep theirs."""
-    rest = left @ measured.covariance @ np.swapaxes(left, 1, 2)
+    rest = left_of_noise(measured.covariance, left)
     return np.where(measured.smoothed[:, None, None], rest, measured.covariance)

@@ -1,0 +1,123 @@
+"""What is left of the noise of smoothed positions once the corrections have followed it.
+
+A smoother averages the noise of the fixes over some tenths of a second, so that what is left of it is no white noise:
+its spectrum ends at the smoother's bandwidth ``w_s``. Where rays are dense the corrections follow the wander up to a
+bandwidth ``w_c``, and they cannot tell wander from noise: the part of the noise below ``w_c`` is corrected with it. To
+state all of the noise, in the weights of rays and beside the covariance of the corrections, is to state too much.
+
+With a wander of spectral density ``s / w^4`` and rays that see it with white noise of density ``1 / i``, the
+corrections are the wander through ``H = 1 / (1 + (w / w_c)^4)``, ``w_c^4 = s i`` (the Wiener smoother of a twice
+integrated white noise). The noise of a smoother for white jerk has the spectrum ``1 / (1 + (w / w_s)^6)``. What is left
+of its variance is its integral times ``(1 - H)^2``. Position and attitude are corrected together; the directions in
+which each bandwidth holds are those in which information and wander are both diagonal. The information counted is that
+of the rays with the points eliminated, for corrections that differ from look to look.
+
+Source: Wiener smoother as in P. S. Maybeck, Stochastic Models, Estimation, and Control, vol. 1, 1979, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
+from .linearisation import Linearisation
+from .network import Network, Rays
+from .normal_equations import PointNormals, inverse_factors
+from .problem import Solution
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Bandwidths of corrections over that of the noise for which the share left is computed; linear between.
+_LOWEST, _HIGHEST, _STEPS = 1e-2, 1e2, 81
+#: Information is counted in pieces of so long, s.
+PIECE_S = 2.0
+
+
+@cache
+def _left() -> tuple[Array, Array]:
+    """Share of the noise variance that is left, by the logarithm of ``w_c / w_s``."""
+    ratio = np.linspace(np.log(_LOWEST), np.log(_HIGHEST), _STEPS)
+    w = np.linspace(0.0, 8.0, 4001)
+    spectrum = 1.0 / (1.0 + w**6)
+    w4 = (w[:, None] / np.exp(ratio)) ** 4
+    kept = (w4 / (1.0 + w4)) ** 2
+    return ratio, (spectrum @ kept) / spectrum.sum()
+
+
+def share_left(bandwidth: ArrayLike, noise_time_s: float) -> Array:
+    """Share of the noise variance that corrections of a bandwidth (...), rad/s, leave.
+
+    Parameters
+    ----------
+    noise_time_s : lag at which the noise is correlated by 1/e
+    """
+    x = np.asarray(bandwidth, dtype=float) * noise_time_s / NOISE_TIMES_BANDWIDTH
+    return np.interp(np.log(np.maximum(x, _LOWEST)), *_left())
+
+
+def followed(information: Array, density: Array, noise_time_s: float) -> Array:
+    """What corrections leave of the noise of a position: (6, 6), to be multiplied with a noise of pose.
+
+    Parameters
+    ----------
+    information : (6, 6) of the rays about the corrections, a second
+    density : (6,) of the wander, ``s`` of its spectral density ``s / w^4``; 0 where nothing wanders
+    noise_time_s : of the positions
+    """
+    left = np.eye(6)
+    root = np.sqrt(density)
+    if noise_time_s <= 0.0 or not (root[:3] > 0.0).all():
+        return left
+    value, vector = np.linalg.eigh(information * root[:, None] * root)
+    share = share_left(np.maximum(value, 0.0) ** 0.25, noise_time_s)
+    left[:, :3] = (root[:, None] * (vector * np.sqrt(share)) @ vector.T)[:, :3] / root[:3]
+    return left
+
+
+def ray_information(lin: Linearisation, normals: PointNormals, point: IntArray, weight: Array) -> Array:
+    """Information (n, 6, 6) of rays of points (n,) about their own corrections, the points eliminated."""
+    through = lin.point.transpose(2, 0, 1) @ np.swapaxes(inverse_factors(normals), 1, 2)[point]
+    own = np.eye(2) - through @ np.swapaxes(through, 1, 2)
+    rows = lin.orientation.transpose(2, 0, 1) * np.sqrt(weight)[:, None, None]
+    return np.swapaxes(rows, 1, 2) @ own @ rows
+
+
+def information_by_pieces(time_s: Array, information: Array) -> dict[int, Array]:
+    """Information (6, 6) a second of rays (n,), summed over pieces of `PIECE_S` by their numbers."""
+    piece = np.floor(time_s / PIECE_S).astype(np.int64)
+    return {k: information[piece == k].sum(axis=0) / PIECE_S for k in np.unique(piece).tolist()}
+
+
+def left_of_noise(noise: Array, left: Array) -> Array:
+    """Covariance (n, 6, 6) of what `followed` (n, 6, 6) leaves of a noise."""
+    return left @ noise @ np.swapaxes(left, -1, -2)
+
+
+def with_noise_left(network: Network, solution: Solution) -> Network | None:
+    """The network with what the corrections of a solution leave of the noise of poses; None where they leave all.
+
+    Parameters
+    ----------
+    network : as measured, with the whole noise
+    solution : of it, or of it with other noise
+    """
+    rays, slow = network.rays, getattr(solution.problem.model, "slow", None)
+    if slow is None or rays.orientation_noise is None or not any(s.noise_time_s for s in network.strips):
+        return None
+    found = ray_information(solution.linearisation, solution.points, rays.point, solution.ray_weight)
+    left = np.broadcast_to(np.eye(6), found.shape).copy()
+    for i, strip in enumerate(network.strips):
+        mine = np.flatnonzero(rays.strip == i)
+        _follow(left, rays, mine, found[mine], slow.wander_density, strip.noise_time_s)
+    return replace(network, rays=replace(rays, orientation_noise=left_of_noise(rays.orientation_noise, left)))
+
+
+def _follow(left: Array, rays: Rays, mine: IntArray, information: Array, density: Array, noise_time_s: float) -> None:
+    piece = np.floor(rays.time_s[mine] / PIECE_S).astype(np.int64)
+    for k, of_piece in information_by_pieces(rays.time_s[mine], information).items():
+        left[mine[piece == k]] = followed(of_piece, density, noise_time_s)
