@@ -29,6 +29,8 @@ import numpy as np
 
 from triline.solver.adjustment.batch import Job
 from triline.solver.adjustment.batch import run as run_batch
+from triline.solver.models.lim import LimOptions
+from triline.solver.models.ppm import PpmOptions
 from triline.solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
 from triline.solver.sensors import preset
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
@@ -158,8 +160,11 @@ def one_adjustment(seed: int, case: Case) -> dict[str, np.ndarray]:
     poses = navigate(simulation)
     parameters, options = case.parameters, WindowOptions(model=case.model, snoop=False, grid_hz=5.0)
     online = adjust_online(simulation, poses, options, parameters, live=False, update_s=0.5)
-    slow, strip = slow_errors_of(simulation.errors), simulation.flight.strips[0]
-    model = model_options(slow, options, strip.lines / strip.line_rate_hz)
+    model = model_options(slow_errors_of(simulation.errors), options, case.strip_s)
+    if isinstance(model, PpmOptions):
+        model = replace(model, segments=0)  # of each strip as many as its length asks for
+    elif isinstance(model, LimOptions):
+        model = replace(model, fixes=0)
     found = run_batch(network_of(simulation, poses), Job(model, self_calibration=parameters, eliminate=False))
     names = list(found.network.point_ids)
     place = {name: i for i, name in enumerate(names)}

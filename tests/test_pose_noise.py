@@ -5,13 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from triline.solver.adjustment.pose_noise import followed, share_left
+from triline.solver.adjustment.adjustment import solve
+from triline.solver.adjustment.batch import Job, run
+from triline.solver.adjustment.pose_noise import followed, share_left, with_noise_left
+from triline.solver.adjustment.problem import pose_problem
 from triline.solver.navigation.kinematic_model import noise_time
 from triline.solver.selfcalibration import tls
 from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.flight_network import network_of
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, slow_errors_of
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.strip import model_options
 
 JERK_PSD, FIX_DENSITY = 1.0, 1.8e-4
 
@@ -76,3 +81,28 @@ def test_many_rays_without_control_do_not_make_the_image_small():
         known = next(r.parameters for r in reversed(result.reports) if r.parameters)
         off.append(np.mean([p.value / p.sigma for p in known if p.name.startswith("sy")]))
     assert abs(np.mean(off)) < 1.5, off
+
+
+def test_the_batch_adjustment_states_as_much_of_the_noise_as_the_window_does():
+    """Low and dense, so that the corrections follow much of it; two estimators, one answer."""
+    plan = FlightPlan(height_m=800.0, strip_s=12.0, lead_in_s=3.0, lead_out_s=2.0)
+    flown = simulate(plan, 3, observation_plan=ObservationPlan(tie_points_per_s=15.0))
+    poses = navigate(flown)
+    options = WindowOptions(snoop=False)
+    network = network_of(flown, poses)
+    model = model_options(slow_errors_of(flown.errors), options, plan.strip_s)
+    whole = solve(pose_problem(network, model))
+    found = run(network, Job(model)).solution
+    rays, stated = found.network.rays, with_noise_left(network, found)
+    assert stated is not None
+    # nothing changes any more when it is looked at again
+    left_out = found.problem.layout.sets[0].model.left_out_variance(rays.time_s)[:, :, None] * np.eye(6)
+    np.testing.assert_allclose(stated.rays.orientation_noise + left_out, rays.orientation_noise, rtol=0.05, atol=1e-12)
+    share = np.sqrt(
+        np.einsum("nii->ni", stated.rays.orientation_noise) / np.einsum("nii->ni", network.rays.orientation_noise)
+    )[:, :3]
+    window = adjust_at_once(flown, poses, options).window
+    assert window is not None
+    by_window = np.diagonal(window._pose_noise.usual)[:3]
+    assert np.median(share, axis=0) == pytest.approx(by_window, rel=0.15) and by_window.max() < 0.8
+    assert whole.sigma0 < found.sigma0 - 0.05 and found.sigma0 == pytest.approx(1.0, abs=0.12)
