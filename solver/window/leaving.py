@@ -27,6 +27,10 @@ IntArray = NDArray[np.int64]
 
 #: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
 MOST_LEAVING = 1000
+#: What is older than the window leaves within about so long, s, but so many rays in each update at least: points that
+#: are completed together were seen first at different times, so that at the border of a segment many batches are old
+#: at once.
+LEAVING_S, LEAST_LEAVING = 1.0, 100
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
@@ -62,14 +66,18 @@ class Leaver:
         self._watch, self._orienter, self._apart = watch, orienter, apart
         self._steps: list[Step] = []
         self._left: list[LeftPoints] = []
+        self._let_go_s = -np.inf
 
     def let_go(
         self, now_s: float, limit_s: float, length_s: float, serial: int, result: WindowUpdate, at_the_end: bool = False
     ) -> None:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
         limits = {}
+        bearable_s = self._bearable_s(limit_s, now_s - self._let_go_s)
+        self._let_go_s = now_s
         for strip in self._strips.values():
-            limits[strip.id] = max(self._settled_to(strip), limit_s) if self._is_settled(strip, now_s) else limit_s
+            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
+            limits[strip.id] = max(settled_s, bearable_s)
         by_index = [limits[id] for id in self._strips]
         latest = max(by_index, default=-np.inf)
         old = [b for b in self._batches if b.oldest_s <= latest]
@@ -129,6 +137,19 @@ class Leaver:
             return True
         index = list(self._strips).index(strip.id)
         return smoothed_s >= strip.end_s and not any(b.provisional and index in b.strips for b in self._batches)
+
+    def _bearable_s(self, limit_s: float, passed_s: float) -> float:
+        """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
+        if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
+            return limit_s
+        old = sorted((b for b in self._batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
+        most = max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S)
+        rays = 0
+        for batch in old:
+            rays += len(batch.rays)
+            if rays >= most:
+                return batch.oldest_s
+        return limit_s
 
     def _settled_to(self, strip: WindowStrip) -> float:
         """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
