@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--window", type=float, default=40.0, help="s")
     parser.add_argument("--seconds", type=float, default=75.0, help="of the strip")
     parser.add_argument("--selfcal", default="none", help="set of additional parameters")
-    parser.add_argument("--update-rays", type=int, default=16, help="an update as soon as so many wait")
+    parser.add_argument("--update-rays", type=int, default=12, help="an update as soon as so many wait")
     parser.add_argument("--port", type=int, default=17621)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
