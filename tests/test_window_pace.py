@@ -70,3 +70,18 @@ def test_what_is_old_leaves_a_little_at_a_time() -> None:
     assert leaving.sum() > 1000  # 12 in each update, on average
     assert leaving.max() < 65  # 80 at the border of a segment, if all that is old leaves at once
     assert max(late_s) < LEAVING_S
+
+
+def test_results_do_not_hang_on_the_size_of_batches() -> None:
+    """Two points an update, or forty: the same final orientation, where both know the same when it becomes final."""
+    simulation = simulate(FlightPlan(strip_s=26.0, lead_in_s=4.0), 3, observation_plan=ObservationPlan(40.0))
+    poses, options = navigate(simulation), WindowOptions(window_s=60.0, grid_hz=2.0)
+    found = []
+    for update_s in (0.05, 1.0):
+        final = adjust_online(simulation, poses, options, live=False, update_s=update_s).final
+        values = np.concatenate([np.hstack([o.position_l, o.angles]) for o in final])
+        found.append((values, np.concatenate([np.sqrt(np.einsum("nii->ni", o.covariance)) for o in final])))
+    (few, sigma), (many, sigma_of_many) = found
+    assert len(few) > 50
+    assert np.abs((few - many) / sigma).max() < 0.05
+    assert np.abs(np.log(sigma_of_many / sigma)).max() < 0.01
