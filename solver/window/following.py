@@ -26,8 +26,8 @@ LOOKED_AFTER = 16
 #: So many batches at most are linearised again in one turn. Where new data moved far, or weights have changed, so many
 #: rays, the oldest first, which leave first, the others in the turns after it: by platform time, and so many at least.
 MOST_AGAIN = 6
-AGAIN_HZ, LEAST_AGAIN = 6000.0, 600
-REWEIGHED_HZ, LEAST_REWEIGHED = 3000.0, 250
+AGAIN_HZ, LEAST_AGAIN = 4000.0, 400
+REWEIGHED_HZ, LEAST_REWEIGHED = 2000.0, 200
 #: Rays that get their smoothed orientation in one update, about, or half of those that wait; the others in the next.
 MOST_REPLACED = 600
 #: Batches of one time are joined up to so many rays when they get their smoothed orientation. None waits for others: of
