@@ -1,11 +1,12 @@
 """Tie point published to refined orientation received, over the bus: publisher and adjuster are two processes.
 
-    python bench/tie_latency.py [--rays 500] [--window 40] [--seconds 75] [--selfcal none]
+    python bench/tie_latency.py [--rays 500] [--window 40] [--seconds 75] [--selfcal none] [--computed]
 
 A flight with so many tie rays a second is simulated and navigated beforehand; then its poses, tie points and control
 are published at the pace of their stamps, and an adjuster (``triline node adjuster``) answers. A tie point is answered
 by the first ``orientation/live`` that comes after the ``point/object`` of that point: it was computed with the point in
-the window. Tie points count once the window is full. Times are wall time.
+the window. Tie points count once the window is full. Times are wall time, or with ``--computed``, which needs no bus,
+processor times, for machines that others use as well.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from tie_latency_computed import computed
 
 from triline.nodes.bus import Bus
 from triline.nodes.node import Message
@@ -92,12 +94,19 @@ def main() -> None:
     parser.add_argument("--window", type=float, default=40.0, help="s")
     parser.add_argument("--seconds", type=float, default=75.0, help="of the strip")
     parser.add_argument("--selfcal", default="none", help="set of additional parameters")
-    parser.add_argument("--update-rays", type=int, default=16, help="an update as soon as so many wait")
+    parser.add_argument("--update-rays", type=int, default=12, help="an update as soon as so many wait")
+    parser.add_argument("--computed", action="store_true", help="from processor times, without the bus")
     parser.add_argument("--port", type=int, default=17621)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = prepare(folder, args)
+        if args.computed:
+            named = {"self_calibration": args.selfcal, "update_rays": args.update_rays, "window_s": args.window}
+            # the strip begins 10 s after the first message; at its end everything leaves
+            found = computed(recording, TOPICS, named, 11.0 + args.window, 8.0 + args.seconds)
+            print(json.dumps(found, indent=2))
+            return
         ears = Ears()
         with NodeGroup(folder, "bench", args.port) as group, Bus("bench", source="bench", port=args.port) as bus:
             settings = (

@@ -1,6 +1,6 @@
 """The sliding window, measured: latency, consistency, a long flight. Efficiency: `efficiency.py`.
 
-    python bench/window.py latency [--selfcal] [--interval 0.032]
+    python bench/window.py latency [--selfcal] [--interval 0.024]
     python bench/window.py consistency [--seeds 20] [--rough] [--model wander]
     python bench/window.py long [--minutes 20]
 
@@ -37,7 +37,7 @@ COMPONENTS = ("X", "Y", "Z", "omega", "phi", "kappa")
 def latency(args: argparse.Namespace) -> dict[str, object]:
     """20 000 rays in a window of 40 s, while it is full; the end of the strip apart.
 
-    Every 0.032 s is the adjuster's pace at 500 rays a second: 16 new rays an update.
+    Every 0.024 s is the adjuster's pace at 500 rays a second: 12 new rays an update.
     """
     simulation = simulate(FlightPlan(strip_s=110.0), 1, observation_plan=ObservationPlan(tie_points_per_s=300.0))
     RareCollections()

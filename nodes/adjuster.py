@@ -93,7 +93,7 @@ class Adjuster(Node):
         settle_s: float = WindowOptions.settle_s,
         snoop: bool = True,
         update_s: float = 0.2,
-        update_rays: int = 16,
+        update_rays: int = 12,
         pace: str = "load",
         self_calibration: str = "none",
         camera_sigma: float = 1.0,

@@ -21,11 +21,13 @@ IntArray = NDArray[np.int64]
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
 #: the linear equations then miss goes with its square: two hundredths of a pixel.
 MOVED = 1.5e-3
-#: Every so many updates it is looked whether a batch has moved, if new data did not move far.
+#: Every so many turns it is looked whether a batch has moved, if new data did not move far.
 LOOKED_AFTER = 16
-#: So many batches at most are linearised again in one update; where new data moved far, so many rays, the oldest first,
-#: which leave first, the others in the updates after it.
-MOST_AGAIN, MOST_RAYS_AGAIN = 6, 2500
+#: So many batches at most are linearised again in one turn. Where new data moved far, or weights have changed, so many
+#: rays, the oldest first, which leave first, the others in the turns after it: by platform time, and so many at least.
+MOST_AGAIN = 6
+AGAIN_HZ, LEAST_AGAIN = 4000.0, 400
+REWEIGHED_HZ, LEAST_REWEIGHED = 2000.0, 200
 #: Rays that get their smoothed orientation in one update, about, or half of those that wait; the others in the next.
 MOST_REPLACED = 600
 #: Batches of one time are joined up to so many rays when they get their smoothed orientation. None waits for others: of
@@ -56,15 +58,22 @@ class Follower:
         self._step_s, self._dropped = step_s, dropped
         self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
         self._following = False  # whether they are what was left when new data moved far
+        self._reweighing = False  # whether they are what was left when weights changed
         self._turn = 0
+        self._looked_s = -np.inf
+        self._passed_s = 0.0  # between the last two turns
 
     # -- smoothed orientation ------------------------------------------------------------------------------------------
 
-    def replace_filtered(self) -> list[Batch]:
+    def replace_filtered(self, all_at_once: bool = False) -> list[Batch]:
         """Put smoothed orientation under batches that had to do with the filtered one, the oldest first.
 
         Small ones are joined then, so that a window into which rays come a few at a time costs no more than others;
         those that came about that way are returned.
+
+        Parameters
+        ----------
+        all_at_once : however many they are
         """
         smoothed_s = self._trajectory.smoothed_to_s
         due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
@@ -73,7 +82,7 @@ class Follower:
         groups: dict[int, list[list[Batch]]] = {}
         rays = 0
         for batch in due:
-            if rays > max(MOST_REPLACED, number // 2):
+            if rays > max(MOST_REPLACED, number // 2) and not all_at_once:
                 break
             rays += len(batch.rays)
             if batch.ties is not None:
@@ -114,20 +123,28 @@ class Follower:
 
     # -- what has moved ------------------------------------------------------------------------------------------------
 
-    def look_after(self) -> None:
+    def look_after(self, now_s: float) -> None:
         """Linearise again what has moved, in turn; before the solution, for which it then counts."""
+        self._passed_s, self._looked_s = now_s - self._looked_s, now_s
         if not self._suspects:
-            self._following = False
+            self._following = self._reweighing = False
             self._turn += 1
             turn = list(self._batches)[self._turn % LOOKED_AFTER :: LOOKED_AFTER]
             self._suspects = {id(b): b for b in turn}
-        self._again(MOST_RAYS_AGAIN if self._following else 0)
+        if self._following:
+            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
+        else:
+            self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ) if self._reweighing else 0.0)
 
     def reweigh(self) -> None:
         """Other noise of poses has become known: all batches are linearised again, the oldest first."""
         self._suspects = {id(b): b for b in self._batches}
-        self._following = True
-        self._again(MOST_RAYS_AGAIN)
+        self._reweighing = True
+        self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ))
+
+    def _bearable(self, least: int, rays_hz: float) -> float:
+        """Rays of a turn."""
+        return max(least, rays_hz * self._passed_s)
 
     def follow(self, fresh: list[Batch]) -> bool:
         """After a solution, linearise again new batches that have moved far; whether there were any.
@@ -143,10 +160,10 @@ class Follower:
             new = {id(b) for b in fresh}
             self._suspects = {id(b): b for b in self._batches if id(b) not in new}
             self._following = True
-            self._again(MOST_RAYS_AGAIN)
+            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
         return bool(due)
 
-    def _again(self, most_rays: int) -> None:
+    def _again(self, most_rays: float) -> None:
         """Linearise suspects again that have moved, up to a number of rays, or of batches if that is 0."""
         rays = batches = 0
         for key, batch in list(self._suspects.items()):

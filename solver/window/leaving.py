@@ -27,9 +27,17 @@ IntArray = NDArray[np.int64]
 
 #: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
 MOST_LEAVING = 1000
+#: What is older than the window leaves within about so long, s, but so many rays in each update at least: points that
+#: are completed together were seen first at different times, so that at the border of a segment many batches are old
+#: at once.
+LEAVING_S, LEAST_LEAVING = 1.0, 100
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
+#: A strip waits so long beyond its time, s, for smoothed poses of its end where there are smoothed ones: longer than a
+#: smoother lags behind. Filtered ones differ by more than any wander explains while a filter learns, and where they
+#: follow smoothed ones is a step that no correction can take.
+SMOOTHED_LATE_S = 12.0
 
 
 class Leaver:
@@ -58,15 +66,18 @@ class Leaver:
         self._watch, self._orienter, self._apart = watch, orienter, apart
         self._steps: list[Step] = []
         self._left: list[LeftPoints] = []
+        self._let_go_s = -np.inf
 
     def let_go(
         self, now_s: float, limit_s: float, length_s: float, serial: int, result: WindowUpdate, at_the_end: bool = False
     ) -> None:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
         limits = {}
+        bearable_s = self._bearable_s(limit_s, now_s - self._let_go_s)
+        self._let_go_s = now_s
         for strip in self._strips.values():
-            settled = strip.ended and now_s >= strip.end_s + self.options.settle_s
-            limits[strip.id] = max(self._settled_to(strip), limit_s) if settled else limit_s
+            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
+            limits[strip.id] = max(settled_s, bearable_s)
         by_index = [limits[id] for id in self._strips]
         latest = max(by_index, default=-np.inf)
         old = [b for b in self._batches if b.oldest_s <= latest]
@@ -115,6 +126,30 @@ class Leaver:
                 self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s, result)
+
+    def _is_settled(self, strip: WindowStrip, now_s: float) -> bool:
+        """Whether a strip is over and nothing is waited for: late tie points, and smoothed poses under its rays."""
+        late_s = now_s - strip.end_s - self.options.settle_s
+        if not strip.ended or late_s < 0.0:
+            return False
+        smoothed_s = self._trajectory.smoothed_to_s
+        if np.isinf(smoothed_s) or late_s >= SMOOTHED_LATE_S:
+            return True
+        index = list(self._strips).index(strip.id)
+        return smoothed_s >= strip.end_s and not any(b.provisional and index in b.strips for b in self._batches)
+
+    def _bearable_s(self, limit_s: float, passed_s: float) -> float:
+        """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
+        if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
+            return limit_s
+        old = sorted((b for b in self._batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
+        most = max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S)
+        rays = 0
+        for batch in old:
+            rays += len(batch.rays)
+            if rays >= most:
+                return batch.oldest_s
+        return limit_s
 
     def _settled_to(self, strip: WindowStrip) -> float:
         """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""

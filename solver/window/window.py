@@ -26,6 +26,7 @@ from .batch import Batch
 from .batches import Batches
 from .block import Block
 from .determinability import Standing
+from .duties import LOOK_AFTER, RETEST, WATCH, Duties
 from .following import Follower
 from .intake import Intake
 from .leaving import Leaver, grid
@@ -48,10 +49,6 @@ AHEAD_S = 1.0
 USUAL_DELAY_S = 2.0
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
-#: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
-HURRIED_S = 0.1
-#: Time between two looks of the watch, s, if updates are not hurried.
-WATCH_S = 0.3
 #: Time between two looks at what corrections leave of the noise of poses, s.
 LEARNT_S = 2.0
 
@@ -104,7 +101,8 @@ class Window:
         self._settler = Settler()
         self._now_s = -np.inf
         self._serial = 0
-        self._newest_ray_s = self._watched_s = self._learnt_s = -np.inf
+        self._newest_ray_s = self._learnt_s = -np.inf
+        self._duties = Duties()
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory, self._pose_noise)
         self._watch = Watch(
@@ -172,36 +170,35 @@ class Window:
 
     def update(self, now_s: float) -> WindowUpdate:
         """Work in what has arrived, let go what is older than the window."""
-        hurried = now_s - self._now_s < HURRIED_S
         self._now_s = max(self._now_s, now_s)
         self._serial += 1
-        turn = self._serial % 3 if hurried else None
         result = WindowUpdate()
         for strip in self.strips.values():
             if not strip.is_over(self.state):
                 strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
         fresh = self._take_arrived(result)
         joined = self._follower.replace_filtered()
-        if turn in (None, 0):
-            self._follower.look_after()
-        iterations = self._solve(fresh, joined, turn in (None, 1), result)
+        duties = self._duties.take(self._now_s, busy=bool(joined))
+        if LOOK_AFTER in duties:
+            self._follower.look_after(self._now_s)
+        iterations = self._solve(fresh, joined, RETEST in duties, result)
         self._learn_noise()
         for batch in fresh:
             result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
         self._let_go(self._limit_s(), result)
-        look = turn == 2 if hurried else self._now_s > self._watched_s + WATCH_S
-        result.report = self._report(iterations, fresh + joined, look, result)
+        result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
         return result
 
     def finish(self) -> WindowUpdate:
         """Everything that is left becomes final."""
         result = WindowUpdate()
         fresh = self._take_arrived(result)
-        iterations = self._solve(fresh, [], True, result)
+        joined = self._follower.replace_filtered(all_at_once=True)
+        iterations = self._solve(fresh, joined, True, result)
         for strip in self.strips.values():
             strip.end(0)
         self._let_go(np.inf, result, at_the_end=True)
-        result.report = self._report(iterations, [], True, result)
+        result.report = self._report(iterations, joined, True, result)
         return result
 
     def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
@@ -345,7 +342,6 @@ class Window:
         self._watch.note(changed)
         watched = self._watch.last
         if look or watched is None:
-            self._watched_s = self._now_s
             watched = self._watch.look(
                 self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
                 (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
