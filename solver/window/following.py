@@ -60,11 +60,15 @@ class Follower:
 
     # -- smoothed orientation ------------------------------------------------------------------------------------------
 
-    def replace_filtered(self) -> list[Batch]:
+    def replace_filtered(self, all_at_once: bool = False) -> list[Batch]:
         """Put smoothed orientation under batches that had to do with the filtered one, the oldest first.
 
         Small ones are joined then, so that a window into which rays come a few at a time costs no more than others;
         those that came about that way are returned.
+
+        Parameters
+        ----------
+        all_at_once : however many they are
         """
         smoothed_s = self._trajectory.smoothed_to_s
         due = [b for b in self._batches if b.provisional and b.newest_s <= smoothed_s]
@@ -73,7 +77,7 @@ class Follower:
         groups: dict[int, list[list[Batch]]] = {}
         rays = 0
         for batch in due:
-            if rays > max(MOST_REPLACED, number // 2):
+            if rays > max(MOST_REPLACED, number // 2) and not all_at_once:
                 break
             rays += len(batch.rays)
             if batch.ties is not None:

@@ -30,6 +30,10 @@ MOST_LEAVING = 1000
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
+#: A strip waits so long beyond its time, s, for smoothed poses of its end where there are smoothed ones: longer than a
+#: smoother lags behind. Filtered ones differ by more than any wander explains while a filter learns, and where they
+#: follow smoothed ones is a step that no correction can take.
+SMOOTHED_LATE_S = 12.0
 
 
 class Leaver:
@@ -65,8 +69,7 @@ class Leaver:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
         limits = {}
         for strip in self._strips.values():
-            settled = strip.ended and now_s >= strip.end_s + self.options.settle_s
-            limits[strip.id] = max(self._settled_to(strip), limit_s) if settled else limit_s
+            limits[strip.id] = max(self._settled_to(strip), limit_s) if self._is_settled(strip, now_s) else limit_s
         by_index = [limits[id] for id in self._strips]
         latest = max(by_index, default=-np.inf)
         old = [b for b in self._batches if b.oldest_s <= latest]
@@ -115,6 +118,17 @@ class Leaver:
                 self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s, result)
+
+    def _is_settled(self, strip: WindowStrip, now_s: float) -> bool:
+        """Whether a strip is over and nothing is waited for: late tie points, and smoothed poses under its rays."""
+        late_s = now_s - strip.end_s - self.options.settle_s
+        if not strip.ended or late_s < 0.0:
+            return False
+        smoothed_s = self._trajectory.smoothed_to_s
+        if np.isinf(smoothed_s) or late_s >= SMOOTHED_LATE_S:
+            return True
+        index = list(self._strips).index(strip.id)
+        return smoothed_s >= strip.end_s and not any(b.provisional and index in b.strips for b in self._batches)
 
     def _settled_to(self, strip: WindowStrip) -> float:
         """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""

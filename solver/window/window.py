@@ -197,11 +197,12 @@ class Window:
         """Everything that is left becomes final."""
         result = WindowUpdate()
         fresh = self._take_arrived(result)
-        iterations = self._solve(fresh, [], True, result)
+        joined = self._follower.replace_filtered(all_at_once=True)
+        iterations = self._solve(fresh, joined, True, result)
         for strip in self.strips.values():
             strip.end(0)
         self._let_go(np.inf, result, at_the_end=True)
-        result.report = self._report(iterations, [], True, result)
+        result.report = self._report(iterations, joined, True, result)
         return result
 
     def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
