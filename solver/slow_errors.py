@@ -27,6 +27,10 @@ LEARNING_TIME_S = 6.0
 #: Correlation time of what a smoother takes back of a position, s: a random walk from one smoothing to the next, each
 #: second, over a lag of 5 s; a process with a continuous slope that varies as much from second to second has this one.
 TAKEN_BACK_TIME_S = 4.0
+#: Between two smoothings, s (one on line, two where answers are not wanted early), the GNSS becomes another by so much;
+#: no more is taken back. What smoothed positions change by within some seconds is compared with it over seeds by
+#: bench/pose_changes.py.
+TAKEN_BACK_WITHIN_S = 1.5
 
 #: No pose has less white noise than this, m and rad.
 LEAST_NOISE = (1e-3, 1e-6)
@@ -124,9 +128,9 @@ class SlowErrors:
         )
 
     def with_taken_back(self) -> SlowErrors:
-        """With what a filter that learns takes back of its positions from second to second beside their wander: in the
-        time it learns in, no more than the wander becomes another in it; see `joined`."""
-        another = 1.0 - float(autocorrelation(self.wander_time_s, LEARNING_TIME_S)) ** 2
+        """With what a filter that learns takes back of its positions from one smoothing to the next, beside their
+        wander: no more than this becomes another by in that time; see `joined`."""
+        another = 1.0 - float(autocorrelation(self.wander_time_s, TAKEN_BACK_WITHIN_S)) ** 2
         taken_back = another * np.square(self.wander_m)
         wander_m, position_s = joined(self.wander_m, self.wander_time_s, taken_back, TAKEN_BACK_TIME_S)
         return replace(self, wander_m=wander_m, wander_time_s=position_s, attitude_time_s=float(self.wander_times_s[3]))

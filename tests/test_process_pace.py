@@ -93,12 +93,13 @@ def test_results_for_throughput_are_as_good(flights, tmp_path, kind):
     assert (quick_final < 1.1 * final).all()
     assert quick_ratio < max(1.1 * ratio, 1.5)
     assert quick_points < 1.1 * points
-    # and once a strip is over it does not matter that answers were wanted early: X, Y, Z, omega, phi, kappa
+    # and once a strip is over it does not matter that answers were wanted early: X, Y, Z, omega, phi, kappa; the
+    # heading, which is learnt on the strip, to a fifth, the others as much as two solutions of one flight differ
     whole, quick_whole = (component_errors(RecordingReader(tmp_path / p), simulation) for p in ("load", "throughput"))
     assert len(whole) == len(quick_whole) == live.outputs["orientation/final"]
-    assert (rms(whole) < 1.2 * rms(quick_whole) + np.repeat([0.005, 5e-6], 3)).all()
+    assert (rms(whole) < np.array([1.4] * 5 + [1.2]) * rms(quick_whole)).all()
     # the last of it, too, of which the smoothed poses come when it is over
-    assert (rms(whole[-60:]) < 1.5 * rms(quick_whole[-60:]) + np.repeat([0.02, 2e-5], 3)).all()
+    assert (rms(whole[-60:]) < 1.6 * rms(quick_whole[-60:]) + np.repeat([0.02, 2e-5], 3)).all()
 
 
 def rms(e):

@@ -315,6 +315,19 @@ def test_duplicates_single_looks_and_looks_without_orientation_are_refused(fligh
     assert sorted(reasons) == ["duplicate", "no orientation", "too few looks"]
 
 
+def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight):
+    """A filter that has aligned itself in motion says later what was before its first filtered pose."""
+    simulation, poses = flight
+    begin_s = 12.0
+    late = [p for p in poses if p.pose.smoothed or p.pose.time_s > begin_s]
+    late = [replace(p, known_s=max(p.known_s, begin_s + 0.5)) if p.pose.smoothed else p for p in late]
+    used = {}
+    for which in (poses, late):
+        result = adjust_online(simulation, sorted(which, key=lambda p: p.known_s), live=False)
+        used[which is late] = sum(r.reason == "no orientation" for r in result.refused), len(result.final_points)
+    assert used[True] == used[False] and used[True][1] > 100
+
+
 def test_what_is_final_stays_final(flight):
     simulation, poses = flight
     result = adjust_online(simulation, poses)

@@ -16,6 +16,9 @@ from .strip import WindowStrip
 
 #: Time after which a look whose orientation has not come is given up, s.
 PATIENCE_S = 2.0
+#: Where poses were missing and come again, smoothed ones of the time without may follow until so long after, s: those
+#: of a filter that has aligned itself in motion reach back to the first of its data.
+SMOOTHED_LATE_S = 8.0
 
 
 class Intake:
@@ -36,6 +39,7 @@ class Intake:
         self._done: deque[tuple[float, str, str]] = deque()
         self._is_done: set[tuple[str, str]] = set()
         self._refused: list[Refusal] = []
+        self._missing_s = -np.inf  # when poses were missing last
 
     def add_control(self, name: str, point: ControlPoint) -> None:
         self.control[name] = point
@@ -101,7 +105,11 @@ class Intake:
         alone = np.repeat([point.batch is None for point in points], [len(point.looks) for point in points])
         past = alone.astype(bool) & (time_s < final_s)
         covered = self._trajectory.covers(time_s) & ~past
-        late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
+        if self._trajectory.end_s < now_s - PATIENCE_S:
+            self._missing_s = now_s
+        late_s = -np.inf
+        if now_s >= self._missing_s + SMOOTHED_LATE_S:
+            late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
         over, good, lost = past.tolist(), covered.tolist(), (past | (~covered & (time_s < late_s))).tolist()
         ready = []
         end = 0

@@ -28,7 +28,8 @@ class WindowOptions:
     window_s : length; 0 = `window_looks` times the time between the first and the last look at a point
     window_looks : see there
     grid_hz : rate of the published orientation
-    settle_s : so long after the end of a strip late tie points are waited for; then the strip is final
+    settle_s : so long after the end of a strip late tie points are waited for; then the strip is final, if smoothed
+        poses have come to its end
     critical : of Baarda's |w|
     snoop : whether observations are tested at all
     determine : whether it is tested which additional parameters the network can see by now; else all are estimated
