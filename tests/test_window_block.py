@@ -157,12 +157,12 @@ def test_control_that_comes_after_its_strip_is_over_counts_as_in_the_batch(fligh
 
 def test_a_strip_that_is_closed_leaves_what_it_says_of_the_others(online):
     archive = deepcopy(online.window._block._archive)
-    whole = archive.solve()
     stay = np.concatenate([archive.strips[id].entered for id in ("S2", "C1")])
+    values, Q = archive.solve().of(stay)
     archive.close("S1")
-    rest = archive.solve()
+    rest = archive.solve()  # in the place of the one before
     assert len(rest.numbers) == len(stay)
-    (values, Q), (again, Q_again) = whole.of(stay), rest.of(stay)
+    again, Q_again = rest.of(stay)
     sigma = np.sqrt(np.diag(Q))
     assert np.abs((again - values) / sigma).max() < 1e-6
     assert Q_again / sigma / sigma[:, None] == pytest.approx(Q / sigma / sigma[:, None], abs=1e-7)
