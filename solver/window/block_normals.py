@@ -131,7 +131,7 @@ class BlockNormals:
         for i, row in enumerate(stay.tolist()):
             self._matrix[i, : i + 1] = self._matrix[row, stay[: i + 1]]
         for i in range(len(stay), n):
-            self._matrix[i, :n] = 0.0
+            self._matrix[i, : i + 1] = 0.0
         self._rhs[: len(stay)] = self._rhs[stay]
         self._rhs[len(stay) : n] = 0.0
         self.numbers = self.numbers[stay]
