@@ -21,8 +21,8 @@ from ..adjustment.reduced_system import DenseFactor
 from ..models.base import Design
 from .backward import LeftPoints, again
 from .batch import Batch, inverse_factors
-from .block_normals import ROWS, BlockNormals
-from .block_solution import BlockSolution, Cost, Workspace, factorised, inverted, solved
+from .block_normals import LOOKED_UP, ROWS, BlockNormals
+from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 
@@ -34,8 +34,8 @@ IntArray = NDArray[np.int64]
 MOST_UNKNOWNS = 4200
 #: A strip with more unknowns is no part of a block.
 MOST_OF_STRIP = 1500
-#: What it costs to look up an element of the equations, in operations.
-ASSEMBLED = 500.0
+#: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
+AGAIN, AGAIN_POINTS = 4e7, 8e6
 #: Object points kept; beyond that those of the oldest strip are forgotten.
 MOST_POINTS = 30000
 
@@ -221,12 +221,7 @@ class Archive:
 
     def solve(self) -> BlockSolution:
         """Values and cofactors of all unknowns from all that is kept. The next solution takes its place."""
-        parts = self.solving()
-        while True:
-            try:
-                next(parts)
-            except StopIteration as end:
-                return end.value
+        return in_one_go(self.solving())
 
     def solving(self) -> Generator[Cost, None, BlockSolution]:
         """The same in parts, each with what it costs; nothing may become final meanwhile."""
@@ -251,7 +246,7 @@ class Archive:
         for begin in range(0, n, ROWS):
             rows = range(begin, min(begin + ROWS, n))
             self._normals.lower(numbers, N, rows)
-            yield ASSEMBLED * len(rows) * rows.stop
+            yield LOOKED_UP * len(rows) * rows.stop
         at = np.searchsorted(numbers, self._camera)
         N[at, at] += 1.0 / self._camera_sigma[: len(at)] ** 2
         for strip in self.strips.values():
@@ -262,14 +257,18 @@ class Archive:
             N[row, : row + 1] *= scale[row] * scale[: row + 1]
         return rhs * scale, scale
 
-    def whole(self, solution: BlockSolution, strips: Iterable[str]) -> WholeStrips:
-        """Orientation and points of strips with the information of the block; a point goes with its last strip."""
+    def refining(self, solution: BlockSolution, strips: Iterable[str]) -> Generator[Cost, None, WholeStrips]:
+        """Orientation and points of strips with the information of the block; a point goes with its last strip.
+
+        In parts, each with what it costs.
+        """
         wanted = set(strips)
         orientation = []
         for strip in self.strips.values():
             if strip.id in wanted:
                 for old, design, noise in strip.orientation:
                     orientation.append(again(old, design, noise, solution.numbers, solution.values, solution.cofactors))
+                    yield AGAIN
         groups: dict[int, tuple[LeftPoints, set[str]]] = {}
         for name, kept in self.points.items():
             if kept.strips & wanted:
@@ -277,6 +276,7 @@ class Archive:
         points = []
         for left, names in groups.values():
             points += [p for p in left.refined(*solution.of(left.columns)) if p.name in names]
+            yield AGAIN_POINTS
         return WholeStrips(orientation, points)
 
     # -- bounds --------------------------------------------------------------------------------------------------------
@@ -285,11 +285,16 @@ class Archive:
         """Whether a strip has too many unknowns for a block."""
         return id in self.strips and len(self.strips[id].entered) > MOST_OF_STRIP
 
-    def oldest_beyond(self) -> str | None:
-        """The strip that must be closed so that the block keeps its bounds, None if it keeps them."""
-        if len(self.strips) < 2 or (self.n_unknowns <= MOST_UNKNOWNS and len(self.points) <= MOST_POINTS):
-            return None
-        return next(iter(self.strips))
+    def beyond(self) -> list[str]:
+        """The strips that must be closed so that the block keeps its bounds, oldest first."""
+        unknowns, left, points = self.n_unknowns, list(self.strips), list(self.points.values())
+        found = []
+        while len(left) > 1 and (unknowns > MOST_UNKNOWNS or len(points) > MOST_POINTS):
+            id = left.pop(0)
+            unknowns -= len(self.strips[id].entered)
+            points = [p for p in points if id not in p.strips]
+            found.append(id)
+        return found
 
     def drop(self, id: str) -> None:
         """Forget a strip as if it had never been tied to others."""
@@ -298,11 +303,19 @@ class Archive:
 
     def close(self, id: str) -> None:
         """Let a strip's unknowns go; what they say of the others stays: their solution does too."""
+        in_one_go(self.closing(id))
+
+    def closing(self, id: str) -> Parts:
+        """The same in parts, each with what it costs; where the last solution stood."""
         strip = self.strips[id]
         numbers = np.sort(strip.entered)
-        prior, right = np.zeros((len(numbers), len(numbers))), np.zeros(len(numbers))
-        _add_prior(prior, right, numbers, strip)
-        self._normals.close(numbers, prior, right)
+        n = len(numbers)
+        own, through = self._workspace.pair(n, len(self._normals))
+        rhs = self._normals.rhs(numbers)
+        self._normals.lower(numbers, own, range(n))
+        _add_prior(own, rhs, numbers, strip)
+        yield LOOKED_UP * n * n / 2.0
+        yield from self._normals.close(numbers, own, rhs, through)
         self._forget(id)
 
     def _forget(self, id: str) -> IntArray:

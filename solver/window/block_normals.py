@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import solve_triangular
+
+from .block_solution import Parts, factorised, reduced
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -18,6 +20,8 @@ IntArray = NDArray[np.int64]
 ROOM, GROWTH = 512, 1.5
 #: Rows worked on at once.
 ROWS = 256
+#: What it costs to look up an element, in operations.
+LOOKED_UP = 500.0
 
 
 class BlockNormals:
@@ -91,37 +95,48 @@ class BlockNormals:
                 here = known[: np.searchsorted(known, i, side="right")]
                 out[i, here] = self._row(int(place[i]), place[here])
 
-    def close(self, numbers: IntArray, prior: Array, right: Array) -> None:
+    def close(self, numbers: IntArray, own: Array, rhs: Array, room: Array) -> Parts:
         """Let unknowns (n,) go, of which nothing else will be said: what they say of others stays (Schur complement).
+
+        In parts, each with what it costs.
 
         Parameters
         ----------
-        prior, right : (n, n) lower triangle, (n,) of information about them alone that is not in yet
+        own, rhs : lower triangle (n, n), (n,) of the normal equations of them alone, all that is known; used up
+        room : (n m,) for m = all unknowns at least, whatever it holds
 
         Raises
         ------
         numpy.linalg.LinAlgError : unknowns that are undetermined
         """
-        N = np.zeros_like(prior)
-        self.lower(numbers, N, range(len(N)))
-        N, rhs = N + prior, right + self.rhs(numbers)
-        scale = 1.0 / np.sqrt(np.diagonal(N))
-        L = cholesky(N * scale * scale[:, None], lower=True, overwrite_a=True, check_finite=False)
+        n = len(own)
+        scale = 1.0 / np.sqrt(own.diagonal())
+        for row in range(n):
+            own[row, : row + 1] *= scale[row] * scale[: row + 1]
+        yield from factorised(own)
         gone = self._places(numbers)
         stay = np.setdiff1d(np.arange(len(self)), gone)
-        through = np.zeros((len(N), len(stay)))
-        for i in np.flatnonzero(gone >= 0).tolist():
-            through[i] = self._row(int(gone[i]), stay)
-        tied = np.flatnonzero(through.any(axis=0))
+        known = np.flatnonzero(gone >= 0)
+        tied = np.zeros(len(stay), dtype=bool)
+        for place in gone[known].tolist():
+            tied |= self._row(place, stay) != 0.0
         at = stay[tied]
-        through = solve_triangular(L, through[:, tied] * scale[:, None], lower=True, check_finite=False)
-        y = solve_triangular(L, rhs * scale, lower=True, check_finite=False)
+        yield LOOKED_UP * len(known) * len(stay)
+        through = room[: n * len(at)].reshape(n, len(at))
+        through[:] = 0.0
+        for i in known.tolist():
+            through[i] = self._row(int(gone[i]), at) * scale[i]
+        y = rhs * scale
+        yield LOOKED_UP * len(known) * len(at)
+        yield from reduced(own, through)
+        y = solve_triangular(own, y, lower=True, check_finite=False)
         self._rhs[at] -= through.T @ y
         for begin in range(0, len(at), ROWS):
             part = slice(begin, begin + ROWS)
             less = through[:, part].T @ through[:, : begin + ROWS]
             for i, row in enumerate(at[part].tolist()):
                 self._matrix[row, at[: begin + i + 1]] -= less[i, : begin + i + 1]
+            yield 2.0 * n * less.size
         self.drop(numbers)
 
     def drop(self, numbers: IntArray) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,18 @@ TILE, TOGETHER = 192, 3
 SINGULAR = 1e-11
 
 _potrf, _trtri = get_lapack_funcs(("potrf", "trtri"), dtype=float)
+
+
+T = TypeVar("T")
+
+
+def in_one_go(parts: Generator[Cost, None, T]) -> T:
+    """What comes out when all parts are done."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            return end.value
 
 
 @dataclass(frozen=True)
@@ -45,17 +58,25 @@ class BlockSolution:
 
 
 class Workspace:
-    """Memory for a square matrix that is used again and again; grows when it must, and is not given back."""
+    """Memory that is used again and again; grows when it must, and is not given back."""
 
     def __init__(self) -> None:
         self._buffer = np.empty(0)
 
     def square(self, n: int) -> Array:
-        """(n, n), whatever it holds; the one before it is no more."""
-        if n * n > len(self._buffer):
+        """(n, n), whatever it holds; what was asked for before is no more."""
+        return self._of(n * n).reshape(n, n)
+
+    def pair(self, n: int, m: int) -> tuple[Array, Array]:
+        """(n, n) and (n m,), likewise."""
+        both = self._of(n * n + n * m)
+        return both[: n * n].reshape(n, n), both[n * n :]
+
+    def _of(self, size: int) -> Array:
+        if size > len(self._buffer):
             self._buffer = np.empty(0)  # first let go of the old one
-            self._buffer = np.empty((n + n // 16) ** 2)  # a strip is a little longer than another
-        return self._buffer[: n * n].reshape(n, n)
+            self._buffer = np.empty(size + size // 8)  # a strip is a little longer than another
+        return self._buffer[:size]
 
 
 def factorised(A: Array) -> Parts:
@@ -92,6 +113,14 @@ def solved(L: Array, rhs: Array) -> Array:
         x[begin:end] -= L[end:, begin:end].T @ x[end:]
         x[begin:end] = solve_triangular(L[begin:end, begin:end], x[begin:end], lower=True, trans=1, check_finite=False)
     return x
+
+
+def reduced(L: Array, B: Array) -> Parts:
+    """Put ``L^-1 B`` (n, m) in the place of B, with what `factorised` made."""
+    for begin, end in _tiles(len(L)):
+        B[begin:end] -= L[begin:end, :begin] @ B[:begin]
+        B[begin:end] = solve_triangular(L[begin:end, begin:end], B[begin:end], lower=True, check_finite=False)
+        yield 2.0 * B.shape[1] * end * (end - begin)
 
 
 def inverted(L: Array, scale: Array) -> Parts:
