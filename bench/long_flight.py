@@ -6,7 +6,8 @@ Prints a row for each ten minutes as soon as they are flown, and at the end whet
 5 % and the latency has no trend; draws both. Latency is processor time of the window's updates while a strip is flown;
 divided by that of a fixed piece of work (a Cholesky decomposition of 500 x 500) at the same time it does not depend on
 what else the machine does. The flight is warm when the block holds as many strips as it keeps (twenty minutes), and
-what it keeps is no more for hours: memory is told in medians of ten minutes and in single samples, a minute apart.
+what it keeps is no more for hours: memory is told in medians of ten minutes, in single samples a minute apart, and as a
+second thread sees it every 20 ms, however short the peak.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -56,6 +58,27 @@ def resident_mb() -> float:
         return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
 
 
+class Watcher:
+    """Memory as a second thread sees it all the time, (s, MB); ``now_s`` is set by the first one."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.seen: list[tuple[float, float]] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._over.wait(0.02):
+            self.seen.append((self.now_s, resident_mb()))
+
+    def close(self) -> np.ndarray:
+        """All that was seen (n, 2)."""
+        self._over.set()
+        self._thread.join()
+        return np.array(self.seen)
+
+
 class Reference:
     """Processor time of a fixed piece of work, ms: the least of the last few times."""
 
@@ -71,8 +94,8 @@ class Reference:
         return float(np.median(self._last))
 
 
-def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarray]:
-    """Memory (n, 2: s, MB) each minute, and updates (m, 3: s, ms, of the reference); told while it goes on."""
+def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Memory (n, 2: s, MB) each minute and all the time, updates (m, 3: s, ms, of the reference); told meanwhile."""
     memory: list[tuple[float, float]] = []
     updates: list[tuple[float, float, float]] = []
     plain, reference = Window.update, Reference()
@@ -90,13 +113,14 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
     reader = RecordingReader(recording)
     nodes = [build(registry.node_class(name), at_pace({}, pace)) for name in registry.ESTIMATING]
     first_ns = int(reader.index.stamp_ns.min())
+    watcher = Watcher()
     with RecordingWriter(output) as writer:
         due, row_due = 0.0, ROW_S
 
         def write(raw: RawMessage) -> None:
             nonlocal due, row_due
             writer.write_raw(raw)
-            now_s = (raw.envelope.stamp_ns - first_ns) / 1e9
+            now_s = watcher.now_s = (raw.envelope.stamp_ns - first_ns) / 1e9
             if now_s >= due:
                 due = now_s + 60.0
                 collections.if_due()
@@ -106,7 +130,7 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
                     row_due += ROW_S
 
         process(reader, nodes, write)
-    return np.array(memory), np.array(updates)
+    return np.array(memory), watcher.close(), np.array(updates)
 
 
 def tell(memory: np.ndarray, updates: np.ndarray, to_s: float) -> None:
@@ -131,10 +155,11 @@ def main() -> int:
         folder = Path(name)
         recording = args.recording or simulate(folder, args.hours)
         print("  minutes  memory MB, least, most  updates  p50 ms  p99 ms  p50/ref", flush=True)
-        memory, updates = fly(recording, folder / "out.mcap", args.pace)
+        memory, seen, updates = fly(recording, folder / "out.mcap", args.pace)
     tell(memory, updates, np.ceil(memory[-1, 0] / ROW_S) * ROW_S)
     from_s = min(WARM_S, 0.5 * memory[-1, 0])
     warm = memory[memory[:, 0] >= from_s]
+    seen_mb = seen[seen[:, 0] >= from_s, 1]
     late = updates[updates[:, 0] >= from_s]
     half = len(late) // 2
     rows = [warm[(warm[:, 0] >= t) & (warm[:, 0] < t + ROW_S), 1] for t in np.arange(from_s, warm[-1, 0], ROW_S)]
@@ -144,6 +169,8 @@ def main() -> int:
         "hours": round(memory[-1, 0] / 3600.0, 2),
         "wall time, s": round(time.monotonic() - begun),
         "memory after warm-up, MB": [round(float(warm[:, 1].min()), 1), round(float(warm[:, 1].max()), 1)],
+        "memory every 20 ms, least, 1 %, 99 %, most, MB": np.percentile(seen_mb, [0, 1, 99, 100]).round(1).tolist(),
+        "memory, trend an hour, MB": round(float(np.polyfit(warm[:, 0] / 3600.0, warm[:, 1], 1)[0]), 2),
         "memory, medians of ten minutes, MB": [round(min(medians), 1), round(max(medians), 1)],
         "memory, last half over first": round(
             float(np.median(warm[len(warm) // 2 :, 1]) / np.median(warm[: len(warm) // 2, 1])), 4

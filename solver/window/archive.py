@@ -1,16 +1,16 @@
 """What the strips of a block have said so far, kept after they have left the window.
 
 The window lets go of unknowns by marginalisation, one strip at a time. So that a later strip can still tell an earlier
-one something, the information of every batch that became final is kept here a second time, before marginalisation: one
-dense block of normal equations for every pair of strips that points tie together, and for every object point its
-coordinates given the unknowns its rays touched (`LeftPoints`). A point that is seen again in a later strip thus ties
-both, and its earlier looks are never counted twice. Solving the whole gives every line and every point the information
-of the block: it is the backward pass of `backward` for several strips.
+one something, the information of every batch that became final is kept here a second time, before marginalisation: the
+normal equations of all strips, dense, and for every object point its coordinates given the unknowns its rays touched
+(`LeftPoints`). A point that is seen again in a later strip thus ties both, and its earlier looks are never counted
+twice. Solving the whole gives every line and every point the information of the block: it is the backward pass of
+`backward` for several strips.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,17 +21,21 @@ from ..adjustment.reduced_system import DenseFactor
 from ..models.base import Design
 from .backward import LeftPoints, again
 from .batch import Batch, inverse_factors
+from .block_normals import LOOKED_UP, ROWS, BlockNormals
+from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
-#: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about a
-#: second of one core and 300 MB.
+#: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
+#: two seconds of one core; with the equations it takes 210 MB, which are kept.
 MOST_UNKNOWNS = 4200
 #: A strip with more unknowns is no part of a block.
 MOST_OF_STRIP = 1500
+#: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
+AGAIN, AGAIN_POINTS = 4e7, 8e6
 #: Object points kept; beyond that those of the oldest strip are forgotten.
 MOST_POINTS = 30000
 
@@ -72,23 +76,6 @@ class KeptStrip:
     orientation: list[tuple[RefinedOrientation, Design, Array]] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class BlockSolution:
-    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), ascending."""
-
-    numbers: IntArray
-    values: Array
-    cofactors: Array
-
-    def places(self, numbers: IntArray) -> IntArray:
-        return np.searchsorted(self.numbers, numbers)
-
-    def of(self, numbers: IntArray) -> tuple[Array, Array]:
-        """Values and cofactors of some."""
-        at = self.places(numbers)
-        return self.values[at], self.cofactors[np.ix_(at, at)]
-
-
 class Archive:
     """The strips of a block that are over or being flown; see the module.
 
@@ -108,31 +95,19 @@ class Archive:
         self.points: dict[str, KeptPoint] = {}
         self.changed = False
         self._camera, self._camera_sigma = camera_columns, camera_sigma
-        self._group = np.full(256, -1, dtype=np.int64)
-        self._first: dict[int, int] = {}
-        self._blocks: dict[tuple[int, int], Array] = {}
-        self._rhs: dict[int, Array] = {}
-        self._groups: dict[str, int] = {}
-        self._begin("", camera_columns)
-
-    def _begin(self, id: str, numbers: IntArray) -> None:
-        group = len(self._first)
-        self._groups[id] = group
-        self._first[group] = int(numbers[0]) if len(numbers) else 0
-        if len(numbers):
-            top = int(numbers[-1]) + 1
-            if top > len(self._group):
-                self._group = np.concatenate([self._group, np.full(top, -1, dtype=np.int64)])
-            self._group[numbers] = group
+        self._normals, self._workspace = BlockNormals(), Workspace()
 
     def begin_strip(self, id: str, numbers: IntArray) -> None:
         """A strip begins, whose unknowns have these numbers (consecutive)."""
         self.strips[id] = KeptStrip(id, numbers)
-        self._begin(id, numbers)
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept."""
-        return bool((columns < len(self._group)).all() and (self._group[columns] >= 0).all())
+        kept = np.isin(columns, self._camera)
+        for strip in self.strips.values():
+            if len(strip.numbers):
+                kept |= (columns >= strip.numbers[0]) & (columns <= strip.numbers[-1])
+        return bool(kept.all())
 
     # -- what becomes final --------------------------------------------------------------------------------------------
 
@@ -141,35 +116,7 @@ class Archive:
         if not self.holds(columns):
             return
         self.changed = True
-        groups = self._group[columns]
-        parts = [(int(g), np.flatnonzero(groups == g)) for g in np.unique(groups)]
-        for i, (g, mine) in enumerate(parts):
-            row = columns[mine] - self._first[g]
-            self._right(g, int(row.max()) + 1)[row] += rhs[mine]
-            for h, others in parts[i:]:
-                column = columns[others] - self._first[h]
-                block = self._block(g, h, int(row.max()) + 1, int(column.max()) + 1)
-                block[np.ix_(row, column)] += matrix[np.ix_(mine, others)]
-
-    def _block(self, g: int, h: int, rows: int, columns: int) -> Array:
-        """The block of two groups, made large enough: at once for the longest strip, since memory that nothing was
-        written to costs nothing, and copying would write to all of it."""
-        old = self._blocks.get((g, h), np.zeros((0, 0)))
-        if old.shape[0] < rows or old.shape[1] < columns:
-            size = [
-                max(n, wanted + wanted // 4, MOST_OF_STRIP)
-                for n, wanted in zip(old.shape, (rows, columns), strict=True)
-            ]
-            new = np.zeros((max(size), max(size)) if g == h else size)
-            new[: old.shape[0], : old.shape[1]] = old
-            self._blocks[g, h] = old = new
-        return old
-
-    def _right(self, g: int, size: int) -> Array:
-        old = self._rhs.get(g, np.zeros(0))
-        if len(old) < size:
-            old = self._rhs[g] = np.concatenate([old, np.zeros(size + size // 4 - len(old))])
-        return old
+        self._normals.add(columns, matrix, rhs)
 
     def leave(self, batch: Batch, published: Sequence[AdjustedPoint]) -> None:
         """A batch became final.
@@ -273,53 +220,55 @@ class Archive:
         return len(self._camera) + sum(len(s.entered) for s in self.strips.values())
 
     def solve(self) -> BlockSolution:
-        """Values and cofactors of all unknowns from all that is kept."""
-        numbers = np.concatenate([self._camera, *(s.entered for s in self.strips.values())])
-        order = np.argsort(numbers)
-        numbers = numbers[order]
-        n = len(numbers)
-        N, rhs = np.zeros((n, n)), np.zeros(n)
-        m = len(self._camera)
+        """Values and cofactors of all unknowns from all that is kept. The next solution takes its place."""
+        return in_one_go(self.solving())
+
+    def solving(self) -> Generator[Cost, None, BlockSolution]:
+        """The same in parts, each with what it costs; nothing may become final meanwhile."""
+        self.changed = False
+        numbers = np.sort(np.concatenate([self._camera, *(s.entered for s in self.strips.values())]))
+        N = self._workspace.square(len(numbers))
+        rhs, scale = yield from self._equations(numbers, N)
+        try:
+            yield from factorised(N)
+        except np.linalg.LinAlgError:  # something is hardly determined, even beforehand
+            rhs, scale = yield from self._equations(numbers, N)
+            factor = DenseFactor(np.tril(N) + np.tril(N, -1).T)
+            N[:] = factor.inverse() * scale[:, None] * scale
+            return BlockSolution(numbers, scale * factor.solve(rhs), N)
+        values = scale * solved(N, rhs)
+        yield from inverted(N, scale)
+        return BlockSolution(numbers, values, N)
+
+    def _equations(self, numbers: IntArray, N: Array) -> Generator[Cost, None, tuple[Array, Array]]:
+        """Put the scaled normal equations of sorted unknowns into the lower triangle of N; right-hand side, scale."""
+        n, rhs = len(numbers), self._normals.rhs(numbers)
+        for begin in range(0, n, ROWS):
+            rows = range(begin, min(begin + ROWS, n))
+            self._normals.lower(numbers, N, rows)
+            yield LOOKED_UP * len(rows) * rows.stop
         at = np.searchsorted(numbers, self._camera)
-        N[at, at] += 1.0 / self._camera_sigma[:m] ** 2
-        names = ["", *self.strips]
-        places = {self._groups[id]: self._present(id, numbers) for id in names}
-        for (g, h), block in self._blocks.items():
-            if g in places and h in places:
-                place_g, row = self._inside(places[g], block.shape[0])
-                place_h, column = self._inside(places[h], block.shape[1])
-                part = block[np.ix_(row, column)]
-                N[np.ix_(place_g, place_h)] += part
-                if g != h:
-                    N[np.ix_(place_h, place_g)] += part.T
-        for g, values in self._rhs.items():
-            if g in places:
-                place, row = self._inside(places[g], len(values))
-                rhs[place] += values[row]
+        N[at, at] += 1.0 / self._camera_sigma[: len(at)] ** 2
         for strip in self.strips.values():
             _add_prior(N, rhs, numbers, strip)
-        factor = DenseFactor(N)
-        self.changed = False
-        return BlockSolution(numbers, factor.solve(rhs), factor.inverse())
+        diagonal = N.diagonal()
+        scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+        for row in range(n):
+            N[row, : row + 1] *= scale[row] * scale[: row + 1]
+        return rhs * scale, scale
 
-    def _present(self, id: str, numbers: IntArray) -> tuple[IntArray, IntArray]:
-        """Places of a group's unknowns in the solution and in its blocks."""
-        mine = self._camera if not id else np.sort(self.strips[id].entered)
-        return np.searchsorted(numbers, mine), mine - self._first[self._groups[id]]
+    def refining(self, solution: BlockSolution, strips: Iterable[str]) -> Generator[Cost, None, WholeStrips]:
+        """Orientation and points of strips with the information of the block; a point goes with its last strip.
 
-    @staticmethod
-    def _inside(place: tuple[IntArray, IntArray], size: int) -> tuple[IntArray, IntArray]:
-        keep = place[1] < size
-        return place[0][keep], place[1][keep]
-
-    def whole(self, solution: BlockSolution, strips: Iterable[str]) -> WholeStrips:
-        """Orientation and points of strips with the information of the block; a point goes with its last strip."""
+        In parts, each with what it costs.
+        """
         wanted = set(strips)
         orientation = []
         for strip in self.strips.values():
             if strip.id in wanted:
                 for old, design, noise in strip.orientation:
                     orientation.append(again(old, design, noise, solution.numbers, solution.values, solution.cofactors))
+                    yield AGAIN
         groups: dict[int, tuple[LeftPoints, set[str]]] = {}
         for name, kept in self.points.items():
             if kept.strips & wanted:
@@ -327,6 +276,7 @@ class Archive:
         points = []
         for left, names in groups.values():
             points += [p for p in left.refined(*solution.of(left.columns)) if p.name in names]
+            yield AGAIN_POINTS
         return WholeStrips(orientation, points)
 
     # -- bounds --------------------------------------------------------------------------------------------------------
@@ -335,51 +285,43 @@ class Archive:
         """Whether a strip has too many unknowns for a block."""
         return id in self.strips and len(self.strips[id].entered) > MOST_OF_STRIP
 
-    def oldest_beyond(self) -> str | None:
-        """The strip that must be closed so that the block keeps its bounds, None if it keeps them."""
-        if len(self.strips) < 2 or (self.n_unknowns <= MOST_UNKNOWNS and len(self.points) <= MOST_POINTS):
-            return None
-        return next(iter(self.strips))
+    def beyond(self) -> list[str]:
+        """The strips that must be closed so that the block keeps its bounds, oldest first."""
+        unknowns, left, points = self.n_unknowns, list(self.strips), list(self.points.values())
+        found = []
+        while len(left) > 1 and (unknowns > MOST_UNKNOWNS or len(points) > MOST_POINTS):
+            id = left.pop(0)
+            unknowns -= len(self.strips[id].entered)
+            points = [p for p in points if id not in p.strips]
+            found.append(id)
+        return found
 
     def drop(self, id: str) -> None:
         """Forget a strip as if it had never been tied to others."""
-        group = self._groups.pop(id)
-        strip = self.strips.pop(id)
-        self._group[strip.numbers] = -1
-        self._blocks = {k: v for k, v in self._blocks.items() if group not in k}
-        self._rhs.pop(group, None)
-        self.points = {name: p for name, p in self.points.items() if id not in p.strips}
+        numbers = self._forget(id)
+        self._normals.drop(self._normals.numbers[np.isin(self._normals.numbers, numbers)])
 
     def close(self, id: str) -> None:
-        """Let a strip's unknowns go; what they say of the others stays (Schur complement): their solution does too."""
-        strip, g = self.strips[id], self._groups[id]
+        """Let a strip's unknowns go; what they say of the others stays: their solution does too."""
+        in_one_go(self.closing(id))
+
+    def closing(self, id: str) -> Parts:
+        """The same in parts, each with what it costs; where the last solution stood."""
+        strip = self.strips[id]
         numbers = np.sort(strip.entered)
         n = len(numbers)
-        local = numbers - self._first[g]
-        keep = local < len(self._block(g, g, 1, 1))
-        N, rhs = np.zeros((n, n)), np.zeros(n)
-        N[np.ix_(keep, keep)] = self._blocks[g, g][np.ix_(local[keep], local[keep])]
-        right = self._right(g, int(local[-1]) + 1)
-        rhs += right[local]
-        _add_prior(N, rhs, numbers, strip)
-        others = {}
-        for (a, b), block in self._blocks.items():
-            if (a == g) != (b == g):
-                cross = block if a == g else block.T
-                whole = np.zeros((n, cross.shape[1]))
-                inside = local < len(cross)
-                whole[inside] = cross[local[inside]]
-                others[b if a == g else a] = whole
-        factor = DenseFactor(N)
-        groups = sorted(others)
-        for i, h in enumerate(groups):
-            through = factor.solve(others[h]).T
-            size = through.shape[0]
-            self._right(h, size)[:size] -= through @ rhs
-            for k in groups[i:]:
-                block = self._block(h, k, size, others[k].shape[1])
-                block[:size, : others[k].shape[1]] -= through @ others[k]
-        self.drop(id)
+        own, through = self._workspace.pair(n, len(self._normals))
+        rhs = self._normals.rhs(numbers)
+        self._normals.lower(numbers, own, range(n))
+        _add_prior(own, rhs, numbers, strip)
+        yield LOOKED_UP * n * n / 2.0
+        yield from self._normals.close(numbers, own, rhs, through)
+        self._forget(id)
+
+    def _forget(self, id: str) -> IntArray:
+        """A strip and its points are kept no more; numbers of its unknowns."""
+        self.points = {name: p for name, p in self.points.items() if id not in p.strips}
+        return self.strips.pop(id).numbers
 
 
 def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:
@@ -402,12 +344,14 @@ def _eliminated(
 
 
 def _add_prior(N: Array, rhs: Array, numbers: IntArray, strip: KeptStrip) -> None:
-    """Add a strip's a-priori equations to normal equations of sorted unknowns."""
+    """Add a strip's a-priori equations to the lower triangle of normal equations of sorted unknowns."""
     if strip.prior is None:
         return
     columns, coefficients, value, sigma = strip.prior
     weighted, right = coefficients / sigma[:, None], value / sigma
     place = np.where(columns >= 0, np.searchsorted(numbers, columns), 0)
     weighted = np.where(columns >= 0, weighted, 0.0)
-    np.add.at(N, (place[:, :, None], place[:, None, :]), weighted[:, :, None] * weighted[:, None, :])
+    row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
+    lower = (row >= column) & (columns >= 0)[:, :, None] & (columns >= 0)[:, None, :]
+    np.add.at(N, (row[lower], column[lower]), (weighted[:, :, None] * weighted[:, None, :])[lower])
     np.add.at(rhs, place, weighted * right[:, None])

@@ -50,7 +50,10 @@ class Arrivals:
         """Batches of the points that have new looks with a measured orientation; others wait."""
         ready: dict[tuple[int, bool], list[str]] = {}
         again: list[Batch] = []
-        for name in self._intake.ready(now_s):
+        names = self._intake.ready(now_s)
+        if names:
+            self._block.conclude()  # points are about to be looked up among those of earlier strips
+        for name in names:
             point = self._intake.points[name]
             if point.batch is not None:
                 again.append(point.batch)

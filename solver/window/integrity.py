@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import nlargest
 from itertools import chain
@@ -102,6 +103,31 @@ class _Exposed:
         self.inverse = _inverse(C)
         self.leverage = float(_ratio(R, C))
 
+    def told(self, delta: float) -> tuple[str, bool, float]:
+        """It in words, whether it is a control coordinate, and its marginal detectable error if it is one, else 0."""
+        name = self.batch.names[self.point]
+        if self.ray >= 0:
+            return f"ray of point {name}", False, 0.0
+        detectable = delta * float(np.sqrt(self.inverse[0, 0] / self.batch.control.weight[self.point, self.axis]))
+        return f"{AXES[self.axis]} of control point {name}", True, detectable
+
+
+@dataclass
+class _Departed:
+    """An observation that has left the window: what is needed of `_Exposed`, without the batch."""
+
+    rows: Array
+    inverse: Array
+    leverage: float
+    told_at_last: tuple[str, bool, float]
+
+    def told(self, delta: float) -> tuple[str, bool, float]:
+        """As `_Exposed.told` when it left."""
+        return self.told_at_last
+
+
+_Observation = _Exposed | _Departed
+
 
 @dataclass
 class _OfBatch:
@@ -140,7 +166,9 @@ class Integrity:
         for batch in batches:
             known = self._of_batch.pop(id(batch), None)
             if known is not None:
-                self._left.add([e for e in known.exposed if e.counts], known.rest, batch.newest_s, state)
+                counting = [e for e in known.exposed if e.counts]
+                departed = [_Departed(e.rows, e.inverse, e.leverage, e.told(self._delta)) for e in counting]
+                self._left.add(departed, batch.columns, known.rest, batch.newest_s, state)
         self._left.forget(before_s)
 
     def marginalised(self, marginal: Marginal) -> None:
@@ -222,8 +250,8 @@ class Integrity:
         bias = self._delta * np.sqrt(rest) * sigma
         near = [e for e in ranked[:OF_WINDOW] if e.counts]
         on_near = [e.rows @ Qg[state.places(e.batch.columns)] for e in near]
-        observations = near + self._left.exposed
-        worst: _Exposed | None = None
+        observations: list[_Observation] = [*near, *self._left.exposed]
+        worst: _Observation | None = None
         if observations:
             h = np.concatenate([*on_near, self._left.effects(Qg, state)])
             effect = self._delta * np.sqrt(_squares(observations, h))
@@ -233,17 +261,9 @@ class Integrity:
             bias = np.maximum(bias, effect.max(axis=0))
         if renew:
             self._left.thin(state)
-            self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
-        return Exposure(bias, sigma, *self._name(worst), self._critical)
-
-    def _name(self, e: _Exposed | None) -> tuple[str, bool, float]:
-        if e is None:
-            return "", False, 0.0
-        name = e.batch.names[e.point]
-        if e.ray >= 0:
-            return f"ray of point {name}", False, 0.0
-        detectable = self._delta * float(np.sqrt(e.inverse[0, 0] / e.batch.control.weight[e.point, e.axis]))
-        return f"{AXES[e.axis]} of control point {name}", True, detectable
+            self.most_exposed = worst.batch if isinstance(worst, _Exposed) else None
+        told = ("", False, 0.0) if worst is None else worst.told(self._delta)
+        return Exposure(bias, sigma, *told, self._critical)
 
 
 class _Left:
@@ -257,20 +277,20 @@ class _Left:
     def __init__(self) -> None:
         self._numbers: IntArray = np.empty(0, dtype=np.int64)
         self._rhs = np.empty((0, 0))
-        self.exposed: list[_Exposed] = []
+        self.exposed: list[_Departed] = []
         self._bounds: deque[tuple[float, float]] = deque()
         self._newest_s = -np.inf
 
-    def add(self, exposed: list[_Exposed], rest: float, time_s: float, state: WindowState) -> None:
-        """Observations that leave, and the largest lambda of the others of their batch."""
+    def add(self, exposed: list[_Departed], columns: IntArray, rest: float, time_s: float, state: WindowState) -> None:
+        """Observations that leave, unknowns (u,) of their rows, and the largest lambda of the others of their batch."""
         new = np.setdiff1d(state.numbers, self._numbers)
         self._numbers = np.concatenate([self._numbers, new])
         width = sum(len(e.rows) for e in exposed)
         self._rhs = np.pad(self._rhs, ((0, len(new)), (0, width)))
         place = {int(n): i for i, n in enumerate(self._numbers)}
         column = self._rhs.shape[1] - width
+        rows = [place[n] for n in columns.tolist()]
         for e in exposed:
-            rows = [place[int(n)] for n in e.batch.columns]
             self._rhs[rows, column : column + len(e.rows)] = e.rows.T
             column += len(e.rows)
         self.exposed += exposed
@@ -324,24 +344,24 @@ class _Left:
             self._bounds.popleft()
 
 
-def _leverage(e: _Exposed) -> float:
+def _leverage(e: _Observation) -> float:
     return e.leverage
 
 
-def _rows_of(exposed: list[_Exposed]) -> tuple[IntArray, IntArray]:
+def _rows_of(exposed: Sequence[_Observation]) -> tuple[IntArray, IntArray]:
     """First and last row (n,) of each where the rows of all stand one below the other."""
     widths = np.array([len(e.rows) for e in exposed], dtype=np.int64)
     ends = np.cumsum(widths)
     return ends - widths, ends - 1
 
 
-def _inverses(exposed: list[_Exposed]) -> Array:
+def _inverses(exposed: Sequence[_Observation]) -> Array:
     """``C^-1`` (n, 2, 2) of each; of a control coordinate it stands first, and the rest is zero."""
     values = [(*e.inverse.ravel().tolist(), 0.0, 0.0, 0.0)[:4] for e in exposed]
     return np.array(values).reshape(-1, 2, 2)
 
 
-def _squares(exposed: list[_Exposed], h: Array) -> Array:
+def _squares(exposed: Sequence[_Observation], h: Array) -> Array:
     """``h^T C^-1 h`` (n, k) of each; the rows (m, k) of all stand one below the other."""
     first, last = _rows_of(exposed)
     a, b, c, d = _inverses(exposed).reshape(-1, 4).T[:, :, None]

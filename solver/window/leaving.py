@@ -119,11 +119,9 @@ class Leaver:
         modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in self._batches))
         if len(modes):
             self._step(modes)
+        result.whole = self._block.refined(now_s, self._steps, at_the_end)
         if self._block.quiet:
-            result.whole = self._block.refined(self._steps, at_the_end)
             result.events += self._block.take_events()
-            if result.whole is not None:
-                self._steps = []
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s, result)
 

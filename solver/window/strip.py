@@ -208,6 +208,7 @@ class WindowStrip:
         """It is over and will not come back: give up what was only needed to fly it, for flights go on for hours."""
         self._over = True
         none = np.empty(0)
+        self.model = DgrOptions().build(self.model.extent)  # a small one: that of the strip names all its unknowns
         self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
         self._need = self._first_use = self._last_use = none
         self._row_done = self._entered = np.empty(0, dtype=bool)

@@ -14,7 +14,7 @@ solved again with all the equations (`archive`); a patch that has left is closed
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..adjustment.linearisation import Linearisation
 from .archive import Archive, BlockSolution, KeptPoint
 from .batch import inverse_factors
+from .block_solution import Parts
 from .points import ControlPoint
 from .state import WindowState
 
@@ -38,6 +39,8 @@ SAMPLED = 60
 NEGLIGIBLE, MOST_MODES = 0.05, 32
 #: Modes in the window at most; while there are as many, points of further patches do not tie.
 MOST_PRESENT = 240
+#: What it costs to find the modes of a patch, for each of its points, in operations.
+PATCH_COST = 4e6
 #: Variance of a mode given those present, at least: of what all but follows from them.
 FLOOR = 1e-6
 
@@ -49,6 +52,7 @@ class Patch:
     Attributes
     ----------
     strip : which
+    place : among the patches
     modes : its rows in the joint covariance of all modes
     numbers : of its unknowns in the window, empty while they are not present
     used_s : newest ray that touched it
@@ -56,6 +60,7 @@ class Patch:
     """
 
     strip: str
+    place: int
     modes: slice
     numbers: IntArray
     used_s: float = -np.inf
@@ -137,7 +142,7 @@ class EarlierStrips:
         self.full = 0
         self._state, self._camera = state, camera_columns
         self._patches: list[Patch] = []
-        self._covariance = np.empty((0, 0))
+        self._covariance: list[Array] = []  # of the modes of each patch with those up to it, then of the parameters
         self._camera_values = np.zeros(len(camera_columns))
 
     @property
@@ -145,14 +150,26 @@ class EarlierStrips:
         """Whether modes are in the window."""
         return any(len(p.numbers) for p in self._patches)
 
-    def learn(self, archive: Archive, solution: BlockSolution) -> None:
-        """Take the points of a solution of the block in place of those known so far."""
+    def learning(self, archive: Archive, solution: BlockSolution, without: Collection[str] = ()) -> Parts:
+        """Take the points of a solution of the block in place of those known so far, which are forgotten at once.
+
+        In parts, each with what it costs; before the last one nothing is known.
+
+        Parameters
+        ----------
+        without : strips whose points are left out
+        """
+        self.points, self._patches, self._covariance = {}, [], []
         members: dict[tuple[str, int], list[tuple[str, KeptPoint]]] = {}
+        order = {id: i for i, id in enumerate(archive.strips)}
         for name, kept in archive.points.items():
-            strip = max(kept.strips, key=list(archive.strips).index)
+            if not kept.strips.isdisjoint(without):
+                continue
+            strip = max(kept.strips, key=order.__getitem__)
             part = int(kept.time_s // PATCH_S) if len(archive.strips[strip].entered) > 4 * MOST_MODES else 0
             members.setdefault((strip, part), []).append((name, kept))
-        self.points, self._patches = {}, []
+        points: dict[str, EarlierPoint] = {}
+        patches: list[Patch] = []
         functionals: list[tuple[IntArray, Array]] = []
         first = 0
         for (strip, _), kept in members.items():
@@ -160,11 +177,17 @@ class EarlierStrips:
             functionals.append(M)
             size = len(M[1])
             for (name, k), (xyz, B, root) in zip(kept, found, strict=True):
-                self.points[name] = EarlierPoint(len(self._patches), xyz, B, root, k.with_control)
-            self._patches.append(Patch(strip, slice(first, first + size), np.empty(0, dtype=np.int64)))
+                points[name] = EarlierPoint(len(patches), xyz, B, root, k.with_control)
+            patches.append(Patch(strip, len(patches), slice(first, first + size), np.empty(0, dtype=np.int64)))
             first += size
+            yield PATCH_COST * len(kept)
         functionals.append((solution.places(self._camera), np.eye(len(self._camera))))
-        self._covariance = _covariance(functionals, solution.cofactors)
+        rows = []
+        for row in _covariance_rows(functionals, solution.cofactors):
+            rows.append(row)
+            yield 2.0 * row.size * len(solution.numbers)
+        self.points, self._patches = points, patches
+        self._covariance = rows
         self._camera_values = solution.of(self._camera)[0]
 
     # -- in the window -------------------------------------------------------------------------------------------------
@@ -196,11 +219,10 @@ class EarlierStrips:
 
     def _observe(self, patch: Patch, here: Sequence[Patch]) -> None:
         """What is known of modes that enter, given those present and the additional parameters."""
-        S = self._covariance
-        given = np.concatenate(
-            [np.arange(len(S))[p.modes] for p in here] + [len(S) - len(self._camera) + np.arange(len(self._camera))]
-        )
-        own = np.arange(len(S))[patch.modes]
+        groups = [*(p.place for p in here), len(self._patches), patch.place]
+        S = self._joint(groups)
+        m = patch.modes.stop - patch.modes.start
+        given, own = np.arange(len(S) - m), np.arange(len(S) - m, len(S))
         numbers = np.concatenate([*(p.numbers for p in here), self._camera])
         scale = np.sqrt(np.maximum(S[given, given], 1e-300))
         known = S[np.ix_(given, given)] / scale[:, None] / scale + FLOOR * np.eye(len(given))
@@ -211,6 +233,14 @@ class EarlierStrips:
         value = -root @ K[:, len(given) - len(self._camera) :] @ self._camera_values
         columns = np.tile(np.concatenate([patch.numbers, numbers]), (len(own), 1))
         self._state.observe(columns.astype(np.int32), rows, value, np.ones(len(own)))
+
+    def _joint(self, groups: Sequence[int]) -> Array:
+        """Covariance of the modes of some patches; the additional parameters come after the last patch."""
+        places = [p.modes for p in self._patches]
+        last = places[-1].stop if places else 0
+        places.append(slice(last, last + len(self._camera)))
+        S = self._covariance
+        return np.block([[S[a][:, places[b]] if b <= a else S[b][:, places[a]].T for b in groups] for a in groups])
 
     def ties(self, names: Sequence[str], control: Array) -> PointTies:
         """Of points whose patches are present; ``control`` (p, 3) are the weights of their known coordinates."""
@@ -300,8 +330,9 @@ def _patch(
     return list(zip(xyz, B, root, strict=True)), (solution.places(columns), M)
 
 
-def _covariance(functionals: Sequence[tuple[IntArray, Array]], cofactors: Array) -> Array:
-    """Covariance (r, r) of linear functions, one group below the other, each of few unknowns: their places (u,) in the
-    cofactors (n, n), and coefficients (., u)."""
-    half = np.concatenate([M @ cofactors[places] for places, M in functionals])
-    return np.concatenate([half[:, places] @ M.T for places, M in functionals], axis=1)
+def _covariance_rows(functionals: Sequence[tuple[IntArray, Array]], cofactors: Array) -> Iterator[Array]:
+    """Covariance of linear functions: of each group with those up to it, (r, r1 + .. + r). Each is one of few unknowns,
+    of their places (u,) in the cofactors (n, n), with coefficients (r, u)."""
+    for i, (own, mine) in enumerate(functionals):
+        half = mine @ cofactors[own]
+        yield np.concatenate([half[:, places] @ M.T for places, M in functionals[: i + 1]], axis=1)

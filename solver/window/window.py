@@ -339,7 +339,7 @@ class Window:
         sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
         total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
         active = [s for s in self.strips.values() if not s.is_gone(state)]
-        self._watch.note(changed)
+        self._watch.note([b for b in changed if b in self._batches])  # what left at once is no more exposed
         watched = self._watch.last
         if look or watched is None:
             watched = self._watch.look(
