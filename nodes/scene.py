@@ -227,6 +227,9 @@ class Scene:
             "control points, blue check points, magenta targets that are held (with the reason) and rejected rays.\n\n"
             "Outlines on the ground: the part of the strip in the *live* window; the *marginal* part before it is "
             "final and kept as a prior on what follows; the *whole* strip has been through the backward pass.\n\n"
+            "Correction functions: green and final, with three sigma, until the window begins; orange, with its own "
+            "three sigma, what was said at once of the time that the window holds; thin, what was said at once of "
+            "earlier times.\n\n"
             "Protection level: with a risk of 0.001 the orientation is not further off, even if one gross error that "
             "the tests do not find is among the observations.",
         )
