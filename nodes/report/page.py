@@ -12,6 +12,7 @@ from . import figures
 from .accuracy_table import early_lines
 from .evaluation import triangulated
 from .flight import Flight
+from .integrity import LIGHTS, protection_figure
 from .page_style import CSS
 from .style import styled, svg
 
@@ -41,6 +42,7 @@ _PARAMETERS_NOTE = (
 )
 _SHOWN_REJECTED = 40
 _SHOWN_EVENTS = 60
+_SHOWN_REASONS = 10
 
 
 def page(flight: Flight, result: dict[str, Any]) -> str:
@@ -58,6 +60,7 @@ def page(flight: Flight, result: dict[str, Any]) -> str:
             _section("Flight", _figure(figures.trajectory_map(flight), _MAP_NOTE)),
             _section("Accuracy", *_accuracy(result)),
             _section("Errors against truth", _figure(figures.errors(flight), _ERRORS_NOTE)),
+            _section("Integrity", *_integrity(flight, result)),
             _section("Adjustment", _figure(figures.progress(flight), "")),
             _section("Correction functions", _figure(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
             _section("Residuals in image space", _figure(figures.residuals(flight), _RESIDUALS_NOTE)),
@@ -82,6 +85,10 @@ _ERRORS_NOTE = (
 )
 _CORRECTIONS_NOTE = (
     "What is added to the measured orientation. The dashed line is what would have been right (truth minus measured)."
+)
+_INTEGRITY_NOTE = (
+    "Protection level: what could be wrong and not be seen; with a risk of 0.001 the orientation is not further off, "
+    "even if one gross error that the tests do not find is among the observations. The ground is the light."
 )
 _RESIDUALS_NOTE = (
     "Measured minus computed at the last estimate of each point. Crosses: rejected rays at their place, without those "
@@ -258,6 +265,50 @@ def _accuracy_table(heads: list[tuple[str, str]], rows: list[Any], digits: list[
                 body += f"<td{_edge(i)}>{_number(None if values is None else values[i], d)}</td>"
         body += f'<td class="edge">{_number(nees, 2)}</td></tr>'
     return f'<div class="scroll"><table><thead>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _integrity(flight: Flight, result: dict[str, Any]) -> Iterable[str]:
+    """The light, what the protection levels were and whether they held, and what drifted."""
+    said = result.get("integrity")
+    if said is None:
+        return
+    shares = ", ".join(f"{light} {100 * said['share'][light]:.0f} %" for light in LIGHTS)
+    yield f"<p>The operator's light over {said['seconds']:.0f} s on strips: <b>{shares}</b>.</p>"
+    rows = [(r["light"], _number(r["seconds"], 0), r["times"], r["reason"] or "–") for r in said["reasons"]]
+    heads = ("light", "time [s]", "times", "reason (numbers: when it first came up)")
+    shown = [(light, reason, seconds, times) for light, seconds, times, reason in rows[:_SHOWN_REASONS]]
+    yield _table((heads[0], heads[3], heads[1], heads[2]), shown, left=2, wrapped=(1,))
+    if len(rows) > len(shown):
+        yield f'<p class="note">The {_SHOWN_REASONS} longest of {len(rows)} reasons.</p>'
+    if "protection_m" in said:
+        yield "<h3>Protection level of the newest orientation</h3>"
+        yield _levels_table(said)
+        yield _figure(protection_figure(flight), _INTEGRITY_NOTE)
+    if said["sources"]:
+        yield "<h3>Sources of tie points that drifted</h3>"
+        yield _table(
+            ("source", "CCD", "or, as likely", "first alarm [s]", "time [s]", "line [px]", "sample [px]"),
+            [
+                (
+                    s["source"], s["ccd"], ", ".join(s["rivals"]) or "–", _number(s["since_s"], 1),
+                    _number(s["seconds"], 0), f"{s['line_px']:+.2f}", f"{s['sample_px']:+.2f}",
+                )
+                for s in said["sources"]
+            ],
+            left=3, wrapped=(2,),
+        )  # fmt: skip
+        yield '<p class="note">Time: how long it was said to drift. Line and sample: the largest bias.</p>'
+
+
+def _levels_table(said: dict[str, Any]) -> str:
+    heads = ("", "X [m]", "Y [m]", "Z [m]", "ω [mdeg]", "φ [mdeg]", "κ [mdeg]")
+    rows = []
+    for name, text in (("protection", "protection level, median"), ("sigma", "σ, median")):
+        metres, angles = said[f"{name}_m"], [_MDEG * v for v in said[f"{name}_deg"]]
+        rows.append((text, *(_number(v, 2) for v in metres), *(_number(v, 1) for v in angles)))
+    if "exceeded" in said:
+        rows.append((f"errors beyond it, of {said['compared']}", *said["exceeded"]))
+    return _table(heads, rows)
 
 
 def _edge(i: int) -> str:
