@@ -10,7 +10,7 @@ from synthetic_flight import LIVE_SIGMA, START_NS, flight_messages
 from triline.nodes import convert
 from triline.nodes.cli.view import show
 from triline.nodes.node import Message
-from triline.nodes.rerun_scene import _corrections, _overview
+from triline.nodes.rerun_scene import _corrections, _overview, viewpoint
 from triline.schemas import messages as m
 
 WINDOW_S = 9.0
@@ -87,6 +87,26 @@ def test_deviations_are_not_joined_from_strip_to_strip(notes):
         for strips in notes.pieces(entity):
             steps = np.linalg.norm(np.diff(strips[0], axis=0), axis=1)
             assert steps.max() < 200.0, entity  # 14 m between samples, and exaggerated errors
+
+
+def test_names_stand_on_the_side_of_the_eye_on_strips_that_are_flown_back(strip, block):
+    canvas, back = Notebook(), Notebook()
+    show(strip, canvas)
+    turned = []
+    for k in block:
+        body = k.body
+        if k.stamp_ns > START_NS + 40 * convert.SECOND_NS and hasattr(body, "pose"):
+            body = type(body)()
+            body.CopyFrom(k.body)
+            q = body.pose.orientation
+            q.x, q.y, q.z, q.w = q.y, -q.x, q.w, -q.z  # half a turn about the vertical
+        turned.append(Message(k.topic, k.stamp_ns, body, k.source, k.sequence))
+    show(turned, back)
+    to_eye, target = viewpoint(back.layouts[-1])
+    for notes in (canvas, back):
+        name = notes.drawn["flight/window/live/name"][0][0]
+        outline = notes.drawn["flight/window/live"][0][0]
+        assert (name - outline.mean(axis=0))[:2] @ (to_eye - target)[:2] > 0
 
 
 def test_the_window_s_part_of_the_correction_functions_has_the_band_of_live(notes, block):
