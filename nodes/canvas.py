@@ -35,7 +35,7 @@ class Layout:
     ccds : ids of the CCD lines, one image-space view each, and the view's title
     image_size : width (samples) and height of an image-space view
     units : units of the parameters, one plot each
-    strip_s : length of the longest strip
+    strip_s : length of the longest strip, about
     window_s : length of the adjustment's window: so far back what is not final yet is shown in plots; None: all of it
     truth : whether errors against truth are shown
     mosaic : whether there is an orthoimage

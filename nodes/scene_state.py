@@ -241,8 +241,9 @@ class SceneState:
 
     @property
     def strip_s(self) -> float:
-        """Length of the longest strip, s."""
-        return max(map(_length_s, (s for s in self.strips.values() if s.line_rate_hz > 0)), default=_NO_LENGTH_S)
+        """Length of the longest strip, s, in full tens: one that ends a little off its plan changes no view."""
+        longest = max(map(_length_s, (s for s in self.strips.values() if s.line_rate_hz > 0)), default=_NO_LENGTH_S)
+        return 10.0 * float(np.ceil(longest / 10.0))
 
     @property
     def lines_reduced(self) -> int:

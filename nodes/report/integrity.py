@@ -170,7 +170,7 @@ def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array) -> None:
     for k, light in enumerate(LIGHTS):
         burning = np.isfinite(x[1:] - x[:-1]) & (values[:-1, 0] == k)  # each holds until the next report
         edges = np.flatnonzero(np.diff(burning, prepend=False, append=False))
-        spans = [(x[start], x[end] - x[start]) for start, end in zip(edges[::2], edges[1::2], strict=True)]
+        spans = [(float(x[a]), float(x[b] - x[a])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         if spans:
             style = {"color": _COLORS[light], "lw": 0, "zorder": 0, "label": light}
             ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), **style)

@@ -12,9 +12,10 @@ from . import figures
 from .accuracy_table import early_lines
 from .evaluation import triangulated
 from .flight import Flight
-from .integrity import LIGHTS, protection_figure
+from .integrity_section import integrity_section
+from .page_parts import captioned, number, table
 from .page_style import CSS
-from .style import styled, svg
+from .style import styled
 
 _MDEG = 1000.0
 _ORIENTATION = {
@@ -42,7 +43,6 @@ _PARAMETERS_NOTE = (
 )
 _SHOWN_REJECTED = 40
 _SHOWN_EVENTS = 60
-_SHOWN_REASONS = 10
 
 
 def page(flight: Flight, result: dict[str, Any]) -> str:
@@ -57,13 +57,13 @@ def page(flight: Flight, result: dict[str, Any]) -> str:
             _warnings(result),
             _tiles(result),
             _missing(result["missing"]),
-            _section("Flight", _figure(figures.trajectory_map(flight), _MAP_NOTE)),
+            _section("Flight", captioned(figures.trajectory_map(flight), _MAP_NOTE)),
             _section("Accuracy", *_accuracy(result)),
-            _section("Errors against truth", _figure(figures.errors(flight), _ERRORS_NOTE)),
-            _section("Integrity", *_integrity(flight, result)),
-            _section("Adjustment", _figure(figures.progress(flight), "")),
-            _section("Correction functions", _figure(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
-            _section("Residuals in image space", _figure(figures.residuals(flight), _RESIDUALS_NOTE)),
+            _section("Errors against truth", captioned(figures.errors(flight), _ERRORS_NOTE)),
+            _section("Integrity", *integrity_section(flight, result)),
+            _section("Adjustment", captioned(figures.progress(flight), "")),
+            _section("Correction functions", captioned(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
+            _section("Residuals in image space", captioned(figures.residuals(flight), _RESIDUALS_NOTE)),
             _section("Rejected observations", _rejected(result)),
             _section("Parameters", _parameters(result)),
             _section("Messages, nodes and events", *_operation(result)),
@@ -85,10 +85,6 @@ _ERRORS_NOTE = (
 )
 _CORRECTIONS_NOTE = (
     "What is added to the measured orientation. The dashed line is what would have been right (truth minus measured)."
-)
-_INTEGRITY_NOTE = (
-    "Protection level: what could be wrong and not be seen; with a risk of 0.001 the orientation is not further off, "
-    "even if one gross error that the tests do not find is among the observations. The ground is the light."
 )
 _RESIDUALS_NOTE = (
     "Measured minus computed at the last estimate of each point. Crosses: rejected rays at their place, without those "
@@ -182,13 +178,6 @@ def _section(title: str, *parts: str) -> str:
     return f"<section><h2>{escape(title)}</h2>\n{content}\n</section>" if content else ""
 
 
-def _figure(figure: Any, caption: str) -> str:
-    if figure is None:
-        return ""
-    note = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{svg(figure)}{note}</figure>"
-
-
 def _accuracy(result: dict[str, Any]) -> Iterable[str]:
     if result["orientation"]:
         yield "<h3>Exterior orientation against truth</h3>"
@@ -262,75 +251,13 @@ def _accuracy_table(heads: list[tuple[str, str]], rows: list[Any], digits: list[
         body += f"<tr{' class=main' if main else ''}><td>{escape(label)}</td><td>{n}</td>"
         for values, d in zip(groups, digits, strict=True):
             for i in range(3):
-                body += f"<td{_edge(i)}>{_number(None if values is None else values[i], d)}</td>"
-        body += f'<td class="edge">{_number(nees, 2)}</td></tr>'
+                body += f"<td{_edge(i)}>{number(None if values is None else values[i], d)}</td>"
+        body += f'<td class="edge">{number(nees, 2)}</td></tr>'
     return f'<div class="scroll"><table><thead>{top}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _integrity(flight: Flight, result: dict[str, Any]) -> Iterable[str]:
-    """The light, what the protection levels were and whether they held, and what drifted."""
-    said = result.get("integrity")
-    if said is None:
-        return
-    shares = ", ".join(f"{light} {100 * said['share'][light]:.0f} %" for light in LIGHTS)
-    yield f"<p>The operator's light over {said['seconds']:.0f} s on strips: <b>{shares}</b>.</p>"
-    rows = [(r["light"], _number(r["seconds"], 0), r["times"], r["reason"] or "–") for r in said["reasons"]]
-    heads = ("light", "time [s]", "times", "reason (numbers: when it first came up)")
-    shown = [(light, reason, seconds, times) for light, seconds, times, reason in rows[:_SHOWN_REASONS]]
-    yield _table((heads[0], heads[3], heads[1], heads[2]), shown, left=2, wrapped=(1,))
-    if len(rows) > len(shown):
-        yield f'<p class="note">The {_SHOWN_REASONS} longest of {len(rows)} reasons.</p>'
-    if "protection_m" in said:
-        yield "<h3>Protection level of the newest orientation</h3>"
-        yield _levels_table(said)
-        yield _figure(protection_figure(flight), _INTEGRITY_NOTE)
-    if said["sources"]:
-        yield "<h3>Sources of tie points that drifted</h3>"
-        yield _table(
-            ("source", "CCD", "or, as likely", "first alarm [s]", "time [s]", "line [px]", "sample [px]"),
-            [
-                (
-                    s["source"], s["ccd"], ", ".join(s["rivals"]) or "–", _number(s["since_s"], 1),
-                    _number(s["seconds"], 0), f"{s['line_px']:+.2f}", f"{s['sample_px']:+.2f}",
-                )
-                for s in said["sources"]
-            ],
-            left=3, wrapped=(2,),
-        )  # fmt: skip
-        yield '<p class="note">Time: how long it was said to drift. Line and sample: the largest bias.</p>'
-
-
-def _levels_table(said: dict[str, Any]) -> str:
-    heads = ("", "X [m]", "Y [m]", "Z [m]", "ω [mdeg]", "φ [mdeg]", "κ [mdeg]")
-    rows = []
-    for name, text in (("protection", "protection level, median"), ("sigma", "σ, median")):
-        metres, angles = said[f"{name}_m"], [_MDEG * v for v in said[f"{name}_deg"]]
-        rows.append((text, *(_number(v, 2) for v in metres), *(_number(v, 1) for v in angles)))
-    if "exceeded" in said:
-        rows.append((f"errors beyond it, of {said['compared']}", *said["exceeded"]))
-    return _table(heads, rows)
 
 
 def _edge(i: int) -> str:
     return ' class="edge"' if i == 0 else ""
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1, wrapped: Sequence[int] = ()) -> str:
-    """``left`` columns are set to the left; text in those that are ``wrapped`` takes as many lines as it needs."""
-
-    def mark(i: int) -> str:
-        names = ["left"] * (i < left) + ["wrap"] * (i in wrapped)
-        return f' class="{" ".join(names)}"' if names else ""
-
-    head = "".join(f"<th{' class=left' if i < left else ''}>{escape(h)}</th>" for i, h in enumerate(heads))
-    body = "".join(
-        "<tr>" + "".join(f"<td{mark(i)}>{escape(str(v))}</td>" for i, v in enumerate(row)) + "</tr>" for row in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _rejected(result: dict[str, Any]) -> str:
@@ -343,16 +270,16 @@ def _rejected(result: dict[str, Any]) -> str:
             r["strip"],
             r["ccd"],
             r["reason"],
-            _number(r["line"], 2),
-            _number(r["sample"], 2),
-            _number(r["w"], 1),
+            number(r["line"], 2),
+            number(r["sample"], 2),
+            number(r["w"], 1),
         )
         for r in rows[:_SHOWN_REJECTED]
     ]
     more = (
         f'<p class="note">The {_SHOWN_REJECTED} largest of {result["rejected"]}.</p>' if len(rows) > len(shown) else ""
     )
-    return _table(("point", "strip", "CCD", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+    return table(("point", "strip", "CCD", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
 
 
 def _parameters(result: dict[str, Any]) -> str:
@@ -363,10 +290,10 @@ def _parameters(result: dict[str, Any]) -> str:
             unit, scale = "mdeg" + unit[3:], figures.MDEG
         value, sigma = (None if p[k] is None else scale * p[k] for k in ("value", "sigma"))
         status = _OVER.get(p["status"], p["status"])
-        numbers = _figures(value), _figures(sigma), _number(p["t"], 1)
+        numbers = _figures(value), _figures(sigma), number(p["t"], 1)
         rows.append((p["name"], unit, status, p["reason"] or "–", *numbers))
     heads = ("parameter", "unit", "status", "why", "value", "sigma", "t")
-    return _table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
+    return table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
 
 
 def _figures(value: float | None) -> str:
@@ -379,10 +306,10 @@ def _count(value: int | None) -> str:
 
 def _operation(result: dict[str, Any]) -> Iterable[str]:
     rows = [
-        (name, t["messages"], _number(t["rate_hz"], 1), t["gaps"], _count(t["unusable"]))
+        (name, t["messages"], number(t["rate_hz"], 1), t["gaps"], _count(t["unusable"]))
         for name, t in result["topics"].items()
     ]
-    yield _table(("topic", "messages", "rate [1/s]", "missing numbers", "unusable"), rows)
+    yield table(("topic", "messages", "rate [1/s]", "missing numbers", "unusable"), rows)
     yield (
         '<p class="note">Rate: between the first and the last message of the topic. Image lines and inertial data are '
         "counted, not looked at.</p>"
@@ -392,9 +319,9 @@ def _operation(result: dict[str, Any]) -> Iterable[str]:
         for name, node in result["nodes"].items():
             counters = ", ".join(f"{key} {value}" for key, value in node["counters"].items() if value)
             rows.append((name, node["state"], counters or "–", node["last_problem"] or "–"))
-        yield "<h3>Nodes, newest status</h3>" + _table(
+        yield "<h3>Nodes, newest status</h3>" + table(
             ("node", "state", "counters", "last problem"), rows, left=4, wrapped=(1, 2, 3)
         )
     if result["events"]:
         rows = [(f"{e['time_s']:.2f}", e["level"], e["node"], e["text"]) for e in result["events"][-_SHOWN_EVENTS:]]
-        yield "<h3>Events</h3>" + _table(("time [s]", "level", "node", "event"), rows, left=4, wrapped=(3,))
+        yield "<h3>Events</h3>" + table(("time [s]", "level", "node", "event"), rows, left=4, wrapped=(3,))
