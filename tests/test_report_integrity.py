@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from synthetic_flight import LIVE_SIGMA, START_NS, flight_messages
 
 from triline.nodes import convert
 from triline.nodes.cli import main
+from triline.nodes.recording_summary import Holdings
+from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import orientation_errors
-from triline.nodes.report.flight import collect
+from triline.nodes.report.flight import Look, collect, rejected_key
 from triline.nodes.report.integrity import integrity, levels
+from triline.nodes.report.page import _rejected
 from triline.nodes.report.source import read
 from triline.schemas import messages as m
 
@@ -118,3 +122,19 @@ def test_what_is_said_again_of_a_whole_strip_replaces_what_was_said_before(messa
     whole, before = flight.poses["whole"], flight.poses["final"]
     assert len(whole) == len(final)
     np.testing.assert_allclose(whole.position_l - before.position_l, [[0.25, 0.0, 0.0]] * len(whole), atol=1e-9)
+
+
+def test_coordinates_of_a_control_point_are_refused_one_by_one():
+    """They have no image point, so that only the coordinate tells them apart; the table shows no line 0."""
+    refused = [
+        SimpleNamespace(point="GCP1", strip="", ccd="", line=0.0, sample=0.0, coordinate=c, w=9.0, reason="contradicts")
+        for c in ("X", "Z")
+    ]
+    assert len({rejected_key(r) for r in refused}) == 2
+    look = Look("P1", "S1", "F", 10.0, 20.0, 0.3, 0.3)
+    assert look.key == rejected_key(m.RejectedObservation(point="P1", strip="S1", ccd="F", line=10.0, sample=20.0))
+    flight = collect(flight_messages(seconds=12.0, points=20))
+    flight.rejected = refused
+    rows = analyse(flight, Holdings("x.mcap", 0, 0, None, [], []))["rejected_observations"]
+    html = _rejected({"rejected": 2, "rejected_observations": rows})
+    assert html.count("GCP1") == 2 and ">X<" in html and ">Z<" in html and "0.00" not in html

@@ -108,7 +108,7 @@ def _parameter(p: Any) -> dict[str, Any]:
 
 def _rejected(r: Any) -> dict[str, Any]:
     names = ("point", "strip", "ccd", "line", "sample", "w", "reason")
-    return {name: getattr(r, name) for name in names}
+    return {name: getattr(r, name) for name in names} | {"coordinate": getattr(r, "coordinate", "")}
 
 
 def _level(log: Any) -> str:

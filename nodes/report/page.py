@@ -266,20 +266,17 @@ def _rejected(result: dict[str, Any]) -> str:
         return "<p>None.</p>" if "rejected" in result else ""
     shown = [
         (
-            r["point"],
-            r["strip"],
-            r["ccd"],
-            r["reason"],
-            number(r["line"], 2),
-            number(r["sample"], 2),
-            number(r["w"], 1),
+            r["point"], r["strip"] or "–", r["ccd"] or r["coordinate"] or "–", r["reason"],
+            *(number(r[k] if r["ccd"] else None, 2) for k in ("line", "sample")), number(r["w"], 1),
         )
         for r in rows[:_SHOWN_REJECTED]
-    ]
+    ]  # fmt: skip
     more = (
         f'<p class="note">The {_SHOWN_REJECTED} largest of {result["rejected"]}.</p>' if len(rows) > len(shown) else ""
     )
-    return table(("point", "strip", "CCD", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+    return (
+        table(("point", "strip", "CCD or coordinate", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+    )
 
 
 def _parameters(result: dict[str, Any]) -> str:
