@@ -35,6 +35,8 @@ class Layout:
     ccds : ids of the CCD lines, one image-space view each, and the view's title
     image_size : width (samples) and height of an image-space view
     units : units of the parameters, one plot each
+    strip_s : length of the longest strip, about
+    window_s : length of the adjustment's window: so far back what is not final yet is shown in plots; None: all of it
     truth : whether errors against truth are shown
     mosaic : whether there is an orthoimage
     lines : ids of the CCD lines whose image lines come in; and width and height of a view of them
@@ -48,6 +50,8 @@ class Layout:
     ccds: dict[str, str]
     image_size: tuple[float, float]
     units: tuple[str, ...] = ()
+    strip_s: float = 60.0
+    window_s: float | None = None
     truth: bool = False
     mosaic: bool = False
     lines: tuple[str, ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -27,6 +28,9 @@ _ALWAYS = rrb.TimeRangeBoundary.infinite()  # plots show the whole flight, not w
 _ASPECT, _WIDE_ASPECT = 1.35, 2.0  # of the 3D view, about; wide above curves
 _MOSAIC_ASPECT = 3.6  # of one orthoimage above the other
 _MARGIN = 1.06
+_WINDOW = ("window", "window_upper", "window_lower")  # curves of the window's part of a correction function
+_OVERVIEW = ("dX_window", "dY_window", "dZ_window")
+_LEGEND_ROOM, _LONGEST_S = 1.3, 300.0
 _MAP_POINTS = 300.0  # height and width of the map, about
 
 
@@ -157,7 +161,7 @@ def open_canvas(mode: str) -> Canvas:
 def blueprint(layout: Layout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
     tabs = [_overview(layout), *([_residuals(layout)] if layout.lines else [])]
-    tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(), _adjustment(layout)]
+    tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(layout), _adjustment(layout)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -177,11 +181,17 @@ def _overview(layout: Layout) -> rrb.Container:
         *([_map(layout)] if layout.geographic_centre is not None else []),
         active_tab=0,
     )
+    back = _back_s(layout)
     curves = rrb.Grid(
         _plot("sigma0", "sigma0 and its 95 % band", (0.7, 1.3), legend=False),
         _plot("latency", "Latency [ms]"),
-        _plot("overview/position", "Final dX, dY, dZ [m]"),
-        _plot("integrity/position", "Protection level and sigma of the position [m]"),
+        _plot(
+            "overview/position",
+            "dX, dY, dZ [m]: final, thin in the window",
+            window=_window(layout, _OVERVIEW),
+            back_s=back,
+        ),
+        _plot("overview/integrity", "Protection level and sigma, worst axis [m]", back_s=back),
         grid_columns=2,
     )
     if layout.lines:
@@ -233,15 +243,19 @@ def _lines(ccd: str, layout: Layout) -> rrb.View:
     )
 
 
-def _corrections() -> rrb.Container:
+def _corrections(layout: Layout) -> rrb.Container:
     units = {"dX": "m", "dY": "m", "dZ": "m", "domega": "mdeg", "dphi": "mdeg", "dkappa": "mdeg"}
-    views = [_plot(f"corrections/{name}", f"{name} [{unit}]") for name, unit in units.items()]
+    window, back = _window(layout, _WINDOW), _back_s(layout)
+    views = [
+        _plot(f"corrections/{name}", f"{name} [{unit}]", window=window, back_s=back) for name, unit in units.items()
+    ]
     return rrb.Grid(*views, grid_columns=2, name="Correction functions")
 
 
 def _adjustment(layout: Layout) -> rrb.Container:
     views = [
         _plot("window", "Window: rays, points, rejected"),
+        _plot("integrity/position", "Protection level and sigma of the position [m]"),
         _plot("integrity/attitude", "Protection level and sigma of the attitude [mdeg]"),
     ]
     if layout.truth:
@@ -325,14 +339,40 @@ def _image(ccd: str, title: str, layout: Layout) -> rrb.View:
     )
 
 
-def _plot(entity: str, title: str, span: tuple[float, float] | None = None, legend: bool = True) -> rrb.View:
+def _back_s(layout: Layout) -> float:
+    """How far back plots of the present strip reach: all of it, and room for the legend; of a long one the end."""
+    return _LEGEND_ROOM * min(layout.strip_s, _LONGEST_S)
+
+
+def _since(seconds: float) -> tuple[rrb.TimeRangeBoundary, rrb.TimeRangeBoundary]:
+    """From so long before the time cursor up to the cursor."""
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    return cursor(seconds=-seconds), cursor(seconds=0.0)
+
+
+def _window(layout: Layout, entities: tuple[str, ...]) -> dict[str, Any]:
+    """Curves of a plot of which only what the window holds is shown."""
+    if layout.window_s is None:
+        return {}
+    start, end = _since(layout.window_s)
+    return {n: rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIMELINE, start=start, end=end)]) for n in entities}
+
+
+def _plot(
+    entity: str, title: str, span: tuple[float, float] | None = None, legend: bool = True,
+    window: dict[str, Any] | None = None, back_s: float | None = None,
+) -> rrb.View:  # fmt: skip
+    """A plot of the whole flight, or of the time before the cursor; the axes fit what is shown."""
+    start, end = (_ALWAYS, _ALWAYS) if back_s is None else _since(back_s)
     return rrb.TimeSeriesView(
         origin=f"/plots/{entity}",
         name=title,
+        overrides={f"/plots/{entity}/{name}": ranges for name, ranges in (window or {}).items()},
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         background=rrb.archetypes.PlotBackground(color=_BACKGROUND, show_grid=True),
-        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=_ALWAYS, end=_ALWAYS)),
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end)),
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
+        time_ranges=[rrb.VisibleTimeRange(TIMELINE, start=start, end=end)],
     )
 
 

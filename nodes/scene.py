@@ -174,7 +174,16 @@ class Scene:
         """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
         s = self.state
         has = s.has_truth, s.has_mosaic, s.has_lines
-        key = (tuple(s.extent), s.camera is not None, has, tuple(s.units), s.frame is not None, s.bar_px)
+        key = (
+            tuple(s.extent),
+            s.camera is not None,
+            has,
+            tuple(s.units),
+            s.frame is not None,
+            s.bar_px,
+            s.window_s,
+            s.strip_s,
+        )
         if key == self._laid_out or not s.extent:
             return
         self._laid_out = key
@@ -194,6 +203,8 @@ class Scene:
             ccds={ccd: f"Residuals {ccd}: samples to the right, lines up, bar = {s.bar_px:g} px" for ccd in s.ccds},
             image_size=s.image_size,
             units=tuple(s.units),
+            strip_s=s.strip_s,
+            window_s=s.window_s,
             truth=s.has_truth,
             mosaic=s.has_mosaic,
             lines=tuple(s.ccds) if s.has_lines else (),
@@ -216,6 +227,9 @@ class Scene:
             "control points, blue check points, magenta targets that are held (with the reason) and rejected rays.\n\n"
             "Outlines on the ground: the part of the strip in the *live* window; the *marginal* part before it is "
             "final and kept as a prior on what follows; the *whole* strip has been through the backward pass.\n\n"
+            "Correction functions: green and final, with three sigma, until the window begins; orange, with its own "
+            "three sigma, what was said at once of the time that the window holds; thin, what was said at once of "
+            "earlier times.\n\n"
             "Protection level: with a risk of 0.001 the orientation is not further off, even if one gross error that "
             "the tests do not find is among the observations.",
         )
@@ -223,14 +237,13 @@ class Scene:
     def _corners(self) -> Array:
         """Ends of the strips in the air, with room for exaggerated deviations, and their swaths on the ground."""
         s = self.state
-        room = 0.12 * s.height_m
         places = []
         for start, end in s.extent.values():
             along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)
             left = np.array([-along[1], along[0], 0.0]) * s.swath_m / 2
             for place in (start, end):
                 ground = np.array([place[0], place[1], s.ground_m])
-                above = np.array([0.0, 0.0, room])
+                above = np.array([0.0, 0.0, s.room_m])
                 places += [place + above, place - above, ground - left, ground + left]
         return s.display(np.array(places))
 

@@ -17,8 +17,7 @@ Array = NDArray[np.floating]
 #: The tiles lie so far below the ground, shares of the flying height, that points and residuals stand above them.
 BELOW = {"live": 0.062, "final": 0.060}
 LARGEST_TILE = 4096
-#: Ground is dark to a sensor that clouds must not blind: what a grey value is shown as.
-SHOWN = np.rint(255.0 * (np.arange(256) / 255.0) ** 0.6).astype(np.uint8)
+_WHITE, _HEADROOM, _GAMMA = 99.5, 1.2, 0.8  # percentile of a tile, and how much brighter is shown as white
 
 
 class MosaicPart(Part):
@@ -27,6 +26,7 @@ class MosaicPart(Part):
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
         self._changed: dict[tuple[str, int, int], Any] = {}
+        self._white = 0.0
 
     def take(self, message: Message) -> None:
         """Take a tile.
@@ -46,6 +46,17 @@ class MosaicPart(Part):
         self.state.has_mosaic = True
         self._changed[version, tile.row, tile.column] = tile
 
+    def _shown(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Brighter: ground is dark to a sensor that clouds must not blind. Tiles share one scale: none stands out.
+
+        It is decided by the first tile, and again where a tile is brighter than that.
+        """
+        bright = float(np.percentile(grey[grey > 0], _WHITE))
+        if bright > self._white:
+            self._white = _HEADROOM * bright
+        table = np.rint(255.0 * np.clip(np.arange(256) / self._white, 0.0, 1.0) ** _GAMMA).astype(np.uint8)
+        return table[grey]
+
     def draw(self, canvas: Canvas) -> None:
         if self.state.newest is None:  # the display frame is not known yet
             return
@@ -59,5 +70,7 @@ class MosaicPart(Part):
             x0, x1 = tile.x + c0 * tile.gsd_m, tile.x + c1 * tile.gsd_m
             y0, y1 = tile.y - r0 * tile.gsd_m, tile.y - r1 * tile.gsd_m
             corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)])
-            canvas.picture(f"mosaic/{version}/{row}_{column}", self.state.display(corners), SHOWN[grey[r0:r1, c0:c1]])
+            canvas.picture(
+                f"mosaic/{version}/{row}_{column}", self.state.display(corners), self._shown(grey[r0:r1, c0:c1])
+            )
         self._changed.clear()

@@ -16,7 +16,7 @@ from . import convert
 from .canvas import Canvas, Color, Series
 from .convert import PoseSample
 from .node import Message
-from .scene_parts import AXES, FILTERED, FINAL, LIVE, TRUTH, Part, faded
+from .scene_parts import AXES, CHECK, FILTERED, FINAL, LIVE, TRUTH, Part, faded
 from .scene_state import SceneState
 
 Array = NDArray[np.floating]
@@ -27,9 +27,12 @@ _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
 _STEP_NS = int(0.2 * convert.SECOND_NS)
 _ALPHA = 0.05
 _WAITING = 1000
+_GAP_S, _UPDATES, _RAYS_GAP_S = 1.5, 3.0, 6.0  # a curve is broken after so long without a pose, so many updates, rays
 _TELLING = 30  # redundancy from which sigma0 says something
+_RECORD = faded(LIVE, 0.45)
 _GREY = (140, 140, 150, 255)
 _LEVELS = {1: "DEBUG", 2: "INFO", 3: "WARN", 4: "ERROR", 5: "CRITICAL"}
+_SIGMAS = 3.0
 _NAMES = {"orientation/live": "live", "orientation/final": "final"}
 
 
@@ -45,6 +48,7 @@ class PlotsPart(Part):
         self._last: dict[str, int] = {}
         self._untested: list[tuple[float, str, PoseSample]] = []  # orientations that came before their truth
         self._newest_ray_ns = 0
+        self._newest: dict[str, float] = {}  # time of the newest value of a curve
 
     # ---- taking
 
@@ -80,30 +84,39 @@ class PlotsPart(Part):
                 self._error(time_s, kind, sample.position_l, sample.quaternion, *true)
 
     def _corrections(self, t: float, kind: str, sample: PoseSample) -> None:
+        """The correction functions: final with its band, and the part that the window holds with its own.
+
+        What was said at once is drawn twice: thin, as a record, and as the window's part, of which views show no more
+        than is not final yet.
+        """
         if sample.correction is None or len(sample.correction) != 6:
             return
         values = sample.correction * _SCALE
-        color = LIVE if kind == "live" else FINAL
-        for name, value in zip(COMPONENTS, values, strict=True):
-            self._add(f"corrections/{name}/{kind}", t, value, Series(kind, color, 1.2 if kind == "live" else 2.2))
+        drawn = (("live", "live, earlier", _RECORD, 1.0), ("window", "live, in the window", LIVE, 2.2))
         if kind == "final":
-            for i, (name, value) in enumerate(zip(COMPONENTS, values, strict=True)):
-                group = "position" if i < 3 else "attitude"
-                self._add(f"overview/{group}/{name}", t, value, Series(name, AXES[i % 3], 2.0))
-            if sample.covariance is not None:
-                self._band(t, values, 3 * np.sqrt(np.diag(sample.covariance)) * _SCALE)
+            drawn = (("final", "final", FINAL, 2.2),)
+        for entity, text, color, width in drawn:
+            for name, value in zip(COMPONENTS, values, strict=True):
+                self._add(f"corrections/{name}/{entity}", t, value, Series(text, color, width))
+        for i, (name, value) in enumerate(zip(COMPONENTS[:3], values[:3], strict=True)):
+            style = Series(name, AXES[i], 2.0) if kind == "final" else Series(name, faded(AXES[i], 0.6), 1.0)
+            self._add(f"overview/position/{name}{'' if kind == 'final' else '_window'}", t, value, style)
+        if sample.covariance is not None:
+            self._band(t, kind, values, _SIGMAS * np.sqrt(np.diag(sample.covariance)) * _SCALE)
 
-    def _band(self, t: float, values: Array, width: Array) -> None:
+    def _band(self, t: float, kind: str, values: Array, width: Array) -> None:
+        prefix, text, color = ("", "final", FINAL) if kind == "final" else ("window_", "live", LIVE)
+        style = Series(f"{text} \u00b1 {_SIGMAS:g} sigma", faded(color, 0.6), 1.0)
         for i, name in enumerate(COMPONENTS):
             for bound, sign in (("upper", 1.0), ("lower", -1.0)):
-                value = values[i] + sign * width[i]
-                shade = (60, 150, 90, 255)
-                series = Series(f"final {'+' if sign > 0 else '-'} 3 sigma", shade, 0.8)
-                self._add(f"corrections/{name}/{bound}", t, value, series)
+                self._add(f"corrections/{name}/{prefix}{bound}", t, values[i] + sign * width[i], style)
 
     def _error(self, t: float, kind: str, position: Array, quaternion: Array, true_p: Array, true_q: Array) -> None:
         error = _difference(position, quaternion, true_p, true_q)
         color = {"live": LIVE, "final": FINAL}.get(kind, FILTERED)
+        if kind == "live":
+            worst = float(np.abs(error[:3]).max())
+            self._add("overview/integrity/error", t, worst, Series("error of live", TRUTH, 1.0))
         self._add(f"errors/position/{kind}", t, float(np.linalg.norm(error[:3])), Series(kind, color))
         self._add(f"errors/attitude/{kind}", t, _MDEG * float(np.linalg.norm(error[3:])), Series(kind, color))
 
@@ -116,35 +129,45 @@ class PlotsPart(Part):
             self._events.append((self.state.seconds(message.stamp_ns), text, _LEVELS.get(body.level, "INFO")))
 
     def _report(self, t: float, report: Any) -> None:
-        self._add("sigma0/one", t, 1.0, Series("1.0", TRUTH, 1.0))
+        gap_s = max(_UPDATES * report.update_interval_s, _GAP_S)
+        self._add("sigma0/one", t, 1.0, Series("1.0", TRUTH, 1.0), gap_s)
         if report.redundancy >= _TELLING:
-            self._add("sigma0/value", t, report.sigma0, Series("sigma0", FINAL, 2.0))
+            self._add("sigma0/value", t, report.sigma0, Series("sigma0", FINAL, 2.0), gap_s)
             low, high = _sigma0_band(int(report.redundancy))
-            self._add("sigma0/low", t, low, Series("95 %, low", _GREY, 1.0))
-            self._add("sigma0/high", t, high, Series("95 %, high", _GREY, 1.0))
+            self._add("sigma0/low", t, low, Series("95 %, low", _GREY, 1.0), gap_s)
+            self._add("sigma0/high", t, high, Series("95 %, high", _GREY, 1.0), gap_s)
         if report.rays > 0 and report.window_end_ns > self._newest_ray_ns:
             self._newest_ray_ns = report.window_end_ns
-            self._add("latency/data", t, 1000 * report.data_latency_s, Series("newest ray to answer", FILTERED))
+            style = Series("newest ray to answer", FILTERED)
+            self._add("latency/data", t, 1000 * report.data_latency_s, style, max(gap_s, _RAYS_GAP_S))
         if report.compute_s > 0:
-            self._add("latency/compute", t, 1000 * report.compute_s, Series("update", LIVE))
-        self._add("window/rays", t, report.rays, Series("rays", FILTERED))
-        self._add("window/points", t, report.points, Series("points", FINAL))
-        self._add("window/rejected", t, report.rejected_total, Series("rejected, total", (255, 60, 230, 255)))
+            self._add("latency/compute", t, 1000 * report.compute_s, Series("update", LIVE), gap_s)
+        self._add("window/rays", t, report.rays, Series("rays", FILTERED), gap_s)
+        self._add("window/points", t, report.points, Series("points", FINAL), gap_s)
+        self._add("window/rejected", t, report.rejected_total, Series("rejected, total", (255, 60, 230, 255)), gap_s)
+        if report.strip:
+            self._integrity(t, report, gap_s)
+        for k, parameter in enumerate(report.parameters):
+            self._parameter(t, k, parameter, gap_s)
+        if report.parameters:
+            estimated = sum(p.status == ESTIMATED for p in report.parameters)
+            self._of_unit("determined")
+            self._add("parameters/determined/estimated", t, estimated, Series("estimated", FINAL, 2.0), gap_s)
+            self._add("parameters/determined/all", t, len(report.parameters), Series("all", _GREY, 1.0), gap_s)
+
+    def _integrity(self, t: float, report: Any, gap_s: float) -> None:
+        """Protection levels and sigmas while a strip is flown: of each axis, and of the worst one."""
         for group, part, scale in (("position", slice(0, 3), 1.0), ("attitude", slice(3, 6), _MDEG)):
             for kind, values, width in (("protection", report.protection, 2.0), ("sigma", report.sigma, 1.0)):
                 for axis, value in enumerate(values[part]):
                     name = COMPONENTS[part][axis].removeprefix("d")
-                    series = Series(f"{name}, {kind}", AXES[axis] if width > 1 else faded(AXES[axis], 0.5), width)
-                    self._add(f"integrity/{group}/{name}_{kind}", t, scale * value, series)
-        for k, parameter in enumerate(report.parameters):
-            self._parameter(t, k, parameter)
-        if report.parameters:
-            estimated = sum(p.status == ESTIMATED for p in report.parameters)
-            self._of_unit("determined")
-            self._add("parameters/determined/estimated", t, estimated, Series("estimated", FINAL, 2.0))
-            self._add("parameters/determined/all", t, len(report.parameters), Series("all", _GREY, 1.0))
+                    series = Series(f"{name}, {kind}", AXES[axis] if width > 1 else faded(AXES[axis], 0.7), width)
+                    self._add(f"integrity/{group}/{name}_{kind}", t, scale * value, series, gap_s)
+        for kind, values, color in (("protection", report.protection, LIVE), ("sigma", report.sigma, CHECK)):
+            if len(values) == 6:
+                self._add(f"overview/integrity/{kind}", t, max(values[:3]), Series(kind, color, 2.0), gap_s)
 
-    def _parameter(self, t: float, k: int, parameter: Any) -> None:
+    def _parameter(self, t: float, k: int, parameter: Any, gap_s: float) -> None:
         """The value; faint as long as the network cannot see it."""
         unit, scale = parameter.unit or "1", 1.0
         if unit.startswith("rad"):
@@ -154,17 +177,23 @@ class PlotsPart(Part):
         series = Series(parameter.name, _palette(k), 1.5)
         if parameter.status != ESTIMATED:
             entity, series = f"{entity}_open", Series(f"{parameter.name}, open", faded(_palette(k), 0.4), 1.0)
-        self._add(entity, t, scale * parameter.value, series)
+        self._add(entity, t, scale * parameter.value, series, gap_s)
 
     def _of_unit(self, unit: str) -> None:
         """There is a plot of this unit."""
         if unit not in self.state.units:
             self.state.units.append(unit)
 
-    def _add(self, entity: str, t: float, value: float, style: Series) -> None:
+    def _add(self, entity: str, t: float, value: float, style: Series, gap_s: float = _GAP_S) -> None:
+        """Add to a curve; after a gap (a turn) it begins anew: a value that is not a number breaks it."""
         if not np.isfinite(value):
             return
         times, values = self._curves.setdefault(entity, ([], []))
+        last = self._newest.get(entity, t)
+        if t - last > gap_s:
+            times.append((last + t) / 2)
+            values.append(np.nan)
+        self._newest[entity] = t
         times.append(t)
         values.append(float(value))
         self._styles.setdefault(entity, style)

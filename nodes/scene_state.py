@@ -23,6 +23,9 @@ _LARGEST_GAP_NS = convert.SECOND_NS
 _IMAGE_HEIGHT = 0.16  # of an image-space view, as a share of its width
 _LINES_WIDTH, _LINES_HIGH = 400, 2.4  # of a view of image lines, about, px; and its height at least, in widths
 _NO_LENGTH_S = 60.0  # of a strip whose end is not known
+_WINDOW_CHANGE = 0.2  # of its length, at least: views are arranged again
+_SWING = 3.3  # standard deviations that a slow error reaches in a flight, about
+_ROOM = 0.2  # of the flying height: what deviations of that size are drawn as
 
 
 class PoseHistory:
@@ -73,6 +76,7 @@ class SceneState:
     measured : the trajectory others are compared with, "filtered" or "smoothed"
     trajectory, truth : the newest poses of both
     units : units of the parameters that have come
+    window_s : length of the adjustment's window, from where orientation is final until now; None until it is full
     """
 
     def __init__(self) -> None:
@@ -89,6 +93,7 @@ class SceneState:
         self.height_m = 1000.0
         self.extent: dict[str, Array] = {}
         self.units: list[str] = []
+        self.window_s: float | None = None
         self.has_truth = False
         self.has_mosaic = False
         self.has_lines = False
@@ -118,6 +123,17 @@ class SceneState:
             if self.start_ns is None:
                 self.start_ns = message.stamp_ns
             self.now_s = max(self.now_s, self.seconds(message.stamp_ns))
+            if topic == "adjustment/report":
+                self._note_window(message.stamp_ns, body)
+
+    def _note_window(self, stamp_ns: int, report: Any) -> None:
+        """Keep the length of the window once something has left it; a slightly different one changes nothing."""
+        strip = self.strips.get(report.strip)
+        if strip is None or report.window_start_ns <= strip.first_line_time_ns + convert.SECOND_NS:
+            return
+        length = (stamp_ns - report.window_start_ns) / convert.SECOND_NS
+        if self.window_s is None or abs(length - self.window_s) > _WINDOW_CHANGE * self.window_s:
+            self.window_s = length
 
     def note_pose(self, topic: str, sample: PoseSample) -> None:
         """keep the newest poses; the first one decides the display frame."""
@@ -210,13 +226,24 @@ class SceneState:
 
     @property
     def exaggeration(self) -> float:
-        """Of deviations between trajectories, and of sigmas: what is expected becomes a 12th of the flying height."""
-        return round_number(self.height_m / 12 / self._expected_m)
+        """Of deviations between trajectories, and of sigmas: what they reach in a flight fits in the room above it."""
+        return round_number(_ROOM * self.height_m / (_SWING * self._expected_m))
+
+    @property
+    def room_m(self) -> float:
+        """Above and below a trajectory, for deviations from it: at least as much as a slow error needs."""
+        return max(_ROOM * self.height_m, self.exaggeration * _SWING * self._expected_m)
 
     @property
     def residual_scale(self) -> float:
         """Of residuals in object space: the scale bar of image space becomes a 25th of the flying height."""
         return round_number(self.height_m / 25 / (self.bar_px * self.gsd_m))
+
+    @property
+    def strip_s(self) -> float:
+        """Length of the longest strip, s, in full tens: one that ends a little off its plan changes no view."""
+        longest = max(map(_length_s, (s for s in self.strips.values() if s.line_rate_hz > 0)), default=_NO_LENGTH_S)
+        return 10.0 * float(np.ceil(longest / 10.0))
 
     @property
     def lines_reduced(self) -> int:

@@ -105,9 +105,13 @@ class WindowPart(Part):
         canvas.lines("flight/window/border", [self.state.display(f) for f in fence], [LIVE] * len(fence), 0.8)
 
     def _beside(self, rows: list[tuple[int, Array, Array, Array]]) -> Array:
-        """Where a name stands: to the right of the middle of a swath."""
+        """Where a name stands: beside the middle of a swath, on the side that the eye is on: the right of the first."""
         _, _, left, right = rows[len(rows) // 2]
-        return self.state.display(right + _ASIDE * (right - left))
+        start, end = next(iter(self.state.extent.values()))
+        aside = right - left
+        if aside @ np.array([end[1] - start[1], start[0] - end[0], 0.0]) < 0:  # flown back
+            aside, right = -aside, left
+        return self.state.display(right + _ASIDE * aside)
 
     def _outline(self, rows: list[tuple[int, Array, Array, Array]]) -> Array:
         left, right = np.array([r[2] for r in rows]), np.array([r[3] for r in rows])

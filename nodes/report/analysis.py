@@ -14,6 +14,7 @@ from .. import convert
 from ..recording_summary import Holdings, TopicSummary
 from .evaluation import evaluate_flight
 from .flight import Flight, updates_with_new_rays
+from .integrity import integrity
 from .source import WANTED
 
 _LARGEST_REJECTED = 200
@@ -32,7 +33,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
     ``damage`` (one line each), ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status),
     ``parameters`` (of the newest report that has any), ``rejected_observations`` (the largest first), ``latency_s``
-    (median, max), ``events``
+    (median, max), ``integrity`` (see `integrity.integrity`; absent where nothing is said of it), ``events``
     """
     result = {"recording": _recording(flight, held), "damage": held.damage, **evaluate_flight(flight)}
     result["topics"] = {
@@ -54,6 +55,9 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     latency = [r.data_latency_s for r, new in zip(reports, updates_with_new_rays(reports), strict=True) if new]
     if latency:
         result["latency_s"] = {"median": median(latency), "max": max(latency)}
+    sound = integrity(flight)
+    if sound is not None:
+        result["integrity"] = sound
     result["events"] = [
         {"time_s": float(flight.seconds(stamp)), "level": _level(body), "node": body.name, "text": body.message}
         for stamp, body in flight.events
@@ -120,7 +124,7 @@ def _estimated_since(flight: Flight) -> dict[str, float]:
 
 def _rejected(r: Any) -> dict[str, Any]:
     names = ("point", "strip", "ccd", "line", "sample", "w", "reason")
-    return {name: getattr(r, name) for name in names}
+    return {name: getattr(r, name) for name in names} | {"coordinate": getattr(r, "coordinate", "")}
 
 
 def _level(log: Any) -> str:

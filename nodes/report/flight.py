@@ -17,7 +17,7 @@ from .. import convert
 from ..node import Message
 
 Array = NDArray[np.floating]
-Key = tuple[str, str, str, int, int]
+Key = tuple[str, str, str, int, int, str]
 SECOND_NS = convert.SECOND_NS
 
 #: Topics of poses, and the name a report gives them.
@@ -196,9 +196,9 @@ def rejected_key(r: Any) -> Key:
 
 
 def _key(r: Any) -> Key:
-    """Ids, and line and sample to a hundredth of a pixel; (0, 0) where they are not finite."""
+    """Ids, and line and sample to a hundredth of a pixel, (0, 0) where they are not finite; a coordinate of control."""
     line, sample = (round(100 * v) if np.isfinite(v) else 0 for v in (r.line, r.sample))
-    return r.point, r.strip, r.ccd, line, sample
+    return r.point, r.strip, r.ccd, line, sample, getattr(r, "coordinate", "")
 
 
 def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], topic: str, stamp: int, body: Any):

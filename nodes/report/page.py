@@ -12,8 +12,10 @@ from . import figures
 from .accuracy_table import early_lines
 from .evaluation import triangulated
 from .flight import Flight
+from .integrity_section import integrity_section
+from .page_parts import captioned, number, table
 from .page_style import CSS
-from .style import styled, svg
+from .style import styled
 
 _MDEG = 1000.0
 _ORIENTATION = {
@@ -56,12 +58,13 @@ def page(flight: Flight, result: dict[str, Any]) -> str:
             _warnings(result),
             _tiles(result),
             _missing(result["missing"]),
-            _section("Flight", _figure(figures.trajectory_map(flight), _MAP_NOTE)),
+            _section("Flight", captioned(figures.trajectory_map(flight), _MAP_NOTE)),
             _section("Accuracy", *_accuracy(result)),
-            _section("Errors against truth", _figure(figures.errors(flight), _ERRORS_NOTE)),
-            _section("Adjustment", _figure(figures.progress(flight), "")),
-            _section("Correction functions", _figure(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
-            _section("Residuals in image space", _figure(figures.residuals(flight), _RESIDUALS_NOTE)),
+            _section("Errors against truth", captioned(figures.errors(flight), _ERRORS_NOTE)),
+            _section("Integrity", *integrity_section(flight, result)),
+            _section("Adjustment", captioned(figures.progress(flight), "")),
+            _section("Correction functions", captioned(figures.correction_functions(flight), _CORRECTIONS_NOTE)),
+            _section("Residuals in image space", captioned(figures.residuals(flight), _RESIDUALS_NOTE)),
             _section("Rejected observations", _rejected(result)),
             _section("Parameters", _parameters(result)),
             _section("Messages, nodes and events", *_operation(result)),
@@ -176,13 +179,6 @@ def _section(title: str, *parts: str) -> str:
     return f"<section><h2>{escape(title)}</h2>\n{content}\n</section>" if content else ""
 
 
-def _figure(figure: Any, caption: str) -> str:
-    if figure is None:
-        return ""
-    note = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{svg(figure)}{note}</figure>"
-
-
 def _accuracy(result: dict[str, Any]) -> Iterable[str]:
     if result["orientation"]:
         yield "<h3>Exterior orientation against truth</h3>"
@@ -256,31 +252,13 @@ def _accuracy_table(heads: list[tuple[str, str]], rows: list[Any], digits: list[
         body += f"<tr{' class=main' if main else ''}><td>{escape(label)}</td><td>{n}</td>"
         for values, d in zip(groups, digits, strict=True):
             for i in range(3):
-                body += f"<td{_edge(i)}>{_number(None if values is None else values[i], d)}</td>"
-        body += f'<td class="edge">{_number(nees, 2)}</td></tr>'
+                body += f"<td{_edge(i)}>{number(None if values is None else values[i], d)}</td>"
+        body += f'<td class="edge">{number(nees, 2)}</td></tr>'
     return f'<div class="scroll"><table><thead>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _edge(i: int) -> str:
     return ' class="edge"' if i == 0 else ""
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]], left: int = 1, wrapped: Sequence[int] = ()) -> str:
-    """``left`` columns are set to the left; text in those that are ``wrapped`` takes as many lines as it needs."""
-
-    def mark(i: int) -> str:
-        names = ["left"] * (i < left) + ["wrap"] * (i in wrapped)
-        return f' class="{" ".join(names)}"' if names else ""
-
-    head = "".join(f"<th{' class=left' if i < left else ''}>{escape(h)}</th>" for i, h in enumerate(heads))
-    body = "".join(
-        "<tr>" + "".join(f"<td{mark(i)}>{escape(str(v))}</td>" for i, v in enumerate(row)) + "</tr>" for row in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _rejected(result: dict[str, Any]) -> str:
@@ -289,20 +267,17 @@ def _rejected(result: dict[str, Any]) -> str:
         return "<p>None.</p>" if "rejected" in result else ""
     shown = [
         (
-            r["point"],
-            r["strip"],
-            r["ccd"],
-            r["reason"],
-            _number(r["line"], 2),
-            _number(r["sample"], 2),
-            _number(r["w"], 1),
+            r["point"], r["strip"] or "–", r["ccd"] or r["coordinate"] or "–", r["reason"],
+            *(number(r[k] if r["ccd"] else None, 2) for k in ("line", "sample")), number(r["w"], 1),
         )
         for r in rows[:_SHOWN_REJECTED]
-    ]
+    ]  # fmt: skip
     more = (
         f'<p class="note">The {_SHOWN_REJECTED} largest of {result["rejected"]}.</p>' if len(rows) > len(shown) else ""
     )
-    return _table(("point", "strip", "CCD", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+    return (
+        table(("point", "strip", "CCD or coordinate", "reason", "line [px]", "sample [px]", "w"), shown, left=4) + more
+    )
 
 
 def _parameters(result: dict[str, Any]) -> str:
@@ -315,10 +290,10 @@ def _parameters(result: dict[str, Any]) -> str:
         status = _OVER.get(p["status"], p["status"])
         since = "–" if p["estimated_since_s"] is None else f"{p['estimated_since_s']:.0f}"
         goes_with = f"{p['correlation']:+.2f} {p['partner']}" if p["partner"] else "–"
-        numbers = since, _figures(value), _figures(sigma), _number(p["t"], 1), goes_with
+        numbers = since, _figures(value), _figures(sigma), number(p["t"], 1), goes_with
         rows.append((p["name"], unit, status, p["reason"] or "–", *numbers))
     heads = ("parameter", "unit", "status", "why", "since [s]", "value", "sigma", "t", "strongest correlation")
-    return _table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
+    return table(heads, rows, left=4, wrapped=(3,)) + _PARAMETERS_NOTE if rows else ""
 
 
 def _figures(value: float | None) -> str:
@@ -331,10 +306,10 @@ def _count(value: int | None) -> str:
 
 def _operation(result: dict[str, Any]) -> Iterable[str]:
     rows = [
-        (name, t["messages"], _number(t["rate_hz"], 1), t["gaps"], _count(t["unusable"]))
+        (name, t["messages"], number(t["rate_hz"], 1), t["gaps"], _count(t["unusable"]))
         for name, t in result["topics"].items()
     ]
-    yield _table(("topic", "messages", "rate [1/s]", "missing numbers", "unusable"), rows)
+    yield table(("topic", "messages", "rate [1/s]", "missing numbers", "unusable"), rows)
     yield (
         '<p class="note">Rate: between the first and the last message of the topic. Image lines and inertial data are '
         "counted, not looked at.</p>"
@@ -344,9 +319,9 @@ def _operation(result: dict[str, Any]) -> Iterable[str]:
         for name, node in result["nodes"].items():
             counters = ", ".join(f"{key} {value}" for key, value in node["counters"].items() if value)
             rows.append((name, node["state"], counters or "–", node["last_problem"] or "–"))
-        yield "<h3>Nodes, newest status</h3>" + _table(
+        yield "<h3>Nodes, newest status</h3>" + table(
             ("node", "state", "counters", "last problem"), rows, left=4, wrapped=(1, 2, 3)
         )
     if result["events"]:
         rows = [(f"{e['time_s']:.2f}", e["level"], e["node"], e["text"]) for e in result["events"][-_SHOWN_EVENTS:]]
-        yield "<h3>Events</h3>" + _table(("time [s]", "level", "node", "event"), rows, left=4, wrapped=(3,))
+        yield "<h3>Events</h3>" + table(("time [s]", "level", "node", "event"), rows, left=4, wrapped=(3,))

@@ -59,7 +59,7 @@ class StripTime:
                 for start, end, place, id in self.strips:
                     middle = place + (end - start) / 2
                     anchor = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "top"}
-                    ax.text(middle, 0.985, id, fontsize=7.5, color="#666666", **anchor)
+                    ax.text(middle, 0.985, id, fontsize=7.5, color="#666666", clip_on=True, **anchor)
         for ax in lowest:
             if self.strips:
                 ax.set_xticks([place for _, _, place, _ in self.strips], [f"{start:.0f}" for start, *_ in self.strips])

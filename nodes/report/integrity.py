@@ -1,0 +1,177 @@
+"""The operator's light and the protection levels of a flight: how long, why, and whether they held."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from .. import convert
+from .evaluation import orientation_errors
+from .flight import Flight
+from .strip_time import StripTime
+from .style import FILTERED, FINAL, LIVE, TRUTH, figure
+
+Array = NDArray[np.floating]
+
+LIGHTS = ("good", "weak", "failed")
+_COLORS = {"good": "#dff1e5", "weak": "#fdebc8", "failed": "#f9d2cd"}
+_SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
+_MDEG = 1000.0 * float(np.degrees(1.0))
+_SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
+_LONGEST_S = 6.0  # a report speaks for no longer than this
+_NEAR_S = 0.3  # an error is compared with the protection level of a report that is so near in time
+_NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
+
+
+def integrity(flight: Flight) -> dict[str, Any] | None:
+    """Lights, protection levels and drifting sources, over the time on strips; None where no report has a light.
+
+    Returns
+    -------
+    dict with
+
+    - ``seconds``: time on strips; ``share``: of "good", "weak" and "failed", 0 to 1;
+    - ``reasons``: ``light, reason, seconds, times`` (how often it came up), the longest first; reasons that differ in
+      their numbers only are one, told with the numbers of the first;
+    - ``protection_m``, ``sigma_m`` (X, Y, Z), ``protection_deg``, ``sigma_deg`` (omega, phi, kappa): medians;
+    - with truth ``compared`` (orientations) and ``exceeded`` (by component: errors beyond the protection level);
+    - ``sources``: those that drifted: ``source, ccd, since_s, seconds, line_px, sample_px`` (largest bias), ``rivals``.
+    """
+    lit = _lit(flight)
+    if not lit:
+        return None
+    lasting = _lasting([stamp for stamp, r in flight.reports if r.light], [stamp for stamp, _ in lit])
+    total = sum(lasting)
+    share = {light: 0.0 for light in LIGHTS}
+    reasons: dict[tuple[str, str], dict[str, Any]] = {}
+    before = ("", "")
+    for (_, r), seconds in zip(lit, lasting, strict=True):
+        share[r.light] = share.get(r.light, 0.0) + seconds / max(total, 1e-9)
+        kind = r.light, _NUMBER.sub("#", r.light_reason)
+        row = reasons.setdefault(kind, {"light": r.light, "reason": r.light_reason, "seconds": 0.0, "times": 0})
+        row["seconds"] += seconds
+        row["times"] += kind != before
+        before = kind
+    result: dict[str, Any] = {"seconds": total, "share": share}
+    result["reasons"] = sorted(reasons.values(), key=lambda row: -row["seconds"])
+    _levels(flight, result)
+    result["sources"] = _sources(flight, lit, lasting)
+    return result
+
+
+def _lit(flight: Flight) -> list[tuple[int, Any]]:
+    """Reports that show a light, on strips."""
+    flying = flight.during_strips(np.array([stamp for stamp, _ in flight.reports], dtype=np.int64))
+    return [row for row, on in zip(flight.reports, flying, strict=True) if on and row[1].light and row[1].strip]
+
+
+def _lasting(all_ns: list[int], lit_ns: list[int]) -> list[float]:
+    """How long each report speaks: until the next one, s."""
+    following = dict(pairwise(all_ns))
+    return [min((following.get(ns, ns) - ns) / convert.SECOND_NS, _LONGEST_S) for ns in lit_ns]
+
+
+def _levels(flight: Flight, result: dict[str, Any]) -> None:
+    found = levels(flight)
+    if found is None:
+        return
+    _, protection, sigma, error = found
+    for name, values in (("protection", protection), ("sigma", sigma)):
+        middle = np.median(values, axis=0)
+        result[f"{name}_m"], result[f"{name}_deg"] = middle[:3].tolist(), np.degrees(middle[3:]).tolist()
+    known = np.isfinite(error).all(axis=1)
+    if known.any():
+        result["compared"] = int(known.sum())
+        result["exceeded"] = (np.abs(error[known]) > protection[known]).sum(axis=0).tolist()
+
+
+def levels(flight: Flight) -> tuple[Array, Array, Array, Array] | None:
+    """Time (n,) s, protection level, sigma and error of the live orientation (n, 6), m and rad; None without any.
+
+    Errors are NaN where there is no truth, or no live orientation of about that time.
+    """
+    rows = [(stamp, r.protection, r.sigma) for stamp, r in flight.reports if r.strip]
+    rows = [row for row in rows if len(row[1]) == len(row[2]) == 6 and np.isfinite([*row[1], *row[2]]).all()]
+    if not rows:
+        return None
+    stamps = np.array([row[0] for row in rows], dtype=np.int64)
+    protection, sigma = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
+    error = np.full((len(rows), 6), np.nan)
+    live = orientation_errors(flight).get("live")
+    if live is not None and len(live[0]):
+        nearest = np.clip(np.searchsorted(live[0], stamps), 1, len(live[0]) - 1) if len(live[0]) > 1 else stamps * 0
+        if len(live[0]) > 1:
+            nearest -= stamps - live[0][nearest - 1] < live[0][nearest] - stamps
+        near = np.abs(live[0][nearest] - stamps) <= _NEAR_S * convert.SECOND_NS
+        error[near] = live[1][nearest[near]]
+    return flight.seconds(stamps), protection, sigma, error
+
+
+def _sources(flight: Flight, lit: list[tuple[int, Any]], lasting: list[float]) -> list[dict[str, Any]]:
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    for (_, report), seconds in zip(lit, lasting, strict=True):
+        for s in report.sources:
+            since_s = float(flight.seconds(s.since_ns)) if s.since_ns else None
+            new = {"source": s.source, "ccd": s.ccd, "since_s": since_s, "seconds": 0.0}
+            row = found.setdefault((s.source, s.ccd), {**new, "line_px": 0.0, "sample_px": 0.0, "rivals": []})
+            row["seconds"] += seconds
+            if np.hypot(s.line, s.sample) >= np.hypot(row["line_px"], row["sample_px"]):
+                row["line_px"], row["sample_px"] = s.line, s.sample
+            row["rivals"] = sorted({*row["rivals"], *s.rivals})
+    return sorted(found.values(), key=lambda row: -row["seconds"])
+
+
+def protection_figure(flight: Flight) -> Figure | None:
+    """Protection level and sigma of the newest orientation, its error where there is truth, and the light behind."""
+    found = levels(flight)
+    if found is None:
+        return None
+    t, protection, sigma, error = found
+    fig = figure(5.2)
+    axes = fig.subplots(3, 2, sharex=True)
+    axis = StripTime(flight)
+    lights = _lights(flight)
+    curves = [("σ", sigma, FINAL, 1.0), ("protection level", protection, LIVE, 1.5)]
+    if np.isfinite(error).any():
+        curves.insert(0, ("error of the live orientation", np.abs(error), TRUTH, 0.7))
+    for i, ax in enumerate(axes.T.ravel()):
+        for name, values, color, width in curves:
+            x, y = axis.curve(t, _SCALE[i] * values[:, i : i + 1])
+            ax.plot(x, y[:, 0], color=color, lw=width, label=name)
+        ax.set_yscale("log")
+        low, high = (_SCALE[i] * float(f(v[:, i])) for f, v in ((np.min, sigma), (np.max, protection)))
+        ax.set_ylim(0.2 * max(low, 1e-6 * high, 1e-9), 1.5 * max(high, 1e-9))
+        ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.set_title(f"{_SYMBOLS[i]} [{'m' if i < 3 else 'mdeg'}]")
+        _shade(ax, axis, *lights)
+    axis.dress(axes.ravel(), axes[-1])
+    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    return fig
+
+
+def _lights(flight: Flight) -> tuple[Array, Array]:
+    """Time (n,) s and the light (n,), place in LIGHTS or -1, of reports on strips."""
+    lit = _lit(flight)
+    code = np.array([LIGHTS.index(r.light) if r.light in LIGHTS else -1 for _, r in lit], dtype=float)
+    return np.atleast_1d(flight.seconds(np.array([stamp for stamp, _ in lit], dtype=np.int64))), code
+
+
+def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array) -> None:
+    """The light as the colour of the ground."""
+    if not len(time_s):
+        return
+    x, values = axis.curve(time_s, code[:, None])
+    for k, light in enumerate(LIGHTS):
+        burning = np.isfinite(x[1:] - x[:-1]) & (values[:-1, 0] == k)  # each holds until the next report
+        edges = np.flatnonzero(np.diff(burning, prepend=False, append=False))
+        spans = [(float(x[a]), float(x[b] - x[a])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        if spans:
+            style = {"color": _COLORS[light], "lw": 0, "zorder": 0, "label": light}
+            ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), **style)
+    ax.grid(True, axis="y", color=FILTERED, alpha=0.25)
