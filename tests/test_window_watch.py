@@ -294,6 +294,8 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"sigma0": 2.1}, FAILED, "observations contradict each other: sigma0 2.1"),
         ({"refused": 120}, FAILED, "120 of 200 tie points contradict the others"),
         ({"control_refused": 2}, FAILED, "2 control points contradict"),
+        ({"control_doubt": "GCP1 Z or GCP2 Z"}, WEAK, "GCP1 Z or GCP2 Z"),
+        ({"control_doubt": "GNSS differs in Z", "control_failed": True}, FAILED, "GNSS differs in Z"),
         ({"points": 0, "refused": 0}, WEAK, "no tie points within 40 s"),
         ({"points": 0, "refused": 0, "since_s": 5.0}, WEAK, "no tie points yet"),
         ({"sources": (DRIFT,)}, WEAK, "source matcher-2 on CCD B drift: line +0.00 px, sample +0.50 px"),

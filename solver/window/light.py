@@ -40,6 +40,8 @@ class Situation:
     apriori_m : (3,) sigma of X, Y and Z before any observation
     exposure : of the newest orientation, None without
     sources : those that drift
+    control_doubt : what control contradicts, itself or the GNSS, in words; "" where it does not
+    control_failed : whether by so much that no sigma can be relied on
     """
 
     flying: bool
@@ -54,6 +56,8 @@ class Situation:
     apriori_m: Array
     exposure: Exposure | None
     sources: tuple[BiasedSource, ...]
+    control_doubt: str = ""
+    control_failed: bool = False
 
 
 def light(s: Situation) -> tuple[str, str]:
@@ -66,6 +70,8 @@ def light(s: Situation) -> tuple[str, str]:
         return FAILED, f"{s.refused} of {s.points} tie points contradict the others"
     if s.control_refused >= max(2, int(s.control.max())):
         return FAILED, f"{s.control_refused} control points contradict the orientation"
+    if s.control_doubt:
+        return FAILED if s.control_failed else WEAK, s.control_doubt
     if s.points - s.refused == 0:
         if s.since_s < s.length_s or not s.length_s:
             return WEAK, "no tie points yet: the orientation is the measured one"
