@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ..adjustment.reliability import CRITICAL_W, noncentrality
-from .batch import Batch, inverse_factors
+from .batch import Batch, Information, inverse_factors
 from .protection import protection_factor
 from .state import Marginal, WindowState
 
@@ -35,8 +35,8 @@ IntArray = NDArray[np.int64]
 RISK = 1e-3
 #: Observations of a batch, and of the window, that are looked at exactly, if their lambda is not small.
 OF_BATCH, OF_WINDOW, SMALL = 12, 24, 0.15
-#: Observations whose lambda is computed anew in one update.
-RENEWED = 4
+#: Observations whose lambda is computed anew in one update, and batches with other equations than before.
+RENEWED, JUDGED_ANEW = 4, 2
 #: Cofactors of residuals below this are those of a direction that nothing checks: along the base at two rays.
 UNCHECKED = 1e-6
 AXES = "XYZ"
@@ -105,11 +105,23 @@ class _Exposed:
 
 @dataclass
 class _OfBatch:
-    """The most exposed observations of a batch, the largest lambda of its others, and the solution they are for."""
+    """The most exposed observations of a batch, the largest lambda of its others, and what they are for.
 
+    Cofactors of residuals are a small difference of large figures, a thousandth of them where the datum rests on a
+    control point. So rows of one linearisation do not go with the solution of another, and nothing of a batch is
+    renewed that has been linearised or weighted anew since.
+    """
+
+    batch: Batch
     exposed: list[_Exposed]
     rest: float
     solution: int
+    information: Information
+
+    @property
+    def current(self) -> bool:
+        """Whether the batch has the same equations still."""
+        return self.batch.information is self.information
 
 
 class Integrity:
@@ -133,7 +145,8 @@ class Integrity:
                 continue
             known = self._of_batch.get(id(batch))
             if known is None or known.solution != batch.judged[0]:
-                self._of_batch[id(batch)] = _OfBatch(*self._look_at(batch), batch.judged[0])
+                found = self._look_at(batch)
+                self._of_batch[id(batch)] = _OfBatch(batch, *found, batch.judged[0], batch.information)
 
     def leave(self, batches: list[Batch], state: WindowState, before_s: float) -> None:
         """Batches leave that have been noted; what left before a time is forgotten where only a bound is known."""
@@ -195,10 +208,12 @@ class Integrity:
         state : solved
         renew : look again at some of the observations that seem most exposed
         """
+        if renew:
+            self._judge_changed(state)
         everyone = chain.from_iterable(b.exposed for b in self._of_batch.values())
         # of those that are renewed none can come behind so many others and still count
         ranked = nlargest(OF_WINDOW + 1 + RENEWED, everyone, key=_leverage)
-        again = ranked[:RENEWED] if renew else []
+        again = [e for e in ranked if self._of_batch[id(e.batch)].current][:RENEWED] if renew else []
         widths = [len(e.rows) for e in again]
         G = np.zeros((len(state), 6 + sum(widths)))
         G[state.places(numbers), :6] = design.T
@@ -214,9 +229,8 @@ class Integrity:
         if renew and self._of_batch:  # the one whose bound is the largest is judged anew
             loosest = max(self._of_batch.values(), key=lambda b: b.rest)
             if loosest.exposed and loosest.rest > ranked[min(OF_WINDOW, len(ranked) - 1)].leverage:
-                batch = loosest.exposed[0].batch
-                batch.judge(state)
-                self.note([batch])
+                loosest.batch.judge(state)
+                self.note([loosest.batch])
         rest = max((b.rest for b in self._of_batch.values()), default=0.0)
         rest = max([rest, self._left.bound(), *(e.leverage for e in ranked[OF_WINDOW:][:1])])
         bias = self._delta * np.sqrt(rest) * sigma
@@ -235,6 +249,13 @@ class Integrity:
             self._left.thin(state)
             self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
         return Exposure(bias, sigma, *self._name(worst), self._critical)
+
+    def _judge_changed(self, state: WindowState) -> None:
+        """Look again at batches that have been linearised or weighted anew, those first that were most exposed."""
+        changed = [b for b in self._of_batch.values() if b.exposed and not b.current]
+        for of in nlargest(JUDGED_ANEW, changed, key=lambda b: max(map(_leverage, b.exposed))):
+            of.batch.judge(state)
+            self.note([of.batch])
 
     def _name(self, e: _Exposed | None) -> tuple[str, bool, float]:
         if e is None:
