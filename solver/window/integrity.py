@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from heapq import nlargest
 from itertools import chain
 
@@ -39,6 +39,8 @@ OF_BATCH, OF_WINDOW, SMALL = 12, 24, 0.15
 RENEWED, JUDGED_ANEW = 4, 2
 #: Cofactors of residuals below this are those of a direction that nothing checks: along the base at two rays.
 UNCHECKED = 1e-6
+#: Control points are named together whose errors do as much, up to this share.
+ALIKE = 0.6
 AXES = "XYZ"
 
 
@@ -54,6 +56,8 @@ class Exposure:
     control : whether that is a control coordinate
     detectable_m : its marginal detectable error if it is one, else 0
     critical : of the test that ought to notice
+    names : the control points that it is about as exposed to, if it is most exposed to one
+    ground_bias, ground_sigma : (g,) the same on the ground, m, see `ground`; none where it was not asked for
     """
 
     bias: Array
@@ -62,11 +66,21 @@ class Exposure:
     control: bool
     detectable_m: float
     critical: float = CRITICAL_W
+    names: tuple[str, ...] = ()
+    ground_bias: Array = field(default_factory=lambda: np.empty(0))
+    ground_sigma: Array = field(default_factory=lambda: np.empty(0))
 
     def protection(self, sigma: Array, risk: float = RISK) -> Array:
         """Protection levels (n, 6) where the orientation has standard deviations (n, 6)."""
-        outer = self.bias / (noncentrality(self.critical) * np.maximum(self.sigma, 1e-300))
-        return protection_factor(outer, risk, self.critical) * sigma
+        return self._factor(self.bias, self.sigma, risk) * sigma
+
+    def ground_protection(self, sigma: Array, risk: float = RISK) -> Array:
+        """Protection levels (..., g) on the ground where its functions have standard deviations (..., g)."""
+        return self._factor(self.ground_bias, self.ground_sigma, risk) * sigma
+
+    def _factor(self, bias: Array, sigma: Array, risk: float) -> Array:
+        outer = bias / (noncentrality(self.critical) * np.maximum(sigma, 1e-300))
+        return protection_factor(outer, risk, self.critical)
 
 
 @dataclass
@@ -204,7 +218,8 @@ class Integrity:
 
         Parameters
         ----------
-        numbers, design : (u,), (6, u) unknowns of the window it depends on, and how
+        numbers, design : (u,), (6 + g, u) unknowns of the window it depends on, and how; from the seventh on, functions
+            on the ground: then these say which observation it is most exposed to
         state : solved
         renew : look again at some of the observations that seem most exposed
         """
@@ -215,16 +230,17 @@ class Integrity:
         ranked = nlargest(OF_WINDOW + 1 + RENEWED, everyone, key=_leverage)
         again = [e for e in ranked if self._of_batch[id(e.batch)].current][:RENEWED] if renew else []
         widths = [len(e.rows) for e in again]
-        G = np.zeros((len(state), 6 + sum(widths)))
-        G[state.places(numbers), :6] = design.T
-        ends = 6 + np.cumsum(widths, dtype=np.int64)
-        for e, k, end in zip(again, widths, ends, strict=True):
-            G[state.places(e.batch.columns), end - k : end] = e.rows.T
+        k = len(design)
+        G = np.zeros((len(state), k + sum(widths)))
+        G[state.places(numbers), :k] = design.T
+        ends = k + np.cumsum(widths, dtype=np.int64)
+        for e, width, end in zip(again, widths, ends, strict=True):
+            G[state.places(e.batch.columns), end - width : end] = e.rows.T
         S = state.propagated(G)
-        for e, k, end in zip(again, widths, ends, strict=True):
-            e.renew(e.rows @ S[state.places(e.batch.columns), end - k : end])
-        Qg = S[:, :6]
-        sigma = np.sqrt(np.maximum(np.einsum("uk,uk->k", G[:, :6], Qg), 0.0))
+        for e, width, end in zip(again, widths, ends, strict=True):
+            e.renew(e.rows @ S[state.places(e.batch.columns), end - width : end])
+        Qg = S[:, :k]
+        sigma = np.sqrt(np.maximum(np.einsum("uk,uk->k", G[:, :k], Qg), 0.0))
         ranked.sort(key=_leverage, reverse=True)
         if renew and self._of_batch:  # the one whose bound is the largest is judged anew
             loosest = max(self._of_batch.values(), key=lambda b: b.rest)
@@ -238,17 +254,22 @@ class Integrity:
         on_near = [e.rows @ Qg[state.places(e.batch.columns)] for e in near]
         observations = near + self._left.exposed
         worst: _Exposed | None = None
+        names: tuple[str, ...] = ()
         if observations:
             h = np.concatenate([*on_near, self._left.effects(Qg, state)])
             effect = self._delta * np.sqrt(_squares(observations, h))
-            size = np.linalg.norm(effect[:, :3], axis=1)
-            if size.max() > float(np.linalg.norm(bias[:3])):
+            size = effect[:, 6:].max(axis=1) if k > 6 else np.linalg.norm(effect[:, :3], axis=1)
+            if size.max() > float(bias[6:].max() if k > 6 else np.linalg.norm(bias[:3])):
                 worst = observations[int(np.argmax(size))]
+                names = _control_points([e for e, s in zip(observations, size, strict=True) if s > ALIKE * size.max()])
             bias = np.maximum(bias, effect.max(axis=0))
         if renew:
             self._left.thin(state)
             self.most_exposed = worst.batch if worst is not None and id(worst.batch) in self._of_batch else None
-        return Exposure(bias, sigma, *self._name(worst), self._critical)
+        said = self._name(worst)
+        return Exposure(
+            bias[:6], sigma[:6], *said, self._critical, names if said[1] else (), bias[6:].copy(), sigma[6:].copy()
+        )
 
     def _judge_changed(self, state: WindowState) -> None:
         """Look again at batches that have been linearised or weighted anew, those first that were most exposed."""
@@ -343,6 +364,11 @@ class _Left:
     def forget(self, before_s: float) -> None:
         while self._bounds and self._bounds[0][0] < before_s:
             self._bounds.popleft()
+
+
+def _control_points(exposed: list[_Exposed]) -> tuple[str, ...]:
+    """Names of the control points among observations."""
+    return tuple(sorted({e.batch.names[e.point] for e in exposed if e.ray < 0}))
 
 
 def _leverage(e: _Exposed) -> float:

@@ -147,7 +147,11 @@ class Leaver:
             return None
         times = grid(self.options.grid_hz, strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
         times = times[self._trajectory.covers(times)] if len(times) else times
-        return self.protected(strip, self._orienter.at(strip, times)) if len(times) else None
+        if not len(times):
+            return None
+        final = self.protected(strip, self._orienter.at(strip, times))
+        self._watch.became_final(strip, final)
+        return final
 
     def protected(self, strip: WindowStrip, orientation: RefinedOrientation) -> RefinedOrientation:
         """With protection levels as the middle of the times is exposed."""

@@ -33,6 +33,8 @@ class WindowOptions:
     snoop : whether observations are tested at all
     determine : whether it is tested which additional parameters the network can see by now; else all are estimated
     retest : batches tested again per update, besides new ones
+    alert_limit_m : what an error on the ground must stay below for the operator's light to be good; 0 = so many ground
+        sample distances (see `ground`)
     """
 
     model: str = "wander"
@@ -45,6 +47,7 @@ class WindowOptions:
     snoop: bool = True
     determine: bool = True
     retest: int = 4
+    alert_limit_m: float = 0.0
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
