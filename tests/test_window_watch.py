@@ -319,7 +319,7 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ),
         (
             {"exposure": EXPOSED, "ground_m": HIGH},
-            WEAK, "the datum rests on Z of control point GCP3: an error of 2.1 m in it would not be seen "
+            WEAK, "the datum rests on GCP3 alone: an error of 2.1 m in its Z would not be seen "
             "(height up to 4.4 m off unseen, limit 1.0 m)",
         ),
         (

@@ -1,8 +1,8 @@
 """The lamp that the operator looks at: the light with a memory.
 
 It goes to a worse colour at once, and to a better one when that has held for a while; words of the same colour stay for
-a while, so that it does not chatter. When a strip is over it says what became of the strip as a whole, until the next one
-begins.
+a while, so that it does not chatter. When a strip is over it says what became of the strip as a whole, until the next
+one begins.
 """
 
 from __future__ import annotations
@@ -18,13 +18,20 @@ from .light import FAILED, GOOD, WEAK, Situation, contradiction, datum_on_gnss, 
 
 Array = NDArray[np.floating]
 
-#: A better colour is shown when it has held for so long, s; other words of the same colour after so long.
-HOLD_S, WORDS_S = 3.0, 5.0
+#: A better colour is shown when it has held for so long, s.
+HOLD_S = 3.0
+#: Other figures in the words of the same colour are shown after so long, s, and words of another kind.
+WORDS_S, KIND_S = 5.0, 1.0
 #: A strip is good if this share of its final orientation is within the alert limit.
 MOSTLY = 0.9
 #: A strip has failed that contradicted itself for this share of its time, or at its end.
 LONG = 0.1
 RANK = {GOOD: 0, WEAK: 1, FAILED: 2}
+
+
+def kind(reason: str) -> str:
+    """A reason without what changes from second to second: its first words."""
+    return " ".join([word for word in reason.split() if not any(map(str.isdigit, word))][:3])
 
 
 @dataclass
@@ -69,9 +76,8 @@ class StripRecord:
             self.failed += 1
             self.failure = reason
         elif colour == WEAK:
-            kind = reason.partition(":")[0].partition(" within")[0]
-            self.weak_for[kind] = self.weak_for.get(kind, 0) + 1
-            self.words[kind] = reason.partition(" (")[0]
+            self.weak_for[kind(reason)] = self.weak_for.get(kind(reason), 0) + 1
+            self.words[kind(reason)] = reason.partition(" (")[0]
 
     def became_final(self, times: int, protection_m: Array | None, limit_m: float) -> None:
         """So many times of its orientation are final, with protection levels (times, 4) on the ground if known."""
@@ -99,12 +105,14 @@ class StripRecord:
         limit = "" if np.isinf(self.limit_m) else f" {metres(self.limit_m)}"
         if self.final and self.beyond <= (1.0 - MOSTLY) * self.final:
             return GOOD, f"{over}: within the limit of{limit}" if limit else over
-        share = f"{100 * self.beyond / self.final:.0f} % of it" if self.final else "all of it"
-        text = f"{over}: {share} beyond the limit of{limit}"
+        if not self.final:
+            text = f"{over}: no orientation"
+        else:
+            text = f"{over}: {100 * self.beyond / self.final:.0f} % of its final orientation beyond the limit of{limit}"
         if self.where:
             text += f", {self.where} up to {metres(self.worst_m)} off unseen"
         if self.weak_for:
-            text += f"; {self.words[max(self.weak_for, key=lambda kind: self.weak_for[kind])]}"
+            text += f"; {self.words[max(self.weak_for, key=self.weak_for.__getitem__)]}"
         return WEAK, text
 
 
@@ -141,7 +149,8 @@ class Lamp:
             self._said.popleft()
         worst = max((c for _, c, _ in self._said), key=RANK.__getitem__)
         words = next(r for _, c, r in reversed(self._said) if c == worst)
-        if worst != self._shown[0] or now_s - self._worded_s >= WORDS_S:
+        stay_s = WORDS_S if kind(words) == kind(self._shown[1]) else KIND_S
+        if worst != self._shown[0] or now_s - self._worded_s >= stay_s:
             self._shown, self._worded_s = (worst, words), now_s
         return self._shown
 

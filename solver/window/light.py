@@ -152,10 +152,13 @@ def _exposed(s: Situation) -> str:
     off = f"{WHERE[worst]} up to {metres(float(s.ground_m[worst]))} off unseen, {limit}"
     e = s.exposure
     if e is not None and e.control:
-        names = e.names if len(e.names) > 1 else (e.observation,)
-        rests = "the datum rests on " + ", ".join(names[:-2]) + ", " * (len(names) > 2) + " and ".join(names[-2:])
-        one = "it" if len(names) == 1 else "one of them"
-        return f"{rests}: an error of {metres(e.detectable_m)} in {one} would not be seen ({off})"
+        if len(e.names) > 1:
+            rests, one = ", ".join(e.names[:-1]) + " and " + e.names[-1], "one of them"
+        else:
+            axis, _, name = e.observation.partition(" of control point ")
+            rests, one = f"{name} alone", f"its {axis}"
+        error = metres(e.detectable_m)
+        return f"the datum rests on {rests}: an error of {error} in {one} would not be seen ({off})"
     if s.ground_sigma_m is not None and EVERYDAY * s.ground_sigma_m[worst] > s.limit_m:
         return f"{WHERE[worst]} known to {metres(float(s.ground_sigma_m[worst]))}, 1 sigma ({off})"
     if e is not None and e.observation:

@@ -55,6 +55,8 @@ class WindowOptions:
         for name in ("segment_s", "window_s", "settle_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
+        if not 0 <= self.alert_limit_m < float("inf"):
+            raise ValueError(f"alert_limit_m: wanted metres, or 0 for the default, got {self.alert_limit_m}")
         for name in ("window_looks", "grid_hz", "critical"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: wanted more than 0, got {getattr(self, name)}")
