@@ -260,7 +260,7 @@ def test_without_control_it_is_weak_and_says_so():
 
 def test_protection_levels_are_those_of_the_present_equations():
     """Kept figures against all batches judged anew: where the datum rests on a pair of control points."""
-    ratios = []
+    found: list[np.ndarray] = []
 
     def watch(now, window):
         integrity, state = window._watch._integrity, window.state
@@ -276,11 +276,11 @@ def test_protection_levels_are_those_of_the_present_equations():
         anew = window._watch.exposure_at(strip, now, ground=True)
         integrity._of_batch = kept
         if said is not None and anew is not None and len(said.ground_bias) and len(anew.ground_bias):
-            ratios.append(said.ground_bias / anew.ground_bias)
+            found.append(said.ground_bias / anew.ground_bias)
 
     plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
     simulation = simulate(plan, 11, SENSORS, ObservationPlan(tie_points_per_s=8.0, check=0))
     adjust_online(simulation, navigate(simulation), WindowOptions(grid_hz=2.0), watch=watch, update_s=0.5, live=False)
-    ratios = np.array(ratios)
+    ratios = np.array(found)
     assert len(ratios) > 20
     assert (ratios > 0.8).mean() > 0.95 and np.median(ratios) < 1.3

@@ -80,6 +80,11 @@ class _Count:
     control_refused: int
 
 
+def middle(orientation: RefinedOrientation) -> float:
+    """The time whose exposure stands for all."""
+    return float(orientation.time_s[len(orientation.time_s) // 2])
+
+
 class Watch:
     """Looks at the window after its updates; what costs much is spread over updates.
 
@@ -148,13 +153,14 @@ class Watch:
         self._integrity.marginalised(marginal)
         self._sources.marginalised(marginal)
 
-    def became_final(self, strip: WindowStrip, orientation: RefinedOrientation) -> None:
-        """Orientation has become final."""
-        times, protection = orientation.time_s, None
-        exposure = self.exposure_at(strip, float(times[len(times) // 2]), ground=True)
+    def became_final(self, strip: WindowStrip, orientation: RefinedOrientation) -> Exposure | None:
+        """Orientation has become final; returns how exposed the middle of its times is."""
+        protection = None
+        exposure = self.exposure_at(strip, middle(orientation), ground=True)
         if exposure is not None and (ground := self._ground.ground) is not None:
             protection = exposure.ground_protection(ground.sigma_m(orientation.covariance))
-        self._lamp.became_final(strip.id, len(times), protection, self.alert_limit_m)
+        self._lamp.became_final(strip.id, len(orientation.time_s), protection, self.alert_limit_m)
+        return exposure
 
     @property
     def alert_limit_m(self) -> float:
