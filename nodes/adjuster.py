@@ -57,6 +57,8 @@ class Adjuster(Node):
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
         for a pose with a known attitude.
+    alert_limit_m : what an error on the ground must stay below for the light to be good; 0 = 25 ground sample
+        distances, and no more than 2.5 per mille of the height of flight
     """
 
     name = "adjuster"
@@ -98,6 +100,7 @@ class Adjuster(Node):
         self_calibration: str = "none",
         camera_sigma: float = 1.0,
         apriori: str = "trajectory",
+        alert_limit_m: float = 0.0,
     ) -> None:
         super().__init__()
         if not update_s > 0:
@@ -117,7 +120,7 @@ class Adjuster(Node):
             raise ValueError(f"apriori: {apriori!r} is not known, wanted one of {', '.join(APRIORI)}")
         self.options = WindowOptions(
             model=model, segment_s=segment_s or 0.0, window_s=window_s, window_looks=window_looks, grid_hz=grid_hz,
-            settle_s=settle_s, snoop=snoop,
+            settle_s=settle_s, snoop=snoop, alert_limit_m=alert_limit_m,
         )  # fmt: skip
         self._early = pace != "throughput"  # whether answers are wanted early
         self._update_ns = round((update_s if self._early else max(update_s, THROUGHPUT_S)) * convert.SECOND_NS)

@@ -118,6 +118,8 @@ def report(
         body.protection.extend(watched.protection.tolist())
         body.sigma.extend(watched.sigma.tolist())
         body.exposed = watched.exposure.observation
+        body.ground_protection.extend(watched.ground_protection_m.tolist())
+    body.alert_limit_m = _number(watched.alert_limit_m)
     return Message("adjustment/report", stamp_ns, body)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 
+from ..solver.window.lamp import kind
 from ..solver.window.results import TAKEN_BACK, RefinedOrientation, Refusal, WindowUpdate
 from . import adjuster_messages as out
 from . import convert
@@ -14,11 +14,6 @@ from .node import Message
 
 #: A reason that has become another one, under a light of the same colour, is told after so long, s.
 REASON_S = 10.0
-
-
-def _kind(reason: str) -> str:
-    """A reason without what changes from second to second."""
-    return re.sub(r"\S*\d\S*", "", reason.partition(":")[0])
 
 
 class Teller:
@@ -48,6 +43,7 @@ class Teller:
         self._updates = 0
         self._sources: frozenset[tuple[str, str]] = frozenset()
         self._told_ns, self._told_kind = 0, ""  # the last word about the light
+        self._strip = ""
 
     def live(self, orientation: RefinedOrientation, stamp_ns: int) -> list[Message]:
         """Live orientation."""
@@ -103,10 +99,11 @@ class Teller:
             self._updates += 1
             watched, before = update.report.watched, (self.light[0], self._sources)
             self.light, self._sources = (watched.light, watched.reason), watched.names
-            other = _kind(self.light[1]) != self._told_kind and self.light[0] != "good"
+            other = kind(self.light[1]) != self._told_kind and self.light[0] != "good"
             settled = stamp_ns - self._told_ns >= REASON_S * convert.SECOND_NS
-            if before != (self.light[0], self._sources) or (other and settled):
-                self._told_ns, self._told_kind = stamp_ns, _kind(self.light[1])
+            over, self._strip = self._strip and not update.report.strip, update.report.strip
+            if before != (self.light[0], self._sources) or over or (other and settled):
+                self._told_ns, self._told_kind = stamp_ns, kind(self.light[1])
                 outputs.append(self._log(": ".join(filter(None, self.light)), stamp_ns, self.light[0] != "good"))
         outputs += [self._log(text, stamp_ns) for text in update.events]
         return outputs

@@ -282,7 +282,12 @@ def test_camera_errors_not_seen_yet_are_in_the_covariance():
 # ---- light
 
 CALM = Exposure(np.full(6, 0.2), np.full(6, 0.1), "ray of point T1", False, 0.0)
-FINE = Situation(True, 40.0, 100.0, 1.0, 500, 200, 2, 0, np.full(3, 2.0), np.full(3, 1.0), CALM, ())
+FINE = Situation(
+    True, 40.0, 100.0, 1.0, 500, 200, 2, 0, np.full(3, 2.0), np.full(3, 1.0), CALM, (), strip="S1", tied=190,
+    ground_m=np.full(4, 0.5), ground_sigma_m=np.full(4, 0.1), limit_m=1.0,
+)  # fmt: skip
+EXPOSED = Exposure(np.full(6, 2.0), np.full(6, 0.1), "Z of control point GCP3", True, 2.14)
+HIGH = np.array([0.3, 0.3, 4.4, 0.2])
 DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
 
 
@@ -294,6 +299,8 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"sigma0": 2.1}, FAILED, "observations contradict each other: sigma0 2.1"),
         ({"refused": 120}, FAILED, "120 of 200 tie points contradict the others"),
         ({"control_refused": 2}, FAILED, "2 control points contradict"),
+        ({"control_doubt": "GCP1 Z or GCP2 Z"}, WEAK, "GCP1 Z or GCP2 Z"),
+        ({"control_doubt": "GNSS differs in Z", "control_failed": True}, FAILED, "GNSS differs in Z"),
         ({"points": 0, "refused": 0}, WEAK, "no tie points within 40 s"),
         ({"points": 0, "refused": 0, "since_s": 5.0}, WEAK, "no tie points yet"),
         ({"sources": (DRIFT,)}, WEAK, "source matcher-2 on CCD B drift: line +0.00 px, sample +0.50 px"),
@@ -311,9 +318,24 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
             WEAK, "no height control within 40 s; height datum rests on GNSS",
         ),
         (
-            {"exposure": Exposure(np.full(6, 2.0), np.full(6, 0.1), "Z of control point GCP3", True, 2.14)},
-            WEAK, "the datum rests on Z of control point GCP3: an error of 2.1 m in it would not be seen",
+            {"exposure": EXPOSED, "ground_m": HIGH},
+            WEAK, "the datum rests on GCP3 alone: an error of 2.1 m in its Z would not be seen "
+            "(height up to 4.4 m off unseen, limit 1.0 m)",
         ),
+        (
+            {"exposure": replace(EXPOSED, names=("GCP1", "GCP2", "GCP3")), "ground_m": HIGH},
+            WEAK, "the datum rests on GCP1, GCP2 and GCP3: an error of 2.1 m in one of them would not be seen",
+        ),
+        ({"exposure": EXPOSED}, GOOD, ""),  # it rests on it, but not so that it matters
+        ({"ground_m": HIGH}, WEAK, "an error in the ray of point T1 would not be seen (height up to 4.4 m off unseen"),
+        (
+            {"ground_m": HIGH, "ground_sigma_m": np.array([0.1, 0.1, 0.8, 0.1])},
+            WEAK, "height known to 0.8 m, 1 sigma (height up to 4.4 m off unseen, limit 1.0 m)",
+        ),
+        ({"ground_m": HIGH, "limit_m": 4.5}, GOOD, ""),
+        ({"ground_m": np.full(4, np.nan)}, WEAK, "off unseen"),
+        ({"ground_m": None}, WEAK, "not known yet"),
+        ({"tied": 1}, WEAK, "too few tie points within 40 s: 1 are seen twice, wanted 6"),
     ],
 )  # fmt: skip
 def test_the_light_says_why(change, colour, words):

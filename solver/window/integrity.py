@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from heapq import nlargest
 from itertools import chain
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ..adjustment.reliability import CRITICAL_W, noncentrality
-from .batch import Batch, inverse_factors
+from .batch import Batch, Information, inverse_factors
 from .protection import protection_factor
 from .state import Marginal, WindowState
 
@@ -36,10 +36,12 @@ IntArray = NDArray[np.int64]
 RISK = 1e-3
 #: Observations of a batch, and of the window, that are looked at exactly, if their lambda is not small.
 OF_BATCH, OF_WINDOW, SMALL = 12, 24, 0.15
-#: Observations whose lambda is computed anew in one update.
-RENEWED = 4
+#: Observations whose lambda is computed anew in one update, and batches with other equations than before.
+RENEWED, JUDGED_ANEW = 4, 2
 #: Cofactors of residuals below this are those of a direction that nothing checks: along the base at two rays.
 UNCHECKED = 1e-6
+#: Control points are named together whose errors do as much, up to this share.
+ALIKE = 0.6
 AXES = "XYZ"
 
 
@@ -55,6 +57,8 @@ class Exposure:
     control : whether that is a control coordinate
     detectable_m : its marginal detectable error if it is one, else 0
     critical : of the test that ought to notice
+    names : the control points that it is about as exposed to, if it is most exposed to one
+    ground_bias, ground_sigma : (g,) the same on the ground, m, see `ground`; none where it was not asked for
     """
 
     bias: Array
@@ -63,11 +67,21 @@ class Exposure:
     control: bool
     detectable_m: float
     critical: float = CRITICAL_W
+    names: tuple[str, ...] = ()
+    ground_bias: Array = field(default_factory=lambda: np.empty(0))
+    ground_sigma: Array = field(default_factory=lambda: np.empty(0))
 
     def protection(self, sigma: Array, risk: float = RISK) -> Array:
         """Protection levels (n, 6) where the orientation has standard deviations (n, 6)."""
-        outer = self.bias / (noncentrality(self.critical) * np.maximum(self.sigma, 1e-300))
-        return protection_factor(outer, risk, self.critical) * sigma
+        return self._factor(self.bias, self.sigma, risk) * sigma
+
+    def ground_protection(self, sigma: Array, risk: float = RISK) -> Array:
+        """Protection levels (..., g) on the ground where its functions have standard deviations (..., g)."""
+        return self._factor(self.ground_bias, self.ground_sigma, risk) * sigma
+
+    def _factor(self, bias: Array, sigma: Array, risk: float) -> Array:
+        outer = bias / (noncentrality(self.critical) * np.maximum(sigma, 1e-300))
+        return protection_factor(outer, risk, self.critical)
 
 
 @dataclass
@@ -103,6 +117,11 @@ class _Exposed:
         self.inverse = _inverse(C)
         self.leverage = float(_ratio(R, C))
 
+    @property
+    def control_point(self) -> str:
+        """Name of the control point whose coordinate it is, "" for a ray."""
+        return "" if self.ray >= 0 else self.batch.names[self.point]
+
     def told(self, delta: float) -> tuple[str, bool, float]:
         """It in words, whether it is a control coordinate, and its marginal detectable error if it is one, else 0."""
         name = self.batch.names[self.point]
@@ -119,6 +138,7 @@ class _Departed:
     rows: Array
     inverse: Array
     leverage: float
+    control_point: str
     told_at_last: tuple[str, bool, float]
 
     def told(self, delta: float) -> tuple[str, bool, float]:
@@ -131,11 +151,23 @@ _Observation = _Exposed | _Departed
 
 @dataclass
 class _OfBatch:
-    """The most exposed observations of a batch, the largest lambda of its others, and the solution they are for."""
+    """The most exposed observations of a batch, the largest lambda of its others, and what they are for.
 
+    Cofactors of residuals are a small difference of large figures, a thousandth of them where the datum rests on a
+    control point. So rows of one linearisation do not go with the solution of another, and nothing of a batch is
+    renewed that has been linearised or weighted anew since.
+    """
+
+    batch: Batch
     exposed: list[_Exposed]
     rest: float
     solution: int
+    information: Information
+
+    @property
+    def current(self) -> bool:
+        """Whether the batch has the same equations still."""
+        return self.batch.information is self.information
 
 
 class Integrity:
@@ -159,7 +191,8 @@ class Integrity:
                 continue
             known = self._of_batch.get(id(batch))
             if known is None or known.solution != batch.judged[0]:
-                self._of_batch[id(batch)] = _OfBatch(*self._look_at(batch), batch.judged[0])
+                found = self._look_at(batch)
+                self._of_batch[id(batch)] = _OfBatch(batch, *found, batch.judged[0], batch.information)
 
     def leave(self, batches: list[Batch], state: WindowState, before_s: float) -> None:
         """Batches leave that have been noted; what left before a time is forgotten where only a bound is known."""
@@ -167,7 +200,9 @@ class Integrity:
             known = self._of_batch.pop(id(batch), None)
             if known is not None:
                 counting = [e for e in known.exposed if e.counts]
-                departed = [_Departed(e.rows, e.inverse, e.leverage, e.told(self._delta)) for e in counting]
+                departed = [
+                    _Departed(e.rows, e.inverse, e.leverage, e.control_point, e.told(self._delta)) for e in counting
+                ]
                 self._left.add(departed, batch.columns, known.rest, batch.newest_s, state)
         self._left.forget(before_s)
 
@@ -219,32 +254,35 @@ class Integrity:
 
         Parameters
         ----------
-        numbers, design : (u,), (6, u) unknowns of the window it depends on, and how
+        numbers, design : (u,), (6 + g, u) unknowns of the window it depends on, and how; from the seventh on, functions
+            on the ground: then these say which observation it is most exposed to
         state : solved
         renew : look again at some of the observations that seem most exposed
         """
+        if renew:
+            self._judge_changed(state)
         everyone = chain.from_iterable(b.exposed for b in self._of_batch.values())
         # of those that are renewed none can come behind so many others and still count
         ranked = nlargest(OF_WINDOW + 1 + RENEWED, everyone, key=_leverage)
-        again = ranked[:RENEWED] if renew else []
+        again = [e for e in ranked if self._of_batch[id(e.batch)].current][:RENEWED] if renew else []
         widths = [len(e.rows) for e in again]
-        G = np.zeros((len(state), 6 + sum(widths)))
-        G[state.places(numbers), :6] = design.T
-        ends = 6 + np.cumsum(widths, dtype=np.int64)
-        for e, k, end in zip(again, widths, ends, strict=True):
-            G[state.places(e.batch.columns), end - k : end] = e.rows.T
+        k = len(design)
+        G = np.zeros((len(state), k + sum(widths)))
+        G[state.places(numbers), :k] = design.T
+        ends = k + np.cumsum(widths, dtype=np.int64)
+        for e, width, end in zip(again, widths, ends, strict=True):
+            G[state.places(e.batch.columns), end - width : end] = e.rows.T
         S = state.propagated(G)
-        for e, k, end in zip(again, widths, ends, strict=True):
-            e.renew(e.rows @ S[state.places(e.batch.columns), end - k : end])
-        Qg = S[:, :6]
-        sigma = np.sqrt(np.maximum(np.einsum("uk,uk->k", G[:, :6], Qg), 0.0))
+        for e, width, end in zip(again, widths, ends, strict=True):
+            e.renew(e.rows @ S[state.places(e.batch.columns), end - width : end])
+        Qg = S[:, :k]
+        sigma = np.sqrt(np.maximum(np.einsum("uk,uk->k", G[:, :k], Qg), 0.0))
         ranked.sort(key=_leverage, reverse=True)
         if renew and self._of_batch:  # the one whose bound is the largest is judged anew
             loosest = max(self._of_batch.values(), key=lambda b: b.rest)
             if loosest.exposed and loosest.rest > ranked[min(OF_WINDOW, len(ranked) - 1)].leverage:
-                batch = loosest.exposed[0].batch
-                batch.judge(state)
-                self.note([batch])
+                loosest.batch.judge(state)
+                self.note([loosest.batch])
         rest = max((b.rest for b in self._of_batch.values()), default=0.0)
         rest = max([rest, self._left.bound(), *(e.leverage for e in ranked[OF_WINDOW:][:1])])
         bias = self._delta * np.sqrt(rest) * sigma
@@ -252,18 +290,29 @@ class Integrity:
         on_near = [e.rows @ Qg[state.places(e.batch.columns)] for e in near]
         observations: list[_Observation] = [*near, *self._left.exposed]
         worst: _Observation | None = None
+        names: tuple[str, ...] = ()
         if observations:
             h = np.concatenate([*on_near, self._left.effects(Qg, state)])
             effect = self._delta * np.sqrt(_squares(observations, h))
-            size = np.linalg.norm(effect[:, :3], axis=1)
-            if size.max() > float(np.linalg.norm(bias[:3])):
+            size = effect[:, 6:].max(axis=1) if k > 6 else np.linalg.norm(effect[:, :3], axis=1)
+            if size.max() > float(bias[6:].max() if k > 6 else np.linalg.norm(bias[:3])):
                 worst = observations[int(np.argmax(size))]
+                names = _control_points([e for e, s in zip(observations, size, strict=True) if s > ALIKE * size.max()])
             bias = np.maximum(bias, effect.max(axis=0))
         if renew:
             self._left.thin(state)
             self.most_exposed = worst.batch if isinstance(worst, _Exposed) else None
-        told = ("", False, 0.0) if worst is None else worst.told(self._delta)
-        return Exposure(bias, sigma, *told, self._critical)
+        said = ("", False, 0.0) if worst is None else worst.told(self._delta)
+        return Exposure(
+            bias[:6], sigma[:6], *said, self._critical, names if said[1] else (), bias[6:].copy(), sigma[6:].copy()
+        )
+
+    def _judge_changed(self, state: WindowState) -> None:
+        """Look again at batches that have been linearised or weighted anew, those first that were most exposed."""
+        changed = [b for b in self._of_batch.values() if b.exposed and not b.current]
+        for of in nlargest(JUDGED_ANEW, changed, key=lambda b: max(map(_leverage, b.exposed))):
+            of.batch.judge(state)
+            self.note([of.batch])
 
 
 class _Left:
@@ -342,6 +391,11 @@ class _Left:
     def forget(self, before_s: float) -> None:
         while self._bounds and self._bounds[0][0] < before_s:
             self._bounds.popleft()
+
+
+def _control_points(observations: list[_Observation]) -> tuple[str, ...]:
+    """Names of the control points among observations."""
+    return tuple(sorted({e.control_point for e in observations if e.control_point}))
 
 
 def _leverage(e: _Observation) -> float:

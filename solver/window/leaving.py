@@ -14,13 +14,14 @@ from .backward import LeftPoints, Step
 from .batches import Batches
 from .block import Block
 from .intake import Intake
+from .integrity import Exposure
 from .output import Orienter, adjusted_points
 from .results import RefinedOrientation, WindowOptions, WindowUpdate
 from .snooping import snoop
 from .state import WindowState
 from .strip import WindowStrip
 from .tie_snooping import snoop_ties
-from .watch import Watch
+from .watch import Watch, middle
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -180,15 +181,14 @@ class Leaver:
             return None
         times = grid(self.options.grid_hz, strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
         times = times[self._trajectory.covers(times)] if len(times) else times
-        return self.protected(strip, self._orienter.at(strip, times)) if len(times) else None
+        if not len(times):
+            return None
+        final = self._orienter.at(strip, times)
+        return _protected(final, self._watch.became_final(strip, final))
 
     def protected(self, strip: WindowStrip, orientation: RefinedOrientation) -> RefinedOrientation:
         """With protection levels as the middle of the times is exposed."""
-        exposure = self._watch.exposure_at(strip, float(orientation.time_s[len(orientation.time_s) // 2]))
-        if exposure is None:
-            return orientation
-        sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
-        return replace(orientation, protection=exposure.protection(sigma))
+        return _protected(orientation, self._watch.exposure_at(strip, middle(orientation)))
 
     def _forget(self, limit_s: float, length_s: float, result: WindowUpdate) -> None:
         """Drop what nothing can need any more: single looks that found no partner, old poses, strips that are over."""
@@ -199,6 +199,13 @@ class Leaver:
         waiting = self._intake.oldest_waiting_s
         finals = min((s.final_to_s for s in self._strips.values() if not s.is_gone(self._state)), default=np.inf)
         self._trajectory.forget(min(limit_s - length_s, used, waiting, finals) - 1.0)
+
+
+def _protected(orientation: RefinedOrientation, exposure: Exposure | None) -> RefinedOrientation:
+    if exposure is None:
+        return orientation
+    sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
+    return replace(orientation, protection=exposure.protection(sigma))
 
 
 def grid(hz: float, from_s: float, to_s: float) -> Array:

@@ -34,6 +34,8 @@ class WindowOptions:
     snoop : whether observations are tested at all
     determine : whether it is tested which additional parameters the network can see by now; else all are estimated
     retest : batches tested again per update, besides new ones
+    alert_limit_m : what an error on the ground must stay below for the operator's light to be good; 0 = so many ground
+        sample distances (see `ground`)
     """
 
     model: str = "wander"
@@ -46,6 +48,7 @@ class WindowOptions:
     snoop: bool = True
     determine: bool = True
     retest: int = 4
+    alert_limit_m: float = 0.0
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -53,6 +56,8 @@ class WindowOptions:
         for name in ("segment_s", "window_s", "settle_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
+        if not 0 <= self.alert_limit_m < float("inf"):
+            raise ValueError(f"alert_limit_m: wanted metres, or 0 for the default, got {self.alert_limit_m}")
         for name in ("window_looks", "grid_hz", "critical"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: wanted more than 0, got {getattr(self, name)}")

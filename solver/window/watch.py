@@ -12,9 +12,12 @@ from ..camera import LineCamera
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, Information
 from .determinability import Determinability, Standing, ranks
+from .ground import GroundBelow
 from .integrity import Exposure, Integrity
-from .light import Situation, light
+from .lamp import Lamp
+from .light import Situation
 from .points import PointLooks
+from .results import RefinedOrientation
 from .settle import refused_control
 from .sources import BiasedSource, Group, SourceMonitor
 from .state import Marginal, WindowState
@@ -35,13 +38,15 @@ class Watched:
 
     Attributes
     ----------
-    light, reason : see `light`
+    light, reason : see `lamp`
     exposure : at the newest time, None without tie points
     time_s : of that
     sources : those that drift
     standing : of the additional parameters
     events : for the operator
     sigma, protection : (6,) of the newest orientation, m and rad
+    ground_protection_m : (4,) of the same on the ground, see `ground`; none where it is not known
+    alert_limit_m : what these stay below if the light is good; inf before the ground is seen
     """
 
     light: str
@@ -53,6 +58,8 @@ class Watched:
     events: tuple[str, ...]
     sigma: Array
     protection: Array
+    ground_protection_m: Array
+    alert_limit_m: float
 
     @property
     def names(self) -> frozenset[Group]:
@@ -62,14 +69,20 @@ class Watched:
 
 @dataclass(frozen=True)
 class _Count:
-    """Of a batch, as long as its information is this: points of which nothing is left, control coordinates (3,) in use,
-    control points of which nothing is left."""
+    """Of a batch, as long as its information is this: points of which nothing is left, points of two rays or more,
+    control coordinates (3,) in use, control points of which nothing is left."""
 
     information: Information
     refused: int
+    tied: int
     has_control: bool
     control: Array
     control_refused: int
+
+
+def middle(orientation: RefinedOrientation) -> float:
+    """The time whose exposure stands for all."""
+    return float(orientation.time_s[len(orientation.time_s) // 2])
 
 
 class Watch:
@@ -78,11 +91,13 @@ class Watch:
     Parameters
     ----------
     determine : whether it is tested which additional parameters are determined
+    alert_limit_m : of the light; 0 = see `ground`
 
     Attributes
     ----------
     exposure : of the newest orientation
     last : the findings of the last look, without its events
+    strip : that was flown at the last look, "" for none
     """
 
     def __init__(
@@ -94,6 +109,7 @@ class Watch:
         camera_columns: IntArray,
         state: WindowState,
         determine: bool,
+        alert_limit_m: float = 0.0,
     ) -> None:
         self._integrity = Integrity(critical)
         self._sources = SourceMonitor()
@@ -107,9 +123,11 @@ class Watch:
             order = ranks(self_calibration, nadir)
             self._determinability = Determinability(self_calibration, camera_columns, order, Limits(alpha=ALPHA))
         self._next_step_s = -np.inf
+        self._ground, self._limit_m, self._lamp = GroundBelow(camera), alert_limit_m, Lamp()
         self._counts: dict[int, _Count] = {}
         self.exposure: Exposure | None = None
         self.last: Watched | None = None
+        self.strip = ""
 
     @property
     def most_exposed(self) -> Batch | None:
@@ -135,8 +153,25 @@ class Watch:
         self._integrity.marginalised(marginal)
         self._sources.marginalised(marginal)
 
-    def exposure_at(self, strip: WindowStrip, time_s: float, renew: bool = False) -> Exposure | None:
-        """Exposure of the orientation at a time of a strip; None if its unknowns are not there."""
+    def became_final(self, strip: WindowStrip, orientation: RefinedOrientation) -> Exposure | None:
+        """Orientation has become final; returns how exposed the middle of its times is."""
+        protection = None
+        exposure = self.exposure_at(strip, middle(orientation), ground=True)
+        if exposure is not None and (ground := self._ground.ground) is not None:
+            protection = exposure.ground_protection(ground.sigma_m(orientation.covariance))
+        self._lamp.became_final(strip.id, len(orientation.time_s), protection, self.alert_limit_m)
+        return exposure
+
+    @property
+    def alert_limit_m(self) -> float:
+        """See `Watched`."""
+        ground = self._ground.ground
+        return self._limit_m or (np.inf if ground is None else ground.limit_m)
+
+    def exposure_at(
+        self, strip: WindowStrip, time_s: float, renew: bool = False, ground: bool = False
+    ) -> Exposure | None:
+        """Exposure of the orientation at a time of a strip, and on the ground; None if its unknowns are not there."""
         design = strip.design([time_s])
         numbers = np.unique(design.columns)
         numbers = numbers[numbers >= 0].astype(np.int64)
@@ -145,7 +180,11 @@ class Watch:
         A = np.zeros((6, len(numbers) + 1))
         local = np.where(design.columns[0] >= 0, np.searchsorted(numbers, design.columns[0]), len(numbers))
         A[np.arange(6), local] += design.coefficients[0][:, None]
-        return self._integrity.at(numbers, A[:, :-1], self._state, renew)
+        A = A[:, :-1]
+        below = self._ground.ground if ground else None
+        if below is not None:
+            A = np.concatenate([A, below.functions @ A])
+        return self._integrity.at(numbers, A, self._state, renew)
 
     def look(
         self,
@@ -157,6 +196,7 @@ class Watch:
         redundancy: int,
         total: tuple[float, int],
         apriori_m: Array,
+        noise: Array,
     ) -> Watched:
         """Findings of an update.
 
@@ -166,12 +206,19 @@ class Watch:
         batches : of the window
         sigma0, redundancy, total : over the window, since the start
         apriori_m : (3,) sigma of the position beforehand
+        noise : (6, 6) covariance of the noise that is on the newest orientation
         """
         time_s = -np.inf
+        self.strip = "" if strip is None else strip.id
         self.exposure = None
+        ground = self._ground.look(batches)
         if strip is not None and batches:
             time_s = min(now_s, strip.end_s)
-            self.exposure = self.exposure_at(strip, time_s, renew=True)
+            self.exposure = self.exposure_at(strip, time_s, renew=True, ground=True)
+        ground_m = ground_sigma_m = None
+        if self.exposure is not None and ground is not None:
+            ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise))
+            ground_m = self.exposure.ground_protection(ground_sigma_m)
         self._sources.update(now_s, batches, self._state, self._groups)
         events: list[str] = []
         d = self._determinability
@@ -182,20 +229,26 @@ class Watch:
         self._counts = {id(b): self._count_of(b) for b in batches}
         points = sum(b.n_points for b in batches)
         refused = sum(c.refused for c in self._counts.values())
+        tied = sum(c.tied for c in self._counts.values())
         known = [c for c in self._counts.values() if c.has_control]
         control = sum((c.control for c in known), np.zeros(3))
         control_refused = sum(c.control_refused for c in known)
         since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
-        colour, reason = light(
+        colour, reason = self._lamp.look(
+            now_s,
             Situation(
                 strip is not None, length_s, since_s, sigma0, redundancy, points, refused, control_refused, control,
-                apriori_m, self.exposure, self._sources.biased,
-            )
+                apriori_m, self.exposure, self._sources.biased, strip=self.strip, tied=tied,
+                ground_m=ground_m, ground_sigma_m=ground_sigma_m, limit_m=self.alert_limit_m,
+            ),
         )  # fmt: skip
         standing = tuple(d.standing()) if d is not None else ()
         sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
         protection = sigma if self.exposure is None else self.exposure.protection(sigma)
-        found = Watched(colour, reason, self.exposure, time_s, self._sources.biased, standing, (), sigma, protection)
+        found = Watched(
+            colour, reason, self.exposure, time_s, self._sources.biased, standing, (), sigma, protection,
+            np.empty(0) if ground_m is None else ground_m, self.alert_limit_m,
+        )  # fmt: skip
         self.last = found
         return replace(found, events=tuple(events))
 
@@ -204,10 +257,11 @@ class Watch:
         count = self._counts.get(id(batch))
         if count is not None and count.information is batch.information:
             return count
-        kept = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points) > 0
+        rays = np.bincount(batch.rays.point, batch.weight > 0, batch.n_points)
+        kept, tied = rays > 0, int((rays >= 2).sum())
         control = ((batch.control.weight > 0) & kept[:, None]).sum(axis=0)
         refused = batch.n_points - int(kept.sum())
-        return _Count(batch.information, refused, bool(batch.active_control), control, refused_control(batch))
+        return _Count(batch.information, refused, tied, bool(batch.active_control), control, refused_control(batch))
 
     def _groups(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""

@@ -107,7 +107,7 @@ class Window:
         self._orienter = Orienter(self.state, self.trajectory, self._pose_noise)
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
-            options.determine,
+            options.determine, options.alert_limit_m,
         )  # fmt: skip
         step_s = segment_length(slow, options)
         self._arrivals = Arrivals(
@@ -341,10 +341,11 @@ class Window:
         active = [s for s in self.strips.values() if not s.is_gone(state)]
         self._watch.note([b for b in changed if b in self._batches])  # what left at once is no more exposed
         watched = self._watch.last
-        if look or watched is None:
+        if look or watched is None or self._watch.strip != (active[-1].id if active else ""):
             watched = self._watch.look(
                 self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
                 (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
+                self._noise(active[-1]) if active else np.zeros((6, 6)),
             )  # fmt: skip
         result.events += watched.events
         determined = rows = rays = points = control = 0
@@ -372,6 +373,13 @@ class Window:
             parameters=self.parameters(active[-1], watched.standing) if active else (),
             watched=watched,
         )
+
+    def _noise(self, strip: WindowStrip) -> Array:
+        """Covariance (6, 6) of the noise of its newest orientation; 0 where there is none."""
+        times = np.array([min(self._now_s, strip.end_s, self.trajectory.end_s)])
+        if not np.isfinite(times[0]) or not self.trajectory.covers(times)[0]:
+            return np.zeros((6, 6))
+        return self._orienter.noise(strip, times)[0]
 
     def parameters(self, strip: WindowStrip, standing: tuple[Standing, ...] = ()) -> tuple[Parameter, ...]:
         """Offset, shift and drift of a strip where its model has them, and the additional parameters."""
