@@ -36,8 +36,10 @@ IntArray = NDArray[np.int64]
 RISK = 1e-3
 #: Observations of a batch, and of the window, that are looked at exactly, if their lambda is not small.
 OF_BATCH, OF_WINDOW, SMALL = 12, 24, 0.15
-#: Observations whose lambda is computed anew in one update, and batches with other equations than before.
-RENEWED, JUDGED_ANEW = 4, 2
+#: Observations whose lambda is computed anew in one update.
+RENEWED = 4
+#: From this lambda on cofactors of residuals are a difference too small to be taken between old equations and new ones.
+CANCELS = 3.0
 #: Cofactors of residuals below this are those of a direction that nothing checks: along the base at two rays.
 UNCHECKED = 1e-6
 #: Control points are named together whose errors do as much, up to this share.
@@ -154,8 +156,8 @@ class _OfBatch:
     """The most exposed observations of a batch, the largest lambda of its others, and what they are for.
 
     Cofactors of residuals are a small difference of large figures, a thousandth of them where the datum rests on a
-    control point. So rows of one linearisation do not go with the solution of another, and nothing of a batch is
-    renewed that has been linearised or weighted anew since.
+    control point. So rows of one linearisation do not go with the solution of another, and such figures are not renewed
+    where the batch has been linearised or weighted anew since.
     """
 
     batch: Batch
@@ -168,6 +170,11 @@ class _OfBatch:
     def current(self) -> bool:
         """Whether the batch has the same equations still."""
         return self.batch.information is self.information
+
+    @property
+    def largest(self) -> float:
+        """Largest lambda."""
+        return max(map(_leverage, self.exposed), default=0.0)
 
 
 class Integrity:
@@ -264,7 +271,8 @@ class Integrity:
         everyone = chain.from_iterable(b.exposed for b in self._of_batch.values())
         # of those that are renewed none can come behind so many others and still count
         ranked = nlargest(OF_WINDOW + 1 + RENEWED, everyone, key=_leverage)
-        again = [e for e in ranked if self._of_batch[id(e.batch)].current][:RENEWED] if renew else []
+        again = [e for e in ranked if e.leverage < CANCELS or self._of_batch[id(e.batch)].current][:RENEWED]
+        again = again if renew else []
         widths = [len(e.rows) for e in again]
         k = len(design)
         G = np.zeros((len(state), k + sum(widths)))
@@ -308,11 +316,12 @@ class Integrity:
         )
 
     def _judge_changed(self, state: WindowState) -> None:
-        """Look again at batches that have been linearised or weighted anew, those first that were most exposed."""
-        changed = [b for b in self._of_batch.values() if b.exposed and not b.current]
-        for of in nlargest(JUDGED_ANEW, changed, key=lambda b: max(map(_leverage, b.exposed))):
-            of.batch.judge(state)
-            self.note([of.batch])
+        """Look again at the most exposed of the batches that have been linearised or weighted anew."""
+        changed = [b for b in self._of_batch.values() if not b.current and b.largest > CANCELS]
+        if changed:
+            batch = max(changed, key=lambda b: b.largest).batch
+            batch.judge(state)
+            self.note([batch])
 
 
 class _Left:
