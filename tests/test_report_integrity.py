@@ -31,7 +31,7 @@ def _light(message):
     t = (message.stamp_ns - START_NS) / convert.SECOND_NS
     body.strip = "S1"
     if t < 2.0 + WEAK_S:
-        body.light, body.light_reason = "weak", f"no control within {t:.0f} s; position datum rests on GNSS"
+        body.light, body.light_reason = "weak", f"no control within {t:.0f} s, {np.sin(t):+.2f} px"
     else:
         body.light, body.light_reason = "good", ""
     body.protection.extend(FACTOR * LIVE_SIGMA)

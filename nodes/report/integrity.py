@@ -26,7 +26,7 @@ _MDEG = 1000.0 * float(np.degrees(1.0))
 _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
 _LONGEST_S = 6.0  # a report speaks for no longer than this
 _NEAR_S = 0.3  # an error is compared with the protection level of a report that is so near in time
-_NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
+_NUMBER = re.compile(r"[+-]?\b\d+(\.\d+)?\b")
 
 
 def integrity(flight: Flight) -> dict[str, Any] | None:
