@@ -33,6 +33,11 @@ def integrity_section(flight: Flight, result: dict[str, Any]) -> Iterable[str]:
     if "protection_m" in said:
         yield "<h3>Protection level of the newest orientation</h3>"
         yield _levels_table(said)
+        if "alert_limit_m" in said:
+            yield (
+                f"<p>On the ground, the worst of four: {said['ground_m']:.2f} m (median); below the alert limit of "
+                f"{said['alert_limit_m']:.2f} m in {100 * said['below_limit']:.0f} % of the reports.</p>"
+            )
         yield captioned(protection_figure(flight), _NOTE)
     if said["sources"]:
         yield "<h3>Sources of tie points that drifted</h3>"
