@@ -16,7 +16,7 @@ from . import convert
 from .canvas import Canvas, Color, Series
 from .convert import PoseSample
 from .node import Message
-from .scene_parts import AXES, CHECK, FILTERED, FINAL, LIVE, TRUTH, Part, faded
+from .scene_parts import AXES, CHECK, CONTROL, FILTERED, FINAL, LIVE, TRUTH, Part, faded
 from .scene_state import SceneState
 
 Array = NDArray[np.floating]
@@ -166,6 +166,11 @@ class PlotsPart(Part):
         for kind, values, color in (("protection", report.protection, LIVE), ("sigma", report.sigma, CHECK)):
             if len(values) == 6:
                 self._add(f"overview/integrity/{kind}", t, max(values[:3]), Series(kind, color, 2.0), gap_s)
+        if report.alert_limit_m > 0 and report.ground_protection:
+            ground = Series("protection on the ground", FINAL, 2.0)
+            self._add("overview/integrity/ground", t, max(report.ground_protection), ground, gap_s)
+            limit = Series("alert limit", CONTROL, 1.0)
+            self._add("overview/integrity/limit", t, report.alert_limit_m, limit, gap_s)
 
     def _parameter(self, t: float, k: int, parameter: Any, gap_s: float) -> None:
         """The value; faint as long as the network cannot see it."""

@@ -18,7 +18,7 @@ Array = NDArray[np.floating]
 _STEP_NS = int(0.4 * SECOND_NS)
 _PERIOD_S = 0.4
 _LIGHTS: dict[str, Color] = {"good": (70, 220, 120, 255), "weak": (255, 190, 40, 255), "failed": (255, 60, 60, 255)}
-_WRAP = 64  # characters of a reason
+_WRAP = 84  # characters of a reason
 _ASIDE = 0.18  # of the swath's width: names stand so far beside it, on the viewer's side
 
 

@@ -31,11 +31,13 @@ def _light(message):
     t = (message.stamp_ns - START_NS) / convert.SECOND_NS
     body.strip = "S1"
     if t < 2.0 + WEAK_S:
-        body.light, body.light_reason = "weak", f"no control within {t:.0f} s; position datum rests on GNSS"
+        body.light, body.light_reason = "weak", f"no control within {t:.0f} s, {np.sin(t):+.2f} px"
     else:
         body.light, body.light_reason = "good", ""
     body.protection.extend(FACTOR * LIVE_SIGMA)
     body.sigma.extend(LIVE_SIGMA)
+    body.ground_protection.extend([0.5, 3.0 if body.light == "weak" else 1.0, 0.4, 0.2])
+    body.alert_limit_m = 2.0
     if 15.0 < t < 20.0:
         body.sources.append(
             m.BiasedSource(
@@ -65,6 +67,8 @@ def test_shares_of_the_light_and_its_reasons(messages):
     # reasons that differ in numbers only are one
     assert [(r["light"], r["times"]) for r in said["reasons"]] == [("good", 1), ("weak", 1)]
     assert sum(r["seconds"] for r in said["reasons"]) == pytest.approx(said["seconds"])
+    assert (said["alert_limit_m"], said["ground_m"]) == (2.0, 1.0)
+    assert said["below_limit"] == pytest.approx(said["share"]["good"], abs=0.05)
     (source,) = said["sources"]
     assert (source["source"], source["ccd"], source["rivals"]) == ("matcher", "F", ["matcher/B"])
     assert source["since_s"] == pytest.approx(15.0, abs=0.1) and 3.5 < source["seconds"] < 5.5
@@ -102,6 +106,7 @@ def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path):
     section = section[: section.index("</section>")]
     assert re.search(r"good (69|70|71) %, weak (29|30|31) %, failed 0 %", section)
     assert section.count("<svg") == 1 and "protection level, median" in section and "κ [mdeg]" in section
+    assert re.search(r"1\.00 m \(median\); below the alert limit of 2\.00 m in (69|7[0-2]) % of", section)
     assert "matcher/B" in section and "-0.20" in section
     plain = write_recording(tmp_path / "plain.mcap", flight_messages(seconds=12.0, points=20))
     assert main(["analyze", str(plain), "-o", str(page), "-q"]) == 0

@@ -45,6 +45,8 @@ def strip():
                 message.stamp_ns - round(WINDOW_S * convert.SECOND_NS), START_NS + 2 * convert.SECOND_NS
             )
             body.protection.extend([1.0, 2.0, 1.5, 1e-4, 1e-4, 1e-4])
+            body.ground_protection.extend([0.5, 0.9, 0.7, 0.6])
+            body.alert_limit_m = 2.5
             body.sigma.extend([0.1, 0.2, 0.3, 1e-5, 1e-5, 1e-5])
         told.append(message)
     return told
@@ -80,6 +82,8 @@ def test_curves_are_not_drawn_across_a_turn(notes):
         t, v = notes.curves[f"plots/{entity}"]
         assert np.isnan(v).sum() == 1 and 34.0 < t[int(np.flatnonzero(np.isnan(v))[0])] < 34.0 + TURN_S, entity
     assert checked > 30
+    assert set(np.array(notes.curves["plots/overview/integrity/limit"][1])[:10]) == {2.5}
+    assert set(np.array(notes.curves["plots/overview/integrity/ground"][1])[:10]) == {0.9}
 
 
 def test_deviations_are_not_joined_from_strip_to_strip(notes):

@@ -26,7 +26,7 @@ _MDEG = 1000.0 * float(np.degrees(1.0))
 _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
 _LONGEST_S = 6.0  # a report speaks for no longer than this
 _NEAR_S = 0.3  # an error is compared with the protection level of a report that is so near in time
-_NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
+_NUMBER = re.compile(r"[+-]?\b\d+(\.\d+)?\b")
 
 
 def integrity(flight: Flight) -> dict[str, Any] | None:
@@ -40,6 +40,8 @@ def integrity(flight: Flight) -> dict[str, Any] | None:
     - ``reasons``: ``light, reason, seconds, times`` (how often it came up), the longest first; reasons that differ in
       their numbers only are one, told with the numbers of the first;
     - ``protection_m``, ``sigma_m`` (X, Y, Z), ``protection_deg``, ``sigma_deg`` (omega, phi, kappa): medians;
+    - ``alert_limit_m`` and ``ground_m`` (worst protection level on the ground), medians, and ``below_limit``, the share
+      of the reports in which it is below;
     - with truth ``compared`` (orientations) and ``exceeded`` (by component: errors beyond the protection level);
     - ``sources``: those that drifted: ``source, ccd, since_s, seconds, line_px, sample_px`` (largest bias), ``rivals``.
     """
@@ -61,6 +63,13 @@ def integrity(flight: Flight) -> dict[str, Any] | None:
     result: dict[str, Any] = {"seconds": total, "share": share}
     result["reasons"] = sorted(reasons.values(), key=lambda row: -row["seconds"])
     _levels(flight, result)
+    limited = [
+        (max(r.ground_protection), r.alert_limit_m) for _, r in lit if r.alert_limit_m > 0 and r.ground_protection
+    ]
+    if limited:
+        worst, limit = np.array(limited).T
+        result["alert_limit_m"], result["ground_m"] = float(np.median(limit)), float(np.median(worst))
+        result["below_limit"] = float(np.mean(worst < limit))
     result["sources"] = _sources(flight, lit, lasting)
     return result
 

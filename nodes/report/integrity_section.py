@@ -10,7 +10,7 @@ from .integrity import LIGHTS, protection_figure
 from .page_parts import captioned, number, table
 
 _MDEG = 1000.0
-_SHOWN_REASONS = 10
+_SHOWN_REASONS, _LEAST_S = 10, 0.5
 _NOTE = (
     "Protection level: what could be wrong and not be seen; with a risk of 0.001 the orientation is not further off, "
     "even if one gross error that the tests do not find is among the observations. The ground is the light."
@@ -24,7 +24,8 @@ def integrity_section(flight: Flight, result: dict[str, Any]) -> Iterable[str]:
         return
     shares = ", ".join(f"{light} {100 * said['share'][light]:.0f} %" for light in LIGHTS)
     yield f"<p>The operator's light over {said['seconds']:.0f} s on strips: <b>{shares}</b>.</p>"
-    rows = [(r["light"], r["reason"] or "–", number(r["seconds"], 0), r["times"]) for r in said["reasons"]]
+    lasting = [r for r in said["reasons"] if r["seconds"] >= _LEAST_S]
+    rows = [(r["light"], r["reason"] or "–", number(r["seconds"], 0), r["times"]) for r in lasting]
     shown = rows[:_SHOWN_REASONS]
     yield table(("light", "reason (numbers: when it first came up)", "time [s]", "times"), shown, left=2, wrapped=(1,))
     if len(rows) > len(shown):
@@ -32,6 +33,11 @@ def integrity_section(flight: Flight, result: dict[str, Any]) -> Iterable[str]:
     if "protection_m" in said:
         yield "<h3>Protection level of the newest orientation</h3>"
         yield _levels_table(said)
+        if "alert_limit_m" in said:
+            yield (
+                f"<p>On the ground, the worst of four: {said['ground_m']:.2f} m (median); below the alert limit of "
+                f"{said['alert_limit_m']:.2f} m in {100 * said['below_limit']:.0f} % of the reports.</p>"
+            )
         yield captioned(protection_figure(flight), _NOTE)
     if said["sources"]:
         yield "<h3>Sources of tie points that drifted</h3>"
