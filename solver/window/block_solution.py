@@ -89,6 +89,7 @@ def factorised(A: Array) -> Parts:
     n = len(A)
     for begin, end in _tiles(n):
         panel = A[:, begin:end]
+        panel[begin:end] = np.tril(panel[begin:end])  # what stands above is whatever the memory held, no numbers maybe
         for first in range(begin, n, TOGETHER * TILE):
             last = min(first + TOGETHER * TILE, n)
             panel[first:last] -= A[first:last, :begin] @ A[begin:end, :begin].T
