@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from triline.solver.adjustment.reliability import CRITICAL_W
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
@@ -39,9 +40,9 @@ def entering():
 
 def test_square_sums_of_good_points_are_chi_square(entering):
     below = []
-    for _, equations in entering:
-        square, _ = equations.test(equations.present)
-        redundancy = 2 * equations.present.sum(axis=1) + (equations.control > 0).sum(axis=1) - 3
+    for batch, equations in entering:
+        square, *_ = equations.test(equations.present, batch.control.weight)
+        redundancy = 2 * equations.present.sum(axis=1) + (batch.control.weight > 0).sum(axis=1) - 3
         below += list(chi2.cdf(square, redundancy))
     assert len(below) > 150
     assert 0.42 < np.mean(below) < 0.58
@@ -56,7 +57,7 @@ class Spoilt:
         residual[point, 2 * ray : 2 * ray + 2] += by
         moved = _Equations(**{**vars(equations), "residual": residual})
         monkeypatch.setattr(_Equations, "of", classmethod(lambda cls, *_: moved))
-        self.weight = entry_weight(batch, None)
+        self.weight, self.w = entry_weight(batch, None)
         self.of_point = self.weight[batch.rays.point == point]
         self.others = self.weight[batch.rays.point != point]
 
@@ -74,6 +75,7 @@ def test_a_bad_look_is_named_and_nothing_else_or_its_point_goes(entering, monkey
             expected[ray] = 0.0
             named += (spoilt.of_point == expected).all()
             lost += not spoilt.of_point.any()
+            assert spoilt.w[batch.rays.point == point][ray] > CRITICAL_W
             assert (spoilt.of_point == expected).all() or not spoilt.of_point.any()
     assert named > 10 * max(lost, 1) and named > 30
 

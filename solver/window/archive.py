@@ -213,6 +213,25 @@ class Archive:
         self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, True)
         return True
 
+    def weigh_control(self, name: str, axis: int, change: float, value: float) -> None:
+        """Change the weight of a known coordinate of a point that is final."""
+        kept = self.points.get(name)
+        if kept is None or not self.holds(kept.left.columns):
+            return
+        L, D, y = kept.root  # (3, 3), (3, u), (3,)
+        origin = kept.left.origin_l[kept.place]
+        normal, into, moment = L.T @ L, L.T @ D, L.T @ y
+        normal[axis, axis] = max(normal[axis, axis] + change, 0.0)
+        normal += 1e-12 * np.trace(normal) * np.eye(3)  # one ray alone does not place it
+        moment[axis] += change * (value - origin[axis])
+        L_inv = np.linalg.inv(np.linalg.cholesky(normal))
+        D_new, y_new = L_inv @ into, L_inv @ moment
+        normals = PointNormals(L_inv[np.tril_indices(3)][:, None], y_new[:, None], np.array([3]))
+        point = kept.left.points[list(kept.left.order).index(kept.place)]
+        left = LeftPoints(kept.left.columns, origin[None], normals, D_new[None], np.zeros(1, dtype=np.int64), (point,))
+        self.add(kept.left.columns, D.T @ D - D_new.T @ D_new, D.T @ y - D_new.T @ y_new)
+        self.points[name] = replace(kept, left=left, place=0)
+
     # -- solution ------------------------------------------------------------------------------------------------------
 
     @property
