@@ -23,6 +23,7 @@ from .backward import LeftPoints, again
 from .batch import Batch, inverse_factors
 from .block_normals import LOOKED_UP, ROWS, BlockNormals
 from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
+from .output import checks
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 
@@ -187,8 +188,8 @@ class Archive:
         if old is not None:
             seen |= old.strips
             before = old.left.points[list(old.left.order).index(old.place)]
-            merged = replace(published, rays=published.rays + before.rays,
-                             residuals=before.residuals + published.residuals)  # fmt: skip
+            rays, looks = published.rays + before.rays, before.residuals + published.residuals
+            merged = replace(published, rays=rays, residuals=looks, checked=checks(rays, len(looks), control))
             left = replace(left, points=(merged,))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(name, KeptPoint(left, 0, seen, time_s, control or (old is not None and old.with_control)))

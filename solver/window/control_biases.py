@@ -63,7 +63,7 @@ class Biases:
 
 
 def biases_of(batch: Batch, p: int, weight: Array, out: Bools) -> Biases:
-    """Of a point of a batch, with the given weights (3,), of which those that are out (3,) have none in the batch now."""
+    """Of a point of a batch with given weights (3,), of which those that are out (3,) do not count in it now."""
     axes = np.flatnonzero(weight > 0)
     L = inverse_factors(batch.normals)[p]
     Q, moment = L.T @ L, L.T @ batch.normals.y[:, p]  # of the point given the orientation, from where it is counted

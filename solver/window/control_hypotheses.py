@@ -1,10 +1,10 @@
 """Which of several known coordinates are wrong, judged together: sets of biases against each other.
 
-The coordinates' discrepancies ``b`` have the covariance ``C^-1``, with what the GNSS and the slow errors of the measured
-trajectory allow in it. A hypothesis says which of them may have a bias: any single coordinates, and a shift that all
-have in common in an axis (the height system). It explains ``v_S' C_SS^-1 v_S`` of the cost; each bias has its price, the
-square of the critical value, so that one alone is Baarda's test. Where another set explains the discrepancies nearly as
-well it cannot be told which is wrong.
+The coordinates' discrepancies ``b`` have the covariance ``C^-1``, with what the GNSS and the slow errors of the
+measured trajectory allow in it. A hypothesis says which of them may have a bias: any single coordinates, and a shift
+that all have in common in an axis (the height system). It explains ``v_S' C_SS^-1 v_S`` of the cost; each bias has its
+price, the square of the critical value, so that one alone is Baarda's test. Where another set explains the
+discrepancies nearly as well it cannot be told which is wrong.
 """
 
 from __future__ import annotations

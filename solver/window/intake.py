@@ -44,6 +44,7 @@ class Intake:
     def add_control(self, name: str, point: ControlPoint) -> None:
         self.control[name] = point
         if name in self.points:
+            self.points[name].out.clear()  # it is judged anew
             self._arrived[name] = None
 
     def add_look(self, name: str, look: Look) -> str:

@@ -88,9 +88,8 @@ class Leaver:
         old = [b for b in self._batches if b.oldest_s <= latest]
         leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
         if self.options.snoop and leaving:
-            refused, rounds = snoop(
-                leaving, self._state, self._intake.points, self.options.critical, serial, partial(self._control.look, now_s)
-            )
+            control = partial(self._control.look, now_s)
+            refused, rounds = snoop(leaving, self._state, self._intake.points, self.options.critical, serial, control)
             result.refused += refused
             failed = snoop_ties([b for b in leaving if b.ties is not None], self._state)
             self._apart(failed, result)

@@ -239,7 +239,7 @@ class Watch:
         known = [c for c in self._counts.values() if c.has_control]
         control = sum((c.control for c in known), np.zeros(3))
         control_refused = sum(c.control_refused for c in known)
-        since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
+        since_s = now_s - strip.model.extent.start_s if strip is not None else 0.0
         colour, reason = self._lamp.look(
             now_s,
             Situation(

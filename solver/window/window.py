@@ -134,9 +134,17 @@ class Window:
         return self._length_s
 
     def begin_strip(
-        self, id: str, first_line_time_s: float, line_rate_hz: float, lines: int = 0, slow: SlowErrors | None = None
+        self,
+        id: str,
+        first_line_time_s: float,
+        line_rate_hz: float,
+        lines: int = 0,
+        slow: SlowErrors | None = None,
+        joined_s: float = -np.inf,
     ) -> None:
         """A strip begins; ``slow`` are its slow errors if they are not those of the window.
+
+        What was flown of it before ``joined_s`` is not adjusted: there is no orientation for it.
 
         Raises
         ------
@@ -147,7 +155,7 @@ class Window:
         if id in self.strips:
             return
         self.strips[id] = WindowStrip(
-            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state
+            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s
         )
         self._block.begin(self.strips[id])
 
