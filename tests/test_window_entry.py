@@ -24,17 +24,18 @@ def entering():
         ErrorModel(attitude_rate_hz=100.0),
         ObservationPlan(tie_points_per_s=8.0),
     )
-    seen = []
+    seen, refused = [], []
     admit = module.admit
 
     def watch(batch, state, points):
         seen.append((batch, _Equations.of(batch, state)))
-        return admit(batch, state, points)
+        refused.extend(found := admit(batch, state, points))
+        return found
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "admit", watch)
-        result = adjust_online(simulation, navigate(simulation), live=False)
-    assert not [r for r in result.refused if r.w == 0.0 and r.reason == "snooping"]
+        adjust_online(simulation, navigate(simulation), live=False)
+    assert not refused
     return seen
 
 
@@ -86,6 +87,21 @@ def test_of_two_looks_that_contradict_each_other_none_enters(entering, monkeypat
     results = [Spoilt(monkeypatch, batch, equations, point, 0, by) for by in ([200.0, 0.0], [0.0, 200.0])]
     assert any(not r.of_point.any() for r in results)
     assert all(r.of_point.all() or not r.of_point.any() for r in results)
+
+
+def test_three_looks_that_agree_stay_where_known_coordinates_are_wrong(entering, monkeypatch):
+    known = [(b, e, p) for b, e in entering for p in np.flatnonzero((b.control.weight > 0).all(axis=1))
+             if e.present[p].sum() == 3]  # fmt: skip
+    assert known
+    for batch, equations, point in known:
+        off = equations.off.copy()
+        off[point, 2] += 47.0
+        moved = _Equations(**{**vars(equations), "off": off})
+        monkeypatch.setattr(_Equations, "of", classmethod(lambda cls, *_, moved=moved: moved))
+        square, *_ = moved.test(equations.present, batch.control.weight)
+        assert square[point] > chi2.isf(SUSPECTED, 6)
+        weight, _ = entry_weight(batch, None)
+        assert (weight[batch.rays.point == point] == 1.0).all()
 
 
 def test_the_level_is_what_it_says():
