@@ -222,3 +222,16 @@ def test_one_wrong_coordinate_is_named_and_good_control_is_not(flight):
     assert not [r for r in right.refused if r.coordinate]
     whole = [orientation_errors(flight[0], r.whole).rmse[2] for r in (online, right)]
     assert whole[0] < 1.3 * whole[1] + 0.02
+
+
+def test_control_in_another_height_system_moves_no_strip_of_a_block():
+    plan = FlightPlan(strips=2, strip_s=30.0, sidelap=0.35, turns=False, gap_s=8.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, 2, ErrorModel(attitude_rate_hz=100.0), ObservationPlan(tie_points_per_s=4.0, control=6))
+    surveyed = simulation.surveyed_l + np.where(simulation.points.role == "control", 47.0, 0.0)[:, None] * [0, 0, 1]
+    poses = navigate(simulation)
+    online = adjust_online(replace(simulation, surveyed_l=surveyed), poses, WindowOptions(grid_hz=4.0), update_s=0.5)
+    seen = [p.rays for p in online.whole_points.values() if p.role == "control"]
+    assert max(seen) > 3  # some from both strips
+    assert {r.coordinate for r in online.refused if r.reason == CONTRADICTS} == {"Z"}
+    for run in (online.final, online.whole):
+        assert not beyond(orientation_errors(simulation, run)).any()

@@ -198,6 +198,8 @@ class Batch:
         """Give a control coordinate another weight; `eliminate` makes it count."""
         weights = self.control.weight.copy()
         weights[point, axis] = weight
+        if self.ties is not None:
+            self.ties.control[point, axis] = weight
         self.control = ControlWeights(weights, self.control.xyz_l, int((weights > 0).sum()))
 
     def cofactors(self, Q: Array) -> Cofactors:

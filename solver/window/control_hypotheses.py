@@ -63,7 +63,7 @@ def judge(C: Array, v: Array, axis: NDArray[np.int64], price: float, before: Boo
     M, m = M * scale[:, None] * scale, m * scale
     scores = _search(M, m, np.flatnonzero(usable), price)
     best = min(scores, key=scores.__getitem__)
-    refused = {s: covers[list(s)].any(axis=0) for s in scores}
+    refused: dict[frozenset[int], Bools] = {s: np.asarray(covers[list(s)].any(axis=0)) for s in scores}
     for s in sorted(scores, key=scores.__getitem__):  # what holds already holds
         if scores[s] > scores[best] + STEADY:
             break
