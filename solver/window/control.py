@@ -16,6 +16,7 @@ from .batches import Batches
 from .block import Block
 from .control_biases import Biases, Discrepancies, LeftControl, biases_of, discrepancies
 from .control_hypotheses import Verdict, biases, judge
+from .following import MOVED
 from .intake import Intake
 from .results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal
 from .state import Marginal, WindowState
@@ -163,8 +164,17 @@ class ControlDesk:
                 if lost != was:
                     self._block.weigh_control(c.point, c.axis, -c.weight if lost else c.weight, c.value)
         self._state.solve()
-        for batch in changed.values():
-            batch.back_substitute(self._state.values(batch.columns))
+        for again in (True, False):  # a point that had been held far off was linearised there
+            far = False
+            for batch in changed.values():
+                theta = self._state.values(batch.columns)
+                batch.back_substitute(theta)
+                if again and batch.points_moved() > MOVED * batch.height_m:
+                    self._batches.linearise(batch, theta, reweigh=True)
+                    far = True
+            if not far:
+                break
+            self._state.solve()
 
     # -- words ---------------------------------------------------------------------------------------------------------
 
