@@ -51,10 +51,6 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     result["parameters"] = [] if newest is None else [_parameter(p, since.get(p.name)) for p in newest.parameters]
     ranked = sorted(flight.rejected, key=lambda r: (-abs(r.w), r.point, r.ccd))
     result["rejected_observations"] = [_rejected(r) for r in ranked[:_LARGEST_REJECTED]]
-    result["control_refused"] = [
-        {"point": r.point, "coordinate": r.coordinate, "w": r.w, "off_m": r.off}
-        for _, r in sorted(flight.control_refused.items())
-    ]
     reports = [r for _, r in flight.reports]
     latency = [r.data_latency_s for r, new in zip(reports, updates_with_new_rays(reports), strict=True) if new]
     if latency:

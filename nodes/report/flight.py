@@ -96,7 +96,7 @@ class Flight:
         each object point
     ground : control and check points by id; truth_points : true coordinates by id
     reports : adjustment reports in order; rejected : the rejected observations they name, once each, without those
-        that were taken back; control_refused : those of known coordinates, by point and coordinate
+        that were taken back
     counts : messages taken in, by topic; refused : messages that hold no usable value
     status : newest status of each node
     """
@@ -117,7 +117,6 @@ class Flight:
     truth_points: dict[str, Array] = field(default_factory=dict)
     reports: list[tuple[int, Any]] = field(default_factory=list)
     rejected: list[Any] = field(default_factory=list)
-    control_refused: dict[tuple[str, str], Any] = field(default_factory=dict)
     events: list[tuple[int, Any]] = field(default_factory=list)
     status: dict[str, Any] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
@@ -223,13 +222,9 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
             (stamp, _finite(body, body.sigma0, body.sigma0_total, body.data_latency_s, body.compute_s))
         )
         for r in body.rejected:
-            if r.coordinate:
-                flight.control_refused[r.point, r.coordinate] = r
-            else:
-                rejected[rejected_key(r)] = r
+            rejected[rejected_key(r)] = r
         for r in body.returned:
             rejected.pop(rejected_key(r), None)
-            flight.control_refused.pop((r.point, r.coordinate), None)
     elif topic == "sensor/gnss":
         flight.gnss.append(_finite(body, body.latitude, body.longitude, body.altitude, *body.position_covariance))
     elif topic == "sensor/attitude":
