@@ -404,7 +404,9 @@ class Adjuster(Node):
             now_s = min(now_s, self._window.trajectory.end_s)
         self._strips.use_to(now_s)
         self._take_ties()
-        outputs = self._results(self._window.update(now_s))
+        outputs = [self._log(text, warning=True) for text in self._strips.take_events()]
+        outputs += [self._log(text) for text in self._control.take_news()]
+        outputs += self._results(self._window.update(now_s))
         return outputs if self._early else outputs + self._live_since()
 
     @property

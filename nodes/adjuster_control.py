@@ -12,6 +12,9 @@ from . import convert
 
 Array = NDArray[np.floating]
 
+#: Points named in one line at most.
+NAMED = 8
+
 
 class GroundPoints:
     """Known ground points by name, and those whose coordinates do not count."""
@@ -19,6 +22,8 @@ class GroundPoints:
     def __init__(self) -> None:
         self.bodies: dict[str, Any] = {}
         self._refused: set[str] = set()
+        self._came: list[str] = []
+        self._changed: list[str] = []
 
     def __contains__(self, name: str) -> bool:
         return name in self.bodies
@@ -33,11 +38,32 @@ class GroundPoints:
         if not body.point:
             raise ValueError("ground point without a name")
         xyz, sigma, role = _coordinates(body)
+        if window is not None and window.strips and role != "check":
+            self._note(body)
         self.bodies[body.point] = body
         if body.point in self._refused:
             sigma, role = np.full(3, np.inf), "check"
         if window is not None:
             window.add_control(body.point, xyz, sigma, role)
+
+    def _note(self, body: Any) -> None:
+        """Control that comes in flight, or becomes another."""
+        old = self.bodies.get(body.point)
+        if old is None:
+            self._came.append(body.point)
+        elif old != body:
+            dx, dy, dz = body.x - old.x, body.y - old.y, body.z - old.z
+            self._changed.append(f"{body.point} by {dx:.2f}, {dy:.2f}, {dz:.2f} m")
+
+    def take_news(self) -> list[str]:
+        """Lines for the operator about control that came or changed in flight since the last call."""
+        lines = [
+            f"control {what} in flight: {_several(names)}"
+            for what, names in (("came", self._came), ("changed", self._changed))
+            if names
+        ]
+        self._came, self._changed = [], []
+        return lines
 
     def judge(self, verdict: Any, window: Window | None) -> None:
         """A surveyor says whether the coordinates of a point count.
@@ -50,6 +76,11 @@ class GroundPoints:
             raise ValueError(f"verdict on {verdict.point!r}, which is no ground point")
         (self._refused.discard if verdict.accepted else self._refused.add)(verdict.point)
         self.take(self.bodies[verdict.point], window)
+
+
+def _several(names: list[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
 
 
 def _coordinates(body: Any) -> tuple[Array, Array, str]:

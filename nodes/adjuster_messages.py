@@ -126,7 +126,7 @@ def report(
 def _refusal(r: Refusal) -> Any:
     return m.RejectedObservation(
         point=r.point, strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, w=r.w,
-        reason=r.reason,
+        reason=r.reason, coordinate=r.coordinate, off=r.off_m,
     )  # fmt: skip
 
 

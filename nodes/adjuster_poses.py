@@ -69,6 +69,10 @@ class PoseBuffer:
     ----------
     known_only : leave out poses that say that they do not know the attitude
     smoothed_only : hand over smoothed poses alone, unless there are none for `PATIENCE_S`
+
+    Attributes
+    ----------
+    first_known_s : of the first pose with a known attitude
     """
 
     def __init__(self, known_only: bool = False, smoothed_only: bool = False) -> None:
@@ -77,6 +81,7 @@ class PoseBuffer:
         self._attitude_lost = False
         self._left_out = (0.0, 0.0)
         self.filtered_seen = False
+        self.first_known_s = np.inf
         self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
         self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
         self._invalid: dict[bool, list[tuple[float, float, str]]] = {False: [], True: []}
@@ -86,6 +91,7 @@ class PoseBuffer:
         for waiting in self._waiting.values():
             waiting.clear()
         self._latest.clear()
+        self.first_known_s = np.inf
 
     def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
         self.filtered_seen |= not smoothed
@@ -93,6 +99,8 @@ class PoseBuffer:
         known = float(np.diagonal(sample.covariance)[3:].max()) < KNOWN_ATTITUDE_RAD**2
         if not smoothed and self._latest:
             self._attitude_lost |= not known
+        if known:
+            self.first_known_s = min(self.first_known_s, time_s)
         if known or not self._known_only:
             self._waiting[smoothed].append((time_s, sample))
         if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):

@@ -105,6 +105,7 @@ class Teller:
             if before != (self.light[0], self._sources) or over or (other and settled):
                 self._told_ns, self._told_kind = stamp_ns, kind(self.light[1])
                 outputs.append(self._log(": ".join(filter(None, self.light)), stamp_ns, self.light[0] != "good"))
+        outputs += [self._log(text, stamp_ns, warning=True) for text in update.warnings]
         outputs += [self._log(text, stamp_ns) for text in update.events]
         return outputs
 

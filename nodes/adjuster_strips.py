@@ -14,6 +14,8 @@ from .adjuster_poses import PoseBuffer, SlowHistory
 
 #: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
 NEAR_START_S = 1.0
+#: Smoothed poses reach back so far behind the first filtered one, s; where there is none a strip is joined later.
+REACHED_BACK_S = 10.0
 
 
 class StripDesk:
@@ -30,6 +32,7 @@ class StripDesk:
     bodies : strip messages by name
     held_ties : tie points of strips that wait for a pose, with their source
     poses : measured poses since the last hand-over
+    events : lines for the operator since they were taken last
     """
 
     def __init__(self, by_poses: bool, counters: Counter[str], smoothed_only: bool = False) -> None:
@@ -37,6 +40,7 @@ class StripDesk:
         self.bodies: dict[str, Any] = {}
         self.poses = PoseBuffer(known_only=by_poses, smoothed_only=smoothed_only)
         self.held_ties: list[tuple[Any, str]] = []
+        self.events: list[str] = []
         self._held: dict[str, Any] = {}
         self._slow = SlowHistory()
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
@@ -64,7 +68,7 @@ class StripDesk:
     def begin(self, body: Any, first_s: float, window: Window) -> None:
         """A strip begins, or ends, or waits for a pose."""
         self._held.pop(body.id, None)
-        slow = window.slow
+        slow, joined_s = window.slow, -np.inf
         if self._by_poses and body.id not in window.strips:
             covariance = self.poses.covariance_after(first_s - NEAR_START_S)
             if covariance is not None:
@@ -74,13 +78,25 @@ class StripDesk:
                 return
             self._slow.add(first_s, slow)
             self._stated[body.id] = slow, slow
-        window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow)
+            late_s = self.poses.first_known_s - first_s
+            if REACHED_BACK_S < late_s < np.inf:
+                joined_s = self.poses.first_known_s - REACHED_BACK_S
+                self.events.append(
+                    f"strip {body.id} is joined {late_s:.0f} s after its first line: what was flown before that is "
+                    "not adjusted, neither final nor whole"
+                )
+        window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow, joined_s)
         if body.ended:
             window.end_strip(body.id, int(body.lines))
 
     def held(self) -> list[Any]:
         """Strips that wait."""
         return list(self._held.values())
+
+    def take_events(self) -> list[str]:
+        """Lines for the operator since the last call."""
+        events, self.events = self.events, []
+        return events
 
     def use_to(self, time_s: float) -> None:
         """The window is about to be updated: its models are in use for times up to this and a little beyond."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -248,3 +250,83 @@ def test_settings_are_checked():
         Adjuster(window_s=-1.0)
     with pytest.raises(ValueError, match="spline"):
         Adjuster(model="spline")
+
+
+def with_control(messages, change):
+    """The flight with other control: what `change` makes of each ground point, None to leave it out."""
+    for message in messages:
+        if message.topic != "observation/control" or message.body.role == m.GroundPoint.Role.Value("CHECK"):
+            yield message
+            continue
+        body = m.GroundPoint()
+        body.CopyFrom(message.body)
+        yield from change(replace(message, body=body))
+
+
+def lines(outputs):
+    return [(o.body.message, o.body.level) for o in outputs if o.topic == "event/log"]
+
+
+def test_refused_control_is_in_the_report_and_in_the_log(flight):
+    def raised(message):
+        message.body.z += 47.0
+        return [message]
+
+    outputs = run(Adjuster(grid_hz=2.0), with_control(flight[1], raised))
+    refused = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.coordinate]
+    assert refused and {(r.coordinate, r.reason) for r in refused} == {("Z", "contradicts")}
+    assert all(r.w > 5.0 and r.off == pytest.approx(47.0, abs=8.0) and not r.ccd for r in refused)
+    warning = m.Log.Level.Value("WARNING")
+    for r in refused:
+        assert any(text.startswith(f"control {r.point} Z refused: w ") and level == warning
+                   for text, level in lines(outputs))  # fmt: skip
+    assert sum("height system (geoid)?" in text and "rests on GNSS" in text for text, _ in lines(outputs)) == 1
+    lights = [b for b in bodies(outputs, "adjustment/report") if b.control >= 2]
+    assert lights and all(b.light == "failed" for b in lights)
+
+
+def test_every_look_that_a_test_refused_has_its_w(flight):
+    rng = np.random.default_rng(2)
+    messages = []
+    for message in flight[1]:
+        if message.topic == "observation/tie" and rng.random() < 0.1:
+            body = m.TiePoint()
+            body.CopyFrom(message.body)
+            body.images[0].sample += rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 80.0)
+            message = replace(message, body=body)
+        messages.append(message)
+    outputs = run(Adjuster(grid_hz=2.0), messages)
+    rejected = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.reason == "snooping"]
+    assert len(rejected) > 20 and all(r.w > 0.0 for r in rejected)
+    assert np.median([r.w for r in rejected]) > 5.0
+
+
+def test_control_that_comes_or_changes_in_flight_is_told(flight):
+    control = [x for x in flight[1] if x.topic == "observation/control"]
+    late = max(x.stamp_ns for x in flight[1]) - 15 * convert.SECOND_NS
+    first = next(i for i, x in enumerate(flight[1]) if x.stamp_ns >= late)
+    mine = [x for x in control if x.body.role == m.GroundPoint.Role.Value("CONTROL")]
+    rest = [x for x in flight[1] if x is not mine[0]]
+    changed = m.GroundPoint()
+    changed.CopyFrom(mine[1].body)
+    changed.z += 0.5
+    news = [replace(mine[0], stamp_ns=late), Message("observation/control", late, changed)]
+    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0), rest[:first] + news + rest[first:]))]
+    assert f"control came in flight: {mine[0].body.point}" in said
+    assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m" in said
+    assert not [text for text, _ in lines(run(Adjuster(grid_hz=2.0), flight[1])) if "in flight" in text]
+
+
+def test_a_strip_joined_in_its_middle_says_so_and_begins_there(flight):
+    start = next(x.body.first_line_time_ns for x in flight[1] if x.topic == "configuration/strip")
+    joined = start + 15 * convert.SECOND_NS
+    known = ("configuration/", "observation/control")
+    late = [x for x in flight[1] if x.topic.startswith(known) or x.stamp_ns >= joined]
+    node = Adjuster(grid_hz=2.0)
+    outputs = run(node, late)
+    said = [text for text, _ in lines(outputs) if "joined" in text]
+    assert len(said) == 1 and said[0].startswith("strip S1 is joined 1") and "neither final nor whole" in said[0]
+    model = node._window.strips["S1"].model
+    assert model.extent.start_s * 1e9 + node._reference_ns == pytest.approx(joined - 10e9, abs=6e9)
+    assert min(seconds(p) for p in bodies(outputs, "orientation/final")) > (joined - EPOCH) * 1e-9 - 6.0
+    assert not [text for text, _ in lines(run(Adjuster(grid_hz=2.0), flight[1])) if "joined" in text]

@@ -269,3 +269,9 @@ def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
     name = str(simulation.points.id[thinned.images.looks.point[wrong]])
     assert any("do not agree with earlier strips" in e and name in e for e in spoilt.events)
     assert far_apart(spoilt.final, result.final)[0] < 1.0
+
+
+def test_a_point_of_several_strips_is_checked_by_all_its_rays(online):
+    points = [p for p in online.whole_points.values() if p.rays > 2 and len(p.residuals) < 2 * p.rays]
+    assert max(p.rays for p in points) > 3
+    assert {p.checked for p in points} == {"all"}

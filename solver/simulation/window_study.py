@@ -271,7 +271,7 @@ def _collect(update: WindowUpdate, result: OnlineResult, now: float) -> None:
     result.final += update.final
     result.final_known_s += [now] * len(update.final)
     result.refused += update.refused
-    result.events += update.events
+    result.events += update.warnings + update.events
     if update.whole is not None:
         again = {(o.strip, float(o.time_s[0])) for o in update.whole.orientation}
         result.whole = [o for o in result.whole if (o.strip, float(o.time_s[0])) not in again]

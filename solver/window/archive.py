@@ -23,6 +23,7 @@ from .backward import LeftPoints, again
 from .batch import Batch, inverse_factors
 from .block_normals import LOOKED_UP, ROWS, BlockNormals
 from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
+from .output import checks
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 
@@ -187,8 +188,8 @@ class Archive:
         if old is not None:
             seen |= old.strips
             before = old.left.points[list(old.left.order).index(old.place)]
-            merged = replace(published, rays=published.rays + before.rays,
-                             residuals=before.residuals + published.residuals)  # fmt: skip
+            rays, looks = published.rays + before.rays, before.residuals + published.residuals
+            merged = replace(published, rays=rays, residuals=looks, checked=checks(rays, len(looks), control))
             left = replace(left, points=(merged,))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(name, KeptPoint(left, 0, seen, time_s, control or (old is not None and old.with_control)))
@@ -212,6 +213,25 @@ class Archive:
         self.add(kept.left.columns, matrix, rhs)
         self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, True)
         return True
+
+    def weigh_control(self, name: str, axis: int, change: float, value: float) -> None:
+        """Change the weight of a known coordinate of a point that is final."""
+        kept = self.points.get(name)
+        if kept is None or not self.holds(kept.left.columns):
+            return
+        L, D, y = kept.root  # (3, 3), (3, u), (3,)
+        origin = kept.left.origin_l[kept.place]
+        normal, into, moment = L.T @ L, L.T @ D, L.T @ y
+        normal[axis, axis] = max(normal[axis, axis] + change, 0.0)
+        normal += 1e-12 * np.trace(normal) * np.eye(3)  # one ray alone does not place it
+        moment[axis] += change * (value - origin[axis])
+        L_inv = np.linalg.inv(np.linalg.cholesky(normal))
+        D_new, y_new = L_inv @ into, L_inv @ moment
+        normals = PointNormals(L_inv[np.tril_indices(3)][:, None], y_new[:, None], np.array([3]))
+        point = kept.left.points[list(kept.left.order).index(kept.place)]
+        left = LeftPoints(kept.left.columns, origin[None], normals, D_new[None], np.zeros(1, dtype=np.int64), (point,))
+        self.add(kept.left.columns, D.T @ D - D_new.T @ D_new, D.T @ y - D_new.T @ y_new)
+        self.points[name] = replace(kept, left=left, place=0)
 
     # -- solution ------------------------------------------------------------------------------------------------------
 

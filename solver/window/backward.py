@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ..adjustment.normal_equations import PointNormals
+from ..adjustment.reliability import CRITICAL_W
 from ..models.base import Design
 from ..rotation import corrected_angles
 from .batch import Batch, inverse_factors
@@ -23,6 +24,9 @@ from .state import Marginal, WindowState
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
+
+#: A variance that is so many times larger is larger.
+CLEARLY = 1.01
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,11 @@ def again(
     angles = corrected_angles(old.angles, change[:, 3:])
     angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
     covariance = A @ Q[np.ix_(place, place)] @ np.swapaxes(A, 1, 2) + noise
+    protection = old.protection
+    if protection is not None:  # where control was taken out since, less is known than then
+        now, then = np.einsum("nii->ni", covariance), np.einsum("nii->ni", old.covariance)
+        protection = np.where(now > CLEARLY * then, np.hypot(protection, CRITICAL_W * np.sqrt(now)), protection)
     return replace(
         old, position_l=old.position_l + change[:, :3], angles=angles, covariance=covariance,
-        correction=old.correction + change,
+        correction=old.correction + change, protection=protection,
     )  # fmt: skip

@@ -194,10 +194,13 @@ class Batch:
         """How far a point has moved at most since the linearisation, m."""
         return float(np.abs(self.points_l - self.origin_l).max(initial=0.0))
 
-    def leave_out_control(self, fails: NDArray[np.bool_]) -> None:
-        """Take the weight from control coordinates (p, 3)."""
-        weight = np.where(fails, 0.0, self.control.weight)
-        self.control = ControlWeights(weight, self.control.xyz_l, int((weight > 0).sum()))
+    def weigh_control(self, point: int, axis: int, weight: float) -> None:
+        """Give a control coordinate another weight; `eliminate` makes it count."""
+        weights = self.control.weight.copy()
+        weights[point, axis] = weight
+        if self.ties is not None:
+            self.ties.control[point, axis] = weight
+        self.control = ControlWeights(weights, self.control.xyz_l, int((weights > 0).sum()))
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""

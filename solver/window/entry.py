@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ..adjustment.reliability import UNCONTROLLED
 from .batch import Batch
 from .state import WindowState
 
@@ -30,11 +31,13 @@ DECISIVE = 10.8
 LEFT_OUT = 1e10
 
 
-def entry_weight(batch: Batch, state: WindowState, suspected: float = SUSPECTED) -> Array:
-    """Weights (n,) with which the rays of a batch should enter: 1, or 0 for those that contradict the others.
+def entry_weight(batch: Batch, state: WindowState, suspected: float = SUSPECTED) -> tuple[Array, Array]:
+    """Weights (n,) with which the rays of a batch should enter: 1, or 0 for those that contradict the others; and their
+    w (n,), the larger residual against what the others predict over its sigma.
 
     Where looks of a point contradict each other and it cannot be told which is bad, all go; but not those of known
-    coordinates, where the fault may lie with the coordinates: these are left to data snooping.
+    coordinates, where the fault may lie with the coordinates: these are left to data snooping. So are those of three
+    and more looks that agree with each other.
 
     Parameters
     ----------
@@ -47,10 +50,18 @@ def entry_weight(batch: Batch, state: WindowState, suspected: float = SUSPECTED)
     known = batch.control.weight > 0
     open_ = np.ones(batch.n_points, dtype=bool)
     limits = _limits(2 * active.shape[1] + 3, suspected)
+    w = np.zeros(active.shape)
+    unknown = np.zeros_like(batch.control.weight)
     for _ in range(active.shape[1]):
-        square, loss = equations.test(active)
+        square, loss, now_w = equations.test(active, batch.control.weight)
+        w = np.where(active, now_w, w)
         redundancy = 2 * active.sum(axis=1) + known.sum(axis=1) - 3
         fails = open_ & (square > limits[np.maximum(redundancy, 0)])
+        among = fails & known.any(axis=1) & (active.sum(axis=1) >= 3)
+        if among.any():
+            alike = equations.test(active, unknown)[0] <= limits[np.maximum(2 * active.sum(axis=1) - 3, 0)]
+            open_ &= ~(among & alike)
+            fails &= open_
         if not fails.any():
             break
         ordered = np.sort(loss, axis=1)
@@ -63,7 +74,8 @@ def entry_weight(batch: Batch, state: WindowState, suspected: float = SUSPECTED)
     before = known.all(axis=1) if batch.ties is None else known.all(axis=1) | batch.ties.active
     alone = (active.sum(axis=1) < 2) & ((equations.present.sum(axis=1) > 1) | ~before)
     active[alone] = False
-    return np.where(active[batch.rays.point, equations.slot], 1.0, 0.0)
+    place = batch.rays.point, equations.slot
+    return np.where(active[place], 1.0, 0.0), w[place]
 
 
 @cache
@@ -82,7 +94,7 @@ class _Equations:
     residual : (p, 2k) at the state's orientation and the batch's points
     point : (p, 2k, 3) derivative to the object point
     covariance : (p, 2k, 2k) of noise and orientation together
-    control, off : (p, 3) weight of known coordinates, and how far the points are from them
+    off : (p, 3) how far the points are from known coordinates
     """
 
     slot: NDArray[np.int64]
@@ -90,7 +102,6 @@ class _Equations:
     residual: Array
     point: Array
     covariance: Array
-    control: Array
     off: Array
 
     @classmethod
@@ -111,25 +122,28 @@ class _Equations:
         covariance = through @ np.swapaxes(A, 1, 2) + np.eye(2 * k)
         off = np.where(batch.control.weight > 0, batch.control.xyz_l - batch.origin_l, 0.0)
         residual, point = e.reshape(p, 2 * k), J.reshape(p, 2 * k, 3)
-        return cls(slot, present, residual, point, covariance, batch.control.weight, off)
+        return cls(slot, present, residual, point, covariance, off)
 
-    def test(self, active: Bools) -> tuple[Array, Array]:
-        """Weighted square sum (p,) of active rays about their best points; what it loses without each ray (p, k)."""
+    def test(self, active: Bools, control: Array) -> tuple[Array, Array, Array]:
+        """Weighted square sum (p,) of active rays about their best points, with weights (p, 3) of known coordinates;
+        what it loses without each ray (p, k); the larger |w| of each ray (p, k)."""
         p, k = active.shape
         out = np.where(np.repeat(active, 2, axis=1), 0.0, LEFT_OUT)
         W = np.linalg.inv(self.covariance + out[:, :, None] * np.eye(2 * k))
         WJ = W @ self.point
-        N = np.swapaxes(self.point, 1, 2) @ WJ + self.control[:, :, None] * np.eye(3)
+        N = np.swapaxes(self.point, 1, 2) @ WJ + control[:, :, None] * np.eye(3)
         N += 1e-9 * np.einsum("pii->p", N)[:, None, None] * np.eye(3)
-        rhs = np.einsum("pik,pi->pk", WJ, self.residual) + self.control * self.off
+        rhs = np.einsum("pik,pi->pk", WJ, self.residual) + control * self.off
         shift = np.linalg.solve(N, rhs[:, :, None])[:, :, 0]
         rest = self.residual - np.einsum("pik,pk->pi", self.point, shift)
         h = np.einsum("pij,pj->pi", W, rest)
-        square = np.einsum("pi,pi->p", rest, h) + (self.control * (self.off - shift) ** 2).sum(axis=1)
+        square = np.einsum("pi,pi->p", rest, h) + (control * (self.off - shift) ** 2).sum(axis=1)
         S = W - WJ @ np.linalg.solve(N, np.swapaxes(WJ, 1, 2))
         each = np.arange(k)
         own = S.reshape(p, k, 2, k, 2)[:, each, :, each].transpose(1, 0, 2, 3)
         own = np.where(active[:, :, None, None], own, np.eye(2))
         h = np.where(active[:, :, None], h.reshape(p, k, 2), 0.0)
         loss = np.einsum("pka,pkab,pkb->pk", h, np.linalg.pinv(own, rcond=1e-6, hermitian=True), h)
-        return square, loss
+        checked = np.maximum(np.einsum("pkaa->pka", own), 0.0)
+        w = np.where(checked > UNCONTROLLED, np.abs(h) / np.sqrt(np.maximum(checked, UNCONTROLLED)), 0.0)
+        return square, loss, w.max(axis=2)

@@ -40,10 +40,13 @@ class Intake:
         self._is_done: set[tuple[str, str]] = set()
         self._refused: list[Refusal] = []
         self._missing_s = -np.inf  # when poses were missing last
+        self._out_before: dict[str, set[int]] = {}
 
     def add_control(self, name: str, point: ControlPoint) -> None:
         self.control[name] = point
+        self._out_before.pop(name, None)
         if name in self.points:
+            self.points[name].out.clear()  # it is judged anew
             self._arrived[name] = None
 
     def add_look(self, name: str, look: Look) -> str:
@@ -53,7 +56,9 @@ class Intake:
         if reason:
             self._refused.append(Refusal(name, look, reason))
             return reason
-        point = self.points.setdefault(name, PointLooks())
+        point = self.points.get(name)
+        if point is None:  # what was refused of it in an earlier strip is in doubt
+            point = self.points[name] = PointLooks(out=set(self._out_before.get(name, ())))
         point.looks.append(look)
         point.time_s.append(time_s)
         point.weight.append(1.0)
@@ -137,6 +142,8 @@ class Intake:
         """The points of a batch are final."""
         for name in batch.names:
             strips = {look.strip for look in self.points[name].looks}
+            if name in self.control:
+                self._out_before[name] = self.points[name].out
             del self.points[name]
             self._arrived.pop(name, None)
             for strip in strips:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from ..models.base import Design
 from .backward import LeftPoints, Step
 from .batches import Batches
 from .block import Block
+from .control import ControlDesk
 from .intake import Intake
 from .integrity import Exposure
 from .output import Orienter, adjusted_points
@@ -46,6 +48,7 @@ class Leaver:
 
     Parameters
     ----------
+    control : weighs control
     apart : told the points that do not agree with earlier strips, and the result
     """
 
@@ -60,11 +63,12 @@ class Leaver:
         block: Block,
         watch: Watch,
         orienter: Orienter,
+        control: ControlDesk,
         apart: Callable[[list[str], WindowUpdate], None],
     ) -> None:
         self.options, self._state, self._strips, self._batches = options, state, strips, batches
         self._intake, self._trajectory, self._block = intake, trajectory, block
-        self._watch, self._orienter, self._apart = watch, orienter, apart
+        self._watch, self._orienter, self._control, self._apart = watch, orienter, control, apart
         self._steps: list[Step] = []
         self._left: list[LeftPoints] = []
         self._let_go_s = -np.inf
@@ -84,7 +88,8 @@ class Leaver:
         old = [b for b in self._batches if b.oldest_s <= latest]
         leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
         if self.options.snoop and leaving:
-            refused, rounds = snoop(leaving, self._state, self._intake.points, self.options.critical, serial)
+            control = partial(self._control.look, now_s)
+            refused, rounds = snoop(leaving, self._state, self._intake.points, self.options.critical, serial, control)
             result.refused += refused
             failed = snoop_ties([b for b in leaving if b.ties is not None], self._state)
             self._apart(failed, result)

@@ -85,7 +85,8 @@ def adjusted_points(
     w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
     first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
-    known: list[bool] = np.all(batch.control.weight > 0, axis=1).tolist()
+    held = np.all(batch.control.weight > 0, axis=1)
+    known: list[bool] = (held if batch.ties is None else held | batch.ties.active).tolist()
     out = []
     for i, name in enumerate(batch.names):
         if batch.normals.rank[i] < 3:
@@ -96,12 +97,12 @@ def adjusted_points(
         residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
         role = control[name].role if name in control else "tie"
         rays = int(used[i])
-        checked = _checked(rays, len(residuals), known[i])
+        checked = checks(rays, len(residuals), known[i])
         out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals, checked))
     return out
 
 
-def _checked(rays: int, looks: int, known: bool) -> str:
+def checks(rays: int, looks: int, known: bool) -> str:
     """See `AdjustedPoint`."""
     if 2 * rays <= looks and looks > 2:
         return "doubtful"

@@ -187,7 +187,10 @@ class BatchMaker:
             seen = np.bincount(rays.point, weight > 0, len(names))
             known = {n: xyz for n, xyz, k in zip(names, ties.xyz_l, seen, strict=True) if k < 2} | known
         theta = self.state.values(columns)
-        points_l = self._place(names, rays, weight, layout.corrections(theta), layout.displacement(theta), known)
+        in_doubt = {n for n, p in zip(names, points, strict=True) if p.out}
+        points_l = self._place(
+            names, rays, weight, layout.corrections(theta), layout.displacement(theta), known, in_doubt
+        )
         placed = np.isfinite(points_l)
         lost = [name for i, name in enumerate(names) if not placed[i].all()]
         if lost:
@@ -221,8 +224,9 @@ class BatchMaker:
         correction: Array,
         displacement: Array | float,
         known: dict[str, Array],
+        in_doubt: set[str],
     ) -> Array:
-        """Where points are (p, 3): as known, at full control, or where their rays meet; NaN where neither holds."""
+        """Where points are (p, 3): as known, at full control not in doubt, or where their rays meet; else NaN."""
         angles = corrected_angles(rays.angles, correction[3:].T)
         image = np.column_stack([(rays.xy_mm.T - displacement).T, -rays.focal_length_mm])
         direction = np.einsum("nij,nj->ni", matrix_from_angles(*angles.T), image)
@@ -231,7 +235,7 @@ class BatchMaker:
         for i, name in enumerate(names):
             if name in known:
                 xyz[i] = known[name]
-            elif name in self.control and (self.control[name].weight > 0).all():
+            elif name in self.control and (self.control[name].weight > 0).all() and name not in in_doubt:
                 xyz[i] = self.control[name].xyz_l
         return xyz
 

@@ -81,16 +81,25 @@ class Look:
 
 #: Reason of a "refusal" that is the opposite: what was refused before is used again.
 TAKEN_BACK = "taken back"
+#: Reason why a known coordinate does not count.
+CONTRADICTS = "contradicts"
+#: In place of a look where it is a known coordinate that is refused.
+NO_LOOK = Look("", "", 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """A measurement that was not used, and why (or that is `TAKEN_BACK`); ``w`` is 0 where no test decided."""
+    """A measurement that was not used, and why (or that is `TAKEN_BACK`); ``w`` is 0 where no test decided.
+
+    Where it is a known coordinate there is no look: ``coordinate`` is X, Y or Z, and ``off_m`` by how much it is off.
+    """
 
     point: str
     look: Look
     reason: str
     w: float = 0.0
+    coordinate: str = ""
+    off_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -214,11 +223,12 @@ class WholeStrips:
 
 @dataclass
 class WindowUpdate:
-    """What one update gave; ``whole`` when strips have ended."""
+    """What one update gave; ``whole`` when strips have ended; ``events`` and ``warnings`` are for the operator."""
 
     report: WindowReport | None = None
     final: list[RefinedOrientation] = field(default_factory=list)
     points: list[AdjustedPoint] = field(default_factory=list)
     refused: list[Refusal] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     whole: WholeStrips | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -27,18 +28,25 @@ SHARP = 30.0
 
 
 def snoop(
-    batches: list[Batch], state: WindowState, points: dict[str, PointLooks], critical: float, serial: int
+    batches: list[Batch],
+    state: WindowState,
+    points: dict[str, PointLooks],
+    critical: float,
+    serial: int,
+    control: Callable[[list[Refusal]], bool],
 ) -> tuple[list[Refusal], int]:
     """Leave out looks and control coordinates that fail; take back looks that agree with the rest after all.
 
     A look goes if one of its two w exceeds the critical value and the joint test fails too; of several at one point the
     one with the largest joint value. Looks left out come back once, when their prediction passes both tests; points of
-    which nothing was left are judged again as at the door when their batch is tested again.
+    which nothing was left are judged again as at the door when their batch is tested again. Where a control coordinate
+    fails more than any look, all control is weighed first.
 
     Parameters
     ----------
     batches : to be tested; those that change go through further rounds
     serial : number of the update, noted in the batches
+    control : weighs all control, notes what it refuses, and says whether the state has changed
 
     Returns
     -------
@@ -55,32 +63,31 @@ def snoop(
     if rounds:
         state.solve()
     pending = batches
+    weighed = False
     for _ in range(MOST_ROUNDS):
         state.expect(sum(len(batch.columns) for batch in pending))
         judged = [(batch, *_judge(batch, state)) for batch in pending]
         worst = max((float(w[batch.weight > 0].max(initial=0.0)) for batch, w, *_ in judged), default=0.0)
-        worst = max([worst, *(float(c.max(initial=0.0)) for *_, c in judged)])
+        worst_control = max((float(c.max(initial=0.0)) for *_, c in judged), default=0.0)
+        if worst_control > max(critical, worst) and not weighed:
+            weighed = not control(refused)
+            if not weighed:
+                rounds += 1
+                continue
         least = max(critical, TOGETHER * worst)
         changed, next_time = False, []
-        for batch, w, joint, spread, control_w in judged:
+        for batch, w, joint, spread, _ in judged:
             out = np.flatnonzero((batch.weight > 0) & (joint > limit) & (w > least))
             out = _worst_of_point(batch.rays.point[out], joint[out], out)
             out = _with_rivals(batch, out, joint)
-            fails = control_w > least
-            back = (
-                np.empty(0, dtype=np.int64)
-                if len(out) or fails.any()
-                else _agreeing(batch, points, w, joint, spread, critical, limit)
-            )
-            if (w[(batch.weight > 0) & (joint > limit)] > critical).any() or (control_w > critical).any() or len(back):
+            back = out[:0] if len(out) else _agreeing(batch, points, w, joint, spread, critical, limit)
+            if (w[(batch.weight > 0) & (joint > limit)] > critical).any() or len(back):
                 next_time.append(batch)
-            if not (len(out) or len(back) or fails.any()):
+            if not (len(out) or len(back)):
                 continue
             state.add(batch.columns, batch.information, -1)
             batch.weight[out], batch.weight[back] = 0.0, 1.0
             refused += _note(batch, points, out, back, w)
-            if fails.any():
-                _leave_out_control(batch, points, fails & (control_w == control_w.max()))
             batch.eliminate()
             state.add(batch.columns, batch.information)
             changed = True
@@ -97,12 +104,12 @@ _joint_limit = cache(joint_limit)
 
 def admit(batch: Batch, state: WindowState, points: dict[str, PointLooks]) -> list[Refusal]:
     """Set the weights with which the rays of a batch enter that is not in the state; returns the looks left out."""
-    weight = entry_weight(batch, state)
+    weight, w = entry_weight(batch, state)
     out, back = np.flatnonzero((batch.weight > 0) & (weight == 0)), np.flatnonzero((batch.weight == 0) & (weight > 0))
     if not len(out) and not len(back):
         return []
     batch.weight = weight
-    refused = _note(batch, points, out, back, np.zeros(len(weight)))
+    refused = _note(batch, points, out, back, w)
     batch.eliminate()
     return refused
 
@@ -114,20 +121,21 @@ def reweigh(
 
     Looks may be taken back once more, as they were judged by the fault of others.
     """
-    changes = []
+    changed = []
     for batch, weight in zip(batches, weights, strict=True):
         out = np.flatnonzero((batch.weight > 0) & (weight == 0))
         back = np.flatnonzero((batch.weight == 0) & (weight > 0))
+        changed.append((batch, out, back))
         state.add(batch.columns, batch.information, -1)
         batch.weight = weight
-        changes += _note(batch, points, out, back, np.zeros(len(weight)))
-        for name in batch.names:
-            points[name].returned.clear()
         batch.eliminate()
         state.add(batch.columns, batch.information)
     state.solve()
-    for batch in batches:
-        batch.back_substitute(state.values(batch.columns))
+    changes = []
+    for batch, out, back in changed:
+        changes += _note(batch, points, out, back, batch.judge(state)[1].largest_w)
+        for name in batch.names:  # what was taken back may be taken back once more
+            points[name].returned.clear()
     return changes
 
 
@@ -136,13 +144,14 @@ def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks], 
     lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0
     if not lost.any():
         return False
-    weight = np.where(lost[batch.rays.point], entry_weight(batch, state, RETURNING), batch.weight)
+    again, w = entry_weight(batch, state, RETURNING)
+    weight = np.where(lost[batch.rays.point], again, batch.weight)
     back = np.flatnonzero((weight > 0) & (batch.weight == 0))
     if not len(back):
         return False
     state.add(batch.columns, batch.information, -1)
     batch.weight = weight
-    changes += _note(batch, points, back[:0], back, np.zeros(len(weight)))
+    changes += _note(batch, points, back[:0], back, w)
     batch.eliminate()
     state.add(batch.columns, batch.information)
     return True
@@ -227,9 +236,3 @@ def _note(batch: Batch, points: dict[str, PointLooks], out: IntArray, back: IntA
             points[name].reported.discard(source)
             refused.append(Refusal(name, points[name].looks[source], TAKEN_BACK, float(w[ray])))
     return refused
-
-
-def _leave_out_control(batch: Batch, points: dict[str, PointLooks], fails: NDArray[np.bool_]) -> None:
-    for p, axis in zip(*np.nonzero(fails), strict=True):
-        points[batch.names[p]].out.add(int(axis))
-    batch.leave_out_control(fails)

@@ -79,7 +79,7 @@ class WindowStrip:
     slow : its slow errors, as known beforehand
     followed : (6,) spectral density of the wander that its model follows, see `SlowErrors`
     ended : whether the last line has been taken
-    final_to_s : orientation up to here is final
+    final_to_s : orientation up to here is final, or not refined at all where the flight was joined later
     """
 
     def __init__(
@@ -91,6 +91,7 @@ class WindowStrip:
         slow: SlowErrors,
         options: WindowOptions,
         state: WindowState,
+        joined_s: float = -np.inf,
     ):
         self.id = id
         self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
@@ -99,10 +100,11 @@ class WindowStrip:
         self.followed = slow.wander_density if options.model != "dgr" else np.zeros(6)
         self.ended = False
         self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
-        self.final_to_s = first_line_time_s
         length = lines / line_rate_hz if lines else UNKNOWN_LENGTH_S
+        start_s = max(first_line_time_s, min(joined_s, first_line_time_s + length - 1.0))
+        self.final_to_s = start_s
         self.model: CorrectionModel = model_options(slow, options, length).build(
-            Extent(f"strip {id}", first_line_time_s, first_line_time_s + length)
+            Extent(f"strip {id}", start_s, first_line_time_s + length)
         )
         self.numbers = state.new_numbers(self.model.n_unknowns)
         self._prior = self.model.pseudo_observations()

@@ -11,6 +11,7 @@ from ..adjustment.determinability import Limits
 from ..camera import LineCamera
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, Information
+from .control import ControlDesk
 from .determinability import Determinability, Standing, ranks
 from .ground import GroundBelow
 from .integrity import Exposure, Integrity
@@ -92,6 +93,7 @@ class Watch:
     ----------
     determine : whether it is tested which additional parameters are determined
     alert_limit_m : of the light; 0 = see `ground`
+    control : judges control, and is told what leaves
 
     Attributes
     ----------
@@ -109,10 +111,12 @@ class Watch:
         camera_columns: IntArray,
         state: WindowState,
         determine: bool,
+        control: ControlDesk,
         alert_limit_m: float = 0.0,
     ) -> None:
         self._integrity = Integrity(critical)
         self._sources = SourceMonitor()
+        self._control = control
         self._points, self._state = points, state
         self._ccds = [line.id for line in camera.lines]
         self._pitch = float(np.median(np.linalg.norm(np.diff(camera.lines[0].xy_mm[:2], axis=0), axis=1)))
@@ -147,11 +151,13 @@ class Watch:
         self._integrity.note(batches)
         self._integrity.leave(batches, self._state, before_s)
         self._sources.leave(batches, self._state, self._groups)
+        self._control.leaving(batches)
 
     def marginalised(self, marginal: Marginal) -> None:
         """Unknowns have left the window."""
         self._integrity.marginalised(marginal)
         self._sources.marginalised(marginal)
+        self._control.marginalised(marginal)
 
     def became_final(self, strip: WindowStrip, orientation: RefinedOrientation) -> Exposure | None:
         """Orientation has become final; returns how exposed the middle of its times is."""
@@ -233,13 +239,14 @@ class Watch:
         known = [c for c in self._counts.values() if c.has_control]
         control = sum((c.control for c in known), np.zeros(3))
         control_refused = sum(c.control_refused for c in known)
-        since_s = now_s - strip.first_line_time_s if strip is not None else 0.0
+        since_s = now_s - strip.model.extent.start_s if strip is not None else 0.0
         colour, reason = self._lamp.look(
             now_s,
             Situation(
                 strip is not None, length_s, since_s, sigma0, redundancy, points, refused, control_refused, control,
                 apriori_m, self.exposure, self._sources.biased, strip=self.strip, tied=tied,
                 ground_m=ground_m, ground_sigma_m=ground_sigma_m, limit_m=self.alert_limit_m,
+                control_doubt=self._control.doubt, control_failed=self._control.failed,
             ),
         )  # fmt: skip
         standing = tuple(d.standing()) if d is not None else ()

@@ -13,6 +13,7 @@ know of it (`ties`), and after each strip by a solution of the block as a whole 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,7 @@ from .arriving import Arrivals, look_time
 from .batch import Batch
 from .batches import Batches
 from .block import Block
+from .control import ControlDesk
 from .determinability import Standing
 from .duties import LOOK_AFTER, RETEST, WATCH, Duties
 from .following import Follower
@@ -105,9 +107,12 @@ class Window:
         self._duties = Duties()
         self._length_s = options.window_s
         self._orienter = Orienter(self.state, self.trajectory, self._pose_noise)
+        self._control_desk = ControlDesk(
+            self.state, self.strips, self._batches, self._intake, self._block, options.critical
+        )
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
-            options.determine, options.alert_limit_m,
+            options.determine, self._control_desk, options.alert_limit_m,
         )  # fmt: skip
         step_s = segment_length(slow, options)
         self._arrivals = Arrivals(
@@ -118,7 +123,7 @@ class Window:
         )
         self._leaver = Leaver(
             options, self.state, self.strips, self._batches, self._intake, self.trajectory, self._block, self._watch,
-            self._orienter, self._arrivals.apart,
+            self._orienter, self._control_desk, self._arrivals.apart,
         )  # fmt: skip
 
     # -- input ---------------------------------------------------------------------------------------------------------
@@ -129,9 +134,17 @@ class Window:
         return self._length_s
 
     def begin_strip(
-        self, id: str, first_line_time_s: float, line_rate_hz: float, lines: int = 0, slow: SlowErrors | None = None
+        self,
+        id: str,
+        first_line_time_s: float,
+        line_rate_hz: float,
+        lines: int = 0,
+        slow: SlowErrors | None = None,
+        joined_s: float = -np.inf,
     ) -> None:
         """A strip begins; ``slow`` are its slow errors if they are not those of the window.
+
+        What was flown of it before ``joined_s`` is not adjusted: there is no orientation for it.
 
         Raises
         ------
@@ -142,7 +155,7 @@ class Window:
         if id in self.strips:
             return
         self.strips[id] = WindowStrip(
-            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state
+            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s
         )
         self._block.begin(self.strips[id])
 
@@ -232,10 +245,11 @@ class Window:
             iterations += 1
         if self.options.snoop:
             due = joined or (self._due_for_test() if retest else [])
-            refused, rounds = snoop(fresh + due, self.state, self._points, self.options.critical, self._serial)
-            iterations += rounds
-            result.refused += refused
+            iterations += self._snoop(fresh + due, result)
             iterations += self._settle(fresh, result)
+            if self._control_desk.is_due(self._now_s, fresh) and self._control_desk.look(self._now_s, result.refused):
+                iterations += 1
+            result.warnings += self._control_desk.take_warnings()
         for batch in joined:
             batch.judge(self.state)
         self._orienter.forget()
@@ -267,9 +281,14 @@ class Window:
         result.refused += reweigh(due, weights, self.state, self._points)
         self._follower.follow(due)
         self.state.solve()
-        refused, rounds = snoop(due, self.state, self._points, self.options.critical, self._serial)
+        return self._snoop(due, result) + 2
+
+    def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
+        """Test batches; number of solutions computed."""
+        control = partial(self._control_desk.look, self._now_s)
+        refused, rounds = snoop(batches, self.state, self._points, self.options.critical, self._serial, control)
         result.refused += refused
-        return rounds + 2
+        return rounds
 
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""
