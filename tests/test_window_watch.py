@@ -18,7 +18,7 @@ from triline.solver.window.integrity import Exposure, _inverse, _largest_ratio
 from triline.solver.window.light import FAILED, GOOD, WEAK, Situation, light
 from triline.solver.window.results import TAKEN_BACK, Look, WindowOptions
 from triline.solver.window.settle import _consensus, _subsets
-from triline.solver.window.sources import BiasedSource
+from triline.solver.window.suspects import BiasedSource
 from triline.solver.window.window import Window
 
 PLAN = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)

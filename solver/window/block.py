@@ -9,7 +9,7 @@ are looked up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..models.base import Design
 from .archive import MOST_OF_STRIP, MOST_POINTS, MOST_UNKNOWNS, Archive
 from .backward import Step, backward
 from .batch import Batch
-from .block_solution import Parts
+from .block_solution import BlockSolution, Parts
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 from .state import WindowState
@@ -44,6 +44,7 @@ class Block:
     ----------
     earlier : what the strip that is flown knows of those before it
     events : lines for the operator since they were taken last
+    compensate : takes from a solution what tie points that drift did to it
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Block:
     ):
         self.earlier = EarlierStrips(state, camera_columns)
         self.events: list[str] = []
+        self.compensate: Callable[[BlockSolution], None] = lambda _: None
         self._archive = Archive(camera_columns, camera_sigma)
         self._state, self._strips = state, strips
         self._touched: set[str] = set()
@@ -180,6 +182,7 @@ class Block:
     def _refining(self, wanted: Sequence[str], at_the_end: bool) -> Parts:
         """Solve the block, refine strips, close the oldest if there are too many, tell the next one; in parts."""
         solution = yield from self._archive.solving()
+        self.compensate(solution)
         closing = self._archive.beyond()
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))

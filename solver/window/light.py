@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .ground import WHERE
 from .integrity import Exposure
-from .sources import BiasedSource
+from .suspects import BiasedSource
 
 Array = NDArray[np.floating]
 

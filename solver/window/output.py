@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from ..models.base import COMPONENTS
 from ..rotation import corrected_angles
 from ..selfcalibration import SelfCalibration
 from .batch import Batch
+from .compensation import Compensation
 from .determinability import ESTIMATED, NOT_YET, Standing
 from .points import ControlPoint, PointLooks
 from .pose_noise import PoseNoise
@@ -30,10 +31,23 @@ BETTER = 0.7
 
 
 class Orienter:
-    """Refined orientation at any time; keeps the cofactors of the unknowns asked for last."""
+    """Refined orientation at any time; keeps the cofactors of the unknowns asked for last.
 
-    def __init__(self, state: WindowState, trajectory: MeasuredTrajectory, pose_noise: PoseNoise):
+    Parameters
+    ----------
+    compensation : what tie points that drift do to the solution
+    """
+
+    def __init__(
+        self,
+        state: WindowState,
+        trajectory: MeasuredTrajectory,
+        pose_noise: PoseNoise,
+        compensation: Callable[[], Compensation | None],
+    ):
         self._state, self._trajectory, self._pose_noise = state, trajectory, pose_noise
+        self._compensation = compensation
+        self._drift: Compensation | None = None
         self._columns: IntArray = np.empty(0, dtype=np.int64)
         self._cofactors: Array | None = None
 
@@ -64,6 +78,8 @@ class Orienter:
         columns = np.unique(design.columns)
         columns = columns[columns >= 0].astype(np.int64)
         if self._cofactors is None or not np.array_equal(columns, self._columns):
+            if self._cofactors is None:
+                self._drift = self._compensation()
             self._cofactors, self._columns = self._state.covariance(columns), columns
         local = np.where(design.columns >= 0, np.searchsorted(columns, design.columns), len(columns))
         A = np.zeros((len(times), 6, len(columns) + 1))
@@ -73,7 +89,11 @@ class Orienter:
         through = (A.reshape(-1, len(columns)) @ self._cofactors).reshape(A.shape)
         covariance = through @ np.swapaxes(A, 1, 2)
         covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
-        return A @ self._state.values(columns), covariance
+        correction = A @ self._state.values(columns)
+        if self._drift is not None:
+            change, of_drift = self._drift.change(A, self._state.places(columns))
+            correction, covariance = correction + change, covariance + of_drift
+        return correction, covariance
 
 
 def adjusted_points(

@@ -6,78 +6,41 @@ they are a border of the window's normal equations. With the effect ``B`` of ``b
 S that projects out the object points, the border has ``s = sum B^T S (v + A theta)``, ``M = sum B^T S A`` and
 ``sum B^T S B``; when unknowns leave the window they are eliminated from it as from the rest, so nothing is forgotten
 while a strip lasts. Its Schur complement ``V`` is the cofactor matrix of the scores at the solution, and
-``s^T V^-1 s`` is chi-square if there is no bias. The group that fails most clearly is named, its effect on the scores
-of the others taken off, and these are tested again. A bias that a slow error of the trajectory would explain as well
+``s^T V^-1 s`` is chi-square if there is no bias. A bias that a slow error of the trajectory would explain as well
 has no score: what remains unseen does no more harm than that error.
+
+The solution is one of just the batches that are in the border: with others in it, a drift that bends the orientation
+through them, too, would be looked for in part of its rays only, and be taken for another. Which group it is, or which
+ones cannot be told apart, see `suspects`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
 
+from ..adjustment.reduced_system import DenseFactor
+from .archive import MOST_OF_STRIP
 from .batch import Batch, Information, inverse_factors
-from .entry import DECISIVE
+from .compensation import Border, Compensation, estimated
 from .state import Marginal, WindowState
+from .suspects import ALL, EACH, FALSE_ALARM, USUAL_PX, BiasedSource, Group, Scores, Suspicion, hypotheses
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
-Group = tuple[str, str]
-
-#: Probability that a good group is named in one test. Tests follow each other with most of their data in common, so
-#: this is a false alarm in some hundred hours.
-FALSE_ALARM = 1e-6
-#: A bias below this, px, is none that matters; one known no better than this, px, tells nothing.
-MATTERS_PX, TELLING_PX = 0.08, 0.3
-#: Rays of a group needed for a test.
-ENOUGH = 12
 #: Age at which a batch is taken in, s: data snooping has had its say about it.
 SETTLED_S = 3.0
-#: Batches taken in at one update.
-AT_ONCE = 2
+#: Rays of batches taken in at one update, about.
+AT_ONCE = 240
 #: Time between tests, s; unit of the drift, s.
 EVERY_S, DRIFT_S = 1.0, 10.0
-#: Groups at most; unknowns of each.
-MOST_GROUPS, EACH = 16, 4
-
-
-@dataclass(frozen=True)
-class BiasedSource:
-    """A group whose measurements are biased.
-
-    Attributes
-    ----------
-    source, ccd : publisher (may be empty) and CCD line
-    line_px, sample_px : bias now
-    line_px_s, sample_px_s : its drift
-    test, limit : chi-square, and what it should stay below
-    since_s : time of the first alarm
-    rivals : CCD lines (and sources) whose bias would explain the same about as well: on one of them it is
-    """
-
-    source: str
-    ccd: str
-    line_px: float
-    sample_px: float
-    line_px_s: float
-    sample_px_s: float
-    test: float
-    limit: float
-    since_s: float
-    rivals: tuple[Group, ...] = ()
-
-    def __str__(self) -> str:
-        of = f" of source {self.source}" if self.source else ""
-        bias = f"line {self.line_px:+.2f} px, sample {self.sample_px:+.2f} px"
-        rivals = [
-            ccd if source == self.source else f"{ccd} of {source or 'another source'}" for source, ccd in self.rivals
-        ]
-        return f"tie points{of} on CCD {self.ccd} drift: {bias}" + (f" (or {' or '.join(rivals)})" if rivals else "")
+#: Groups at most; strips whose drifts are remembered.
+MOST_GROUPS, MOST_BORDERS = 16, 40
 
 
 @dataclass(frozen=True)
@@ -86,15 +49,18 @@ class _Cell:
 
     Attributes
     ----------
-    information : what the batch was when this was computed
+    information, weight : what the batch was when this was computed
     places : (k,) in the border
     groups, rays : which groups have how many rays
+    shared : share of the variance of a ray that is noise of its position, summed over the rays
     """
 
     information: Information
+    weight: Array
     places: IntArray
     groups: IntArray
     rays: IntArray
+    shared: float
     score: Array
     normal: Array
     numbers: IntArray
@@ -102,24 +68,34 @@ class _Cell:
 
 
 class SourceMonitor:
-    """Watches the groups of the strip that is flown."""
+    """Watches the groups of the strip that is flown.
 
-    def __init__(self, alpha: float = FALSE_ALARM) -> None:
-        self._alpha = alpha
+    Parameters
+    ----------
+    noise_time_s : says for how long the noise of measured positions is correlated
+    alpha : probability that a good group fails in one test
+    """
+
+    def __init__(self, noise_time_s: Callable[[], float], alpha: float = FALSE_ALARM) -> None:
+        self._noise_time_s, self._alpha = noise_time_s, alpha
         self._strip = -1
         self._next_s = -np.inf
+        self._borders: deque[Border] = deque(maxlen=MOST_BORDERS)
         self._restart(0.0)
 
     def _restart(self, now_s: float) -> None:
         n = MOST_GROUPS * EACH
-        self._start_s = now_s
+        self._start_s = self._tested_s = now_s
         self._groups: dict[Group, int] = {}
         self._cells: dict[int, tuple[Batch, _Cell]] = {}
         self._score, self._normal = np.zeros(n), np.zeros((n, n))
         self._numbers: IntArray = np.empty(0, dtype=np.int64)
         self._coupling = np.zeros((n, 0))
         self._rays = np.zeros(MOST_GROUPS, dtype=np.int64)
-        self._since: dict[int, float] = {}
+        self._shared = 0.0
+        self._suspicion = Suspicion(self._alpha)
+        self._whole = _WholeStrip()
+        self._drift: tuple[IntArray, Array, Array] | None = None
         self.biased: tuple[BiasedSource, ...] = ()
 
     def update(
@@ -136,16 +112,31 @@ class SourceMonitor:
         newest = max(reversed(batches), key=_last_strip, default=None)
         if newest is not None and newest.strips[-1] > self._strip:
             self._strip = newest.strips[-1]
+            self._borders += self._of_whole_strip()
             self._restart(newest.oldest_s)
-        mine = [b for b in batches if b.strips[-1] == self._strip and b.newest_s < now_s - SETTLED_S]
-        new = [b for b in mine if id(b) not in self._cells or self._cells[id(b)][1].information is not b.information]
-        for batch in new[:AT_ONCE]:
-            self._take(batch, state, group_of)
+        mine = [b for b in batches if b.strips[-1] == self._strip]
+        # once there is an alarm its effect is taken back, in what has just come, too
+        settled_s = SETTLED_S if not self.biased else 0.0
+        self._take_some([b for b in mine if b.newest_s <= now_s - settled_s], state, group_of)
         if now_s >= self._next_s:
             self._next_s = now_s + EVERY_S
-            present = {id(b) for b in batches}
-            self._cells = {key: value for key, value in self._cells.items() if key in present}
-            self.biased = self._test(now_s, state)
+            self._test(now_s, mine, state)
+
+    def _take_some(self, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]) -> None:
+        """Take in new batches, then those that have changed, as many as one update can bear."""
+        known = [self._cells.get(id(b)) for b in batches]
+        new = [b for b, k in zip(batches, known, strict=True) if k is None]
+        if self.biased:
+            for batch in new:
+                self._take(batch, state, group_of)
+            new = []
+        new += [b for b, k in zip(batches, known, strict=True) if k and k[1].information is not b.information]
+        rays = 0
+        for batch in new:
+            if rays > AT_ONCE:
+                break
+            self._take(batch, state, group_of)
+            rays += len(batch.rays)
 
     def leave(self, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]) -> None:
         """Batches leave the window; call before they are fixed."""
@@ -162,6 +153,8 @@ class SourceMonitor:
             self._score[cell.places] += cell.score
             self._normal[np.ix_(cell.places, cell.places)] += cell.normal
             self._rays[cell.groups] += cell.rays
+            self._shared += cell.shared
+            self._whole.add(cell)
             new = np.setdiff1d(cell.numbers, self._numbers)
             self._numbers = np.concatenate([self._numbers, new])
             self._coupling = np.pad(self._coupling, ((0, 0), (0, len(new))))
@@ -222,60 +215,162 @@ class SourceMonitor:
         score = flat.T @ v.ravel() + coupling @ state.values(batch.columns)
         places = (EACH * present[:, None] + np.arange(EACH)).ravel()
         count = np.bincount(of_ray, minlength=k)
-        return _Cell(batch.information, places, present, count, score, normal, batch.columns, coupling)
+        return _Cell(
+            batch.information, batch.weight.copy(), places, present, count, _shared(batch, use), score, normal,
+            batch.columns, coupling,
+        )  # fmt: skip
 
-    def _test(self, now_s: float, state: WindowState) -> tuple[BiasedSource, ...]:
+    def _test(self, now_s: float, batches: list[Batch], state: WindowState) -> None:
+        """Test with what is in the border, of all batches of the strip."""
+        self._tested_s = now_s
+        cells = self._in_border(batches)
+        scores, count = self._scores(now_s, batches, cells, state)
+        found = hypotheses(list(self._groups), count.tolist())
+        factor = self._factor(now_s, int(count.sum()), self._shared + sum(c.shared for c in cells.values()))
+        self.biased = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        self._drift = None
+        if self.biased:
+            rows = self._suspected()
+            estimate = estimated(scores.score[rows], scores.V[np.ix_(rows, rows)], self._beforehand(rows))
+            self._drift = (rows, *estimate)
+
+    def _factor(self, now_s: float, rays: int, shared: float) -> float:
+        """By how much the variance of scores is larger than stated, where rays are dense.
+
+        Rays of one CCD line within the correlation time of the measured positions have their noise in common, which
+        the adjustment takes for white: the design effect of clusters of m rays with a correlation rho of their errors,
+        1 + (m - 1) rho. Without what corrections follow of that noise it is less; this is on the safe side.
+
+        Source: L. Kish, Survey Sampling, 1965, section 5.4.
+        """
+        if not rays:
+            return 1.0
+        lines = len({ccd for _, ccd in self._groups})
+        m = rays / lines / max(now_s - self._start_s, 1.0) * self._noise_time_s()
+        return 1.0 + max(m - 1.0, 0.0) * shared / rays
+
+    def _in_border(self, batches: list[Batch]) -> dict[int, _Cell]:
+        """Of the batches, those that have been taken in and have lost no ray since."""
+        present = {id(b): b for b in batches}
+        self._cells = {key: kept for key, kept in self._cells.items() if key in present}
+        return {k: c for k, (b, c) in self._cells.items() if np.array_equal(c.weight, b.weight)}
+
+    def _assembled(self, cells: dict[int, _Cell], state: WindowState) -> tuple[Array, Array, Array, IntArray]:
+        """Scores (n,) at theta = 0, normal matrix (n, n), coupling to all unknowns of the state, rays of the groups."""
         m = len(self._groups)
         n = EACH * m
         score, normal, count = self._score[:n].copy(), self._normal[:n, :n].copy(), self._rays[:m].copy()
         coupling = np.zeros((n, len(state)))
         coupling[:, state.places(self._numbers)] = self._coupling[:n]
-        for _, cell in self._cells.values():
+        for cell in cells.values():
             score[cell.places] += cell.score
             normal[np.ix_(cell.places, cell.places)] += cell.normal
             coupling[np.ix_(cell.places, state.places(cell.numbers))] += cell.coupling
             count[cell.groups] += cell.rays
-        score -= coupling @ state.theta
-        V = normal - coupling @ state.propagated(coupling.T)
-        found = []
-        age = (now_s - self._start_s) / DRIFT_S
-        now = np.array([[1.0, 0.0, age, 0.0], [0.0, 1.0, 0.0, age]])
-        # scores of a constant and of what grows to one pixel by now: of one size
-        scale = np.array([1.0, 1.0, max(age, 0.1), max(age, 0.1)])
-        open_ = [i for i in range(m) if count[i] >= ENOUGH]
-        while open_:
-            tests = {i: _test_of(score, V, i, scale, self._alpha) for i in open_}
-            worst = max(open_, key=lambda i: tests[i][0] / tests[i][1])
-            test, limit, bias, gain = tests[worst]
-            if test <= limit or float(np.abs(now @ bias).max()) < MATTERS_PX:
-                break
-            open_.remove(worst)
-            rivals = [i for i in open_ if tests[i][0] - tests[i][1] > test - limit - DECISIVE]
-            found.append((worst, now @ bias, bias[2:] / DRIFT_S, test, limit, rivals))
-            own = slice(EACH * worst, EACH * (worst + 1))
-            cross = V[:, own] @ gain
-            score = score - cross @ score[own]
-            V = V - cross @ V[own, :]
-        names = {i: group for group, i in self._groups.items()}
-        self._since = {i: self._since.get(i, now_s) for i, *_ in found}
-        result = []
-        for i, bias, drift, test, limit, rivals in found:
-            (line, sample), (line_s, sample_s) = bias.tolist(), drift.tolist()
-            others = tuple(names[r] for r in rivals)
-            result.append(BiasedSource(*names[i], line, sample, line_s, sample_s, test, limit, self._since[i], others))
-        return tuple(result)
+        return score, normal, coupling, count
+
+    # -- what it does to the solution ----------------------------------------------------------------------------------
+
+    def compensation(self, batches: Iterable[Batch], state: WindowState) -> Compensation | None:
+        """What has been named does to the solution of the window; None if nothing has.
+
+        The drift is as estimated at the last test, from a solution of just the data that are in the border.
+        """
+        if self._drift is None:
+            return None
+        mine = [b for b in batches if b.strips[-1] == self._strip]
+        _, _, coupling, _ = self._assembled(self._in_border(mine), state)
+        rows, drift, covariance = self._drift
+        return Compensation(state.propagated(coupling[rows].T), drift, covariance)
+
+    def borders(self) -> list[Border]:
+        """Of the strips so far in which something was named when they were over, all of their unknowns in them."""
+        return [*self._borders, *self._of_whole_strip()]
+
+    def _of_whole_strip(self) -> list[Border]:
+        if not self.biased:
+            return []
+        rows = self._suspected()
+        score, normal, numbers, coupling = self._whole.assembled(rows)
+        return [Border(score, normal, numbers, coupling, self._beforehand(rows))]
+
+    def _suspected(self) -> IntArray:
+        """Unknowns of all groups that may drift."""
+        names = [name for s in self.biased for name in s.suspects]
+        of = [i for g, i in self._groups.items() if any(n[0] in (ALL, g[0]) and n[1] in (ALL, g[1]) for n in names)]
+        return (EACH * np.array(of)[:, None] + np.arange(EACH)).ravel()
+
+    def _beforehand(self, rows: IntArray) -> Array:
+        """Sigma of these unknowns: what was named may be as large as that, the others as well."""
+        size = max(USUAL_PX, *(max(abs(s.line_px), abs(s.sample_px)) for s in self.biased))
+        age = max((self._tested_s - self._start_s) / DRIFT_S, 0.1)
+        return np.where(rows % EACH < EACH // 2, size, size / age)
+
+    # -- the test ------------------------------------------------------------------------------------------------------
+
+    def _scores(
+        self, now_s: float, batches: list[Batch], cells: dict[int, _Cell], state: WindowState
+    ) -> tuple[Scores, IntArray]:
+        """Scores of the groups at the solution of the same data, and rays of the groups."""
+        score, normal, coupling, count = self._assembled(cells, state)
+        N, rhs = state.normal()
+        for batch in batches:
+            cell = cells.get(id(batch))
+            matrix, right = -batch.information.matrix, -batch.information.rhs
+            place = state.places(batch.columns)
+            if cell is not None:
+                if cell.information is batch.information:
+                    continue
+                matrix, right = matrix + cell.information.matrix, right + cell.information.rhs
+            N[np.ix_(place, place)] += matrix
+            rhs[place] += right
+        solved = DenseFactor(N).solve(np.column_stack([rhs, coupling.T]))
+        score -= coupling @ solved[:, 0]
+        V = normal - coupling @ solved[:, 1:]
+        return Scores(score, 0.5 * (V + V.T), (now_s - self._start_s) / DRIFT_S, DRIFT_S), count
 
 
-def _test_of(score: Array, V: Array, i: int, scale: Array, alpha: float) -> tuple[float, float, Array, Array]:
-    """Test value of a group, its limit, its bias (4,), and its cofactors (4, 4); of what is known well enough."""
-    own = slice(EACH * i, EACH * (i + 1))
-    values, vectors = np.linalg.eigh(V[own, own] / scale[:, None] / scale)
-    good = values > TELLING_PX**-2
-    vectors = vectors[:, good] / scale[:, None]
-    Q = (vectors / values[good]) @ vectors.T
-    bias = Q @ score[own]
-    limit = float(chi2.isf(alpha, max(int(good.sum()), 1)))
-    return float(score[own] @ bias), limit, bias, Q
+class _WholeStrip:
+    """Border of all batches of a strip that have left, with all its unknowns, unless it is too long for a block."""
+
+    def __init__(self) -> None:
+        n = MOST_GROUPS * EACH
+        self._score, self._normal = np.zeros(n), np.zeros((n, n))
+        self._coupling: dict[int, dict[int, Array]] = {}  # by group, then by unknown
+        self._too_long = False
+
+    def add(self, cell: _Cell) -> None:
+        """A batch has left."""
+        self._score[cell.places] += cell.score
+        self._normal[np.ix_(cell.places, cell.places)] += cell.normal
+        if self._too_long:
+            return
+        parts = cell.coupling.reshape(len(cell.groups), EACH, -1)
+        for group, part in zip(cell.groups.tolist(), parts, strict=True):
+            known = self._coupling.setdefault(group, {})
+            for number, column in zip(cell.numbers.tolist(), part.T, strict=True):
+                known[number] = known[number] + column if number in known else column
+            if len(known) > MOST_OF_STRIP:
+                self._too_long, self._coupling = True, {}
+                return
+
+    def assembled(self, rows: IntArray) -> tuple[Array, Array, IntArray, Array]:
+        """Scores, normal matrix, numbers (u,) and coupling of some of the border's unknowns, whole groups."""
+        of = [self._coupling.get(group, {}) for group in (rows[::EACH] // EACH).tolist()]
+        numbers = np.array(sorted({number for columns in of for number in columns}), dtype=np.int64)
+        coupling = np.zeros((len(of), EACH, len(numbers)))
+        for i, columns in enumerate(of):
+            if not columns:
+                continue
+            at = np.searchsorted(numbers, list(columns))
+            coupling[i][:, at] = np.array(list(columns.values())).reshape(-1, EACH).T
+        return self._score[rows], self._normal[np.ix_(rows, rows)], numbers, coupling.reshape(len(rows), -1)
+
+
+def _shared(batch: Batch, which: IntArray) -> float:
+    """Share of the variance of rays that is noise of the measured position, summed over them."""
+    rows = batch.lin.orientation[:, :3].transpose(2, 0, 1)[which]
+    return 0.5 * float(np.einsum("nij,njk,nik->", rows, batch.pose_covariance[which, :3, :3], rows))
 
 
 def _last_strip(batch: Batch) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,8 +10,11 @@ from numpy.typing import NDArray
 
 from ..adjustment.determinability import Limits
 from ..camera import LineCamera
+from ..measured_trajectory import MeasuredTrajectory
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, Information
+from .block_solution import BlockSolution
+from .compensation import Compensation
 from .control import ControlDesk
 from .determinability import Determinability, Standing, ranks
 from .ground import GroundBelow
@@ -20,9 +24,10 @@ from .light import Situation
 from .points import PointLooks
 from .results import RefinedOrientation
 from .settle import refused_control
-from .sources import BiasedSource, Group, SourceMonitor
+from .sources import SourceMonitor
 from .state import Marginal, WindowState
 from .strip import WindowStrip
+from .suspects import BiasedSource, Group
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -64,8 +69,8 @@ class Watched:
 
     @property
     def names(self) -> frozenset[Group]:
-        """The sources that drift."""
-        return frozenset((s.source, s.ccd) for s in self.sources)
+        """The sources that drift, or may be the one that does."""
+        return frozenset(name for s in self.sources for name in s.suspects)
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,7 @@ class Watch:
     Parameters
     ----------
     determine : whether it is tested which additional parameters are determined
+    trajectory : the measured one
     alert_limit_m : of the light; 0 = see `ground`
     control : judges control, and is told what leaves
 
@@ -112,10 +118,11 @@ class Watch:
         state: WindowState,
         determine: bool,
         control: ControlDesk,
+        trajectory: MeasuredTrajectory,
         alert_limit_m: float = 0.0,
     ) -> None:
         self._integrity = Integrity(critical)
-        self._sources = SourceMonitor()
+        self._sources = SourceMonitor(lambda: trajectory.noise_time_s)
         self._control = control
         self._points, self._state = points, state
         self._ccds = [line.id for line in camera.lines]
@@ -178,15 +185,9 @@ class Watch:
         self, strip: WindowStrip, time_s: float, renew: bool = False, ground: bool = False
     ) -> Exposure | None:
         """Exposure of the orientation at a time of a strip, and on the ground; None if its unknowns are not there."""
-        design = strip.design([time_s])
-        numbers = np.unique(design.columns)
-        numbers = numbers[numbers >= 0].astype(np.int64)
+        numbers, A = _functions(strip, time_s)
         if not len(numbers) or (self._state.places(numbers) < 0).any():
             return None
-        A = np.zeros((6, len(numbers) + 1))
-        local = np.where(design.columns[0] >= 0, np.searchsorted(numbers, design.columns[0]), len(numbers))
-        A[np.arange(6), local] += design.coefficients[0][:, None]
-        A = A[:, :-1]
         below = self._ground.ground if ground else None
         if below is not None:
             A = np.concatenate([A, below.functions @ A])
@@ -221,9 +222,10 @@ class Watch:
         if strip is not None and batches:
             time_s = min(now_s, strip.end_s)
             self.exposure = self.exposure_at(strip, time_s, renew=True, ground=True)
+        drift = self._drift_covariance(strip if self.exposure is not None else None, time_s, batches)
         ground_m = ground_sigma_m = None
         if self.exposure is not None and ground is not None:
-            ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise))
+            ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise + drift))
             ground_m = self.exposure.ground_protection(ground_sigma_m)
         self._sources.update(now_s, batches, self._state, self._groups)
         events: list[str] = []
@@ -250,7 +252,9 @@ class Watch:
             ),
         )  # fmt: skip
         standing = tuple(d.standing()) if d is not None else ()
-        sigma = np.zeros(6) if self.exposure is None else self.exposure.sigma
+        sigma = np.zeros(6)
+        if self.exposure is not None:
+            sigma = np.sqrt(self.exposure.sigma**2 + np.diagonal(drift))
         protection = sigma if self.exposure is None else self.exposure.protection(sigma)
         found = Watched(
             colour, reason, self.exposure, time_s, self._sources.biased, standing, (), sigma, protection,
@@ -258,6 +262,29 @@ class Watch:
         )  # fmt: skip
         self.last = found
         return replace(found, events=tuple(events))
+
+    def compensation(self, batches: Iterable[Batch]) -> Compensation | None:
+        """What tie points that drift do to the solution; None without an alarm."""
+        return self._sources.compensation(batches, self._state)
+
+    def _drift_covariance(self, strip: WindowStrip | None, time_s: float, batches: list[Batch]) -> Array:
+        """(6, 6) of the orientation at a time, for tie points that drift."""
+        drift = self.compensation(batches) if strip is not None else None
+        if strip is None or drift is None:
+            return np.zeros((6, 6))
+        numbers, A = _functions(strip, time_s)
+        return drift.change(A, self._state.places(numbers))[1]
+
+    def compensate(self, solution: BlockSolution) -> None:
+        """Take from a solution of the block what tie points that drift did to it."""
+        for border in self._sources.borders():
+            known = np.isin(border.numbers, solution.numbers)
+            if not known.any():
+                continue
+            border = replace(border, numbers=border.numbers[known], coupling=border.coupling[:, known])
+            border.compensation(solution.values, solution.cofactors, solution.places(border.numbers)).apply(
+                solution.values, solution.cofactors
+            )
 
     def _count_of(self, batch: Batch) -> _Count:
         """Anew only if the batch has changed."""
@@ -285,3 +312,14 @@ class Watch:
         rays = batches[-1].rays
         height = np.abs(rays.position_l[:, 2] - batches[-1].points_l[rays.point, 2])
         return float(np.median(height)) * self._pitch / self._focal
+
+
+def _functions(strip: WindowStrip, time_s: float) -> tuple[IntArray, Array]:
+    """The orientation at a time of a strip as functions (6, u) of unknowns, and their numbers (u,)."""
+    design = strip.design([time_s])
+    numbers = np.unique(design.columns)
+    numbers = numbers[numbers >= 0].astype(np.int64)
+    A = np.zeros((6, len(numbers) + 1))
+    local = np.where(design.columns[0] >= 0, np.searchsorted(numbers, design.columns[0]), len(numbers))
+    A[np.arange(6), local] += design.coefficients[0][:, None]
+    return numbers, A[:, :-1]

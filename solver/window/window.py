@@ -106,14 +106,17 @@ class Window:
         self._newest_ray_s = self._learnt_s = -np.inf
         self._duties = Duties()
         self._length_s = options.window_s
-        self._orienter = Orienter(self.state, self.trajectory, self._pose_noise)
         self._control_desk = ControlDesk(
             self.state, self.strips, self._batches, self._intake, self._block, options.critical
         )
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
-            options.determine, self._control_desk, options.alert_limit_m,
+            options.determine, self._control_desk, self.trajectory, options.alert_limit_m,
         )  # fmt: skip
+        self._orienter = Orienter(
+            self.state, self.trajectory, self._pose_noise, lambda: self._watch.compensation(self._batches)
+        )
+        self._block.compensate = self._watch.compensate
         step_s = segment_length(slow, options)
         self._arrivals = Arrivals(
             self._batches, self.state, self._maker, self._intake, self._block, step_s, options.snoop, self._watch.drop

@@ -1,0 +1,236 @@
+"""Sources of tie points that drift: which hypotheses can be told apart, who is named, what the orientation is then."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from triline.solver.simulation.error_models import ErrorModel
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
+from triline.solver.window.compensation import Border, estimated
+from triline.solver.window.results import Look, WindowOptions
+from triline.solver.window.sources import DRIFT_S, SourceMonitor
+from triline.solver.window.suspects import ALL, EACH, Hypothesis, Scores, Suspicion, hypotheses
+from triline.solver.window.window import Window
+
+PLAN = FlightPlan(strip_s=50.0, lead_in_s=3.0, lead_out_s=2.0)
+SENSORS = ErrorModel(attitude_rate_hz=100.0)
+TIES = ObservationPlan(tie_points_per_s=8.0, check=10)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    simulation = simulate(PLAN, 0, SENSORS, TIES)
+    return simulation, navigate(simulation)
+
+
+def _shifted(simulation: Simulation, shift, ccd: str = ALL, points=None) -> Simulation:
+    """Lines and samples shifted by a function of time (..., 2), px, on a CCD line, at some points."""
+    images, looks = simulation.images, simulation.images.looks
+    ids = np.array([line.id for line in simulation.flight.camera.lines])
+    mine = np.ones(len(looks), dtype=bool) if ccd == ALL else ids[looks.ccd] == ccd
+    if points is not None:
+        mine &= points[looks.point]
+    line, sample = np.where(mine, shift(looks.time_s).T, 0.0)
+    return replace(simulation, images=replace(images, line=images.line + line, sample=images.sample + sample))
+
+
+def _drifting(line: float, sample: float, from_s: float = 5.0):
+    return lambda t: np.multiply.outer(np.maximum(t - from_s, 0.0), [line, sample])
+
+
+def _fly(simulation: Simulation, poses):
+    """Result, and alarms as (time, sources)."""
+    result = adjust_online(simulation, poses, live=False, update_s=0.5)
+    reports = [r.watched for r in result.reports]
+    return result, [(w.time_s, w.sources) for w in reports if w.sources]
+
+
+# ---- one source
+
+
+def test_the_test_value_is_what_the_adjustment_gains_by_the_drift(flight):
+    """The border against a second way: the adjustment of images from which the estimated drift has been taken."""
+    simulation, poses = flight
+    spoilt = _shifted(simulation, _drifting(0.0, 0.02), "N")
+    options = WindowOptions(snoop=False)
+
+    def cost(images: Simulation) -> float:
+        window = adjust_at_once(images, poses, options, until_s=45.0).window
+        assert window is not None
+        return window.state.cost()
+
+    window = adjust_at_once(spoilt, poses, options, until_s=45.0).window
+    assert window is not None
+    monitor, batches = SourceMonitor(lambda: 0.5), list(window._batches)
+    monitor._strip = 0
+    for batch in batches:
+        monitor._take(batch, window.state, window._watch._groups)
+    scores, count = monitor._scores(45.0, batches, monitor._in_border(batches), window.state)
+    before, values = window.state.cost(), {}
+    for h in hypotheses(list(monitor._groups), count.tolist()):
+        own = EACH * h.members[0] + np.arange(EACH)
+        if h.name[1] == ALL:
+            continue
+        b = np.linalg.solve(scores.V[np.ix_(own, own)], scores.score[own])
+        corrected = _shifted(spoilt, lambda t, b=b: -b[:2] - np.multiply.outer(t / DRIFT_S, b[2:]), h.name[1])
+        values[h.name[1]] = scores.test(h)
+        assert before - cost(corrected) == pytest.approx(values[h.name[1]], rel=0.04)
+    # the three are almost parallel, so that noise decides which is the largest
+    assert min(values.values()) > 30.0 and max(values.values()) < 1.2 * min(values.values())
+
+
+@pytest.mark.parametrize(
+    ("ccd", "line", "sample", "seen"),
+    [("F", 0, 0.05, True), ("N", 0, 0.05, True), ("B", 0, 0.05, True), ("F", 0.06, 0, False), ("N", 0.08, 0, True),
+     ("B", 0.12, 0, True)],
+)  # fmt: skip
+def test_of_one_source_the_line_that_drifts_is_always_among_those_named(flight, ccd, line, sample, seen):
+    simulation, poses = flight
+    _, alarms = _fly(_shifted(simulation, _drifting(line, sample), ccd), poses)
+    assert bool(alarms) or not seen
+    for _, sources in alarms:
+        assert ("", ccd) in sources[0].suspects and len(sources) == 1
+    leaders = [sources[0].suspects[0] for _, sources in alarms]
+    assert sum(a != b for a, b in pairwise(leaders)) <= 1
+    if sample:  # geometry: they cannot be told apart
+        assert all(len(sources[0].suspects) > 1 for _, sources in alarms)
+        assert "cannot be told apart" in str(alarms[-1][1][0])
+
+
+def test_the_orientation_and_its_covariance_are_without_a_drift_that_is_named(flight):
+    simulation, poses = flight
+    spoilt = _shifted(simulation, _drifting(0.0, 0.05), "N")
+    result, alarms = _fly(spoilt, poses)
+    later = [o for o, known in zip(result.final, result.final_known_s, strict=True) if known > alarms[0][0] + 1.0]
+    for orientations in (later, result.whole):
+        errors = orientation_errors(simulation, orientations)
+        assert errors.nees.mean() < 3.0  # some hundreds if it stays
+        assert errors.rmse[1] < 1.0
+
+
+# ---- several sources
+
+
+def _with_sources(monkeypatch, simulation: Simulation):
+    """Looks come from two publishers, by the name of the point; which points (p,) the second has."""
+    add_look = Window.add_look
+
+    def add(self, name, look: Look):
+        return add_look(self, name, replace(look, source=f"matcher-{1 + zlib.crc32(name.encode()) % 2}"))
+
+    monkeypatch.setattr(Window, "add_look", add)
+    return np.array([zlib.crc32(str(id).encode()) % 2 == 1 for id in simulation.points.id])
+
+
+def test_a_source_that_drifts_as_a_whole_is_named_and_the_good_one_never_alone(flight, monkeypatch):
+    simulation, poses = flight
+    second = _with_sources(monkeypatch, simulation)
+    result, alarms = _fly(_shifted(simulation, _drifting(0.0, 0.05), ALL, second), poses)
+    assert alarms
+    for _, sources in alarms:
+        assert ("matcher-2", ALL) in sources[0].suspects
+    assert orientation_errors(simulation, result.whole).nees.mean() < 3.0
+
+
+def test_one_line_of_one_of_two_sources_is_named_alone_and_the_other_source_holds_the_orientation(flight, monkeypatch):
+    simulation, poses = flight
+    second = _with_sources(monkeypatch, simulation)
+    result, alarms = _fly(_shifted(simulation, _drifting(0.0, 0.05), "F", second), poses)
+    assert alarms[-1][1][0].suspects == (("matcher-2", "F"),)
+    clean = adjust_online(simulation, poses, live=False, update_s=0.5)
+    with_, without = (orientation_errors(simulation, r.whole).rmse for r in (result, clean))
+    assert np.linalg.norm(with_[:3]) < 1.3 * np.linalg.norm(without[:3])
+
+
+# ---- clean flights
+
+
+@pytest.mark.parametrize(("seed", "rate"), [(6, 300.0), (1, 8.0)])
+def test_a_clean_flight_gives_no_alarm(seed, rate):
+    plan, ties = replace(PLAN, strip_s=30.0), ObservationPlan(tie_points_per_s=rate, check=10)
+    simulation = simulate(plan, seed, SENSORS, ties)
+    assert not _fly(simulation, navigate(simulation))[1]
+
+
+# ---- hypotheses
+
+
+def _scores(effect: dict[int, float], mixing: np.ndarray) -> Scores:
+    """Of groups whose unknowns have effects on residuals (r, m); those of some groups are biased in their samples."""
+    m = mixing.shape[1]
+    V = np.kron(mixing.T @ mixing, np.eye(EACH))
+    b = np.zeros(EACH * m)
+    for group, size in effect.items():
+        b[EACH * group + 1] = size
+    return Scores(V @ b, V, 1.0, DRIFT_S)
+
+
+GROUPS = [("a", "F"), ("a", "N"), ("b", "F"), ("b", "N")]
+OF = hypotheses(GROUPS, [50] * 4)
+APART = 30.0 * np.eye(4)
+
+
+def test_hypotheses_are_groups_wholes_and_lines():
+    names = {h.name: h.members for h in OF}
+    assert set(names) == {*GROUPS, ("a", ALL), ("b", ALL), (ALL, "F"), (ALL, "N"), (ALL, ALL)}
+    assert names["b", ALL] == (2, 3) and names[ALL, "N"] == (1, 3)
+    assert [h.name for h in hypotheses([("", "F"), ("", "N")], [50, 3])] == [("", "F")]
+
+
+def test_what_can_be_told_apart_is_named_alone_and_two_both():
+    def named(scores: Scores):
+        suspicion, found = Suspicion(), ()
+        for k in range(8):
+            found = suspicion.judge(float(k), scores, OF)
+        return [s.suspects for s in found]
+
+    assert named(_scores({2: 0.5}, APART)) == [(("b", "F"),)]
+    assert named(_scores({1: 0.5, 3: 0.5}, APART)) == [((ALL, "N"),)]
+    assert named(_scores({1: 0.8, 2: -0.5}, APART)) == [(("a", "N"),), (("b", "F"),)]
+    assert named(_scores({}, APART)) == []
+    alike = 30.0 * np.array([[1.0, -0.99, 0, 0], [0, 0.14, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    assert named(_scores({1: 0.5}, alike)) == [(("a", "N"), ("a", "F"))]
+
+
+def test_who_is_named_stays_so_until_another_is_decisively_better():
+    suspicion, single = Suspicion(), [Hypothesis(g, (i,)) for i, g in enumerate(GROUPS)]
+
+    def told(now_s, **sizes):
+        effect = {"FNfn".index(k): v for k, v in sizes.items()}
+        found = suspicion.judge(now_s, _scores(effect, APART), single)
+        return [s.suspects[0] for s in found]
+
+    assert not told(0.0, F=0.4) and not told(1.0, F=0.4)  # one bad test is not enough
+    assert told(2.0, F=0.4) == [GROUPS[0]]
+    assert told(3.0, F=0.4, N=0.41)[0] == GROUPS[0]  # about as good
+    assert told(4.0, F=0.2, N=0.6)[0] == GROUPS[1]
+    assert told(5.0, N=0.14)[0] == GROUPS[1]  # below the limit, not cleared
+    assert not told(6.0, N=0.01) and not told(7.0, N=0.6)
+
+
+# ---- what it does
+
+
+def test_compensation_is_the_solution_with_the_drift_as_unknowns():
+    rng = np.random.default_rng(2)
+    A, B, e = rng.standard_normal((30, 6)), rng.standard_normal((30, 3)), rng.standard_normal(30)
+    sigma = np.array([1.0, 0.5, 2.0])
+    N, prior = A.T @ A, np.diag(sigma**-2.0)
+    joint = np.linalg.inv(np.block([[N, A.T @ B], [B.T @ A, B.T @ B + prior]]))
+    expected = joint @ np.concatenate([A.T @ e, B.T @ e])
+    Q = np.linalg.inv(N)
+    border = Border(B.T @ e, B.T @ B, np.arange(6), B.T @ A, sigma)
+    found = border.compensation(Q @ A.T @ e, Q, np.arange(6))
+    change, covariance = found.change(np.eye(6), np.arange(6))
+    assert found.drift == pytest.approx(expected[6:]) and found.covariance == pytest.approx(joint[6:, 6:])
+    assert Q @ A.T @ e + change == pytest.approx(expected[:6])
+    assert Q + covariance == pytest.approx(joint[:6, :6])
+    # without any information, rounding included, it is what was known beforehand
+    assert estimated(np.zeros(3), -1e-12 * np.eye(3), sigma)[1] == pytest.approx(np.diag(sigma**2))
