@@ -2,10 +2,14 @@
 
 All of a strip are weighed together, those in the window and those that have left it (`control_biases`,
 `control_hypotheses`): none is believed because it came first. Where it cannot be told which are wrong, none of those
-counts until later control tells; the datum then rests on what else there is, with its sigma.
+counts until later control tells; the datum then rests on what else there is, with its sigma. While tie points are known
+to drift, or where much of the control would have to be wrong coordinate by coordinate, nothing is refused: then it is
+the tie points that bend what control is held against.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +37,8 @@ LOOK_S = 2.0
 LOOKED_INTO = 1e-3
 #: A difference to the GNSS of more than so many critical values is more than a doubt.
 FAR = 2.0
+#: Share of the known coordinates that may be wrong one by one; if it is more, it may as well be the tie points.
+MOST_WRONG = 0.35
 #: Hypotheses named at most.
 NAMED = 3
 AXES = "XYZ"
@@ -41,8 +47,13 @@ AXES = "XYZ"
 class ControlDesk:
     """Judges control; see the module.
 
+    Parameters
+    ----------
+    ties_drift : says whether tie points are known to drift
+
     Attributes
     ----------
+    rewritten : whether what left has been refused or taken back since this was last set to False
     doubt : what control contradicts, itself or the GNSS, in words; "" where it does not
     failed : whether by so much that no sigma can be relied on
     warnings : lines for the operator since they were taken last
@@ -56,13 +67,15 @@ class ControlDesk:
         intake: Intake,
         block: Block,
         critical: float,
+        ties_drift: Callable[[], bool],
     ) -> None:
         self._state, self._strips, self._batches = state, strips, batches
         self._intake, self._block, self._critical = intake, block, critical
+        self._ties_drift = ties_drift
         self._left = LeftControl(MOST_LEFT)
         self._looked_s = -np.inf
         self._told: set[tuple[str, int]] = set()
-        self.doubt, self.failed = "", False
+        self.doubt, self.failed, self.rewritten = "", False, False
         self.warnings: list[str] = []
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
@@ -91,6 +104,8 @@ class ControlDesk:
         refused : takes the coordinates refused now and those taken back
         """
         self._looked_s = max(now_s, self._looked_s)
+        if self._ties_drift():
+            return False
         self._state.solve()
         self._left.drop_strips({i for i, s in enumerate(self._strips.values()) if s.is_over(self._state)})
         of_batches = [(batch, part) for batch in self._batches for part in self._of_batch(batch)]
@@ -102,6 +117,9 @@ class ControlDesk:
             return False
         d = discrepancies(parts, self._state)
         verdict = self._judge(d)
+        if verdict is not None and _too_many(d, verdict):
+            self.doubt = f"{int(verdict.out.sum())} of {len(d.v)} known coordinates contradict the tie points"
+            return False
         changed = verdict is not None and bool((verdict.out != d.out).any())
         if changed:
             assert verdict is not None
@@ -160,6 +178,7 @@ class ControlDesk:
             self._state.exchange(batch.columns, before[key], batch.information)
         if len(self._left) and (out[at:] != d.out[at:]).any():
             self._left.set_out(out[at:], self._state)
+            self.rewritten = True
             for c, lost, was in zip(d.coordinates[at:], out[at:], d.out[at:], strict=True):
                 if lost != was:
                     self._block.weigh_control(c.point, c.axis, -c.weight if lost else c.weight, c.value)
@@ -236,6 +255,13 @@ class ControlDesk:
         """Lines for the operator since the last call."""
         lines, self.warnings = self.warnings, []
         return lines
+
+
+def _too_many(d: Discrepancies, verdict: Verdict) -> bool:
+    """Whether much of the control would be wrong, each coordinate by itself and not all of an axis alike."""
+    axis = np.array([c.axis for c in d.coordinates])
+    singly = verdict.out & ~np.isin(axis, [a for a in range(3) if len(d.v) + a in verdict.chosen])
+    return len({c.point for c in d.coordinates}) > 2 and bool(singly.sum() > MOST_WRONG * len(d.v))
 
 
 def _either(d: Discrepancies, verdict: Verdict) -> str:

@@ -98,6 +98,10 @@ class SourceMonitor:
         self._drift: tuple[IntArray, Array, Array] | None = None
         self.biased: tuple[BiasedSource, ...] = ()
 
+    def forget(self, now_s: float) -> None:
+        """What has left the window is known otherwise than it was: begin anew."""
+        self._restart(now_s)
+
     def update(
         self, now_s: float, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]
     ) -> None:

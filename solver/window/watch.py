@@ -227,6 +227,9 @@ class Watch:
         if self.exposure is not None and ground is not None:
             ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise + drift))
             ground_m = self.exposure.ground_protection(ground_sigma_m)
+        if self._control.rewritten:
+            self._sources.forget(now_s)
+            self._control.rewritten = False
         self._sources.update(now_s, batches, self._state, self._groups)
         events: list[str] = []
         d = self._determinability
@@ -262,6 +265,11 @@ class Watch:
         )  # fmt: skip
         self.last = found
         return replace(found, events=tuple(events))
+
+    @property
+    def drifting(self) -> bool:
+        """Whether tie points are known to drift."""
+        return bool(self._sources.biased)
 
     def compensation(self, batches: Iterable[Batch]) -> Compensation | None:
         """What tie points that drift do to the solution; None without an alarm."""

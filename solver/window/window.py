@@ -107,8 +107,9 @@ class Window:
         self._duties = Duties()
         self._length_s = options.window_s
         self._control_desk = ControlDesk(
-            self.state, self.strips, self._batches, self._intake, self._block, options.critical
-        )
+            self.state, self.strips, self._batches, self._intake, self._block, options.critical,
+            lambda: self._watch.drifting,
+        )  # fmt: skip
         self._watch = Watch(
             camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
             options.determine, self._control_desk, self.trajectory, options.alert_limit_m,
