@@ -123,8 +123,8 @@ def _estimated_since(flight: Flight) -> dict[str, float]:
 
 
 def _rejected(r: Any) -> dict[str, Any]:
-    names = ("point", "strip", "ccd", "line", "sample", "w", "reason")
-    return {name: getattr(r, name) for name in names} | {"coordinate": getattr(r, "coordinate", "")}
+    names = ("point", "strip", "ccd", "line", "sample", "w", "reason", "coordinate")
+    return {name: getattr(r, name) for name in names}
 
 
 def _level(log: Any) -> str:
