@@ -8,7 +8,7 @@ from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
-from triline.solver.window.integrity import _Exposed, _squares
+from triline.solver.window.exposed_observations import Exposed, squares_of
 from triline.solver.window.window import Window
 
 
@@ -41,10 +41,10 @@ def test_effects_of_rays_and_control_coordinates() -> None:
     for k in widths:
         root = rng.normal(size=(k, k))
         inverse, part = root @ root.T, rng.normal(size=(k, 6))
-        exposed.append(_Exposed(None, 0, 0, 0, np.zeros((k, 3)), inverse, inverse, 0.0))  # type: ignore[arg-type]
+        exposed.append(Exposed(None, 0, 0, 0, np.zeros((k, 3)), inverse, inverse, 0.0))  # type: ignore[arg-type]
         h.append(part)
         wanted.append(np.diagonal(part.T @ inverse @ part))
-    np.testing.assert_allclose(_squares(exposed, np.concatenate(h)), wanted)
+    np.testing.assert_allclose(squares_of(exposed, np.concatenate(h)), wanted)
 
 
 def test_residuals_without_cofactors() -> None:

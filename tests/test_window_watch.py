@@ -14,7 +14,8 @@ from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
-from triline.solver.window.integrity import Exposure, _inverse, _largest_ratio
+from triline.solver.window.exposed_observations import inverse_of, largest_ratios
+from triline.solver.window.integrity import Exposure
 from triline.solver.window.light import FAILED, GOOD, WEAK, Situation, light
 from triline.solver.window.results import TAKEN_BACK, Look, WindowOptions
 from triline.solver.window.settle import _consensus, _subsets
@@ -104,8 +105,8 @@ def test_lambda_is_the_largest_eigenvalue():
     A, B = rng.standard_normal((2, 20, 2, 2))
     R, C = A @ np.swapaxes(A, 1, 2), B @ np.swapaxes(B, 1, 2) + 0.1 * np.eye(2)
     expected = [np.linalg.eigvals(np.linalg.solve(c, r)).real.max() for r, c in zip(R, C, strict=True)]
-    assert _largest_ratio(R, C) == pytest.approx(expected, rel=1e-3)
-    assert _inverse(np.diag([2.0, 0.0])) == pytest.approx(np.diag([0.5, 0.0]))
+    assert largest_ratios(R, C) == pytest.approx(expected, rel=1e-3)
+    assert inverse_of(np.diag([2.0, 0.0])) == pytest.approx(np.diag([0.5, 0.0]))
 
 
 def test_the_effect_of_an_undetected_error_is_what_the_adjustment_makes_of_it(flight):
