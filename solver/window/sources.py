@@ -318,14 +318,23 @@ class SourceMonitor:
         """Scores of the groups at the solution of the same data, and rays of the groups."""
         score, normal, coupling, count = self._assembled(cells, state)
         N, rhs = state.normal()
+        differences: dict[bytes, tuple[IntArray, Array, Array]] = {}  # batches of one segment have the same unknowns
         for batch in batches:
             cell = cells.get(id(batch))
-            matrix, right = -batch.information.matrix, -batch.information.rhs
-            place = state.places(batch.columns)
+            if cell is not None and cell.information is batch.information:
+                continue
+            key = batch.columns.tobytes()
+            if key not in differences:
+                n = len(batch.columns)
+                differences[key] = batch.columns, np.zeros((n, n)), np.zeros(n)
+            _, matrix, right = differences[key]
+            matrix -= batch.information.matrix
+            right -= batch.information.rhs
             if cell is not None:
-                if cell.information is batch.information:
-                    continue
-                matrix, right = matrix + cell.information.matrix, right + cell.information.rhs
+                matrix += cell.information.matrix
+                right += cell.information.rhs
+        for columns, matrix, right in differences.values():
+            place = state.places(columns)
             N[np.ix_(place, place)] += matrix
             rhs[place] += right
         solved = DenseFactor(N).solve(np.column_stack([rhs, coupling.T]))
