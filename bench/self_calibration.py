@@ -20,13 +20,13 @@ from functools import partial
 import numpy as np
 
 from triline.solver.adjustment.batch import BatchResult, Job, run
-from triline.solver.adjustment.refined_orientation import correction_cofactors, corrections_at
+from triline.solver.adjustment.refined_orientation import correction_cofactors
 from triline.solver.models.wander import WanderOptions
 from triline.solver.selfcalibration import SelfCalibration, tls
 from triline.solver.simulation.camera_errors import drawn_parameters, simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
-from triline.solver.simulation.flight_network import network_of
+from triline.solver.simulation.flight_network import batch_errors, network_of
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import (
     Errors,
@@ -48,19 +48,14 @@ Figures = dict[str, float]
 
 def adjust_batch(simulation: Simulation, poses: list[TimedPose], stated: SelfCalibration) -> BatchResult:
     """The batch adjustment with the window's default model and segments, all parameters kept."""
-    strip = simulation.flight.strips[0]
-    inside = [p for p in poses if strip.first_line_time_s - 0.5 < p.pose.time_s < strip.time_of(strip.lines) + 0.5]
     model = WanderOptions(slow_errors_of(simulation.errors))
-    return run(network_of(simulation, inside), Job(model, self_calibration=stated, eliminate=False))
+    return run(network_of(simulation, poses), Job(model, self_calibration=stated, eliminate=False))
 
 
 def of_batch(simulation: Simulation, found: BatchResult, times: np.ndarray) -> tuple[Errors, Errors, list[str]]:
     """Errors of orientation at times, of tie points, and the names of these."""
     solution, strip = found.solution, found.network.strips[0]
-    measured, truth = strip.trajectory.at(times), simulation.flight.truth.at(times)
-    off = np.hstack([measured.position_l - truth.position_l, measured.angles - truth.angles])
-    off += corrections_at(solution, 0, times)
-    off[:, 3:] = (off[:, 3:] + np.pi) % (2 * np.pi) - np.pi
+    off = batch_errors(simulation, found, strip.id, times)
     noise = noise_between(strip.trajectory.time_s, strip.noise, times)
     left_out = solution.layout.sets[0].model.left_out_variance(times)
     covariance = correction_cofactors(solution, 0, times) + noise + left_out[:, :, None] * np.eye(6)
