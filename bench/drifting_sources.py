@@ -19,7 +19,7 @@ import numpy as np
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
-from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors
+from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
 from triline.solver.window.results import Look
 from triline.solver.window.suspects import ALL
 from triline.solver.window.window import Window
@@ -72,14 +72,18 @@ def main() -> int:
     ties = ObservationPlan(tie_points_per_s=8.0, check=10)
     flights = [simulate(PLAN, seed, SENSORS, ties) for seed in range(options.seeds)]
     poses = [navigate(flight) for flight in flights]
-    print("sources  CCD  drifts   named in    after, s  it is among them  alone  others named first  NEES final, whole")
+    print(
+        "sources  CCD  drifts   named in    after, s  it is among them  alone  others named first  NEES final, whole  of points"
+    )
     for number, ccd, rate in CASES:
         OfSources.sources = number
         true, after, among, alone, changes, nees = (f"m{number - 1}", ccd), [], [], [], 0, []
         for flight, known in zip(flights, poses, strict=True):
             result = adjust_online(spoilt(flight, ccd, rate), known, live=False, update_s=0.5)
             alarms = [(r.watched.time_s, r.watched.sources[0]) for r in result.reports if r.watched.sources]
-            nees.append([orientation_errors(flight, o).nees.mean() for o in (result.final, result.whole)])
+            orientation = [orientation_errors(flight, o).nees.mean() for o in (result.final, result.whole)]
+            points = [point_errors(flight, p).nees.mean() for p in (result.final_points, result.whole_points)]
+            nees.append([*orientation, *points])
             if alarms:
                 after.append(alarms[0][0] - FROM_S)
                 among += [true in s.suspects for _, s in alarms]
@@ -89,10 +93,10 @@ def main() -> int:
         seconds = f"{np.median(after):.0f}" if after else "-"
         share = f"{100 * np.mean(among):.0f} %" if among else "-"
         sole = f"{100 * np.mean(alone):.0f} %" if alone else "-"
-        final, whole = np.mean(nees, axis=0)
+        final, whole, final_points, whole_points = np.mean(nees, axis=0)
         print(
             f"{number:4}     {ccd:3}  {what:8}  {len(after)} of {options.seeds}  {seconds:>10}  {share:>16}  {sole:>5}"
-            f"  {changes:>18}  {final:10.1f}, {whole:5.1f}",
+            f"  {changes:>18}  {final:10.1f}, {whole:5.1f}  {final_points:5.1f}, {whole_points:3.1f}",
             flush=True,
         )
     OfSources.sources = 1

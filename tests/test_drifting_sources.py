@@ -12,7 +12,13 @@ import pytest
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
-from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
+from triline.solver.simulation.window_study import (
+    adjust_at_once,
+    adjust_online,
+    navigate,
+    orientation_errors,
+    point_errors,
+)
 from triline.solver.window.compensation import Border, estimated
 from triline.solver.window.results import Look, WindowOptions
 from triline.solver.window.sources import DRIFT_S, SourceMonitor
@@ -68,10 +74,10 @@ def test_the_test_value_is_what_the_adjustment_gains_by_the_drift(flight):
 
     window = adjust_at_once(spoilt, poses, options, until_s=45.0).window
     assert window is not None
-    monitor, batches = SourceMonitor(lambda: 0.5), list(window._batches)
+    monitor, batches = SourceMonitor(window._intake.sources_of, lambda: 0.5), list(window._batches)
     monitor._strip = 0
     for batch in batches:
-        monitor._take(batch, window.state, window._watch._groups)
+        monitor._take(batch, window.state)
     scores, count = monitor._scores(45.0, batches, monitor._in_border(batches), window.state)
     before, values = window.state.cost(), {}
     for h in hypotheses(list(monitor._groups), count.tolist()):
@@ -84,6 +90,40 @@ def test_the_test_value_is_what_the_adjustment_gains_by_the_drift(flight):
         assert before - cost(corrected) == pytest.approx(values[h.name[1]], rel=0.04)
     # the three are almost parallel, so that noise decides which is the largest
     assert min(values.values()) > 30.0 and max(values.values()) < 1.2 * min(values.values())
+
+
+def test_points_are_what_they_are_without_the_drift(flight):
+    """Against a second way: the adjustment of images from which the drift has been taken."""
+    simulation, poses = flight
+    spoilt = _shifted(simulation, _drifting(0.0, 0.03), "N")
+    options = WindowOptions(snoop=False)
+    window = adjust_at_once(spoilt, poses, options, until_s=45.0).window
+    assert window is not None
+    state, batches = window.state, list(window._batches)
+    monitor = window._watch._sources
+    monitor.begin(batches)
+    assert monitor.unknowns(45.0, batches, state) is not None
+    (group,) = [i for (_, ccd), i in monitor._groups.items() if ccd == "N"]
+    rows, drift = EACH * group + np.arange(EACH), np.array([0.3, -0.2, 0.1, 0.25])
+    monitor._drift = rows, drift, 0.04 * np.eye(EACH)
+    compensation = monitor.compensation(batches, state)
+    assert compensation is not None
+    start_s = monitor._start_s
+    corrected = _shifted(spoilt, lambda t: -drift[:2] - np.multiply.outer((t - start_s) / DRIFT_S, drift[2:]), "N")
+    again = adjust_at_once(corrected, poses, options, until_s=45.0).window
+    assert again is not None
+    known = {name: xyz for b in again._batches for name, xyz in zip(b.names, b.points_l, strict=True)}
+    changes, wrong = [], []
+    for batch in batches:
+        change, covariance = monitor.on_points(batch, state, compensation)
+        A = np.array([np.linalg.eigvalsh(c)[-1] for c in covariance])
+        assert (A > 0).all()
+        for i, name in enumerate(batch.names):
+            if batch.normals.rank[i] == 3:
+                changes.append(np.linalg.norm(known[name] - batch.points_l[i]))
+                wrong.append(np.linalg.norm(batch.points_l[i] + change[i] - known[name]))
+    assert np.median(changes) > 0.1
+    assert np.median(wrong) < 0.02 * np.median(changes) and max(wrong) < 0.15 * max(changes)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +153,8 @@ def test_the_orientation_and_its_covariance_are_without_a_drift_that_is_named(fl
         errors = orientation_errors(simulation, orientations)
         assert errors.nees.mean() < 3.0  # some hundreds if it stays
         assert errors.rmse[1] < 1.0
+    for points in (result.final_points, result.whole_points):
+        assert point_errors(simulation, points).nees.mean() < 5.0  # likewise
 
 
 # ---- several sources

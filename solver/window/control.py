@@ -2,14 +2,13 @@
 
 All of a strip are weighed together, those in the window and those that have left it (`control_biases`,
 `control_hypotheses`): none is believed because it came first. Where it cannot be told which are wrong, none of those
-counts until later control tells; the datum then rests on what else there is, with its sigma. While tie points are known
-to drift, or where much of the control would have to be wrong coordinate by coordinate, nothing is refused: then it is
-the tie points that bend what control is held against.
+counts until later control tells; the datum then rests on what else there is, with its sigma. It may as well be tie
+points that drift and bend what control is held against: before any is refused that is weighed, too (`control_or_ties`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,12 @@ from .batches import Batches
 from .block import Block
 from .control_biases import Biases, Discrepancies, LeftControl, biases_of, discrepancies
 from .control_hypotheses import Verdict, biases, judge
+from .control_or_ties import Drifts, Weighed, weigh
+from .drift_border import Cell
 from .following import MOVED
 from .intake import Intake
 from .results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal
+from .sources import SourceMonitor
 from .state import Marginal, WindowState
 from .strip import WindowStrip
 
@@ -37,8 +39,6 @@ LOOK_S = 2.0
 LOOKED_INTO = 1e-3
 #: A difference to the GNSS of more than so many critical values is more than a doubt.
 FAR = 2.0
-#: Share of the known coordinates that may be wrong one by one; if it is more, it may as well be the tie points.
-MOST_WRONG = 0.35
 #: Hypotheses named at most.
 NAMED = 3
 AXES = "XYZ"
@@ -49,11 +49,10 @@ class ControlDesk:
 
     Parameters
     ----------
-    ties_drift : says whether tie points are known to drift
+    sources : watches for tie points that drift
 
     Attributes
     ----------
-    rewritten : whether what left has been refused or taken back since this was last set to False
     doubt : what control contradicts, itself or the GNSS, in words; "" where it does not
     failed : whether by so much that no sigma can be relied on
     warnings : lines for the operator since they were taken last
@@ -67,28 +66,35 @@ class ControlDesk:
         intake: Intake,
         block: Block,
         critical: float,
-        ties_drift: Callable[[], bool],
+        sources: SourceMonitor,
     ) -> None:
         self._state, self._strips, self._batches = state, strips, batches
         self._intake, self._block, self._critical = intake, block, critical
-        self._ties_drift = ties_drift
+        self._sources = sources
         self._left = LeftControl(MOST_LEFT)
         self._looked_s = -np.inf
         self._told: set[tuple[str, int]] = set()
-        self.doubt, self.failed, self.rewritten = "", False, False
+        self._blamed = False  # the tie points, for what contradicts
+        self.doubt, self.failed = "", False
         self.warnings: list[str] = []
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
 
-    def leaving(self, batches: list[Batch]) -> None:
-        """Batches leave the window; their unknowns are still in the state."""
+    def leaving(self, batches: list[Batch], cells: Mapping[int, Cell]) -> None:
+        """Batches leave the window; their unknowns are still in the state. ``cells``: what drifts have to do with them,
+        by identity."""
         for batch in batches:
-            for part in self._of_batch(batch):
+            for part in self._of_batch(batch, cells.get(id(batch))):
                 self._left.add(part)
 
     def marginalised(self, marginal: Marginal) -> None:
-        """Unknowns have left the window."""
+        """Unknowns have left the window; those of drifts are among those that stayed."""
         self._left.marginalised(marginal)
+
+    def strip_began(self) -> None:
+        """From now on drifts are looked for in another strip."""
+        self._left.drop_drifts()
+        self._blamed = False
 
     # -- judgement -----------------------------------------------------------------------------------------------------
 
@@ -104,32 +110,51 @@ class ControlDesk:
         refused : takes the coordinates refused now and those taken back
         """
         self._looked_s = max(now_s, self._looked_s)
-        if self._ties_drift():
-            return False
         self._state.solve()
         self._left.drop_strips({i for i, s in enumerate(self._strips.values()) if s.is_over(self._state)})
         of_batches = [(batch, part) for batch in self._batches for part in self._of_batch(batch)]
-        parts = [part for _, part in of_batches]
-        if len(self._left):
-            parts.append(self._left.biases)
         self.doubt, self.failed = "", False
-        if not parts:
+        if not of_batches and not len(self._left):
             return False
-        d = discrepancies(parts, self._state)
+        d = discrepancies(self._with_left([part for _, part in of_batches]), self._state)
         verdict = self._judge(d)
-        if verdict is not None and _too_many(d, verdict):
-            self.doubt = f"{int(verdict.out.sum())} of {len(d.v)} known coordinates contradict the tie points"
+        if verdict is None:
+            self._blamed = False
             return False
-        changed = verdict is not None and bool((verdict.out != d.out).any())
+        weighed = self._weigh(d, verdict, self._sources.unknowns(now_s, self._batches, self._state))
+        verdict, d, self._blamed = weighed.verdict, weighed.discrepancies, weighed.drift
+        changed = bool((verdict.out != d.out).any())
         if changed:
-            assert verdict is not None
             self._tell_changes(d, verdict, refused)
             self._apply(of_batches, d, verdict.out)
-        if verdict is not None and verdict.out.any():
+        if verdict.out.any():
             self._doubt(d, verdict)
+        self.doubt = "; ".join(filter(None, [self.doubt, self._tie_points_in_doubt(weighed)]))
         return changed
 
-    def _of_batch(self, batch: Batch) -> list[Biases]:
+    def _tie_points_in_doubt(self, weighed: Weighed) -> str:
+        if self._sources.biased:  # that is told by itself
+            return ""
+        if weighed.drift:
+            return "control and tie points contradict each other: tie points seem to drift"
+        return "or tie points drift" if weighed.verdict.out.any() and not weighed.told else ""
+
+    def _with_left(self, parts: list[Biases]) -> list[Biases]:
+        return [*parts, self._left.biases] if len(self._left) else parts
+
+    def _weigh(self, d: Discrepancies, verdict: Verdict, drifts: Drifts | None) -> Weighed:
+        """Against tie points that drift."""
+        if drifts is None:
+            return Weighed(verdict, d, False, True)
+        parts = [part for batch in self._batches for part in self._of_batch(batch, drifts.cells.get(id(batch)))]
+        border = drifts.score, drifts.normal, drifts.coupling
+        d = discrepancies(self._with_left(parts), self._state, border)
+        return weigh(d, drifts, self._hypotheses, verdict, self._blamed)
+
+    def _hypotheses(self, d: Discrepancies) -> Verdict:
+        return judge(d.C, d.v, np.array([c.axis for c in d.coordinates]), self._critical**2, d.out)
+
+    def _of_batch(self, batch: Batch, cell: Cell | None = None) -> list[Biases]:
         """Known coordinates of a batch that can be judged."""
         found = []
         for p, name in enumerate(batch.names):
@@ -140,7 +165,7 @@ class ControlDesk:
             out = np.array([a in refused for a in range(3)])
             weight = np.where(out, control.weight, batch.control.weight[p])
             if (weight > 0).any():
-                found.append(biases_of(batch, p, weight, out & (weight > 0)))
+                found.append(biases_of(batch, p, weight, out & (weight > 0), cell))
         return found
 
     def _judge(self, d: Discrepancies) -> Verdict | None:
@@ -154,7 +179,7 @@ class ControlDesk:
             total = float(d.v @ np.linalg.lstsq(d.C, d.v, rcond=1e-12)[0])
             if max(w.max(), *together) <= self._critical**2 and total <= chi2.isf(LOOKED_INTO, len(d.v)):
                 return None
-        return judge(d.C, d.v, axis, self._critical**2, d.out)
+        return self._hypotheses(d)
 
     def _apply(self, of_batches: list[tuple[Batch, Biases]], d: Discrepancies, out: Bools) -> None:
         at = 0
@@ -177,8 +202,7 @@ class ControlDesk:
             batch.eliminate()
             self._state.exchange(batch.columns, before[key], batch.information)
         if len(self._left) and (out[at:] != d.out[at:]).any():
-            self._left.set_out(out[at:], self._state)
-            self.rewritten = True
+            self._sources.recount(self._left.set_out(out[at:], self._state))
             for c, lost, was in zip(d.coordinates[at:], out[at:], d.out[at:], strict=True):
                 if lost != was:
                     self._block.weigh_control(c.point, c.axis, -c.weight if lost else c.weight, c.value)
@@ -255,13 +279,6 @@ class ControlDesk:
         """Lines for the operator since the last call."""
         lines, self.warnings = self.warnings, []
         return lines
-
-
-def _too_many(d: Discrepancies, verdict: Verdict) -> bool:
-    """Whether much of the control would be wrong, each coordinate by itself and not all of an axis alike."""
-    axis = np.array([c.axis for c in d.coordinates])
-    singly = verdict.out & ~np.isin(axis, [a for a in range(3) if len(d.v) + a in verdict.chosen])
-    return len({c.point for c in d.coordinates}) > 2 and bool(singly.sum() > MOST_WRONG * len(d.v))
 
 
 def _either(d: Discrepancies, verdict: Verdict) -> str:

@@ -7,18 +7,20 @@ is refused, which is the same as leaving it out. With a column for each bias the
     [G' H] [b] = [r]
 
 and keep that form when unknowns are marginalised. So a coordinate can be tested, refused and taken back exactly, also
-long after its rays have left the window, and several of them together.
+long after its rays have left the window, and several of them together. The unknowns of tie points that drift
+(`drift_border`) have rows in G as those of the state have; their numbers are negative.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from .batch import Batch, Information, inverse_factors
+from .drift_border import Cell
 from .state import Marginal, WindowState
 
 Array = NDArray[np.floating]
@@ -50,7 +52,7 @@ class Biases:
     ----------
     coordinates : (c,)
     out : (c,) whether it is refused
-    columns : (u,) numbers of unknowns
+    columns : (u,) numbers of unknowns, negative ones of drifts
     G, H, r : (u, c), (c, c), (c,)
     """
 
@@ -62,55 +64,103 @@ class Biases:
     r: Array
 
 
-def biases_of(batch: Batch, p: int, weight: Array, out: Bools) -> Biases:
-    """Of a point of a batch with given weights (3,), of which those that are out (3,) do not count in it now."""
+def biases_of(batch: Batch, p: int, weight: Array, out: Bools, cell: Cell | None = None) -> Biases:
+    """Of a point of a batch with given weights (3,), of which those that are out (3,) do not count in it now.
+
+    ``cell``: what drifts have to do with the batch.
+    """
     axes = np.flatnonzero(weight > 0)
     L = inverse_factors(batch.normals)[p]
     Q, moment = L.T @ L, L.T @ batch.normals.y[:, p]  # of the point given the orientation, from where it is counted
     into = L.T @ batch.coupling[p]
     off = batch.control.xyz_l[p] - batch.origin_l[p]
+    drifts, on = cell.on_point(p) if cell is not None else (np.empty(0, np.int64), np.empty((0, 3)))
     lost = np.where(out, weight, 0.0)
     if lost.any():  # as if all counted
         update = np.linalg.inv(np.eye(3) + Q * lost)
-        Q, moment, into = update @ Q, update @ (moment + Q @ (lost * off)), update @ into
+        Q, moment, into, on = update @ Q, update @ (moment + Q @ (lost * off)), update @ into, on @ update.T
     w = weight[axes]
     H = np.diag(w) - w[:, None] * Q[np.ix_(axes, axes)] * w
     strip = int(batch.rays.strip[batch.first_ray[p]])
     coordinates = [
         Coordinate(batch.names[p], int(a), strip, float(weight[a]), float(batch.control.xyz_l[p, a])) for a in axes
     ]
-    return Biases(coordinates, out[axes], batch.columns, -(w[:, None] * into[axes]).T, H, w * (off - moment)[axes])
+    G = -(w[:, None] * np.concatenate([into, on.T], axis=1)[axes]).T
+    return Biases(coordinates, out[axes], np.concatenate([batch.columns, drifts]), G, H, w * (off - moment)[axes])
 
 
 @dataclass(frozen=True)
 class Discrepancies:
-    """c biases after the unknowns are eliminated: information ``C``, ``v`` with ``b = C^-1 v`` if all were free."""
+    """c biases after the unknowns are eliminated: information ``C``, ``v`` with ``b = C^-1 v`` if all were free.
+
+    Attributes
+    ----------
+    V, score, X : (k, k), (k,), (c, k) the same of k drifts, if asked for, and what they have to do with each other
+    """
 
     coordinates: list[Coordinate]
     out: Bools
     C: Array
     v: Array
+    V: Array
+    score: Array
+    X: Array
 
 
-def discrepancies(parts: list[Biases], state: WindowState) -> Discrepancies:
-    """Of biases of several points and of what left, from all that the solved state knows."""
+def discrepancies(
+    parts: list[Biases], state: WindowState, drifts: tuple[Array, Array, Array] | None = None
+) -> Discrepancies:
+    """Of biases of several points and of what left, from all that the solved state knows.
+
+    Parameters
+    ----------
+    drifts : scores (k,), normal matrix (k, k) and coupling (k, n) to all unknowns of drifts to be looked at, as they
+        are with what is refused left out
+    """
     coordinates = [c for part in parts for c in part.coordinates]
     out = np.concatenate([part.out for part in parts])
     r = np.concatenate([part.r for part in parts])
-    n = len(coordinates)
-    G, H = np.zeros((len(state), n)), np.zeros((n, n))
+    c = len(coordinates)
+    score, D, M = drifts if drifts is not None else (np.empty(0), np.empty((0, 0)), np.empty((0, len(state))))
+    n, k = len(state), len(score)
+    G, H = np.zeros((n + k, c)), np.zeros((c, c))
     at = 0
     for part in parts:
         own = slice(at, at + len(part.coordinates))
-        G[state.places(part.columns), own] = part.G
+        of_state = part.columns >= 0
+        G[state.places(part.columns[of_state]), own] = part.G[of_state]
+        if k:
+            G[n - 1 - part.columns[~of_state], own] = part.G[~of_state]
         H[own, own] = part.H
         at = own.stop
+    G, K = G[:n], G[n:]
+    if k and out.any():  # as if all counted
+        into = K[:, out] @ np.linalg.inv(H[np.ix_(out, out)])
+        score, D, M = score + into @ r[out], D + into @ K[:, out].T, M + into @ G[:, out].T
+    G, H, r = np.column_stack([G, M.T]), np.block([[H, K.T], [K, D]]), np.concatenate([r, score])
     S, t = G.T @ state.propagated(G), G.T @ state.theta
     if out.any():  # what is refused is put back first
-        gain = S[:, out] @ np.linalg.inv(H[np.ix_(out, out)] + S[np.ix_(out, out)])
-        t = t + gain @ (r[out] - t[out])
-        S = S - gain @ S[out]
-    return Discrepancies(coordinates, out, H - S, r - t)
+        back = np.concatenate([out, np.zeros(k, dtype=bool)])
+        gain = S[:, back] @ np.linalg.inv(H[np.ix_(back, back)] + S[np.ix_(back, back)])
+        t = t + gain @ (r[back] - t[back])
+        S = S - gain @ S[back]
+    C, v = H - S, r - t
+    return Discrepancies(coordinates, out, C[:c, :c], v[:c], C[c:, c:], v[c:], C[:c, c:])
+
+
+@dataclass(frozen=True)
+class Recounted:
+    """What changes in the normal equations when coordinates that have left count otherwise.
+
+    Attributes
+    ----------
+    numbers, change : of unknowns that are still there, negative ones of drifts; what is added
+    of_points : the same, point by point, of the unknowns that were there when it left
+    """
+
+    numbers: IntArray
+    change: Information
+    of_points: list[tuple[IntArray, Information]]
 
 
 class LeftControl:
@@ -128,6 +178,7 @@ class LeftControl:
     def _forget_all(self) -> None:
         none = np.empty(0)
         self._kept = Biases([], np.empty(0, bool), np.empty(0, np.int64), none.reshape(0, 0), none.reshape(0, 0), none)
+        self._as_left: list[Biases] = []
 
     def __len__(self) -> int:
         return len(self._kept.coordinates)
@@ -138,6 +189,7 @@ class LeftControl:
 
     def add(self, new: Biases) -> None:
         """A point leaves with its batch; its unknowns are still there."""
+        self._as_left.append(new)
         old = self._kept
         numbers = np.union1d(old.columns, new.columns)
         k, m = len(old.coordinates), len(new.coordinates)
@@ -163,6 +215,12 @@ class LeftControl:
             )  # fmt: skip
         kept = [c for c, k in zip(old.coordinates, which, strict=True) if k]
         self._kept = Biases(kept, old.out[which], old.columns, G[:, which], H[np.ix_(which, which)], r[which])
+        self._as_left = [b for b in self._as_left if any(c in kept for c in b.coordinates)]
+
+    def drop_drifts(self) -> None:
+        """The drifts that were watched are no unknowns any more."""
+        self._kept = _of_state_only(self._kept)
+        self._as_left = [_of_state_only(b) for b in self._as_left]
 
     def drop_strips(self, over: set[int]) -> None:
         """Forget the coordinates seen from strips that are over."""
@@ -195,16 +253,36 @@ class LeftControl:
         G, H, r = rest - R12.T @ q, old.H - q.T @ q, old.r - q.T @ d
         self._kept = Biases(old.coordinates, old.out, m.stayed.copy(), G, H, r)
 
-    def set_out(self, out: Bools, state: WindowState) -> None:
+    def set_out(self, out: Bools, state: WindowState) -> Recounted:
         """Refuse coordinates and take others back: the state is changed."""
         old = self._kept
-        columns, before, after = old.columns, _taken_away(old, old.out), _taken_away(old, out)
-        change = Information(
-            before.matrix - after.matrix, before.rhs - after.rhs, before.square - after.square, before.rows - after.rows
-        )
-        state.add(columns, change)
-        state.fix(columns, change)
-        self._kept = Biases(old.coordinates, out.copy(), columns, old.G, old.H, old.r)
+        columns, change = old.columns, _exchanged(old, out)
+        own = np.flatnonzero(columns >= 0)
+        of_state = replace(change, matrix=change.matrix[np.ix_(own, own)], rhs=change.rhs[own])
+        state.add(columns[own], of_state)
+        state.fix(columns[own], of_state)
+        self._kept = replace(old, out=out.copy())
+        lost = dict(zip(old.coordinates, out.tolist(), strict=True))
+        of_points = []
+        for i, b in enumerate(self._as_left):
+            now = np.array([lost.get(c, was) for c, was in zip(b.coordinates, b.out.tolist(), strict=True)])
+            if (now != b.out).any():
+                of_points.append((b.columns, _exchanged(b, now)))
+                self._as_left[i] = replace(b, out=now)
+        return Recounted(columns, change, of_points)
+
+
+def _of_state_only(b: Biases) -> Biases:
+    own = b.columns >= 0
+    return replace(b, columns=b.columns[own], G=b.G[own])
+
+
+def _exchanged(b: Biases, out: Bools) -> Information:
+    """What the unknowns gain when others are out than were."""
+    before, after = _taken_away(b, b.out), _taken_away(b, out)
+    return Information(
+        before.matrix - after.matrix, before.rhs - after.rhs, before.square - after.square, before.rows - after.rows
+    )
 
 
 def _taken_away(b: Biases, out: Bools) -> Information:

@@ -36,11 +36,13 @@ class Verdict:
     out : (c,) coordinates not to be used: those of the best hypothesis, and of all others that are nearly as good
     rivals : (k, c) the coordinates of the hypotheses between which it cannot be told, the best one first; k is 1 where
         there is no other
+    score : of the best hypothesis, 0 if nothing is wrong; the lower, the better
     """
 
     chosen: frozenset[int]
     out: Bools
     rivals: tuple[Bools, ...]
+    score: float
 
 
 def judge(C: Array, v: Array, axis: NDArray[np.int64], price: float, before: Bools) -> Verdict:
@@ -81,7 +83,7 @@ def judge(C: Array, v: Array, axis: NDArray[np.int64], price: float, before: Boo
                 continue  # one of them with more to it
             rivals.append(other)
             out |= other
-    return Verdict(best, out, tuple(rivals))
+    return Verdict(best, out, tuple(rivals), scores[best])
 
 
 def _search(M: Array, m: Array, usable: NDArray[np.int64], price: float) -> dict[frozenset[int], float]:

@@ -13,6 +13,7 @@ from .batch import Batch
 from .points import ControlPoint, PointLooks
 from .results import Look, Refusal
 from .strip import WindowStrip
+from .suspects import Group
 
 #: Time after which a look whose orientation has not come is given up, s.
 PATIENCE_S = 2.0
@@ -33,6 +34,7 @@ class Intake:
     def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
         self.points: dict[str, PointLooks] = {}
         self.control: dict[str, ControlPoint] = {}
+        self._ccds = [line.id for line in camera.lines]
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
@@ -66,6 +68,15 @@ class Intake:
         if point.batch is None:
             self._waiting[name] = None
         return ""
+
+    def sources_of(self, batch: Batch) -> list[Group]:
+        """Source and CCD line of each ray."""
+        rays = batch.rays
+        looks = [self.points[name].looks for name in batch.names]
+        return [
+            (looks[p][s].source, self._ccds[c])
+            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
+        ]
 
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""

@@ -98,7 +98,8 @@ class Leaver:
             if rounds or failed:
                 self._orienter.forget()
         for batch in leaving:
-            points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, final=True)
+            drift = self._watch.on_points(batch, self._orienter.drift)
+            points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, True, drift)
             result.points += points
             self._left.append(LeftPoints.of(batch, points))
             self._block.leave(batch, points)

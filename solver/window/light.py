@@ -90,12 +90,12 @@ def contradiction(s: Situation) -> tuple[str, str] | None:
         return FAILED, f"observations contradict each other: sigma0 {s.sigma0:.1f}"
     if s.points >= ENOUGH_POINTS and s.refused > MOSTLY_REFUSED * s.points:
         return FAILED, f"{s.refused} of {s.points} tie points contradict the others"
-    if s.control_refused >= max(2, int(s.control.max())):
+    # looks that drift contradict control: that is no more than has been said
+    if not s.sources and s.control_refused >= max(2, int(s.control.max())):
         return FAILED, f"{s.control_refused} control points contradict the orientation"
-    if s.control_doubt:
-        return FAILED if s.control_failed else WEAK, s.control_doubt
-    if s.sources:
-        return WEAK, "; ".join(map(str, s.sources))
+    doubts = [s.control_doubt] if s.control_doubt else []
+    if doubts or s.sources:
+        return FAILED if s.control_failed else WEAK, "; ".join([*doubts, *map(str, s.sources)])
     return None
 
 

@@ -48,12 +48,20 @@ class Orienter:
         self._state, self._trajectory, self._pose_noise = state, trajectory, pose_noise
         self._compensation = compensation
         self._drift: Compensation | None = None
+        self._drift_is_known = False
         self._columns: IntArray = np.empty(0, dtype=np.int64)
         self._cofactors: Array | None = None
 
     def forget(self) -> None:
         """The state has changed."""
-        self._cofactors = None
+        self._cofactors, self._drift_is_known = None, False
+
+    @property
+    def drift(self) -> Compensation | None:
+        """What tie points that drift do to the solution."""
+        if not self._drift_is_known:
+            self._drift, self._drift_is_known = self._compensation(), True
+        return self._drift
 
     def at(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
         """Orientation at times (n,) that have a measured one."""
@@ -78,8 +86,6 @@ class Orienter:
         columns = np.unique(design.columns)
         columns = columns[columns >= 0].astype(np.int64)
         if self._cofactors is None or not np.array_equal(columns, self._columns):
-            if self._cofactors is None:
-                self._drift = self._compensation()
             self._cofactors, self._columns = self._state.covariance(columns), columns
         local = np.where(design.columns >= 0, np.searchsorted(columns, design.columns), len(columns))
         A = np.zeros((len(times), 6, len(columns) + 1))
@@ -90,17 +96,28 @@ class Orienter:
         covariance = through @ np.swapaxes(A, 1, 2)
         covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
         correction = A @ self._state.values(columns)
-        if self._drift is not None:
-            change, of_drift = self._drift.change(A, self._state.places(columns))
+        if self.drift is not None:
+            change, of_drift = self.drift.change(A, self._state.places(columns))
             correction, covariance = correction + change, covariance + of_drift
         return correction, covariance
 
 
 def adjusted_points(
-    batch: Batch, state: WindowState, points: Mapping[str, PointLooks], control: Mapping[str, ControlPoint], final: bool
+    batch: Batch,
+    state: WindowState,
+    points: Mapping[str, PointLooks],
+    control: Mapping[str, ControlPoint],
+    final: bool,
+    drift: tuple[Array, Array] | None,
 ) -> list[AdjustedPoint]:
-    """The points of a batch that are determined, with covariance and residuals."""
+    """The points of a batch that are determined, with covariance and residuals.
+
+    ``drift``: what to add to coordinates (p, 3) and covariance (p, 3, 3) for tie points that drift.
+    """
     cofactors, statistics = batch.judge(state)
+    xyz_l, covariance = batch.points_l, cofactors.points
+    if drift is not None:
+        xyz_l, covariance = xyz_l + drift[0], covariance + drift[1]
     v_line, v_sample = statistics.v_px.T.tolist()
     w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
@@ -118,7 +135,7 @@ def adjusted_points(
         role = control[name].role if name in control else "tie"
         rays = int(used[i])
         checked = checks(rays, len(residuals), known[i])
-        out.append(AdjustedPoint(name, role, batch.points_l[i], cofactors.points[i], rays, final, residuals, checked))
+        out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
     return out
 
 

@@ -2,12 +2,10 @@
 
 Each ray alone looks good; the mean of many does not. For every group of rays, those of one source on one CCD line, a
 bias and a drift of its lines and samples are tested as additional unknowns ``b`` would be, without estimating them:
-they are a border of the window's normal equations. With the effect ``B`` of ``b`` on the whitened residuals ``v``, and
-S that projects out the object points, the border has ``s = sum B^T S (v + A theta)``, ``M = sum B^T S A`` and
-``sum B^T S B``; when unknowns leave the window they are eliminated from it as from the rest, so nothing is forgotten
-while a strip lasts. Its Schur complement ``V`` is the cofactor matrix of the scores at the solution, and
-``s^T V^-1 s`` is chi-square if there is no bias. A bias that a slow error of the trajectory would explain as well
-has no score: what remains unseen does no more harm than that error.
+they are a border of the window's normal equations (`drift_border`), from which nothing is forgotten while a strip
+lasts. Its Schur complement ``V`` is the cofactor matrix of the scores ``s`` at the solution, and ``s^T V^-1 s`` is
+chi-square if there is no bias. A bias that a slow error of the trajectory would explain as well has no score: what
+remains unseen does no more harm than that error.
 
 The solution is one of just the batches that are in the border: with others in it, a drift that bends the orientation
 through them, too, would be looked for in part of its rays only, and be taken for another. Which group it is, or which
@@ -18,16 +16,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from ..adjustment.reduced_system import DenseFactor
-from .archive import MOST_OF_STRIP
-from .batch import Batch, Information, inverse_factors
+from .batch import Batch, inverse_factors
 from .compensation import Border, Compensation, estimated
+from .control_biases import Recounted
+from .control_or_ties import Drifts
+from .drift_border import MOST_GROUPS, Cell, LeftBorder
 from .state import Marginal, WindowState
 from .suspects import ALL, EACH, FALSE_ALARM, USUAL_PX, BiasedSource, Group, Scores, Suspicion, hypotheses
 
@@ -39,32 +37,8 @@ SETTLED_S = 3.0
 AT_ONCE = 240
 #: Time between tests, s; unit of the drift, s.
 EVERY_S, DRIFT_S = 1.0, 10.0
-#: Groups at most; strips whose drifts are remembered.
-MOST_GROUPS, MOST_BORDERS = 16, 40
-
-
-@dataclass(frozen=True)
-class _Cell:
-    """Border of one batch: scores (k,) at theta = 0, their normal matrix (k, k) and coupling (k, u) to unknowns.
-
-    Attributes
-    ----------
-    information, weight : what the batch was when this was computed
-    places : (k,) in the border
-    groups, rays : which groups have how many rays
-    shared : share of the variance of a ray that is noise of its position, summed over the rays
-    """
-
-    information: Information
-    weight: Array
-    places: IntArray
-    groups: IntArray
-    rays: IntArray
-    shared: float
-    score: Array
-    normal: Array
-    numbers: IntArray
-    coupling: Array
+#: Strips whose drifts are remembered.
+MOST_BORDERS = 40
 
 
 class SourceMonitor:
@@ -72,119 +46,131 @@ class SourceMonitor:
 
     Parameters
     ----------
+    groups_of : says source and CCD line of each ray of a batch
     noise_time_s : says for how long the noise of measured positions is correlated
     alpha : probability that a good group fails in one test
     """
 
-    def __init__(self, noise_time_s: Callable[[], float], alpha: float = FALSE_ALARM) -> None:
-        self._noise_time_s, self._alpha = noise_time_s, alpha
+    def __init__(
+        self,
+        groups_of: Callable[[Batch], list[Group]],
+        noise_time_s: Callable[[], float],
+        alpha: float = FALSE_ALARM,
+    ) -> None:
+        self._groups_of, self._noise_time_s, self._alpha = groups_of, noise_time_s, alpha
         self._strip = -1
         self._next_s = -np.inf
         self._borders: deque[Border] = deque(maxlen=MOST_BORDERS)
         self._restart(0.0)
 
     def _restart(self, now_s: float) -> None:
-        n = MOST_GROUPS * EACH
         self._start_s = self._tested_s = now_s
         self._groups: dict[Group, int] = {}
-        self._cells: dict[int, tuple[Batch, _Cell]] = {}
-        self._score, self._normal = np.zeros(n), np.zeros((n, n))
-        self._numbers: IntArray = np.empty(0, dtype=np.int64)
-        self._coupling = np.zeros((n, 0))
-        self._rays = np.zeros(MOST_GROUPS, dtype=np.int64)
-        self._shared = 0.0
+        self._cells: dict[int, tuple[Batch, Cell]] = {}
+        self._left = LeftBorder()
         self._suspicion = Suspicion(self._alpha)
-        self._whole = _WholeStrip()
         self._drift: tuple[IntArray, Array, Array] | None = None
         self.biased: tuple[BiasedSource, ...] = ()
 
-    def forget(self, now_s: float) -> None:
-        """What has left the window is known otherwise than it was: begin anew."""
-        self._restart(now_s)
+    def begin(self, batches: list[Batch]) -> bool:
+        """Whether a strip has begun; from now on it is the one that is watched."""
+        newest = max(reversed(batches), key=_last_strip, default=None)
+        if newest is None or newest.strips[-1] <= self._strip:
+            return False
+        self._strip = newest.strips[-1]
+        self._borders += self._of_whole_strip()
+        self._restart(newest.oldest_s)
+        return True
 
-    def update(
-        self, now_s: float, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]
-    ) -> None:
+    def update(self, now_s: float, batches: list[Batch], state: WindowState) -> None:
         """Take in what has settled, and test when it is time.
 
         Parameters
         ----------
         batches : of the window
         state : solved
-        group_of : source and CCD line of each ray of a batch
         """
-        newest = max(reversed(batches), key=_last_strip, default=None)
-        if newest is not None and newest.strips[-1] > self._strip:
-            self._strip = newest.strips[-1]
-            self._borders += self._of_whole_strip()
-            self._restart(newest.oldest_s)
-        mine = [b for b in batches if b.strips[-1] == self._strip]
+        mine = self._mine(batches)
         # once there is an alarm its effect is taken back, in what has just come, too
         settled_s = SETTLED_S if not self.biased else 0.0
-        self._take_some([b for b in mine if b.newest_s <= now_s - settled_s], state, group_of)
+        self._take_some([b for b in mine if b.newest_s <= now_s - settled_s], state)
         if now_s >= self._next_s:
             self._next_s = now_s + EVERY_S
             self._test(now_s, mine, state)
 
-    def _take_some(self, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]) -> None:
+    def _take_some(self, batches: list[Batch], state: WindowState) -> None:
         """Take in new batches, then those that have changed, as many as one update can bear."""
         known = [self._cells.get(id(b)) for b in batches]
         new = [b for b, k in zip(batches, known, strict=True) if k is None]
         if self.biased:
             for batch in new:
-                self._take(batch, state, group_of)
+                self._take(batch, state)
             new = []
         new += [b for b, k in zip(batches, known, strict=True) if k and k[1].information is not b.information]
         rays = 0
         for batch in new:
             if rays > AT_ONCE:
                 break
-            self._take(batch, state, group_of)
+            self._take(batch, state)
             rays += len(batch.rays)
 
-    def leave(self, batches: list[Batch], state: WindowState, group_of: Callable[[Batch], list[Group]]) -> None:
-        """Batches leave the window; call before they are fixed."""
-        for batch in batches:
-            if batch.strips[-1] != self._strip:
-                continue
-            known = self._cells.pop(id(batch), None)
-            if known is None or known[1].information is not batch.information:
-                self._take(batch, state, group_of)
-                known = self._cells.pop(id(batch), None)
-            if known is None:
-                continue
-            cell = known[1]
-            self._score[cell.places] += cell.score
-            self._normal[np.ix_(cell.places, cell.places)] += cell.normal
-            self._rays[cell.groups] += cell.rays
-            self._shared += cell.shared
-            self._whole.add(cell)
-            new = np.setdiff1d(cell.numbers, self._numbers)
-            self._numbers = np.concatenate([self._numbers, new])
-            self._coupling = np.pad(self._coupling, ((0, 0), (0, len(new))))
-            self._coupling[np.ix_(cell.places, place_of(self._numbers, cell.numbers))] += cell.coupling
+    def _mine(self, batches: Iterable[Batch]) -> list[Batch]:
+        return [b for b in batches if b.strips[-1] == self._strip]
 
-    def marginalised(self, marginal: Marginal) -> None:
-        """Unknowns have left the window."""
-        gone = np.isin(marginal.gone, self._numbers)
-        if not gone.any():
-            return
-        first = np.zeros((len(self._score), len(marginal.gone)))
-        first[:, gone] = self._coupling[:, place_of(self._numbers, marginal.gone[gone])]
-        stayed = np.isin(marginal.stayed, self._numbers)
-        rest = np.zeros((len(self._score), len(marginal.stayed)))
-        rest[:, stayed] = self._coupling[:, place_of(self._numbers, marginal.stayed[stayed])]
-        T = solve_triangular(marginal.R11, first.T, trans=1, check_finite=False).T
-        self._score = self._score - T @ marginal.d1
-        self._normal = self._normal - T @ T.T
-        self._numbers, self._coupling = marginal.stayed.copy(), rest - T @ marginal.R12
+    def leave(self, batches: list[Batch], state: WindowState) -> dict[int, Cell]:
+        """Batches leave the window; call before they are fixed. Returns their borders, by identity."""
+        left = {}
+        for batch in self._mine(batches):
+            cell = self._up_to_date(batch, state)
+            self._cells.pop(id(batch), None)
+            if cell is not None:
+                self._left.add(cell)
+                left[id(batch)] = cell
+        return left
 
-    def _take(self, batch: Batch, state: WindowState, group_of: Callable[[Batch], list[Group]]) -> None:
-        cell = self._cell(batch, state, group_of(batch))
+    def marginalised(self, marginal: Marginal) -> Marginal:
+        """Unknowns have left the window; what left, with the border's unknowns, see `drift_border`."""
+        return self._left.marginalised(marginal, len(self._groups))
+
+    def recount(self, left: Recounted) -> None:
+        """Known coordinates that have left the window count otherwise than they did."""
+        self._left.exchange(left.numbers, left.change)
+        for numbers, change in left.of_points:
+            self._left.exchange_in_whole(numbers, change)
+
+    def unknowns(self, now_s: float, batches: Iterable[Batch], state: WindowState) -> Drifts | None:
+        """The drifts that can be weighed now, with all batches of the strip; None if there are too few rays."""
+        mine = self._mine(batches)
+        cells = {id(b): cell for b in mine if (cell := self._up_to_date(b, state)) is not None}
+        score, normal, coupling, count = self._assembled(cells, state)
+        found = hypotheses(list(self._groups), count.tolist())
+        if not found:
+            return None
+        limit = self._suspicion.limit(self._factor(now_s, int(count.sum()), self._shared(cells)))
+        named = self._suspected() if self.biased else np.empty(0, np.int64)
+        return Drifts(
+            score, normal, coupling, cells, found, (now_s - self._start_s) / DRIFT_S, limit,
+            named, self._beforehand(named), len(self.biased),
+        )  # fmt: skip
+
+    def _shared(self, cells: dict[int, Cell]) -> float:
+        return self._left.shared + sum(c.shared for c in cells.values())
+
+    def _up_to_date(self, batch: Batch, state: WindowState) -> Cell | None:
+        known = self._cells.get(id(batch))
+        if known is None or known[1].information is not batch.information:
+            self._take(batch, state)
+            known = self._cells.get(id(batch))
+        return known[1] if known is not None else None
+
+    def _take(self, batch: Batch, state: WindowState) -> None:
+        cell = self._cell(batch, state, self._groups_of(batch))
         if cell is not None:
             self._cells[id(batch)] = batch, cell
+        else:
+            self._cells.pop(id(batch), None)
 
-    def _cell(self, batch: Batch, state: WindowState, groups: list[Group]) -> _Cell | None:
+    def _cell(self, batch: Batch, state: WindowState, groups: list[Group]) -> Cell | None:
         for group in groups:
             if group not in self._groups and len(self._groups) < MOST_GROUPS:
                 self._groups[group] = len(self._groups)
@@ -219,9 +205,10 @@ class SourceMonitor:
         score = flat.T @ v.ravel() + coupling @ state.values(batch.columns)
         places = (EACH * present[:, None] + np.arange(EACH)).ravel()
         count = np.bincount(of_ray, minlength=k)
-        return _Cell(
+        seen = point[begins]
+        return Cell(
             batch.information, batch.weight.copy(), places, present, count, _shared(batch, use), score, normal,
-            batch.columns, coupling,
+            batch.columns, coupling, seen, on_point @ inverse_factors(batch.normals)[seen],
         )  # fmt: skip
 
     def _test(self, now_s: float, batches: list[Batch], state: WindowState) -> None:
@@ -230,7 +217,7 @@ class SourceMonitor:
         cells = self._in_border(batches)
         scores, count = self._scores(now_s, batches, cells, state)
         found = hypotheses(list(self._groups), count.tolist())
-        factor = self._factor(now_s, int(count.sum()), self._shared + sum(c.shared for c in cells.values()))
+        factor = self._factor(now_s, int(count.sum()), self._shared(cells))
         self.biased = self._suspicion.judge(now_s, scores, found, factor) if found else ()
         self._drift = None
         if self.biased:
@@ -253,19 +240,20 @@ class SourceMonitor:
         m = rays / lines / max(now_s - self._start_s, 1.0) * self._noise_time_s()
         return 1.0 + max(m - 1.0, 0.0) * shared / rays
 
-    def _in_border(self, batches: list[Batch]) -> dict[int, _Cell]:
+    def _in_border(self, batches: list[Batch]) -> dict[int, Cell]:
         """Of the batches, those that have been taken in and have lost no ray since."""
         present = {id(b): b for b in batches}
         self._cells = {key: kept for key, kept in self._cells.items() if key in present}
         return {k: c for k, (b, c) in self._cells.items() if np.array_equal(c.weight, b.weight)}
 
-    def _assembled(self, cells: dict[int, _Cell], state: WindowState) -> tuple[Array, Array, Array, IntArray]:
+    def _assembled(self, cells: dict[int, Cell], state: WindowState) -> tuple[Array, Array, Array, IntArray]:
         """Scores (n,) at theta = 0, normal matrix (n, n), coupling to all unknowns of the state, rays of the groups."""
         m = len(self._groups)
         n = EACH * m
-        score, normal, count = self._score[:n].copy(), self._normal[:n, :n].copy(), self._rays[:m].copy()
+        left = self._left
+        score, normal, count = left.score[:n].copy(), left.normal[:n, :n].copy(), left.rays[:m].copy()
         coupling = np.zeros((n, len(state)))
-        coupling[:, state.places(self._numbers)] = self._coupling[:n]
+        coupling[:, state.places(left.numbers)] = left.coupling[:n]
         for cell in cells.values():
             score[cell.places] += cell.score
             normal[np.ix_(cell.places, cell.places)] += cell.normal
@@ -282,10 +270,21 @@ class SourceMonitor:
         """
         if self._drift is None:
             return None
-        mine = [b for b in batches if b.strips[-1] == self._strip]
-        _, _, coupling, _ = self._assembled(self._in_border(mine), state)
+        _, _, coupling, _ = self._assembled(self._in_border(self._mine(batches)), state)
         rows, drift, covariance = self._drift
         return Compensation(state.propagated(coupling[rows].T), drift, covariance)
+
+    def on_points(self, batch: Batch, state: WindowState, drift: Compensation) -> tuple[Array, Array]:
+        """What a compensation does to the points of a batch (p, 3) and their covariance (p, 3, 3)."""
+        L = inverse_factors(batch.normals)
+        A = np.swapaxes(L, 1, 2) @ batch.coupling @ drift.through[state.places(batch.columns)]
+        cell = self._up_to_date(batch, state) if self._drift is not None and batch.strips[-1] == self._strip else None
+        if cell is not None and self._drift is not None:
+            rows = self._drift[0]
+            mine = np.isin(cell.places, rows)
+            at = np.searchsorted(rows, cell.places[mine])
+            A[cell.points[:, None, None], np.arange(3)[:, None], at] -= np.swapaxes(cell.on_points[:, mine], 1, 2)
+        return A @ drift.drift, A @ drift.covariance @ np.swapaxes(A, 1, 2)
 
     def borders(self) -> list[Border]:
         """Of the strips so far in which something was named when they were over, all of their unknowns in them."""
@@ -295,7 +294,7 @@ class SourceMonitor:
         if not self.biased:
             return []
         rows = self._suspected()
-        score, normal, numbers, coupling = self._whole.assembled(rows)
+        score, normal, numbers, coupling = self._left.whole.assembled(rows)
         return [Border(score, normal, numbers, coupling, self._beforehand(rows))]
 
     def _suspected(self) -> IntArray:
@@ -306,14 +305,14 @@ class SourceMonitor:
 
     def _beforehand(self, rows: IntArray) -> Array:
         """Sigma of these unknowns: what was named may be as large as that, the others as well."""
-        size = max(USUAL_PX, *(max(abs(s.line_px), abs(s.sample_px)) for s in self.biased))
+        size = max([USUAL_PX, *(max(abs(s.line_px), abs(s.sample_px)) for s in self.biased)])
         age = max((self._tested_s - self._start_s) / DRIFT_S, 0.1)
         return np.where(rows % EACH < EACH // 2, size, size / age)
 
     # -- the test ------------------------------------------------------------------------------------------------------
 
     def _scores(
-        self, now_s: float, batches: list[Batch], cells: dict[int, _Cell], state: WindowState
+        self, now_s: float, batches: list[Batch], cells: dict[int, Cell], state: WindowState
     ) -> tuple[Scores, IntArray]:
         """Scores of the groups at the solution of the same data, and rays of the groups."""
         score, normal, coupling, count = self._assembled(cells, state)
@@ -343,43 +342,6 @@ class SourceMonitor:
         return Scores(score, 0.5 * (V + V.T), (now_s - self._start_s) / DRIFT_S, DRIFT_S), count
 
 
-class _WholeStrip:
-    """Border of all batches of a strip that have left, with all its unknowns, unless it is too long for a block."""
-
-    def __init__(self) -> None:
-        n = MOST_GROUPS * EACH
-        self._score, self._normal = np.zeros(n), np.zeros((n, n))
-        self._coupling: dict[int, dict[int, Array]] = {}  # by group, then by unknown
-        self._too_long = False
-
-    def add(self, cell: _Cell) -> None:
-        """A batch has left."""
-        self._score[cell.places] += cell.score
-        self._normal[np.ix_(cell.places, cell.places)] += cell.normal
-        if self._too_long:
-            return
-        parts = cell.coupling.reshape(len(cell.groups), EACH, -1)
-        for group, part in zip(cell.groups.tolist(), parts, strict=True):
-            known = self._coupling.setdefault(group, {})
-            for number, column in zip(cell.numbers.tolist(), part.T, strict=True):
-                known[number] = known[number] + column if number in known else column
-            if len(known) > MOST_OF_STRIP:
-                self._too_long, self._coupling = True, {}
-                return
-
-    def assembled(self, rows: IntArray) -> tuple[Array, Array, IntArray, Array]:
-        """Scores, normal matrix, numbers (u,) and coupling of some of the border's unknowns, whole groups."""
-        of = [self._coupling.get(group, {}) for group in (rows[::EACH] // EACH).tolist()]
-        numbers = np.array(sorted({number for columns in of for number in columns}), dtype=np.int64)
-        coupling = np.zeros((len(of), EACH, len(numbers)))
-        for i, columns in enumerate(of):
-            if not columns:
-                continue
-            at = np.searchsorted(numbers, list(columns))
-            coupling[i][:, at] = np.array(list(columns.values())).reshape(-1, EACH).T
-        return self._score[rows], self._normal[np.ix_(rows, rows)], numbers, coupling.reshape(len(rows), -1)
-
-
 def _shared(batch: Batch, which: IntArray) -> float:
     """Share of the variance of rays that is noise of the measured position, summed over them."""
     rows = batch.lin.orientation[:, :3].transpose(2, 0, 1)[which]
@@ -388,9 +350,3 @@ def _shared(batch: Batch, which: IntArray) -> float:
 
 def _last_strip(batch: Batch) -> int:
     return batch.strips[-1]
-
-
-def place_of(numbers: IntArray, wanted: IntArray) -> IntArray:
-    """Places of numbers among others that hold them all."""
-    order = np.argsort(numbers)
-    return order[np.searchsorted(numbers, wanted, sorter=order)]

@@ -138,7 +138,7 @@ class Scores:
     age: float
     unit_s: float
 
-    def _of(self, h: Hypothesis) -> tuple[Array, Array, Array]:
+    def of(self, h: Hypothesis) -> tuple[Array, Array, Array]:
         """Choice C (n, 4) of unknowns, of one size, their scores and cofactors."""
         own = [EACH * i + np.arange(EACH) for i in h.members]
         grown = max(self.age, 0.1)
@@ -150,19 +150,19 @@ class Scores:
 
     def test(self, h: Hypothesis) -> float:
         """Test value: chi-square with four degrees of freedom if there is no bias at all."""
-        _, s, V = self._of(h)
+        _, s, V = self.of(h)
         return float(s @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ s)
 
     def bias(self, h: Hypothesis) -> Array:
         """Line and sample, px, now; the same a second, px/s."""
-        _, s, V = self._of(h)
+        _, s, V = self.of(h)
         b = np.linalg.solve(V + np.eye(EACH) / USUAL_PX**2, s)
         grown = max(self.age, 0.1)
         return np.concatenate([b[:2] + b[2:] * self.age / grown, b[2:] / (grown * self.unit_s)])
 
     def without(self, h: Hypothesis) -> Scores:
         """The scores of the others with this one estimated."""
-        C, _, V = self._of(h)
+        C, _, V = self.of(h)
         gain = self.V @ C @ np.linalg.pinv(V, rcond=1e-9, hermitian=True) @ C.T
         return Scores(self.score - gain @ self.score, self.V - gain @ self.V, self.age, self.unit_s)
 
@@ -209,6 +209,10 @@ class Suspicion:
     alpha: float = FALSE_ALARM
     _alarms: list[_Alarm] = field(default_factory=lambda: [_Alarm() for _ in range(MOST)])
 
+    def limit(self, factor: float = 1.0) -> float:
+        """Of test values; ``factor`` as in `judge`."""
+        return float(chi2.isf(self.alpha, EACH)) * factor
+
     def judge(
         self, now_s: float, scores: Scores, of: Sequence[Hypothesis], factor: float = 1.0
     ) -> tuple[BiasedSource, ...]:
@@ -218,7 +222,7 @@ class Suspicion:
         ----------
         factor : by which the cofactors of scores are larger than stated
         """
-        limit = float(chi2.isf(self.alpha, EACH)) * factor
+        limit = self.limit(factor)
         given, open_, result, least = [scores], list(of), [], limit
         for i, alarm in enumerate(self._alarms):
             if not open_:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..adjustment.determinability import Limits
 from ..camera import LineCamera
-from ..measured_trajectory import MeasuredTrajectory
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, Information
 from .block_solution import BlockSolution
@@ -21,7 +20,6 @@ from .ground import GroundBelow
 from .integrity import Exposure, Integrity
 from .lamp import Lamp
 from .light import Situation
-from .points import PointLooks
 from .results import RefinedOrientation
 from .settle import refused_control
 from .sources import SourceMonitor
@@ -97,9 +95,9 @@ class Watch:
     Parameters
     ----------
     determine : whether it is tested which additional parameters are determined
-    trajectory : the measured one
     alert_limit_m : of the light; 0 = see `ground`
     control : judges control, and is told what leaves
+    sources : watches for tie points that drift
 
     Attributes
     ----------
@@ -112,20 +110,16 @@ class Watch:
         self,
         camera: LineCamera,
         critical: float,
-        points: dict[str, PointLooks],
         self_calibration: SelfCalibration | None,
         camera_columns: IntArray,
         state: WindowState,
         determine: bool,
         control: ControlDesk,
-        trajectory: MeasuredTrajectory,
+        sources: SourceMonitor,
         alert_limit_m: float = 0.0,
     ) -> None:
         self._integrity = Integrity(critical)
-        self._sources = SourceMonitor(lambda: trajectory.noise_time_s)
-        self._control = control
-        self._points, self._state = points, state
-        self._ccds = [line.id for line in camera.lines]
+        self._control, self._sources, self._state = control, sources, state
         self._pitch = float(np.median(np.linalg.norm(np.diff(camera.lines[0].xy_mm[:2], axis=0), axis=1)))
         self._focal = float(camera.focal_length_mm[0])
         self._determinability: Determinability | None = None
@@ -157,14 +151,12 @@ class Watch:
         """Batches leave the window; what left before a time is forgotten."""
         self._integrity.note(batches)
         self._integrity.leave(batches, self._state, before_s)
-        self._sources.leave(batches, self._state, self._groups)
-        self._control.leaving(batches)
+        self._control.leaving(batches, self._sources.leave(batches, self._state))
 
     def marginalised(self, marginal: Marginal) -> None:
         """Unknowns have left the window."""
         self._integrity.marginalised(marginal)
-        self._sources.marginalised(marginal)
-        self._control.marginalised(marginal)
+        self._control.marginalised(self._sources.marginalised(marginal))
 
     def became_final(self, strip: WindowStrip, orientation: RefinedOrientation) -> Exposure | None:
         """Orientation has become final; returns how exposed the middle of its times is."""
@@ -227,10 +219,9 @@ class Watch:
         if self.exposure is not None and ground is not None:
             ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise + drift))
             ground_m = self.exposure.ground_protection(ground_sigma_m)
-        if self._control.rewritten:
-            self._sources.forget(now_s)
-            self._control.rewritten = False
-        self._sources.update(now_s, batches, self._state, self._groups)
+        if self._sources.begin(batches):
+            self._control.strip_began()
+        self._sources.update(now_s, batches, self._state)
         events: list[str] = []
         d = self._determinability
         if d is not None:
@@ -266,14 +257,13 @@ class Watch:
         self.last = found
         return replace(found, events=tuple(events))
 
-    @property
-    def drifting(self) -> bool:
-        """Whether tie points are known to drift."""
-        return bool(self._sources.biased)
-
     def compensation(self, batches: Iterable[Batch]) -> Compensation | None:
         """What tie points that drift do to the solution; None without an alarm."""
         return self._sources.compensation(batches, self._state)
+
+    def on_points(self, batch: Batch, drift: Compensation | None) -> tuple[Array, Array] | None:
+        """What a compensation does to the points of a batch (p, 3) and their covariance (p, 3, 3)."""
+        return None if drift is None else self._sources.on_points(batch, self._state, drift)
 
     def _drift_covariance(self, strip: WindowStrip | None, time_s: float, batches: list[Batch]) -> Array:
         """(6, 6) of the orientation at a time, for tie points that drift."""
@@ -304,15 +294,6 @@ class Watch:
         control = ((batch.control.weight > 0) & kept[:, None]).sum(axis=0)
         refused = batch.n_points - int(kept.sum())
         return _Count(batch.information, refused, tied, bool(batch.active_control), control, refused_control(batch))
-
-    def _groups(self, batch: Batch) -> list[Group]:
-        """Source and CCD line of each ray."""
-        rays = batch.rays
-        looks = [self._points[name].looks for name in batch.names]
-        return [
-            (looks[p][s].source, self._ccds[c])
-            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
-        ]
 
     def _gsd(self, batches: list[Batch]) -> float:
         if not batches:

@@ -38,6 +38,7 @@ from .pose_noise import PoseNoise
 from .results import Look, Parameter, RefinedOrientation, WindowOptions, WindowReport, WindowUpdate
 from .settle import Settler, settle
 from .snooping import reweigh, snoop
+from .sources import SourceMonitor
 from .state import WindowState
 from .strip import WindowStrip, segment_length
 from .watch import Watch
@@ -106,13 +107,13 @@ class Window:
         self._newest_ray_s = self._learnt_s = -np.inf
         self._duties = Duties()
         self._length_s = options.window_s
+        sources = SourceMonitor(self._intake.sources_of, lambda: self.trajectory.noise_time_s)
         self._control_desk = ControlDesk(
-            self.state, self.strips, self._batches, self._intake, self._block, options.critical,
-            lambda: self._watch.drifting,
-        )  # fmt: skip
+            self.state, self.strips, self._batches, self._intake, self._block, options.critical, sources
+        )
         self._watch = Watch(
-            camera, options.critical, self._points, self_calibration, self._camera_columns, self.state,
-            options.determine, self._control_desk, self.trajectory, options.alert_limit_m,
+            camera, options.critical, self_calibration, self._camera_columns, self.state, options.determine,
+            self._control_desk, sources, options.alert_limit_m,
         )  # fmt: skip
         self._orienter = Orienter(
             self.state, self.trajectory, self._pose_noise, lambda: self._watch.compensation(self._batches)
@@ -201,7 +202,8 @@ class Window:
         iterations = self._solve(fresh, joined, RETEST in duties, result)
         self._learn_noise()
         for batch in fresh:
-            result.points += adjusted_points(batch, self.state, self._points, self._control, final=False)
+            drift = self._watch.on_points(batch, self._orienter.drift)
+            result.points += adjusted_points(batch, self.state, self._points, self._control, False, drift)
         self._let_go(self._limit_s(), result)
         result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
         return result
