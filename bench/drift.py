@@ -88,6 +88,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
+    if args.minutes < 45.0:
+        parser.error("--minutes: wanted at least 45, two rows of ten minutes in each half")
     strips = max(4, round(60.0 * args.minutes / (STRIP_S + GAP_S)))
     plan = FlightPlan(
         strips=strips, strip_s=STRIP_S, turns=False, gap_s=GAP_S, lead_in_s=3.0, lead_out_s=2.0, sidelap=0.2

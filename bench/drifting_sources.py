@@ -73,8 +73,9 @@ def main() -> int:
     flights = [simulate(PLAN, seed, SENSORS, ties) for seed in range(options.seeds)]
     poses = [navigate(flight) for flight in flights]
     print(
-        "sources  CCD  drifts   named in    after, s  it is among them  alone  others named first  NEES final, whole  of points"
-    )
+        "sources  CCD  drifts   named in    after, s  it is among them  alone  others named first"
+        "  NEES final, whole  of points"
+    )  # fmt: skip
     for number, ccd, rate in CASES:
         OfSources.sources = number
         true, after, among, alone, changes, nees = (f"m{number - 1}", ccd), [], [], [], 0, []
