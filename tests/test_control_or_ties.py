@@ -16,7 +16,7 @@ from triline.solver.window.batch import Information
 from triline.solver.window.control_biases import Biases, Coordinate, Discrepancies, LeftControl, discrepancies
 from triline.solver.window.control_hypotheses import judge
 from triline.solver.window.control_or_ties import Drifts, weigh
-from triline.solver.window.drift_border import Cell, LeftBorder
+from triline.solver.window.drift_border import Cell, LeftBorder, OnPoints
 from triline.solver.window.results import CONTRADICTS, TAKEN_BACK, WindowOptions
 from triline.solver.window.state import WindowState
 from triline.solver.window.suspects import EACH, Hypothesis
@@ -38,11 +38,11 @@ def left_with(N, rhs, square):
     state.fix(numbers, information)
     border, left = LeftBorder(), LeftControl(20)
     groups = np.arange(GROUPS)
-    no_points = np.empty(0, np.int64), np.empty((0, DRIFTS, 3))
+    no_points = OnPoints(0, np.arange(DRIFTS), np.empty(0, np.int64), np.empty((0, DRIFTS, 3)))
     border.add(
         Cell(
             information, np.ones(1), np.arange(DRIFTS), groups, 20 + groups, 0.0, rhs[d], N[d, d], numbers, N[d, x],
-            *no_points,
+            no_points,
         )
     )  # fmt: skip
     coordinates = [Coordinate(f"P{i}", 2, 0, 1.0, 0.0) for i in range(BIASES)]

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from triline.solver.adjustment.normal_equations import PointNormals
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
@@ -19,8 +20,10 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
+from triline.solver.window.backward import LeftPoints, PointDrift
 from triline.solver.window.compensation import Border, estimated
-from triline.solver.window.results import Look, WindowOptions
+from triline.solver.window.drift_border import OnPoints
+from triline.solver.window.results import AdjustedPoint, Look, WindowOptions
 from triline.solver.window.sources import DRIFT_S, SourceMonitor
 from triline.solver.window.suspects import ALL, EACH, Hypothesis, Scores, Suspicion, hypotheses
 from triline.solver.window.window import Window
@@ -276,3 +279,31 @@ def test_compensation_is_the_solution_with_the_drift_as_unknowns():
     assert Q + covariance == pytest.approx(joint[:6, :6])
     # without any information, rounding included, it is what was known beforehand
     assert estimated(np.zeros(3), -1e-12 * np.eye(3), sigma)[1] == pytest.approx(np.diag(sigma**2))
+
+
+def test_a_point_without_the_drift_is_that_of_a_solution_with_the_drift_as_unknowns():
+    rng = np.random.default_rng(4)
+    A, J, B, values = rng.normal(size=(14, 4)), rng.normal(size=(14, 3)), rng.normal(size=(14, 3)), rng.normal(size=14)
+    design = np.hstack([A, J, B])
+    N = design.T @ design + np.diag([1.0] * 4 + [0.0] * 3 + [4.0] * 3)
+    together, covariance = np.linalg.solve(N, design.T @ values), np.linalg.inv(N)
+
+    L_inv = np.linalg.inv(np.linalg.cholesky(J.T @ J))
+    D, y, into = L_inv @ J.T @ A, L_inv @ J.T @ values, L_inv @ J.T @ B
+    Q = np.linalg.inv(A.T @ A - D.T @ D + np.eye(4))
+    theta = Q @ (A.T @ values - D.T @ y)
+    border = Border(
+        B.T @ values - into.T @ y, B.T @ B - into.T @ into, np.arange(4), B.T @ A - into.T @ D, np.full(3, 0.5)
+    )
+    drift = border.compensation(theta, Q, np.arange(4))
+    drift.apply(theta, Q)
+    assert theta == pytest.approx(together[:4]) and pytest.approx(covariance[:4, :4]) == Q
+
+    normals = PointNormals(L_inv[np.tril_indices(3)][:, None], y[:, None], np.array([3]))
+    published = (AdjustedPoint("P", "tie", np.zeros(3), np.eye(3), 2, True, ()),)
+    effect = OnPoints(0, np.arange(3), np.zeros(1, np.int64), (into.T @ L_inv)[None])
+    left = LeftPoints(np.arange(4), np.zeros((1, 3)), normals, D[None], np.zeros(1, np.int64), published, effect)
+    own = effect.of_unknowns(np.arange(3), 1)
+    (point,) = left.refined(theta, Q, PointDrift(own, drift.through, drift.drift, drift.covariance))
+    assert point.xyz_l == pytest.approx(together[4:7])
+    assert point.covariance == pytest.approx(covariance[4:7, 4:7])

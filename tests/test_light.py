@@ -18,6 +18,7 @@ from triline.solver.window.integrity import Exposure
 from triline.solver.window.lamp import HOLD_S, KIND_S, WORDS_S, Lamp
 from triline.solver.window.light import FAILED, GOOD, LEAST_POINTS, WEAK, Situation, light
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.suspects import BiasedSource
 
 RANK = {GOOD: 0, WEAK: 1, FAILED: 2}
 BELOW = Ground(1500.0, 0.15, 900.0)
@@ -85,6 +86,17 @@ def test_how_many_sigmas_an_error_is_does_not_count():
     for sigma in (0.2, 0.02, 0.002):
         sharp = Exposure(np.full(6, 0.3), np.full(6, sigma), "Z of control point GCP1", True, 0.4)
         assert light(replace(FINE, exposure=sharp, ground_sigma_m=np.full(4, sigma)))[0] == GOOD
+
+
+def test_what_contradicts_is_said_with_what_it_comes_from():
+    drift = BiasedSource("m1", "F", 0.1, 1.2, 0.0, 0.02, 90.0, 28.5, 40.0)
+    torn = replace(FINE, control_refused=2)
+    assert light(torn) == (FAILED, "2 control points contradict the orientation")
+    colour, reason = light(replace(torn, sources=(drift,)))  # looks that drift contradict control
+    assert colour == WEAK and reason.startswith("tie points of source m1 on CCD F drift")
+    colour, reason = light(replace(FINE, sources=(drift,), control_doubt="control and GNSS differ"))
+    assert colour == WEAK and reason.startswith("control and GNSS differ; tie points of source m1")
+    assert light(replace(FINE, sources=(drift,), control_doubt="they differ", control_failed=True))[0] == FAILED
 
 
 def test_more_of_anything_never_makes_it_worse():

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from ..adjustment.normal_equations import PointNormals
 from ..adjustment.reduced_system import DenseFactor
 from ..models.base import Design
-from .backward import LeftPoints, again
+from .backward import LeftPoints, PointDrift, again
 from .batch import Batch, inverse_factors
-from .block_normals import LOOKED_UP, ROWS, BlockNormals
+from .block_normals import LOOKED_UP, MOST_OF_STRIP, ROWS, BlockNormals
 from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
+from .drift_border import OnPoints
 from .output import checks
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
@@ -33,8 +34,6 @@ IntArray = NDArray[np.int64]
 #: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
 #: two seconds of one core; with the equations it takes 210 MB, which are kept.
 MOST_UNKNOWNS = 4200
-#: A strip with more unknowns is no part of a block.
-MOST_OF_STRIP = 1500
 #: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
 AGAIN, AGAIN_POINTS = 4e7, 8e6
 #: Object points kept; beyond that those of the oldest strip are forgotten.
@@ -119,7 +118,7 @@ class Archive:
         self.changed = True
         self._normals.add(columns, matrix, rhs)
 
-    def leave(self, batch: Batch, published: Sequence[AdjustedPoint]) -> None:
+    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], drifts: OnPoints | None = None) -> None:
         """A batch became final.
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
@@ -128,12 +127,13 @@ class Archive:
         Parameters
         ----------
         published : its points, those of full rank
+        drifts : what these would do to the points of a strip alone
         """
         if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
             return
         if batch.ties is None:
             self.add(batch.columns, batch.information.matrix, batch.information.rhs)
-            left = LeftPoints.of(batch, published)
+            left = LeftPoints.of(batch, published, drifts)
             time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
             control = [bool(w.any()) for w in batch.control.weight]
             for i, point in zip(left.order.tolist(), left.points, strict=True):
@@ -295,7 +295,9 @@ class Archive:
                 groups.setdefault(id(kept.left), (kept.left, set()))[1].add(name)
         points = []
         for left, names in groups.values():
-            points += [p for p in left.refined(*solution.of(left.columns)) if p.name in names]
+            points += [
+                p for p in left.refined(*solution.of(left.columns), _drift_of(left, solution)) if p.name in names
+            ]
             yield AGAIN_POINTS
         return WholeStrips(orientation, points)
 
@@ -342,6 +344,15 @@ class Archive:
         """A strip and its points are kept no more; numbers of its unknowns."""
         self.points = {name: p for name, p in self.points.items() if id not in p.strips}
         return self.strips.pop(id).numbers
+
+
+def _drift_of(left: LeftPoints, solution: BlockSolution) -> PointDrift | None:
+    """What has been taken back of tie points that drift, for points as they left."""
+    if left.drifts is None or left.drifts.strip not in solution.drifts:
+        return None
+    rows, drift = solution.drifts[left.drifts.strip]
+    own = left.drifts.of_unknowns(rows, len(left.origin_l))
+    return PointDrift(own, drift.through[solution.places(left.columns)], drift.drift, drift.covariance)
 
 
 def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.base import Design
-from .archive import MOST_OF_STRIP, MOST_POINTS, MOST_UNKNOWNS, Archive
+from .archive import MOST_POINTS, MOST_UNKNOWNS, Archive
 from .backward import Step, backward
 from .batch import Batch
+from .block_normals import MOST_OF_STRIP
 from .block_solution import BlockSolution, Parts
+from .drift_border import OnPoints
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 from .state import WindowState
@@ -69,11 +71,11 @@ class Block:
         """A strip begins."""
         self._archive.begin_strip(strip.id, strip.numbers)
 
-    def leave(self, batch: Batch, points: Sequence[AdjustedPoint]) -> None:
-        """A batch became final, with the points it published."""
+    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], drifts: OnPoints | None) -> None:
+        """A batch became final, with the points it published; ``drifts`` are what these would do to them."""
         self.conclude()
         names = list(self._strips)
-        self._archive.leave(batch, points)
+        self._archive.leave(batch, points, drifts)
         self._touched.update(names[i] for i in batch.strips)
 
     def orientation(self, strip: WindowStrip, final: RefinedOrientation, design: Design, noise: Array) -> None:

@@ -18,6 +18,8 @@ IntArray = NDArray[np.int64]
 
 #: Room for unknowns at first, and by how much it grows; what nothing was written to costs nothing.
 ROOM, GROWTH = 512, 1.5
+#: A strip with more unknowns is no part of a block.
+MOST_OF_STRIP = 1500
 #: Rows worked on at once.
 ROWS = 256
 #: What it costs to look up an element, in operations.

@@ -8,12 +8,14 @@ Generators of costs, in floating point operations, about.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from .compensation import Compensation
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -42,11 +44,17 @@ def in_one_go(parts: Generator[Cost, None, T]) -> T:
 
 @dataclass(frozen=True)
 class BlockSolution:
-    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), ascending."""
+    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), ascending.
+
+    Attributes
+    ----------
+    drifts : what has been taken back of tie points that drift, by strip: unknowns of its border, and what they did
+    """
 
     numbers: IntArray
     values: Array
     cofactors: Array
+    drifts: dict[int, tuple[IntArray, Compensation]] = field(default_factory=dict)
 
     def places(self, numbers: IntArray) -> IntArray:
         return np.searchsorted(self.numbers, numbers)

@@ -12,7 +12,7 @@ covariance says how badly that is known where several cannot be told apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ class Border:
     score, normal : (k,), (k, k), for values 0 of all unknowns
     numbers, coupling : (u,), (k, u) unknowns that they are coupled to
     sigma : (k,) of the drift's unknowns beforehand
+    strip, rows : index of the strip, and which unknowns (k,) of its border these are
     """
 
     score: Array
@@ -52,6 +53,8 @@ class Border:
     numbers: IntArray
     coupling: Array
     sigma: Array
+    strip: int = -1
+    rows: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def compensation(self, values: Array, cofactors: Array, places: IntArray) -> Compensation:
         """What it does to a solution of the same data.

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .archive import MOST_OF_STRIP
 from .batch import Information
+from .block_normals import MOST_OF_STRIP
 from .state import Marginal
 from .suspects import EACH
 
@@ -27,6 +27,32 @@ IntArray = NDArray[np.int64]
 
 #: Groups at most.
 MOST_GROUPS = 16
+
+
+@dataclass(frozen=True)
+class OnPoints:
+    """What drifts do to the points of a batch, given the orientation.
+
+    Attributes
+    ----------
+    strip : index
+    unknowns : (k,) places in the border of the strip
+    points : (m,) places in the batch, ascending
+    effect : (m, k, 3) by how much a unit of an unknown shifts the coordinates, m
+    """
+
+    strip: int
+    unknowns: IntArray
+    points: IntArray
+    effect: Array
+
+    def of_unknowns(self, rows: IntArray, points: int) -> Array:
+        """Of some unknowns, ascending, on all points (p, 3, r) of the batch."""
+        mine = np.isin(self.unknowns, rows)
+        at = np.searchsorted(rows, self.unknowns[mine])
+        result = np.zeros((points, 3, len(rows)))
+        result[self.points[:, None, None], np.arange(3)[:, None], at] = np.swapaxes(self.effect[:, mine], 1, 2)
+        return result
 
 
 @dataclass(frozen=True)
@@ -39,8 +65,7 @@ class Cell:
     places : (k,) in the border
     groups, rays : which groups have how many rays
     shared : share of the variance of a ray that is noise of its position, summed over the rays
-    points, on_points : (m,) places of points in the batch, in order, and what the unknowns do to their coordinates,
-        given the orientation (m, k, 3)
+    on_points : what the unknowns do to points
     """
 
     information: Information
@@ -53,14 +78,14 @@ class Cell:
     normal: Array
     numbers: IntArray
     coupling: Array
-    points: IntArray
-    on_points: Array
+    on_points: OnPoints
 
     def on_point(self, place: int) -> tuple[IntArray, Array]:
         """Numbers (k,) of the unknowns, as of `control_biases`, and what they do to a point (k, 3)."""
-        at = int(np.searchsorted(self.points, place))
-        if at < len(self.points) and self.points[at] == place:
-            return -1 - self.places, self.on_points[at]
+        points = self.on_points.points
+        at = int(np.searchsorted(points, place))
+        if at < len(points) and points[at] == place:
+            return -1 - self.places, self.on_points.effect[at]
         return np.empty(0, np.int64), np.empty((0, 3))
 
 

@@ -25,7 +25,7 @@ from .batch import Batch, inverse_factors
 from .compensation import Border, Compensation, estimated
 from .control_biases import Recounted
 from .control_or_ties import Drifts
-from .drift_border import MOST_GROUPS, Cell, LeftBorder
+from .drift_border import MOST_GROUPS, Cell, LeftBorder, OnPoints
 from .state import Marginal, WindowState
 from .suspects import ALL, EACH, FALSE_ALARM, USUAL_PX, BiasedSource, Group, Scores, Suspicion, hypotheses
 
@@ -117,6 +117,11 @@ class SourceMonitor:
     def _mine(self, batches: Iterable[Batch]) -> list[Batch]:
         return [b for b in batches if b.strips[-1] == self._strip]
 
+    def effects(self, batches: list[Batch], state: WindowState) -> dict[int, OnPoints]:
+        """What drifts would do to the points of batches, by identity."""
+        cells = {id(b): self._up_to_date(b, state) for b in self._mine(batches)}
+        return {key: cell.on_points for key, cell in cells.items() if cell is not None}
+
     def leave(self, batches: list[Batch], state: WindowState) -> dict[int, Cell]:
         """Batches leave the window; call before they are fixed. Returns their borders, by identity."""
         left = {}
@@ -206,9 +211,10 @@ class SourceMonitor:
         places = (EACH * present[:, None] + np.arange(EACH)).ravel()
         count = np.bincount(of_ray, minlength=k)
         seen = point[begins]
+        on_points = OnPoints(self._strip, places, seen, on_point @ inverse_factors(batch.normals)[seen])
         return Cell(
             batch.information, batch.weight.copy(), places, present, count, _shared(batch, use), score, normal,
-            batch.columns, coupling, seen, on_point @ inverse_factors(batch.normals)[seen],
+            batch.columns, coupling, on_points,
         )  # fmt: skip
 
     def _test(self, now_s: float, batches: list[Batch], state: WindowState) -> None:
@@ -280,10 +286,7 @@ class SourceMonitor:
         A = np.swapaxes(L, 1, 2) @ batch.coupling @ drift.through[state.places(batch.columns)]
         cell = self._up_to_date(batch, state) if self._drift is not None and batch.strips[-1] == self._strip else None
         if cell is not None and self._drift is not None:
-            rows = self._drift[0]
-            mine = np.isin(cell.places, rows)
-            at = np.searchsorted(rows, cell.places[mine])
-            A[cell.points[:, None, None], np.arange(3)[:, None], at] -= np.swapaxes(cell.on_points[:, mine], 1, 2)
+            A -= cell.on_points.of_unknowns(self._drift[0], len(A))
         return A @ drift.drift, A @ drift.covariance @ np.swapaxes(A, 1, 2)
 
     def borders(self) -> list[Border]:
@@ -295,7 +298,7 @@ class SourceMonitor:
             return []
         rows = self._suspected()
         score, normal, numbers, coupling = self._left.whole.assembled(rows)
-        return [Border(score, normal, numbers, coupling, self._beforehand(rows))]
+        return [Border(score, normal, numbers, coupling, self._beforehand(rows), self._strip, rows)]
 
     def _suspected(self) -> IntArray:
         """Unknowns of all groups that may drift."""

@@ -16,6 +16,7 @@ from .block_solution import BlockSolution
 from .compensation import Compensation
 from .control import ControlDesk
 from .determinability import Determinability, Standing, ranks
+from .drift_border import OnPoints
 from .ground import GroundBelow
 from .integrity import Exposure, Integrity
 from .lamp import Lamp
@@ -265,6 +266,10 @@ class Watch:
         """What a compensation does to the points of a batch (p, 3) and their covariance (p, 3, 3)."""
         return None if drift is None else self._sources.on_points(batch, self._state, drift)
 
+    def effects(self, batches: list[Batch]) -> dict[int, OnPoints]:
+        """What drifts would do to the points of batches, by identity."""
+        return self._sources.effects(batches, self._state)
+
     def _drift_covariance(self, strip: WindowStrip | None, time_s: float, batches: list[Batch]) -> Array:
         """(6, 6) of the orientation at a time, for tie points that drift."""
         drift = self.compensation(batches) if strip is not None else None
@@ -280,9 +285,10 @@ class Watch:
             if not known.any():
                 continue
             border = replace(border, numbers=border.numbers[known], coupling=border.coupling[:, known])
-            border.compensation(solution.values, solution.cofactors, solution.places(border.numbers)).apply(
-                solution.values, solution.cofactors
-            )
+            places = solution.places(border.numbers)
+            drift = border.compensation(solution.values, solution.cofactors, places)
+            drift.apply(solution.values, solution.cofactors)
+            solution.drifts[border.strip] = border.rows, drift
 
     def _count_of(self, batch: Batch) -> _Count:
         """Anew only if the batch has changed."""
