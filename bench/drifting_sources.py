@@ -3,7 +3,8 @@
     python bench/drifting_sources.py [--seeds 5] [--dense 3]
 
 One strip of 70 s a seed, 8 tie points/s; from 5 s on the looks of one CCD line, of one source or of one of two, drift
-by 0.03 px/s in their samples or 0.05 px/s in their lines. Then clean flights with 500 tie points/s. Set
+by 0.03 px/s in their samples or 0.05 px/s in their lines. Then blocks of three strips of 50 s, tied across; in one of
+them samples drift by 0.03 px/s. Then clean flights with 500 tie points/s. Set
 OPENBLAS_NUM_THREADS=1.
 """
 
@@ -25,6 +26,7 @@ from triline.solver.window.suspects import ALL
 from triline.solver.window.window import Window
 
 PLAN = FlightPlan(strip_s=70.0, lead_in_s=3.0, lead_out_s=2.0)
+BLOCK = FlightPlan(strips=3, strip_s=50.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0)
 SENSORS = ErrorModel(attitude_rate_hz=100.0)
 SAMPLE, LINE, FROM_S = (0.0, 0.03), (0.05, 0.0), 5.0
 Drift = tuple[float, float]
@@ -59,6 +61,16 @@ def spoilt(simulation: Simulation, ccd: str, rate: Drift) -> Simulation:
         simulation,
         images=replace(images, line=images.line + rate[0] * since_s, sample=images.sample + rate[1] * since_s),
     )
+
+
+def drifting_in(simulation: Simulation, strip: int, ccd: str) -> Simulation:
+    """The looks of a CCD line drift in one strip of a block."""
+    images, looks = simulation.images, simulation.images.looks
+    ids = np.array([line.id for line in simulation.flight.camera.lines])
+    begin_s, end_s = simulation.flight.covered_s[strip]
+    mine = (ids[looks.ccd] == ccd) & (looks.time_s >= begin_s) & (looks.time_s <= end_s)
+    sample = images.sample + np.where(mine, SAMPLE[1] * (looks.time_s - begin_s), 0.0)
+    return replace(simulation, images=replace(images, sample=sample))
 
 
 def main() -> int:
@@ -101,6 +113,19 @@ def main() -> int:
             flush=True,
         )
     OfSources.sources = 1
+    print("block: drifts    named in  NEES of final orientation, whole, whole points")
+    for strip, ccd in ((0, "N"), (1, "F"), (1, "N")):
+        named, found = 0, []
+        for seed in range(options.seeds):
+            flight = simulate(BLOCK, seed, SENSORS, ObservationPlan(tie_points_per_s=8.0, control=9, check=20))
+            result = adjust_online(drifting_in(flight, strip, ccd), navigate(flight), live=False, update_s=0.5)
+            named += any(r.watched.sources for r in result.reports)
+            last = {(o.strip, float(o.time_s[0])): o for o in result.whole}  # told again when the block has grown
+            runs = result.final, list(last.values())
+            orientation = [orientation_errors(flight, o).nees.mean() for o in runs]
+            found.append([*orientation, point_errors(flight, result.whole_points).nees.mean()])
+        figures = "  ".join(f"{value:5.1f}" for value in np.mean(found, axis=0))
+        print(f"       strip {strip + 1}, {ccd}  {named} of {options.seeds}  {figures}", flush=True)
     many, false = ObservationPlan(tie_points_per_s=500.0, check=10), 0
     for seed in range(options.dense):
         flight = simulate(replace(PLAN, strip_s=60.0), seed, SENSORS, many)

@@ -20,9 +20,10 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
-from triline.solver.window.backward import LeftPoints, PointDrift
+from triline.solver.window.backward import LeftPoints
+from triline.solver.window.block_solution import BlockSolution
 from triline.solver.window.compensation import Border, estimated
-from triline.solver.window.drift_border import OnPoints
+from triline.solver.window.drift_border import of_block
 from triline.solver.window.results import AdjustedPoint, Look, WindowOptions
 from triline.solver.window.sources import DRIFT_S, SourceMonitor
 from triline.solver.window.suspects import ALL, EACH, Hypothesis, Scores, Suspicion, hypotheses
@@ -160,6 +161,26 @@ def test_the_orientation_and_its_covariance_are_without_a_drift_that_is_named(fl
         assert point_errors(simulation, points).nees.mean() < 5.0  # likewise
 
 
+@pytest.mark.parametrize(("strip", "ccd"), [(0, "F"), (1, "N")])
+def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd):
+    """Points that tie strips carry the drift of their looks in one of them."""
+    plan = FlightPlan(strips=2, strip_s=50.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, 1, SENSORS, ObservationPlan(tie_points_per_s=6.0, control=6, check=10))
+    begin_s, end_s = simulation.flight.covered_s[strip]
+    spoilt = _shifted(
+        simulation,
+        lambda t: np.multiply.outer(((t > begin_s) & (t < end_s)) * (0.5 + 0.03 * (t - begin_s)), [0, 1]),
+        ccd,
+    )
+    result, alarms = _fly(spoilt, navigate(simulation))
+    assert alarms and all(("", ccd) in sources[0].suspects for _, sources in alarms)
+    for id in ("S1", "S2"):
+        whole = {float(o.time_s[0]): o for o in result.whole if o.strip == id}
+        assert orientation_errors(simulation, list(whole.values())).nees.mean() < 2.5  # some tens if it stays
+    tied = {name: p for name, p in result.whole_points.items() if p.rays > 3}
+    assert len(tied) > 50 and point_errors(simulation, tied).nees.mean() < 2.0
+
+
 # ---- several sources
 
 
@@ -271,7 +292,7 @@ def test_compensation_is_the_solution_with_the_drift_as_unknowns():
     joint = np.linalg.inv(np.block([[N, A.T @ B], [B.T @ A, B.T @ B + prior]]))
     expected = joint @ np.concatenate([A.T @ e, B.T @ e])
     Q = np.linalg.inv(N)
-    border = Border(B.T @ e, B.T @ B, np.arange(6), B.T @ A, sigma)
+    border = Border(B.T @ e, B.T @ B, B.T @ A, sigma)
     found = border.compensation(Q @ A.T @ e, Q, np.arange(6))
     change, covariance = found.change(np.eye(6), np.arange(6))
     assert found.drift == pytest.approx(expected[6:]) and found.covariance == pytest.approx(joint[6:, 6:])
@@ -289,21 +310,21 @@ def test_a_point_without_the_drift_is_that_of_a_solution_with_the_drift_as_unkno
     together, covariance = np.linalg.solve(N, design.T @ values), np.linalg.inv(N)
 
     L_inv = np.linalg.inv(np.linalg.cholesky(J.T @ J))
-    D, y, into = L_inv @ J.T @ A, L_inv @ J.T @ values, L_inv @ J.T @ B
+    D, y, E = L_inv @ J.T @ A, L_inv @ J.T @ values, L_inv @ J.T @ B
     Q = np.linalg.inv(A.T @ A - D.T @ D + np.eye(4))
     theta = Q @ (A.T @ values - D.T @ y)
-    border = Border(
-        B.T @ values - into.T @ y, B.T @ B - into.T @ into, np.arange(4), B.T @ A - into.T @ D, np.full(3, 0.5)
-    )
-    drift = border.compensation(theta, Q, np.arange(4))
-    drift.apply(theta, Q)
-    assert theta == pytest.approx(together[:4]) and pytest.approx(covariance[:4, :4]) == Q
+    drifts = np.sort(of_block(0, np.arange(3)))
+    border = Border(B.T @ values - E.T @ y, B.T @ B - E.T @ E, B.T @ A - E.T @ D, np.full(3, 0.5))
+    solution = BlockSolution(np.arange(4), theta, Q).without(drifts, border)
+    columns = np.concatenate([np.arange(4), drifts])
+    order = [0, 1, 2, 3, 7, 8, 9]
+    got = solution.of(columns)
+    assert got[0] == pytest.approx(together[order]) and got[1] == pytest.approx(covariance[np.ix_(order, order)])
 
     normals = PointNormals(L_inv[np.tril_indices(3)][:, None], y[:, None], np.array([3]))
     published = (AdjustedPoint("P", "tie", np.zeros(3), np.eye(3), 2, True, ()),)
-    effect = OnPoints(0, np.arange(3), np.zeros(1, np.int64), (into.T @ L_inv)[None])
-    left = LeftPoints(np.arange(4), np.zeros((1, 3)), normals, D[None], np.zeros(1, np.int64), published, effect)
-    own = effect.of_unknowns(np.arange(3), 1)
-    (point,) = left.refined(theta, Q, PointDrift(own, drift.through, drift.drift, drift.covariance))
+    coupling = np.hstack([D, E])[None]
+    left = LeftPoints(columns, np.zeros((1, 3)), normals, coupling, np.zeros(1, dtype=np.int64), published)
+    (point,) = left.refined(*got)
     assert point.xyz_l == pytest.approx(together[4:7])
     assert point.covariance == pytest.approx(covariance[4:7, 4:7])

@@ -4,8 +4,8 @@ The window lets go of unknowns by marginalisation, one strip at a time. So that 
 one something, the information of every batch that became final is kept here a second time, before marginalisation: the
 normal equations of all strips, dense, and for every object point its coordinates given the unknowns its rays touched
 (`LeftPoints`). A point that is seen again in a later strip thus ties both, and its earlier looks are never counted
-twice. Solving the whole gives every line and every point the information of the block: it is the backward pass of
-`backward` for several strips.
+twice. Drifts of tie points are unknowns as well, held at zero until they are named (`drift_border`). Solving the whole
+gives every line and every point the information of the block: it is the backward pass of `backward` for several strips.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from numpy.typing import NDArray
 from ..adjustment.normal_equations import PointNormals
 from ..adjustment.reduced_system import DenseFactor
 from ..models.base import Design
-from .backward import LeftPoints, PointDrift, again
+from .backward import LeftPoints, again
 from .batch import Batch, inverse_factors
-from .block_normals import LOOKED_UP, MOST_OF_STRIP, ROWS, BlockNormals
+from .block_normals import LOOKED_UP, ROWS, BlockNormals
 from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
-from .drift_border import OnPoints
+from .compensation import Border, Named
+from .drift_border import MOST_GROUPS, Cell, of_block
 from .output import checks
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
+from .suspects import EACH
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -34,6 +36,8 @@ IntArray = NDArray[np.int64]
 #: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
 #: two seconds of one core; with the equations it takes 210 MB, which are kept.
 MOST_UNKNOWNS = 4200
+#: A strip with more unknowns is no part of a block.
+MOST_OF_STRIP = 1500
 #: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
 AGAIN, AGAIN_POINTS = 4e7, 8e6
 #: Object points kept; beyond that those of the oldest strip are forgotten.
@@ -70,6 +74,7 @@ class KeptStrip:
     """A strip: numbers of its unknowns, a-priori equations, orientation that became final."""
 
     id: str
+    index: int
     numbers: IntArray
     prior: tuple[NDArray[np.int32], Array, Array, Array] | None = None
     entered: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -94,16 +99,18 @@ class Archive:
         self.strips: dict[str, KeptStrip] = {}
         self.points: dict[str, KeptPoint] = {}
         self.changed = False
+        self._begun = 0
         self._camera, self._camera_sigma = camera_columns, camera_sigma
         self._normals, self._workspace = BlockNormals(), Workspace()
 
     def begin_strip(self, id: str, numbers: IntArray) -> None:
         """A strip begins, whose unknowns have these numbers (consecutive)."""
-        self.strips[id] = KeptStrip(id, numbers)
+        self.strips[id] = KeptStrip(id, self._begun, numbers)
+        self._begun += 1
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept."""
-        kept = np.isin(columns, self._camera)
+        kept = np.isin(columns, self._camera) | (columns < 0)
         for strip in self.strips.values():
             if len(strip.numbers):
                 kept |= (columns >= strip.numbers[0]) & (columns <= strip.numbers[-1])
@@ -118,7 +125,7 @@ class Archive:
         self.changed = True
         self._normals.add(columns, matrix, rhs)
 
-    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], drifts: OnPoints | None = None) -> None:
+    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> None:
         """A batch became final.
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
@@ -127,13 +134,19 @@ class Archive:
         Parameters
         ----------
         published : its points, those of full rank
-        drifts : what these would do to the points of a strip alone
+        cell : what drifts of its strip have to do with it, None if nothing
         """
         if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
             return
         if batch.ties is None:
-            self.add(batch.columns, batch.information.matrix, batch.information.rhs)
-            left = LeftPoints.of(batch, published, drifts)
+            left = LeftPoints.of(batch, published)
+            matrix, rhs = batch.information.matrix, batch.information.rhs
+            if cell is not None:
+                matrix = np.block([[matrix, cell.coupling.T], [cell.coupling, cell.normal]])
+                rhs = np.concatenate([rhs, cell.score])
+                coupling = np.concatenate([left.coupling, cell.roots(batch.normals)], axis=2)
+                left = replace(left, columns=np.concatenate([left.columns, cell.of_block]), coupling=coupling)
+            self.add(left.columns, matrix, rhs)
             time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
             control = [bool(w.any()) for w in batch.control.weight]
             for i, point in zip(left.order.tolist(), left.points, strict=True):
@@ -141,7 +154,7 @@ class Archive:
                 self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), control[i]))
             return
         by_name = {p.name: p for p in published}
-        told = [self._tie(batch, i, by_name.get(name)) for i, name in enumerate(batch.names)]
+        told = [self._tie(batch, i, by_name.get(name), cell) for i, name in enumerate(batch.names)]
         told = [t for t in told if t is not None]
         if not told:
             return
@@ -158,16 +171,22 @@ class Archive:
         self.points.pop(name, None)
         self.points[name] = kept
 
-    def _tie(self, batch: Batch, i: int, published: AdjustedPoint | None) -> tuple[IntArray, Array, Array] | None:
+    def _tie(
+        self, batch: Batch, i: int, published: AdjustedPoint | None, cell: Cell | None
+    ) -> tuple[IntArray, Array, Array] | None:
         """Keep a point of a batch that ties strips; its information (u, u), (u,) about unknowns (u,), if it has any."""
         assert batch.ties is not None
         name, own = batch.names[i], batch.columns[: len(batch.columns) - batch.n_tied]
         A, J, residual, origin = batch.equations(i)
+        A = A[:, : len(own)]
+        if cell is not None:
+            A = np.column_stack([A, cell.on_rays(range(batch.first_ray[i], batch.first_ray[i + 1]))])
+            own = np.concatenate([own, cell.of_block])
         old = self.points.get(name)
         if old is None or not self.holds(old.left.columns) or not batch.ties.active[i]:
             old = None
-        columns = own if old is None else np.union1d(own, old.left.columns)
-        rows, points, values = [_spread(A[:, : len(own)], own, columns)], [J], [residual]
+        columns = np.union1d(own, [] if old is None else old.left.columns).astype(np.int64)
+        rows, points, values = [_spread(A, own, columns)], [J], [residual]
         control = not (old is not None and old.with_control) and bool(batch.ties.control[i].any())
         if old is not None:
             L, D, y = old.root
@@ -277,6 +296,19 @@ class Archive:
             N[row, : row + 1] *= scale[row] * scale[: row + 1]
         return rhs * scale, scale
 
+    def without(self, named: Iterable[Named], solution: BlockSolution) -> BlockSolution:
+        """A solution without the drifts of tie points that have been named."""
+        kept = {s.index for s in self.strips.values()}
+        mine = [drift for drift in named if drift.strip in kept]
+        if not mine:
+            return solution
+        numbers = np.concatenate([of_block(drift.strip, drift.rows) for drift in mine])
+        order = np.argsort(numbers)
+        numbers, sigma = numbers[order], np.concatenate([drift.sigma for drift in mine])[order]
+        N = self._normals
+        border = Border(N.rhs(numbers), N.rows(numbers, numbers), N.rows(numbers, solution.numbers), sigma)
+        return solution.without(numbers, border)
+
     def refining(self, solution: BlockSolution, strips: Iterable[str]) -> Generator[Cost, None, WholeStrips]:
         """Orientation and points of strips with the information of the block; a point goes with its last strip.
 
@@ -295,9 +327,7 @@ class Archive:
                 groups.setdefault(id(kept.left), (kept.left, set()))[1].add(name)
         points = []
         for left, names in groups.values():
-            points += [
-                p for p in left.refined(*solution.of(left.columns), _drift_of(left, solution)) if p.name in names
-            ]
+            points += [p for p in left.refined(*solution.of(left.columns)) if p.name in names]
             yield AGAIN_POINTS
         return WholeStrips(orientation, points)
 
@@ -343,16 +373,10 @@ class Archive:
     def _forget(self, id: str) -> IntArray:
         """A strip and its points are kept no more; numbers of its unknowns."""
         self.points = {name: p for name, p in self.points.items() if id not in p.strips}
-        return self.strips.pop(id).numbers
-
-
-def _drift_of(left: LeftPoints, solution: BlockSolution) -> PointDrift | None:
-    """What has been taken back of tie points that drift, for points as they left."""
-    if left.drifts is None or left.drifts.strip not in solution.drifts:
-        return None
-    rows, drift = solution.drifts[left.drifts.strip]
-    own = left.drifts.of_unknowns(rows, len(left.origin_l))
-    return PointDrift(own, drift.through[solution.places(left.columns)], drift.drift, drift.covariance)
+        strip = self.strips.pop(id)
+        drifts = of_block(strip.index, np.arange(MOST_GROUPS * EACH))
+        self._normals.drop(np.intersect1d(drifts, self._normals.numbers))
+        return strip.numbers
 
 
 def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:

@@ -19,7 +19,6 @@ from ..adjustment.reliability import CRITICAL_W
 from ..models.base import Design
 from ..rotation import corrected_angles
 from .batch import Batch, inverse_factors
-from .drift_border import OnPoints
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 from .state import Marginal, WindowState
 
@@ -31,28 +30,8 @@ CLEARLY = 1.01
 
 
 @dataclass(frozen=True)
-class PointDrift:
-    """A drift with r unknowns in the looks at p points, that the values of u other unknowns are without already.
-
-    Attributes
-    ----------
-    own : (p, 3, r) what a unit of them does to the points through their own looks
-    through : (u, r) what it did to the values
-    drift, covariance : (r,), (r, r)
-    """
-
-    own: Array
-    through: Array
-    drift: Array
-    covariance: Array
-
-
-@dataclass(frozen=True)
 class LeftPoints:
-    """Points of a batch as they left: what leads from the unknowns to them (see `Batch`).
-
-    ``drifts`` are what these would do to them.
-    """
+    """Points of a batch as they left: what leads from the unknowns to them (see `Batch`)."""
 
     columns: IntArray
     origin_l: Array
@@ -60,29 +39,23 @@ class LeftPoints:
     coupling: Array
     order: IntArray
     points: tuple[AdjustedPoint, ...]
-    drifts: OnPoints | None = None
 
     @classmethod
-    def of(cls, batch: Batch, points: Iterable[AdjustedPoint], drifts: OnPoints | None = None) -> LeftPoints:
+    def of(cls, batch: Batch, points: Iterable[AdjustedPoint]) -> LeftPoints:
         """Of a batch and the points it published (those of full rank, in its order)."""
         published = tuple(points)
         place = {name: i for i, name in enumerate(batch.names)}
         order = np.array([place[p.name] for p in published], dtype=np.int64)
-        return cls(batch.columns, batch.origin_l, batch.normals, batch.coupling, order, published, drifts)
+        return cls(batch.columns, batch.origin_l, batch.normals, batch.coupling, order, published)
 
-    def refined(self, theta: Array, Q: Array, drift: PointDrift | None = None) -> list[AdjustedPoint]:
-        """The points for other values (u,) and cofactors (u, u) of their unknowns, without a drift."""
+    def refined(self, theta: Array, Q: Array) -> list[AdjustedPoint]:
+        """The points for other values (u,) and cofactors (u, u) of their unknowns."""
         xyz = self.origin_l + self.normals.back((self.normals.y.T - self.coupling @ theta).T).T
         p, u = len(self.origin_l), len(self.columns)
         D = self.coupling
         inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
         L = inverse_factors(self.normals)
         covariance = np.swapaxes(L, 1, 2) @ inner @ L
-        if drift is not None:
-            E, C = drift.own, drift.covariance
-            xyz = xyz - E @ drift.drift
-            both = np.swapaxes(L, 1, 2) @ D @ drift.through @ C @ np.swapaxes(E, 1, 2)
-            covariance = covariance + E @ C @ np.swapaxes(E, 1, 2) - both - np.swapaxes(both, 1, 2)
         return [
             replace(point, xyz_l=xyz[i], covariance=covariance[i], whole=True)
             for i, point in zip(self.order, self.points, strict=True)

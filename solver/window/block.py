@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.base import Design
-from .archive import MOST_POINTS, MOST_UNKNOWNS, Archive
+from .archive import MOST_OF_STRIP, MOST_POINTS, MOST_UNKNOWNS, Archive
 from .backward import Step, backward
 from .batch import Batch
-from .block_normals import MOST_OF_STRIP
-from .block_solution import BlockSolution, Parts
-from .drift_border import OnPoints
+from .block_solution import Parts
+from .compensation import Named
+from .drift_border import Cell
 from .points import ControlPoint
 from .results import AdjustedPoint, RefinedOrientation, WholeStrips
 from .state import WindowState
@@ -46,7 +46,7 @@ class Block:
     ----------
     earlier : what the strip that is flown knows of those before it
     events : lines for the operator since they were taken last
-    compensate : takes from a solution what tie points that drift did to it
+    drifts : says in which strips tie points drift
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Block:
     ):
         self.earlier = EarlierStrips(state, camera_columns)
         self.events: list[str] = []
-        self.compensate: Callable[[BlockSolution], None] = lambda _: None
+        self.drifts: Callable[[], list[Named]] = list
         self._archive = Archive(camera_columns, camera_sigma)
         self._state, self._strips = state, strips
         self._touched: set[str] = set()
@@ -71,11 +71,11 @@ class Block:
         """A strip begins."""
         self._archive.begin_strip(strip.id, strip.numbers)
 
-    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], drifts: OnPoints | None) -> None:
-        """A batch became final, with the points it published; ``drifts`` are what these would do to them."""
+    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> None:
+        """A batch became final, with the points it published; ``cell``: what drifts have to do with it."""
         self.conclude()
         names = list(self._strips)
-        self._archive.leave(batch, points, drifts)
+        self._archive.leave(batch, points, cell)
         self._touched.update(names[i] for i in batch.strips)
 
     def orientation(self, strip: WindowStrip, final: RefinedOrientation, design: Design, noise: Array) -> None:
@@ -184,7 +184,7 @@ class Block:
     def _refining(self, wanted: Sequence[str], at_the_end: bool) -> Parts:
         """Solve the block, refine strips, close the oldest if there are too many, tell the next one; in parts."""
         solution = yield from self._archive.solving()
-        self.compensate(solution)
+        solution = self._archive.without(self.drifts(), solution)
         closing = self._archive.beyond()
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))

@@ -18,8 +18,6 @@ IntArray = NDArray[np.int64]
 
 #: Room for unknowns at first, and by how much it grows; what nothing was written to costs nothing.
 ROOM, GROWTH = 512, 1.5
-#: A strip with more unknowns is no part of a block.
-MOST_OF_STRIP = 1500
 #: Rows worked on at once.
 ROWS = 256
 #: What it costs to look up an element, in operations.
@@ -96,6 +94,14 @@ class BlockNormals:
             if place[i] >= 0:
                 here = known[: np.searchsorted(known, i, side="right")]
                 out[i, here] = self._row(int(place[i]), place[here])
+
+    def rows(self, numbers: IntArray, others: IntArray) -> Array:
+        """Elements (n, m) between unknowns; 0 where nothing is known."""
+        place, at = self._places(numbers), self._places(others)
+        result, known = np.zeros((len(numbers), len(others))), np.flatnonzero(at >= 0)
+        for i in np.flatnonzero(place >= 0):
+            result[i, known] = self._row(int(place[i]), at[known])
+        return result
 
     def close(self, numbers: IntArray, own: Array, rhs: Array, room: Array) -> Parts:
         """Let unknowns (n,) go, of which nothing else will be said: what they say of others stays (Schur complement).

@@ -8,14 +8,14 @@ Generators of costs, in floating point operations, about.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs, solve_triangular
 
-from .compensation import Compensation
+from .compensation import Border, Compensation
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -46,23 +46,45 @@ def in_one_go(parts: Generator[Cost, None, T]) -> T:
 class BlockSolution:
     """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), ascending.
 
-    Attributes
-    ----------
-    drifts : what has been taken back of tie points that drift, by strip: unknowns of its border, and what they did
+    Beside them stand those of drifts of tie points, with negative numbers: they are zero and certain, unless they have
+    been taken back.
     """
 
     numbers: IntArray
     values: Array
     cofactors: Array
-    drifts: dict[int, tuple[IntArray, Compensation]] = field(default_factory=dict)
+    _drift: tuple[IntArray, Compensation] | None = None
 
     def places(self, numbers: IntArray) -> IntArray:
         return np.searchsorted(self.numbers, numbers)
 
     def of(self, numbers: IntArray) -> tuple[Array, Array]:
-        """Values and cofactors of some."""
-        at = self.places(numbers)
-        return self.values[at], self.cofactors[np.ix_(at, at)]
+        """Values and cofactors of some, also of drifts."""
+        own = numbers >= 0
+        at = self.places(numbers[own])
+        if own.all():
+            return self.values[at], self.cofactors[np.ix_(at, at)]
+        values, Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
+        values[own], Q[np.ix_(own, own)] = self.values[at], self.cofactors[np.ix_(at, at)]
+        if self._drift is not None:
+            known, drift = self._drift
+            here = np.flatnonzero(np.isin(numbers, known))
+            k = np.searchsorted(known, numbers[here])
+            values[here], Q[np.ix_(here, here)] = drift.drift[k], drift.covariance[np.ix_(k, k)]
+            across = -drift.through[at] @ drift.covariance[:, k]
+            Q[np.ix_(own, here)], Q[np.ix_(here, own)] = across, across.T
+        return values, Q
+
+    def without(self, numbers: IntArray, border: Border) -> BlockSolution:
+        """What it is without drifts; its arrays are used up.
+
+        Parameters
+        ----------
+        numbers, border : of the unknowns (k,) of the drifts, ascending; coupled to all others
+        """
+        drift = border.compensation(self.values, self.cofactors, np.arange(len(self.numbers)))
+        drift.apply(self.values, self.cofactors)
+        return BlockSolution(self.numbers, self.values, self.cofactors, (numbers, drift))
 
 
 class Workspace:

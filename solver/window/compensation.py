@@ -12,7 +12,7 @@ covariance says how badly that is known where several cannot be told apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,24 +37,35 @@ def estimated(score: Array, V: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
+class Named:
+    """What drifts in a strip.
+
+    Attributes
+    ----------
+    strip : index
+    rows, sigma : unknowns (k,) of its border, and what they may be beforehand
+    """
+
+    strip: int
+    rows: IntArray
+    sigma: Array
+
+
+@dataclass(frozen=True)
 class Border:
     """Unknowns (k,) of a drift beside those of the normal equations.
 
     Attributes
     ----------
     score, normal : (k,), (k, k), for values 0 of all unknowns
-    numbers, coupling : (u,), (k, u) unknowns that they are coupled to
+    coupling : (k, u) to unknowns
     sigma : (k,) of the drift's unknowns beforehand
-    strip, rows : index of the strip, and which unknowns (k,) of its border these are
     """
 
     score: Array
     normal: Array
-    numbers: IntArray
     coupling: Array
     sigma: Array
-    strip: int = -1
-    rows: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def compensation(self, values: Array, cofactors: Array, places: IntArray) -> Compensation:
         """What it does to a solution of the same data.

@@ -202,7 +202,7 @@ class ControlDesk:
             batch.eliminate()
             self._state.exchange(batch.columns, before[key], batch.information)
         if len(self._left) and (out[at:] != d.out[at:]).any():
-            self._sources.recount(self._left.set_out(out[at:], self._state))
+            self._sources.recount(*self._left.set_out(out[at:], self._state))
             for c, lost, was in zip(d.coordinates[at:], out[at:], d.out[at:], strict=True):
                 if lost != was:
                     self._block.weigh_control(c.point, c.axis, -c.weight if lost else c.weight, c.value)

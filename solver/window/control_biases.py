@@ -148,21 +148,6 @@ def discrepancies(
     return Discrepancies(coordinates, out, C[:c, :c], v[:c], C[c:, c:], v[c:], C[:c, c:])
 
 
-@dataclass(frozen=True)
-class Recounted:
-    """What changes in the normal equations when coordinates that have left count otherwise.
-
-    Attributes
-    ----------
-    numbers, change : of unknowns that are still there, negative ones of drifts; what is added
-    of_points : the same, point by point, of the unknowns that were there when it left
-    """
-
-    numbers: IntArray
-    change: Information
-    of_points: list[tuple[IntArray, Information]]
-
-
 class LeftControl:
     """Coordinates whose batches have left the window.
 
@@ -178,7 +163,6 @@ class LeftControl:
     def _forget_all(self) -> None:
         none = np.empty(0)
         self._kept = Biases([], np.empty(0, bool), np.empty(0, np.int64), none.reshape(0, 0), none.reshape(0, 0), none)
-        self._as_left: list[Biases] = []
 
     def __len__(self) -> int:
         return len(self._kept.coordinates)
@@ -189,7 +173,6 @@ class LeftControl:
 
     def add(self, new: Biases) -> None:
         """A point leaves with its batch; its unknowns are still there."""
-        self._as_left.append(new)
         old = self._kept
         numbers = np.union1d(old.columns, new.columns)
         k, m = len(old.coordinates), len(new.coordinates)
@@ -215,12 +198,12 @@ class LeftControl:
             )  # fmt: skip
         kept = [c for c, k in zip(old.coordinates, which, strict=True) if k]
         self._kept = Biases(kept, old.out[which], old.columns, G[:, which], H[np.ix_(which, which)], r[which])
-        self._as_left = [b for b in self._as_left if any(c in kept for c in b.coordinates)]
 
     def drop_drifts(self) -> None:
         """The drifts that were watched are no unknowns any more."""
-        self._kept = _of_state_only(self._kept)
-        self._as_left = [_of_state_only(b) for b in self._as_left]
+        kept = self._kept
+        own = kept.columns >= 0
+        self._kept = replace(kept, columns=kept.columns[own], G=kept.G[own])
 
     def drop_strips(self, over: set[int]) -> None:
         """Forget the coordinates seen from strips that are over."""
@@ -253,36 +236,19 @@ class LeftControl:
         G, H, r = rest - R12.T @ q, old.H - q.T @ q, old.r - q.T @ d
         self._kept = Biases(old.coordinates, old.out, m.stayed.copy(), G, H, r)
 
-    def set_out(self, out: Bools, state: WindowState) -> Recounted:
-        """Refuse coordinates and take others back: the state is changed."""
+    def set_out(self, out: Bools, state: WindowState) -> tuple[IntArray, Information]:
+        """Refuse coordinates and take others back: the state is changed. Returns by what, with unknowns of drifts."""
         old = self._kept
-        columns, change = old.columns, _exchanged(old, out)
+        columns, before, after = old.columns, _taken_away(old, old.out), _taken_away(old, out)
+        change = Information(
+            before.matrix - after.matrix, before.rhs - after.rhs, before.square - after.square, before.rows - after.rows
+        )
         own = np.flatnonzero(columns >= 0)
         of_state = replace(change, matrix=change.matrix[np.ix_(own, own)], rhs=change.rhs[own])
         state.add(columns[own], of_state)
         state.fix(columns[own], of_state)
         self._kept = replace(old, out=out.copy())
-        lost = dict(zip(old.coordinates, out.tolist(), strict=True))
-        of_points = []
-        for i, b in enumerate(self._as_left):
-            now = np.array([lost.get(c, was) for c, was in zip(b.coordinates, b.out.tolist(), strict=True)])
-            if (now != b.out).any():
-                of_points.append((b.columns, _exchanged(b, now)))
-                self._as_left[i] = replace(b, out=now)
-        return Recounted(columns, change, of_points)
-
-
-def _of_state_only(b: Biases) -> Biases:
-    own = b.columns >= 0
-    return replace(b, columns=b.columns[own], G=b.G[own])
-
-
-def _exchanged(b: Biases, out: Bools) -> Information:
-    """What the unknowns gain when others are out than were."""
-    before, after = _taken_away(b, b.out), _taken_away(b, out)
-    return Information(
-        before.matrix - after.matrix, before.rhs - after.rhs, before.square - after.square, before.rows - after.rows
-    )
+        return columns, change
 
 
 def _taken_away(b: Biases, out: Bools) -> Information:

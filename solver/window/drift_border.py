@@ -1,4 +1,4 @@
-"""Unknowns of drifting tie points as a border of the normal equations: of a batch, of what has left, of a whole strip.
+"""Unknowns of drifting tie points as a border of the normal equations: of a batch, and of what has left.
 
 The unknowns ``b``, four for a group of rays, are held at zero. With the effect ``B`` of ``b`` on whitened residuals
 ``v``, and S that projects out the object points, the border has the scores ``s = sum B^T S (v + A theta)``, the
@@ -6,7 +6,8 @@ coupling ``M = sum B^T S A`` to the other unknowns, and the normal matrix ``sum 
 window they are eliminated from it as from the rest.
 
 Where an object point is known, ``b`` and the biases of its coordinates (`control_biases`) are coupled as well; there
-the unknowns of the border have the numbers -1, -2, ... beside those of the state.
+the unknowns of the border have the numbers -1, -2, ... beside those of the state. In a block of strips they are
+unknowns as others are, but for their numbers (`of_block`) and that they are held at zero until they are named.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ..adjustment.normal_equations import PointNormals, inverse_factors
 from .batch import Information
-from .block_normals import MOST_OF_STRIP
 from .state import Marginal
 from .suspects import EACH
 
@@ -46,6 +47,12 @@ class OnPoints:
     points: IntArray
     effect: Array
 
+    def on_point(self, place: int) -> Array:
+        """On a point of the batch (k, 3); none on one that it does not have."""
+        at = int(np.searchsorted(self.points, place))
+        there = at < len(self.points) and self.points[at] == place
+        return self.effect[at] if there else np.zeros((len(self.unknowns), 3))
+
     def of_unknowns(self, rows: IntArray, points: int) -> Array:
         """Of some unknowns, ascending, on all points (p, 3, r) of the batch."""
         mine = np.isin(self.unknowns, rows)
@@ -66,6 +73,8 @@ class Cell:
     groups, rays : which groups have how many rays
     shared : share of the variance of a ray that is noise of its position, summed over the rays
     on_points : what the unknowns do to points
+    used, of_ray, effect : (n,) rays of the batch, (n,) the group of each as a place in ``groups``, (n, 2, 4) what its
+        unknowns do to the whitened residuals
     """
 
     information: Information
@@ -79,14 +88,32 @@ class Cell:
     numbers: IntArray
     coupling: Array
     on_points: OnPoints
+    used: IntArray
+    of_ray: IntArray
+    effect: Array
+
+    @property
+    def of_block(self) -> IntArray:
+        """Numbers of the unknowns (k,), see `of_block`."""
+        return of_block(self.on_points.strip, self.places)
+
+    def roots(self, normals: PointNormals) -> Array:
+        """What they do to points (p, 3, k) of the batch as its coupling says it of others, see `Batch`."""
+        L = np.linalg.inv(inverse_factors(normals)[self.on_points.points])
+        result = np.zeros((len(normals.rank), 3, len(self.places)))
+        result[self.on_points.points] = np.swapaxes(self.on_points.effect @ L, 1, 2)
+        return result
+
+    def on_rays(self, rays: range) -> Array:
+        """What the unknowns do to the whitened residuals of rays (2 m, k)."""
+        B = np.zeros((len(rays), 2, len(self.groups), EACH))
+        mine = (self.used >= rays.start) & (self.used < rays.stop)
+        B[self.used[mine] - rays.start, :, self.of_ray[mine]] = self.effect[mine]
+        return B.reshape(2 * len(rays), -1)
 
     def on_point(self, place: int) -> tuple[IntArray, Array]:
         """Numbers (k,) of the unknowns, as of `control_biases`, and what they do to a point (k, 3)."""
-        points = self.on_points.points
-        at = int(np.searchsorted(points, place))
-        if at < len(points) and points[at] == place:
-            return -1 - self.places, self.on_points.effect[at]
-        return np.empty(0, np.int64), np.empty((0, 3))
+        return -1 - self.places, self.on_points.on_point(place)
 
 
 class LeftBorder:
@@ -99,13 +126,11 @@ class LeftBorder:
         self.coupling = np.zeros((n, 0))
         self.rays = np.zeros(MOST_GROUPS, dtype=np.int64)
         self.shared = 0.0
-        self.whole = WholeStrip()
 
     def add(self, cell: Cell) -> None:
         """A batch leaves; its unknowns are still there."""
         self.rays[cell.groups] += cell.rays
         self.shared += cell.shared
-        self.whole.add(cell.places, cell.score, cell.normal, cell.numbers, cell.coupling)
         self._add(cell.places, cell.score, cell.normal, cell.numbers, cell.coupling)
 
     def _add(self, places: IntArray, score: Array, normal: Array, numbers: IntArray, coupling: Array) -> None:
@@ -137,57 +162,20 @@ class LeftBorder:
 
     def exchange(self, numbers: IntArray, change: Information) -> None:
         """Known coordinates that have left count otherwise: numbers of unknowns of the state and of the border."""
-        self._add(*_of_border(numbers, change))
-
-    def exchange_in_whole(self, numbers: IntArray, change: Information) -> None:
-        """The same where no unknown has left."""
-        self.whole.add(*_of_border(numbers, change))
-
-
-class WholeStrip:
-    """Border of all batches of a strip that have left, with all its unknowns, unless it is too long for a block."""
-
-    def __init__(self) -> None:
-        n = MOST_GROUPS * EACH
-        self._score, self._normal = np.zeros(n), np.zeros((n, n))
-        self._coupling: dict[int, dict[int, Array]] = {}  # by group, then by unknown
-        self._too_long = False
-
-    def add(self, places: IntArray, score: Array, normal: Array, numbers: IntArray, coupling: Array) -> None:
-        """Add the border of a batch: of whole groups."""
-        self._score[places] += score
-        self._normal[np.ix_(places, places)] += normal
-        if self._too_long:
+        if not (numbers < 0).any():
             return
-        parts = coupling.reshape(-1, EACH, len(numbers))
-        for group, part in zip((places[::EACH] // EACH).tolist(), parts, strict=True):
-            known = self._coupling.setdefault(group, {})
-            for number, column in zip(numbers.tolist(), part.T, strict=True):
-                known[number] = known[number] + column if number in known else column
-            if len(known) > MOST_OF_STRIP:
-                self._too_long, self._coupling = True, {}
-                return
-
-    def assembled(self, rows: IntArray) -> tuple[Array, Array, IntArray, Array]:
-        """Scores, normal matrix, numbers (u,) and coupling of some of the border's unknowns, whole groups."""
-        of = [self._coupling.get(group, {}) for group in (rows[::EACH] // EACH).tolist()]
-        numbers = np.array(sorted({number for columns in of for number in columns}), dtype=np.int64)
-        coupling = np.zeros((len(of), EACH, len(numbers)))
-        for i, columns in enumerate(of):
-            if not columns:
-                continue
-            at = np.searchsorted(numbers, list(columns))
-            coupling[i][:, at] = np.array(list(columns.values())).reshape(-1, EACH).T
-        return self._score[rows], self._normal[np.ix_(rows, rows)], numbers, coupling.reshape(len(rows), -1)
+        own = np.flatnonzero(numbers < 0)
+        own = own[np.argsort(-numbers[own])]  # by their places
+        other = np.flatnonzero(numbers >= 0)
+        matrix = change.matrix
+        self._add(
+            -1 - numbers[own], change.rhs[own], matrix[np.ix_(own, own)], numbers[other], matrix[np.ix_(own, other)]
+        )
 
 
-def _of_border(numbers: IntArray, change: Information) -> tuple[IntArray, Array, Array, IntArray, Array]:
-    """The border's part of a change of the normal equations: places, scores, normal matrix, unknowns, coupling."""
-    own = np.flatnonzero(numbers < 0)
-    own = own[np.argsort(-numbers[own])]  # by their places
-    other = np.flatnonzero(numbers >= 0)
-    matrix = change.matrix
-    return -1 - numbers[own], change.rhs[own], matrix[np.ix_(own, own)], numbers[other], matrix[np.ix_(own, other)]
+def of_block(strip: int, places: IntArray) -> IntArray:
+    """Numbers of a border's unknowns beside those of a block of strips: negative ones."""
+    return -1 - (strip * MOST_GROUPS * EACH + places)
 
 
 def _place_of(numbers: IntArray, wanted: IntArray) -> IntArray:

@@ -97,13 +97,13 @@ class Leaver:
                 self._state.solve()
             if rounds or failed:
                 self._orienter.forget()
-        effects = self._watch.effects(leaving)
+        cells = self._watch.cells(leaving)
         for batch in leaving:
             drift = self._watch.on_points(batch, self._orienter.drift)
             points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, True, drift)
             result.points += points
             self._left.append(LeftPoints.of(batch, points))
-            self._block.leave(batch, points, effects.get(id(batch)))
+            self._block.leave(batch, points, cells.get(id(batch)))
         self._watch.leaving(leaving, limit_s - length_s)
         for batch in leaving:
             self._batches.leave(batch)

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.reduced_system import DenseFactor
-from .batch import Batch, inverse_factors
-from .compensation import Border, Compensation, estimated
-from .control_biases import Recounted
+from .batch import Batch, Information, inverse_factors
+from .compensation import Compensation, Named, estimated
 from .control_or_ties import Drifts
 from .drift_border import MOST_GROUPS, Cell, LeftBorder, OnPoints
 from .state import Marginal, WindowState
@@ -38,7 +37,7 @@ AT_ONCE = 240
 #: Time between tests, s; unit of the drift, s.
 EVERY_S, DRIFT_S = 1.0, 10.0
 #: Strips whose drifts are remembered.
-MOST_BORDERS = 40
+MOST_NAMED = 40
 
 
 class SourceMonitor:
@@ -60,7 +59,7 @@ class SourceMonitor:
         self._groups_of, self._noise_time_s, self._alpha = groups_of, noise_time_s, alpha
         self._strip = -1
         self._next_s = -np.inf
-        self._borders: deque[Border] = deque(maxlen=MOST_BORDERS)
+        self._named: deque[Named] = deque(maxlen=MOST_NAMED)
         self._restart(0.0)
 
     def _restart(self, now_s: float) -> None:
@@ -77,8 +76,8 @@ class SourceMonitor:
         newest = max(reversed(batches), key=_last_strip, default=None)
         if newest is None or newest.strips[-1] <= self._strip:
             return False
+        self._named += self._in_this_strip()
         self._strip = newest.strips[-1]
-        self._borders += self._of_whole_strip()
         self._restart(newest.oldest_s)
         return True
 
@@ -117,10 +116,9 @@ class SourceMonitor:
     def _mine(self, batches: Iterable[Batch]) -> list[Batch]:
         return [b for b in batches if b.strips[-1] == self._strip]
 
-    def effects(self, batches: list[Batch], state: WindowState) -> dict[int, OnPoints]:
-        """What drifts would do to the points of batches, by identity."""
-        cells = {id(b): self._up_to_date(b, state) for b in self._mine(batches)}
-        return {key: cell.on_points for key, cell in cells.items() if cell is not None}
+    def cells(self, batches: list[Batch], state: WindowState) -> dict[int, Cell]:
+        """Borders of batches as they are, by identity."""
+        return {id(b): cell for b in self._mine(batches) if (cell := self._up_to_date(b, state)) is not None}
 
     def leave(self, batches: list[Batch], state: WindowState) -> dict[int, Cell]:
         """Batches leave the window; call before they are fixed. Returns their borders, by identity."""
@@ -137,16 +135,14 @@ class SourceMonitor:
         """Unknowns have left the window; what left, with the border's unknowns, see `drift_border`."""
         return self._left.marginalised(marginal, len(self._groups))
 
-    def recount(self, left: Recounted) -> None:
-        """Known coordinates that have left the window count otherwise than they did."""
-        self._left.exchange(left.numbers, left.change)
-        for numbers, change in left.of_points:
-            self._left.exchange_in_whole(numbers, change)
+    def recount(self, numbers: IntArray, change: Information) -> None:
+        """Known coordinates that have left the window count otherwise: what unknowns gain, negative ones of drifts."""
+        self._left.exchange(numbers, change)
 
     def unknowns(self, now_s: float, batches: Iterable[Batch], state: WindowState) -> Drifts | None:
         """The drifts that can be weighed now, with all batches of the strip; None if there are too few rays."""
         mine = self._mine(batches)
-        cells = {id(b): cell for b in mine if (cell := self._up_to_date(b, state)) is not None}
+        cells = self.cells(mine, state)
         score, normal, coupling, count = self._assembled(cells, state)
         found = hypotheses(list(self._groups), count.tolist())
         if not found:
@@ -214,7 +210,7 @@ class SourceMonitor:
         on_points = OnPoints(self._strip, places, seen, on_point @ inverse_factors(batch.normals)[seen])
         return Cell(
             batch.information, batch.weight.copy(), places, present, count, _shared(batch, use), score, normal,
-            batch.columns, coupling, on_points,
+            batch.columns, coupling, on_points, use, of_ray, B,
         )  # fmt: skip
 
     def _test(self, now_s: float, batches: list[Batch], state: WindowState) -> None:
@@ -289,16 +285,13 @@ class SourceMonitor:
             A -= cell.on_points.of_unknowns(self._drift[0], len(A))
         return A @ drift.drift, A @ drift.covariance @ np.swapaxes(A, 1, 2)
 
-    def borders(self) -> list[Border]:
-        """Of the strips so far in which something was named when they were over, all of their unknowns in them."""
-        return [*self._borders, *self._of_whole_strip()]
+    def named(self) -> list[Named]:
+        """The strips so far in which something was named when they were over."""
+        return [*self._named, *self._in_this_strip()]
 
-    def _of_whole_strip(self) -> list[Border]:
-        if not self.biased:
-            return []
-        rows = self._suspected()
-        score, normal, numbers, coupling = self._left.whole.assembled(rows)
-        return [Border(score, normal, numbers, coupling, self._beforehand(rows), self._strip, rows)]
+    def _in_this_strip(self) -> list[Named]:
+        rows = self._suspected() if self.biased else np.empty(0, np.int64)
+        return [Named(self._strip, rows, self._beforehand(rows))] if len(rows) else []
 
     def _suspected(self) -> IntArray:
         """Unknowns of all groups that may drift."""

@@ -327,7 +327,8 @@ def _patch(
     B = (through.reshape(-1, len(columns)) @ M.T).reshape(len(P), 3, r)
     rest = through @ np.swapaxes(P, 1, 2) + noise - B @ np.swapaxes(B, 1, 2)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(rest)), 1, 2)
-    return list(zip(xyz, B, root, strict=True)), (solution.places(columns), M)
+    own = columns >= 0  # drifts are of one strip alone
+    return list(zip(xyz, B, root, strict=True)), (solution.places(columns[own]), M[:, own])
 
 
 def _covariance_rows(functionals: Sequence[tuple[IntArray, Array]], cofactors: Array) -> Iterator[Array]:

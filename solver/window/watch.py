@@ -12,11 +12,10 @@ from ..adjustment.determinability import Limits
 from ..camera import LineCamera
 from ..selfcalibration import SelfCalibration
 from .batch import Batch, Information
-from .block_solution import BlockSolution
 from .compensation import Compensation
 from .control import ControlDesk
 from .determinability import Determinability, Standing, ranks
-from .drift_border import OnPoints
+from .drift_border import Cell
 from .ground import GroundBelow
 from .integrity import Exposure, Integrity
 from .lamp import Lamp
@@ -266,9 +265,9 @@ class Watch:
         """What a compensation does to the points of a batch (p, 3) and their covariance (p, 3, 3)."""
         return None if drift is None else self._sources.on_points(batch, self._state, drift)
 
-    def effects(self, batches: list[Batch]) -> dict[int, OnPoints]:
-        """What drifts would do to the points of batches, by identity."""
-        return self._sources.effects(batches, self._state)
+    def cells(self, batches: list[Batch]) -> dict[int, Cell]:
+        """What drifts have to do with batches, by identity."""
+        return self._sources.cells(batches, self._state)
 
     def _drift_covariance(self, strip: WindowStrip | None, time_s: float, batches: list[Batch]) -> Array:
         """(6, 6) of the orientation at a time, for tie points that drift."""
@@ -277,18 +276,6 @@ class Watch:
             return np.zeros((6, 6))
         numbers, A = _functions(strip, time_s)
         return drift.change(A, self._state.places(numbers))[1]
-
-    def compensate(self, solution: BlockSolution) -> None:
-        """Take from a solution of the block what tie points that drift did to it."""
-        for border in self._sources.borders():
-            known = np.isin(border.numbers, solution.numbers)
-            if not known.any():
-                continue
-            border = replace(border, numbers=border.numbers[known], coupling=border.coupling[:, known])
-            places = solution.places(border.numbers)
-            drift = border.compensation(solution.values, solution.cofactors, places)
-            drift.apply(solution.values, solution.cofactors)
-            solution.drifts[border.strip] = border.rows, drift
 
     def _count_of(self, batch: Batch) -> _Count:
         """Anew only if the batch has changed."""

@@ -118,7 +118,7 @@ class Window:
         self._orienter = Orienter(
             self.state, self.trajectory, self._pose_noise, lambda: self._watch.compensation(self._batches)
         )
-        self._block.compensate = self._watch.compensate
+        self._block.drifts = sources.named
         step_s = segment_length(slow, options)
         self._arrivals = Arrivals(
             self._batches, self.state, self._maker, self._intake, self._block, step_s, options.snoop, self._watch.drop
