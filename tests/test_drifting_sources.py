@@ -20,6 +20,7 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
+from triline.solver.window import archive
 from triline.solver.window.backward import LeftPoints
 from triline.solver.window.block_solution import BlockSolution
 from triline.solver.window.compensation import Border, estimated
@@ -161,9 +162,11 @@ def test_the_orientation_and_its_covariance_are_without_a_drift_that_is_named(fl
         assert point_errors(simulation, points).nees.mean() < 5.0  # likewise
 
 
-@pytest.mark.parametrize(("strip", "ccd"), [(0, "F"), (1, "N")])
-def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd):
-    """Points that tie strips carry the drift of their looks in one of them."""
+@pytest.mark.parametrize(("strip", "ccd", "bounded"), [(0, "F", False), (1, "N", False), (0, "N", True)])
+def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd, bounded, monkeypatch):
+    """Points that tie strips carry the drift of their looks in one of them, also of one that is refined no more."""
+    if bounded:
+        monkeypatch.setattr(archive, "MOST_UNKNOWNS", 200)
     plan = FlightPlan(strips=2, strip_s=50.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0)
     simulation = simulate(plan, 1, SENSORS, ObservationPlan(tie_points_per_s=6.0, control=6, check=10))
     begin_s, end_s = simulation.flight.covered_s[strip]
@@ -177,6 +180,7 @@ def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd):
     for id in ("S1", "S2"):
         whole = {float(o.time_s[0]): o for o in result.whole if o.strip == id}
         assert orientation_errors(simulation, list(whole.values())).nees.mean() < 2.5  # some tens if it stays
+    assert any("refined no more" in text for text in result.events) == bounded
     tied = {name: p for name, p in result.whole_points.items() if p.rays > 3}
     assert len(tied) > 50 and point_errors(simulation, tied).nees.mean() < 2.0
 

@@ -353,19 +353,24 @@ class Archive:
         numbers = self._forget(id)
         self._normals.drop(self._normals.numbers[np.isin(self._normals.numbers, numbers)])
 
-    def close(self, id: str) -> None:
-        """Let a strip's unknowns go; what they say of the others stays: their solution does too."""
-        in_one_go(self.closing(id))
+    def close(self, id: str, named: Iterable[Named] = ()) -> None:
+        """Let a strip's unknowns go, also the drifts in it that are named; what they say of the others stays: their
+        solution does too."""
+        in_one_go(self.closing(id, named))
 
-    def closing(self, id: str) -> Parts:
+    def closing(self, id: str, named: Iterable[Named] = ()) -> Parts:
         """The same in parts, each with what it costs; where the last solution stood."""
         strip = self.strips[id]
-        numbers = np.sort(strip.entered)
+        drifts = [(of_block(d.strip, d.rows), d.sigma) for d in named if d.strip == strip.index]
+        numbers = np.sort(np.concatenate([strip.entered, *(own for own, _ in drifts)]))
         n = len(numbers)
         own, through = self._workspace.pair(n, len(self._normals))
         rhs = self._normals.rhs(numbers)
         self._normals.lower(numbers, own, range(n))
         _add_prior(own, rhs, numbers, strip)
+        for of_drift, sigma in drifts:
+            at = np.searchsorted(numbers, of_drift)
+            own[at, at] += 1.0 / sigma**2
         yield LOOKED_UP * n * n / 2.0
         yield from self._normals.close(numbers, own, rhs, through)
         self._forget(id)

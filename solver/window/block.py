@@ -184,14 +184,15 @@ class Block:
     def _refining(self, wanted: Sequence[str], at_the_end: bool) -> Parts:
         """Solve the block, refine strips, close the oldest if there are too many, tell the next one; in parts."""
         solution = yield from self._archive.solving()
-        solution = self._archive.without(self.drifts(), solution)
+        named = self.drifts()
+        solution = self._archive.without(named, solution)
         closing = self._archive.beyond()
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))
         if not at_the_end:
             yield from self.earlier.learning(self._archive, solution, closing)
         for id in closing:
-            yield from self._archive.closing(id)
+            yield from self._archive.closing(id, named)
             self.events.append(
                 f"strip {id} is refined no more: the block has over {MOST_UNKNOWNS} unknowns or {MOST_POINTS} points"
             )
