@@ -53,14 +53,19 @@ class KeptPoint:
     left, place : where its coordinates come from, given the unknowns
     strips : where it was seen
     time_s : about when, in the last of them
-    with_control : whether known coordinates are in it
+    control : (3,) weights of known coordinates that are in it
     """
 
     left: LeftPoints
     place: int
     strips: frozenset[str]
     time_s: float
-    with_control: bool
+    control: Array
+
+    @property
+    def with_control(self) -> bool:
+        """Whether known coordinates are in it."""
+        return bool(self.control.any())
 
     @property
     def root(self) -> tuple[Array, Array, Array]:
@@ -148,10 +153,9 @@ class Archive:
                 left = replace(left, columns=np.concatenate([left.columns, cell.of_block]), coupling=coupling)
             self.add(left.columns, matrix, rhs)
             time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
-            control = [bool(w.any()) for w in batch.control.weight]
             for i, point in zip(left.order.tolist(), left.points, strict=True):
                 seen = frozenset(r.look.strip for r in point.residuals)
-                self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), control[i]))
+                self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), batch.control.weight[i]))
             return
         by_name = {p.name: p for p in published}
         told = [self._tie(batch, i, by_name.get(name), cell) for i, name in enumerate(batch.names)]
@@ -187,14 +191,15 @@ class Archive:
             old = None
         columns = np.union1d(own, [] if old is None else old.left.columns).astype(np.int64)
         rows, points, values = [_spread(A, own, columns)], [J], [residual]
-        control = not (old is not None and old.with_control) and bool(batch.ties.control[i].any())
+        before = np.zeros(3) if old is None else old.control
+        control = np.where(before > 0, 0.0, batch.ties.control[i])
         if old is not None:
             L, D, y = old.root
             rows.append(_spread(D, old.left.columns, columns))
             points.append(L)
             values.append(y - L @ (origin - old.left.origin_l[old.place]))
-        if control:
-            root = np.sqrt(batch.ties.control[i])
+        if control.any():
+            root = np.sqrt(control)
             rows.append(np.zeros((3, len(columns))))
             points.append(np.diag(root))
             values.append(root * (batch.control.xyz_l[i] - origin))
@@ -206,12 +211,12 @@ class Archive:
         seen = frozenset(r.look.strip for r in published.residuals)
         if old is not None:
             seen |= old.strips
-            before = old.left.points[list(old.left.order).index(old.place)]
-            rays, looks = published.rays + before.rays, before.residuals + published.residuals
-            merged = replace(published, rays=rays, residuals=looks, checked=checks(rays, len(looks), control))
+            then = old.left.points[list(old.left.order).index(old.place)]
+            rays, looks = published.rays + then.rays, then.residuals + published.residuals
+            merged = replace(published, rays=rays, residuals=looks, checked=checks(rays, len(looks), control.any()))
             left = replace(left, points=(merged,))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
-        self._keep(name, KeptPoint(left, 0, seen, time_s, control or (old is not None and old.with_control)))
+        self._keep(name, KeptPoint(left, 0, seen, time_s, before + control))
         return columns, matrix, rhs
 
     def add_control(self, name: str, control: ControlPoint) -> bool:
@@ -230,19 +235,21 @@ class Archive:
         )
         # the looks themselves are in already: they leave nothing but L^T p + D theta = y, which p takes up
         self.add(kept.left.columns, matrix, rhs)
-        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, True)
+        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, weight)
         return True
 
-    def weigh_control(self, name: str, axis: int, change: float, value: float) -> None:
-        """Change the weight of a known coordinate of a point that is final."""
+    def weigh_control(self, name: str, axis: int, weight: float, value: float) -> None:
+        """Give a known coordinate of a point that is final another weight, 0 to refuse it."""
         kept = self.points.get(name)
-        if kept is None or not self.holds(kept.left.columns):
+        if kept is None or not self.holds(kept.left.columns) or (weight > 0) == (kept.control[axis] > 0):
             return
+        change = weight - kept.control[axis]
         L, D, y = kept.root  # (3, 3), (3, u), (3,)
         origin = kept.left.origin_l[kept.place]
         normal, into, moment = L.T @ L, L.T @ D, L.T @ y
-        normal[axis, axis] = max(normal[axis, axis] + change, 0.0)
-        normal += 1e-12 * np.trace(normal) * np.eye(3)  # one ray alone does not place it
+        normal[axis, axis] += change
+        values, vectors = np.linalg.eigh(normal)
+        normal = vectors * np.maximum(values, 1e-12 * values[-1]) @ vectors.T  # one ray alone does not place it
         moment[axis] += change * (value - origin[axis])
         L_inv = np.linalg.inv(np.linalg.cholesky(normal))
         D_new, y_new = L_inv @ into, L_inv @ moment
@@ -250,7 +257,8 @@ class Archive:
         point = kept.left.points[list(kept.left.order).index(kept.place)]
         left = LeftPoints(kept.left.columns, origin[None], normals, D_new[None], np.zeros(1, dtype=np.int64), (point,))
         self.add(kept.left.columns, D.T @ D - D_new.T @ D_new, D.T @ y - D_new.T @ y_new)
-        self.points[name] = replace(kept, left=left, place=0)
+        control = np.where(np.arange(3) == axis, weight, kept.control)
+        self.points[name] = replace(kept, left=left, place=0, control=control)
 
     # -- solution ------------------------------------------------------------------------------------------------------
 

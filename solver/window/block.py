@@ -109,9 +109,9 @@ class Block:
         elif over:
             self.events.append(f"control {name} came after its point was final: it counts when the strip is over")
 
-    def weigh_control(self, name: str, axis: int, change: float, value: float) -> None:
-        """Change the weight of a known coordinate of a point that is final."""
-        self._archive.weigh_control(name, axis, change, value)
+    def weigh_control(self, name: str, axis: int, weight: float, value: float) -> None:
+        """Give a known coordinate of a point that is final another weight, 0 to refuse it."""
+        self._archive.weigh_control(name, axis, weight, value)
 
     def take_events(self) -> list[str]:
         """Lines for the operator since the last call."""

@@ -161,6 +161,8 @@ class ControlDesk:
             control = self._intake.control.get(name)
             if control is None or batch.normals.rank[p] < 3:
                 continue
+            if not batch.weight[batch.first_ray[p] : batch.first_ray[p + 1]].any():  # nothing to hold it against
+                continue
             refused = self._intake.points[name].out
             out = np.array([a in refused for a in range(3)])
             weight = np.where(out, control.weight, batch.control.weight[p])
@@ -205,7 +207,7 @@ class ControlDesk:
             self._sources.recount(*self._left.set_out(out[at:], self._state))
             for c, lost, was in zip(d.coordinates[at:], out[at:], d.out[at:], strict=True):
                 if lost != was:
-                    self._block.weigh_control(c.point, c.axis, -c.weight if lost else c.weight, c.value)
+                    self._block.weigh_control(c.point, c.axis, 0.0 if lost else c.weight, c.value)
         self._state.solve()
         for again in (True, False):  # a point that had been held far off was linearised there
             far = False

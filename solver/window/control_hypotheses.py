@@ -24,6 +24,8 @@ STEADY = 3.0
 #: Sets that are followed at a time, and the biases of one at most.
 BEAM, MOST = 24, 12
 AXES = 3
+#: Eigenvalues of scaled information below this are none.
+UNTOLD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def _search(M: Array, m: Array, usable: NDArray[np.int64], price: float) -> dict
         if not sets:
             break
         places = np.array([sorted(s) for s in sets])
-        blocks = M[places[:, :, None], places[:, None]] + 1e-9 * np.eye(size)
+        blocks = M[places[:, :, None], places[:, None]] + UNTOLD * np.eye(size)
         right = m[places]
         drop = np.einsum("ki,ki->k", right, np.linalg.solve(blocks, right[:, :, None])[:, :, 0])
         score = price * size - drop
@@ -113,6 +115,13 @@ def _search(M: Array, m: Array, usable: NDArray[np.int64], price: float) -> dict
 
 
 def biases(C: Array, v: Array, out: Bools) -> tuple[Array, Array]:
-    """Biases (k,) of the coordinates that are out and their sigmas, the others taken for right."""
-    covariance = np.linalg.inv(C[np.ix_(out, out)])
+    """Biases (k,) of the coordinates that are out and their sigmas, the others taken for right.
+
+    Of what nothing else tells, as of a point of one look, biases are the smallest that explain it, with large sigmas.
+    """
+    own = C[np.ix_(out, out)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(own), 1e-30))
+    values, vectors = np.linalg.eigh(own * scale[:, None] * scale)
+    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, UNTOLD))
+    covariance = root @ root.T
     return covariance @ v[out], np.sqrt(np.diagonal(covariance))
