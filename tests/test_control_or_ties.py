@@ -106,7 +106,7 @@ def test_what_drifts_have_to_do_with_control_is_what_refusing_it_changes(flight)
     window = adjust_at_once(*flight, WindowOptions(snoop=False), until_s=50.0).window
     assert window is not None
     desk, sources, state = window._control_desk, window._watch._sources, window.state
-    sources.begin(list(window._batches))
+    sources.begin(list(window._batches), state)
 
     def joint():
         drifts = sources.unknowns(50.0, window._batches, state)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from triline.solver.adjustment.normal_equations import PointNormals
+from triline.solver.selfcalibration import tls
+from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
@@ -106,7 +108,7 @@ def test_points_are_what_they_are_without_the_drift(flight):
     assert window is not None
     state, batches = window.state, list(window._batches)
     monitor = window._watch._sources
-    monitor.begin(batches)
+    monitor.begin(batches, state)
     assert monitor.unknowns(45.0, batches, state) is not None
     (group,) = [i for (_, ccd), i in monitor._groups.items() if ccd == "N"]
     rows, drift = EACH * group + np.arange(EACH), np.array([0.3, -0.2, 0.1, 0.25])
@@ -183,6 +185,22 @@ def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd, b
     assert any("refined no more" in text for text in result.events) == bounded
     tied = {name: p for name, p in result.whole_points.items() if p.rays > 3}
     assert len(tied) > 50 and point_errors(simulation, tied).nees.mean() < 2.0
+
+
+def test_the_camera_is_without_what_drifted_in_the_strip_before():
+    plan = FlightPlan(strips=3, strip_s=50.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0)
+    camera = tls(plan.camera, 12).scaled(0.03)
+    ties = ObservationPlan(tie_points_per_s=8.0, control=9, check=20)
+    simulation = simulate_with_camera_errors(plan, 1, camera, SENSORS, ties)
+    begin_s, end_s = simulation.flight.covered_s[1]
+
+    def shift(t):
+        return np.multiply.outer(((t > begin_s) & (t < end_s)) * 0.03 * (t - begin_s), [0.0, 1.0])
+
+    spoilt = _shifted(simulation, shift, "N")
+    result = adjust_online(spoilt, navigate(simulation), self_calibration=camera, live=False, update_s=0.5)
+    later = [o for o in result.final if o.strip == "S3"]
+    assert orientation_errors(simulation, later).nees.mean() < 2.5  # eight if the camera keeps it
 
 
 # ---- several sources

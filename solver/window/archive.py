@@ -213,7 +213,9 @@ class Archive:
             seen |= old.strips
             then = old.left.points[list(old.left.order).index(old.place)]
             rays, looks = published.rays + then.rays, then.residuals + published.residuals
-            merged = replace(published, rays=rays, residuals=looks, checked=checks(rays, len(looks), control.any()))
+            merged = replace(
+                published, rays=rays, residuals=looks, checked=checks(rays, len(looks), bool(control.any()))
+            )
             left = replace(left, points=(merged,))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(name, KeptPoint(left, 0, seen, time_s, before + control))

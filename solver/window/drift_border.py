@@ -20,6 +20,7 @@ from scipy.linalg import solve_triangular
 
 from ..adjustment.normal_equations import PointNormals, inverse_factors
 from .batch import Information
+from .compensation import Named
 from .state import Marginal
 from .suspects import EACH
 
@@ -159,6 +160,13 @@ class LeftBorder:
         stayed = np.concatenate([marginal.stayed, -1 - np.arange(n)])
         R12 = np.concatenate([marginal.R12, T[:n].T], axis=1)
         return Marginal(marginal.gone, stayed, marginal.R11, R12, marginal.d1)
+
+    def free(self, named: Named) -> Information:
+        """What the unknowns of the state gain where drifts are free, but for what is known of them beforehand."""
+        rows = named.rows
+        M, s = self.coupling[rows], self.score[rows]
+        known = np.linalg.solve(self.normal[np.ix_(rows, rows)] + np.diag(named.sigma**-2.0), np.column_stack([M, s]))
+        return Information(-M.T @ known[:, :-1], -M.T @ known[:, -1], -float(s @ known[:, -1]), 0)
 
     def exchange(self, numbers: IntArray, change: Information) -> None:
         """Known coordinates that have left count otherwise: numbers of unknowns of the state and of the border."""

@@ -71,12 +71,21 @@ class SourceMonitor:
         self._drift: tuple[IntArray, Array, Array] | None = None
         self.biased: tuple[BiasedSource, ...] = ()
 
-    def begin(self, batches: list[Batch]) -> bool:
-        """Whether a strip has begun; from now on it is the one that is watched."""
+    def begin(self, batches: list[Batch], state: WindowState) -> bool:
+        """Whether a strip has begun; from now on it is the one that is watched.
+
+        What the one before says of unknowns that stay, as those of the camera, is without what drifted in it for good.
+        """
         newest = max(reversed(batches), key=_last_strip, default=None)
         if newest is None or newest.strips[-1] <= self._strip:
             return False
-        self._named += self._in_this_strip()
+        for named in self._in_this_strip():
+            self._named.append(named)
+            if len(self._left.numbers):
+                change = self._left.free(named)
+                state.add(self._left.numbers, change)
+                state.fix(self._left.numbers, change)
+                state.solve()
         self._strip = newest.strips[-1]
         self._restart(newest.oldest_s)
         return True

@@ -219,7 +219,7 @@ class Watch:
         if self.exposure is not None and ground is not None:
             ground_sigma_m = np.hypot(self.exposure.ground_sigma, ground.sigma_m(noise + drift))
             ground_m = self.exposure.ground_protection(ground_sigma_m)
-        if self._sources.begin(batches):
+        if self._sources.begin(batches, self._state):
             self._control.strip_began()
         self._sources.update(now_s, batches, self._state)
         events: list[str] = []
