@@ -33,8 +33,8 @@ Bools = NDArray[np.bool_]
 
 #: Coordinates kept that have left the window.
 MOST_LEFT = 36
-#: Time between two looks without news, s.
-LOOK_S = 2.0
+#: Time between two looks without news, s; tie points are weighed again after so long if nothing else asks for it.
+LOOK_S, WEIGH_S = 2.0, 10.0
 #: Probability that discrepancies of good control are looked into.
 LOOKED_INTO = 1e-3
 #: A difference to the GNSS of more than so many critical values is more than a doubt.
@@ -72,9 +72,9 @@ class ControlDesk:
         self._intake, self._block, self._critical = intake, block, critical
         self._sources = sources
         self._left = LeftControl(MOST_LEFT)
-        self._looked_s = -np.inf
+        self._looked_s = self._weighed_s = -np.inf
+        self._weighed: Weighed | None = None  # last
         self._told: set[tuple[str, int]] = set()
-        self._blamed = False  # the tie points, for what contradicts
         self.doubt, self.failed = "", False
         self.warnings: list[str] = []
 
@@ -94,7 +94,7 @@ class ControlDesk:
     def strip_began(self) -> None:
         """From now on drifts are looked for in another strip."""
         self._left.drop_drifts()
-        self._blamed = False
+        self._weighed = None
 
     # -- judgement -----------------------------------------------------------------------------------------------------
 
@@ -113,16 +113,26 @@ class ControlDesk:
         self._state.solve()
         self._left.drop_strips({i for i, s in enumerate(self._strips.values()) if s.is_over(self._state)})
         of_batches = [(batch, part) for batch in self._batches for part in self._of_batch(batch)]
-        self.doubt, self.failed = "", False
         if not of_batches and not len(self._left):
-            return False
+            return self._nothing_wrong()
         d = discrepancies(self._with_left([part for _, part in of_batches]), self._state)
         verdict = self._judge(d)
         if verdict is None:
-            self._blamed = False
+            return self._nothing_wrong()
+        blamed, lately = self._blamed(d), now_s < self._weighed_s + WEIGH_S
+        if blamed and lately:
             return False
-        weighed = self._weigh(d, verdict, self._sources.unknowns(now_s, self._batches, self._state))
-        verdict, d, self._blamed = weighed.verdict, weighed.discrepancies, weighed.drift
+        explained = float(d.v @ np.linalg.lstsq(d.C, d.v, rcond=1e-12)[0])
+        if self._sources.least_score(explained) > verdict.score:  # no drift can be a better explanation
+            weighed = Weighed(verdict, d, False, True)
+        elif lately and self._weighed is not None and (verdict.out == d.out).all():
+            weighed = Weighed(verdict, d, False, self._weighed.told)
+        else:
+            weighed = self._weigh(d, verdict, self._sources.unknowns(now_s, self._batches, self._state))
+            self._weighed_s = now_s
+        self._weighed = weighed
+        verdict, d = weighed.verdict, weighed.discrepancies
+        self.doubt, self.failed = "", False
         changed = bool((verdict.out != d.out).any())
         if changed:
             self._tell_changes(d, verdict, refused)
@@ -131,6 +141,15 @@ class ControlDesk:
             self._doubt(d, verdict)
         self.doubt = "; ".join(filter(None, [self.doubt, self._tie_points_in_doubt(weighed)]))
         return changed
+
+    def _nothing_wrong(self) -> bool:
+        self._weighed, self.doubt, self.failed = None, "", False
+        return False
+
+    def _blamed(self, d: Discrepancies) -> bool:
+        """Whether tie points have been found to drift, of all control there is."""
+        last = self._weighed
+        return last is not None and last.drift and last.discrepancies.coordinates == d.coordinates
 
     def _tie_points_in_doubt(self, weighed: Weighed) -> str:
         if self._sources.biased:  # that is told by itself
@@ -149,7 +168,7 @@ class ControlDesk:
         parts = [part for batch in self._batches for part in self._of_batch(batch, drifts.cells.get(id(batch)))]
         border = drifts.score, drifts.normal, drifts.coupling
         d = discrepancies(self._with_left(parts), self._state, border)
-        return weigh(d, drifts, self._hypotheses, verdict, self._blamed)
+        return weigh(d, drifts, self._hypotheses, verdict, self._weighed is not None and self._weighed.drift)
 
     def _hypotheses(self, d: Discrepancies) -> Verdict:
         return judge(d.C, d.v, np.array([c.axis for c in d.coordinates]), self._critical**2, d.out)
@@ -220,6 +239,7 @@ class ControlDesk:
             if not far:
                 break
             self._state.solve()
+        self._sources.cells(list(changed.values()), self._state)  # at once, without what is refused
 
     # -- words ---------------------------------------------------------------------------------------------------------
 

@@ -36,6 +36,8 @@ SETTLED_S = 3.0
 AT_ONCE = 240
 #: Time between tests, s; unit of the drift, s.
 EVERY_S, DRIFT_S = 1.0, 10.0
+#: How many times its last test value a drift explains at most by now.
+SINCE = 1.5
 #: Strips whose drifts are remembered.
 MOST_NAMED = 40
 
@@ -68,6 +70,7 @@ class SourceMonitor:
         self._cells: dict[int, tuple[Batch, Cell]] = {}
         self._left = LeftBorder()
         self._suspicion = Suspicion(self._alpha)
+        self._limit = 0.0
         self._drift: tuple[IntArray, Array, Array] | None = None
         self.biased: tuple[BiasedSource, ...] = ()
 
@@ -147,6 +150,13 @@ class SourceMonitor:
     def recount(self, numbers: IntArray, change: Information) -> None:
         """Known coordinates that have left the window count otherwise: what unknowns gain, negative ones of drifts."""
         self._left.exchange(numbers, change)
+
+    def least_score(self, control: float) -> float:
+        """What the score of a drift is at least, see `control_or_ties`, where biases of control explain so much.
+
+        Together they explain no more than either on its own; the drift about what it did at the last test.
+        """
+        return self._limit - SINCE * self._suspicion.strongest - control
 
     def unknowns(self, now_s: float, batches: Iterable[Batch], state: WindowState) -> Drifts | None:
         """The drifts that can be weighed now, with all batches of the strip; None if there are too few rays."""
@@ -230,6 +240,7 @@ class SourceMonitor:
         found = hypotheses(list(self._groups), count.tolist())
         factor = self._factor(now_s, int(count.sum()), self._shared(cells))
         self.biased = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        self._limit = self._suspicion.limit(factor)
         self._drift = None
         if self.biased:
             rows = self._suspected()

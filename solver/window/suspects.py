@@ -204,9 +204,16 @@ class _Alarm:
 
 @dataclass
 class Suspicion:
-    """Names what drifts; what has been named stays named until it is cleared, or until another is decisively better."""
+    """Names what drifts; what has been named stays named until it is cleared, or until another is decisively better.
+
+    Attributes
+    ----------
+    alpha : probability that a good group fails in one test
+    strongest : largest test value of the last tests
+    """
 
     alpha: float = FALSE_ALARM
+    strongest: float = np.inf
     _alarms: list[_Alarm] = field(default_factory=lambda: [_Alarm() for _ in range(MOST)])
 
     def limit(self, factor: float = 1.0) -> float:
@@ -231,6 +238,8 @@ class Suspicion:
             tests = {h.name: min(g.test(h) for g in given) for h in open_}
             by_name = {h.name: h for h in open_}
             best = by_name[max(tests, key=tests.__getitem__)]
+            if i == 0:
+                self.strongest = tests[best.name]
             matters = float(np.abs(given[0].bias(best)[:2]).max()) >= MATTERS_PX
             if not alarm.update(now_s, tests, max(limit, least), DECISIVE * factor, matters):
                 for later in self._alarms[i + 1 :]:
