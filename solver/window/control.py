@@ -53,7 +53,6 @@ class ControlDesk:
 
     Attributes
     ----------
-    doubt : what control contradicts, itself or the GNSS, in words; "" where it does not
     failed : whether by so much that no sigma can be relied on
     warnings : lines for the operator since they were taken last
     """
@@ -75,7 +74,7 @@ class ControlDesk:
         self._looked_s = self._weighed_s = -np.inf
         self._weighed: Weighed | None = None  # last
         self._told: set[tuple[str, int]] = set()
-        self.doubt, self.failed = "", False
+        self._contradiction, self.failed = "", False
         self.warnings: list[str] = []
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
@@ -119,47 +118,57 @@ class ControlDesk:
         verdict = self._judge(d)
         if verdict is None:
             return self._nothing_wrong()
-        blamed, lately = self._blamed(d), now_s < self._weighed_s + WEIGH_S
-        if blamed and lately:
-            return False
-        explained = float(d.v @ np.linalg.lstsq(d.C, d.v, rcond=1e-12)[0])
-        if self._sources.least_score(explained) > verdict.score:  # no drift can be a better explanation
-            weighed = Weighed(verdict, d, False, True)
-        elif lately and self._weighed is not None and (verdict.out == d.out).all():
-            weighed = Weighed(verdict, d, False, self._weighed.told)
-        else:
+        weighed = self._weighed_lately(now_s, d, verdict)
+        if weighed is None:
             weighed = self._weigh(d, verdict, self._sources.unknowns(now_s, self._batches, self._state))
             self._weighed_s = now_s
+        if weighed is self._weighed:
+            return False
         self._weighed = weighed
         verdict, d = weighed.verdict, weighed.discrepancies
-        self.doubt, self.failed = "", False
+        self._contradiction, self.failed = "", False
         changed = bool((verdict.out != d.out).any())
         if changed:
             self._tell_changes(d, verdict, refused)
             self._apply(of_batches, d, verdict.out)
         if verdict.out.any():
             self._doubt(d, verdict)
-        self.doubt = "; ".join(filter(None, [self.doubt, self._tie_points_in_doubt(weighed)]))
         return changed
 
     def _nothing_wrong(self) -> bool:
-        self._weighed, self.doubt, self.failed = None, "", False
+        self._weighed, self._contradiction, self.failed = None, "", False
         return False
 
-    def _blamed(self, d: Discrepancies) -> bool:
-        """Whether tie points have been found to drift, of all control there is."""
-        last = self._weighed
-        return last is not None and last.drift and last.discrepancies.coordinates == d.coordinates
-
-    def _tie_points_in_doubt(self, weighed: Weighed) -> str:
-        if self._sources.biased:  # that is told by itself
-            return ""
-        if weighed.drift:
-            return "control and tie points contradict each other: tie points seem to drift"
-        return "or tie points drift" if weighed.verdict.out.any() and not weighed.told else ""
+    @property
+    def doubt(self) -> str:
+        """What control contradicts, itself, the GNSS or tie points, in words; "" where it does not."""
+        last, reasons = self._weighed, [self._contradiction] if self._contradiction else []
+        if last is not None and not self._sources.biased:  # what is named is told by itself
+            if last.drift:
+                reasons.append("control and tie points contradict each other: tie points seem to drift")
+            elif last.verdict.out.any() and not last.told:
+                reasons.append("or tie points drift")
+        return "; ".join(reasons)
 
     def _with_left(self, parts: list[Biases]) -> list[Biases]:
         return [*parts, self._left.biases] if len(self._left) else parts
+
+    def _weighed_lately(self, now_s: float, d: Discrepancies, verdict: Verdict) -> Weighed | None:
+        """What holds without weighing control against tie points anew; None if nothing does.
+
+        Parameters
+        ----------
+        verdict : if nothing drifts
+        """
+        last, lately = self._weighed, now_s < self._weighed_s + WEIGH_S
+        if lately and last is not None and last.drift and last.discrepancies.coordinates == d.coordinates:
+            return last
+        explained = float(d.v @ np.linalg.lstsq(d.C, d.v, rcond=1e-12)[0])
+        if self._sources.least_score(explained) > verdict.score:  # no drift can be a better explanation
+            return Weighed(verdict, d, False, True)
+        if lately and last is not None and (verdict.out == d.out).all():
+            return Weighed(verdict, d, False, last.told)
+        return None
 
     def _weigh(self, d: Discrepancies, verdict: Verdict, drifts: Drifts | None) -> Weighed:
         """Against tie points that drift."""
@@ -295,7 +304,7 @@ class ControlDesk:
             if (AXES[a], strip) not in self._told and n > 1:
                 self._told.add((AXES[a], strip))
                 self.warnings.append(f"{text} {AXES[a]} rests on GNSS")
-        self.doubt = "; ".join(reasons)
+        self._contradiction = "; ".join(reasons)
 
     def take_warnings(self) -> list[str]:
         """Lines for the operator since the last call."""
