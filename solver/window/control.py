@@ -147,7 +147,9 @@ class ControlDesk:
             if last.drift:
                 reasons.append("control and tie points contradict each other: tie points seem to drift")
             elif last.verdict.out.any() and not last.told:
-                reasons.append("or tie points drift")
+                reasons.append(
+                    "or tie points drift" if reasons else "either the control refused is wrong or tie points drift"
+                )
         return "; ".join(reasons)
 
     def _with_left(self, parts: list[Biases]) -> list[Biases]:
