@@ -104,9 +104,9 @@ TOPICS: tuple[Topic, ...] = (
         "observation/progress", m.Progress, _O, 20, allowed_lateness_ms=0, recorded=False, grace_s=3.0, order_only=True
     ),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
-    Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=200),
-    Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=200),
-    Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=200),
+    Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000),
+    Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=1000),
+    Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=1000),
     # comes beside orientation/live: what its publisher says there tells whether one is missing, however rare they are;
     # the first one may wait for the matcher being heard first, and no longer than for that
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=2000, grace_s=2.0, in_bursts=True),
