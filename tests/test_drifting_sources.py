@@ -199,6 +199,8 @@ def test_the_camera_is_without_what_drifted_in_the_strip_before():
 
     spoilt = _shifted(simulation, shift, "N")
     result = adjust_online(spoilt, navigate(simulation), self_calibration=camera, live=False, update_s=0.5)
+    found = np.array([r.sigma0 for r in result.reports if r.strip == "S3"])
+    assert np.nanmin(found) > 0.6 and np.nanmax(found) < 1.5
     later = [o for o in result.final if o.strip == "S3"]
     assert orientation_errors(simulation, later).nees.mean() < 2.5  # eight if the camera keeps it
 

@@ -85,10 +85,11 @@ class SourceMonitor:
         for named in self._in_this_strip():
             self._named.append(named)
             if len(self._left.numbers):
-                change = self._left.free(named)
+                change, cost = self._left.free(named), state.cost()
                 state.add(self._left.numbers, change)
                 state.fix(self._left.numbers, change)
                 state.solve()
+                state.square += cost - state.cost()  # what it has cost stays: sigma0 is of what comes
         self._strip = newest.strips[-1]
         self._restart(newest.oldest_s)
         return True
@@ -154,7 +155,7 @@ class SourceMonitor:
     def least_score(self, control: float) -> float:
         """What the score of a drift is at least, see `control_or_ties`, where biases of control explain so much.
 
-        Together they explain no more than either on its own; the drift about what it did at the last test.
+        Together they explain no more than the sum of what each does alone, the drift about as at the last test.
         """
         return self._limit - SINCE * self._suspicion.strongest - control
 

@@ -367,11 +367,14 @@ class Window:
         self._watch.note([b for b in changed if b in self._batches])  # what left at once is no more exposed
         watched = self._watch.last
         if look or watched is None or self._watch.strip != (active[-1].id if active else ""):
+            solution = state.solution
             watched = self._watch.look(
                 self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
                 (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
                 self._noise(active[-1]) if active else np.zeros((6, 6)),
             )  # fmt: skip
+            if state.solution != solution:
+                self._orienter.forget()
         result.events += watched.events
         determined = rows = rays = points = control = 0
         for batch in self._batches:
