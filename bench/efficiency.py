@@ -1,7 +1,8 @@
 """Is the on-line answer as good as a batch adjustment? RMSE of orientation and object points against two yardsticks.
 
     python bench/efficiency.py table [--seeds 20]          one strip: models, mounts, with and without self-calibration
-    python bench/efficiency.py block [--seeds 20] [--model wander]     six strips and two cross strips
+    python bench/efficiency.py blocks [--seeds 20]         the same for six strips and two cross strips
+    python bench/efficiency.py block [--seeds 20] [--model wander] [--rough] [--selfcal tls12]     one row of it
     python bench/efficiency.py adjust [--seeds 20]         whole strips and a block against `triline adjust`'s estimator
 
 *final / causal*: what became final against a batch adjustment, from scratch, of just the data that had arrived then, at
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -72,6 +73,11 @@ class Case:
     strip_s: float = 40.0
     samples: int = 2
     height_m: float = 1500.0
+
+    @property
+    def title(self) -> str:
+        mount = "rough" if self.rough else "stabilised"
+        return ", ".join([self.model, mount] + ([self.selfcal] if self.selfcal != "none" else []))
 
     @property
     def parameters(self) -> SelfCalibration | None:
@@ -190,13 +196,13 @@ def one_adjustment(seed: int, case: Case) -> dict[str, np.ndarray]:
     }
 
 
-def run(case: Case, seeds: int) -> dict[str, object]:
-    """A row of the table."""
+def run(case: Case, seeds: int, one_by_one: bool = False) -> dict[str, object]:
+    """A row of the table; on the way, where asked for, what it is after each flight."""
     with ProcessPoolExecutor(2) as pool:
         flights = []
         for flight in pool.map(partial(one_flight, case=case), range(1, seeds + 1)):
             flights.append(flight)
-            if case.strips > 1:
+            if one_by_one:
                 show(f"  {len(flights)} flights", _row(flights))
     return _row(flights)
 
@@ -233,28 +239,42 @@ def header() -> None:
     )
 
 
-def table(args: argparse.Namespace) -> None:
-    header()
+def every_case() -> Iterator[Case]:
     for model in ("dgr", "ppm", "lim", "wander"):
         for rough in (False, True):
             for selfcal in ("none", "tls12"):
-                title = f"{model}, {'rough' if rough else 'stabilised'}{', ' + selfcal if selfcal != 'none' else ''}"
-                show(title, run(Case(model, rough, selfcal), args.seeds))
+                yield Case(model, rough, selfcal)
 
 
-def block(args: argparse.Namespace) -> None:
-    header()
-    case = Case(
-        args.model,
-        selfcal=args.selfcal,
+def as_block(case: Case, args: argparse.Namespace) -> Case:
+    return replace(
+        case,
         strips=args.strips,
         cross_strips=args.cross,
         strip_s=args.strip_s,
         samples=args.samples,
         height_m=1000.0,
     )
-    row = run(case, args.seeds)
-    show(f"{args.model}, {args.strips} strips, {args.cross} cross strips", row)
+
+
+def table(args: argparse.Namespace) -> None:
+    header()
+    for case in every_case():
+        show(case.title, run(case, args.seeds))
+
+
+def blocks(args: argparse.Namespace) -> None:
+    print(f"{args.strips} strips, {args.cross} cross strips")
+    header()
+    for case in every_case():
+        show(case.title, run(as_block(case, args), args.seeds))
+
+
+def block(args: argparse.Namespace) -> None:
+    header()
+    case = as_block(Case(args.model, args.rough, args.selfcal), args)
+    row = run(case, args.seeds, one_by_one=True)
+    show(f"{case.title}, {args.strips} + {args.cross} strips", row)
     print(json.dumps({k: np.round(v, 3).tolist() for k, v in row.items() if k != "batch"}, indent=1))
 
 
@@ -284,16 +304,17 @@ def adjust(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("table", "block", "adjust"))
+    parser.add_argument("what", choices=("table", "blocks", "block", "adjust"))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--model", default="wander")
+    parser.add_argument("--rough", action="store_true")
     parser.add_argument("--selfcal", default="none")
     parser.add_argument("--strips", type=int, default=6)
     parser.add_argument("--cross", type=int, default=2)
     parser.add_argument("--strip-s", type=float, default=30.0)
     parser.add_argument("--samples", type=int, default=1, help="causal batches for each strip of a block")
     args = parser.parse_args()
-    {"table": table, "block": block, "adjust": adjust}[args.what](args)
+    {"table": table, "blocks": blocks, "block": block, "adjust": adjust}[args.what](args)
 
 
 if __name__ == "__main__":
