@@ -1,7 +1,9 @@
 """Is the on-line answer as good as a batch adjustment? RMSE of orientation and object points against two yardsticks.
 
-    python bench/efficiency.py table [--seeds 20]          one strip: models, mounts, with and without self-calibration
-    python bench/efficiency.py blocks [--seeds 20]         the same for six strips and two cross strips
+    python bench/efficiency.py table [--seeds 20] [--models dgr ppm lim wander]     one strip: models, mounts, with and
+                                                           without self-calibration
+    python bench/efficiency.py blocks [--seeds 20] [--models dgr ppm lim wander]    the same for six strips and two
+                                                           cross strips
     python bench/efficiency.py block [--seeds 20] [--model wander] [--rough] [--selfcal tls12]     one row of it
     python bench/efficiency.py adjust [--seeds 20]         whole strips and a block against `triline adjust`'s estimator
 
@@ -21,7 +23,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,6 +61,7 @@ CAMERA = preset("ads40")
 CAMERA_SHARE = 0.03
 #: Errors that shifts and drifts describe; what wanders is no case for DGR.
 CONSTANT = replace(ERRORS, wander_sigma_m=(0.0, 0.0, 0.0), wander_sigma_deg=(0.0, 0.0, 0.0))
+MODELS = ("dgr", "ppm", "lim", "wander")
 
 
 @dataclass(frozen=True)
@@ -239,8 +242,8 @@ def header() -> None:
     )
 
 
-def every_case() -> Iterator[Case]:
-    for model in ("dgr", "ppm", "lim", "wander"):
+def every_case(models: Sequence[str]) -> Iterator[Case]:
+    for model in models:
         for rough in (False, True):
             for selfcal in ("none", "tls12"):
                 yield Case(model, rough, selfcal)
@@ -259,14 +262,14 @@ def as_block(case: Case, args: argparse.Namespace) -> Case:
 
 def table(args: argparse.Namespace) -> None:
     header()
-    for case in every_case():
+    for case in every_case(args.models):
         show(case.title, run(case, args.seeds))
 
 
 def blocks(args: argparse.Namespace) -> None:
     print(f"{args.strips} strips, {args.cross} cross strips")
     header()
-    for case in every_case():
+    for case in every_case(args.models):
         show(case.title, run(as_block(case, args), args.seeds))
 
 
@@ -281,7 +284,7 @@ def block(args: argparse.Namespace) -> None:
 def adjust(args: argparse.Namespace) -> None:
     print(f"{'':38}whole / adjusted, RMSE: mean, worst | largest difference")
     print(f"{'':38}{'orientation':>13} | {'points':>13} | {'in sigmas: both':>15} | sigmas of points")
-    for model in ("dgr", "ppm", "lim", "wander"):
+    for model in MODELS:
         for selfcal in ("none", "tls12"):
             name = f"{model}{', ' + selfcal if selfcal != 'none' else ''}"
             cases = {f"{name}, one strip": Case(model, True, selfcal)}
@@ -306,13 +309,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("table", "blocks", "block", "adjust"))
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--model", default="wander")
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="of table and blocks")
+    parser.add_argument("--model", choices=MODELS, default="wander", help="of block")
     parser.add_argument("--rough", action="store_true")
     parser.add_argument("--selfcal", default="none")
     parser.add_argument("--strips", type=int, default=6)
     parser.add_argument("--cross", type=int, default=2)
     parser.add_argument("--strip-s", type=float, default=30.0)
-    parser.add_argument("--samples", type=int, default=1, help="causal batches for each strip of a block")
+    parser.add_argument("--samples", type=int, default=2, help="causal batches for each strip of a block")
     args = parser.parse_args()
     {"table": table, "blocks": blocks, "block": block, "adjust": adjust}[args.what](args)
 
