@@ -196,10 +196,10 @@ def _overview(layout: Layout) -> rrb.Container:
     )
     if layout.lines:
         lines = rrb.Horizontal(*(_lines(ccd, layout) for ccd in layout.lines))
-        left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[2.1, 10, 1.5, 7.6])
+        left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[2.5, 10, 1.5, 7.6])
         right = rrb.Vertical(lines, side, row_shares=[10, 2.2])
         return rrb.Horizontal(left, right, column_shares=[1, 1], name="Overview")
-    left = rrb.Vertical(_light(), _flight(layout), _legend(layout), side, row_shares=[1.5, 10, 1.3, 2.6])
+    left = rrb.Vertical(_light(), _flight(layout), _legend(layout), side, row_shares=[1.9, 10, 1.3, 2.6])
     right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
     return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
 

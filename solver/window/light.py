@@ -145,11 +145,12 @@ def _datum(s: Situation) -> tuple[str, str]:
 
 def _exposed(s: Situation) -> str:
     """Why the protection levels are beyond the alert limit."""
-    if s.ground_m is None:
+    if s.ground_m is None or np.isnan(s.ground_m).any():
         return "how far the orientation may be off is not known yet"
     worst = int(np.argmax(s.ground_m))
-    limit = f"limit {metres(s.limit_m)}"
-    off = f"{WHERE[worst]} up to {metres(float(s.ground_m[worst]))} off unseen, {limit}"
+    level, limit = metres(float(s.ground_m[worst])), metres(s.limit_m)
+    against = f"limit {limit}" if level != limit else "just beyond the limit"
+    off = f"{WHERE[worst]} up to {level} off unseen, {against}"
     e = s.exposure
     if e is not None and e.control:
         if len(e.names) > 1:
