@@ -16,6 +16,7 @@ from triline.solver.simulation.flight_network import network_of
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, slow_errors_of
 from triline.solver.window.results import WindowOptions
+from triline.solver.window.sources import design_effect
 from triline.solver.window.strip import model_options
 
 JERK_PSD, FIX_DENSITY = 1.0, 1.8e-4
@@ -25,6 +26,7 @@ def noise_covariance(lag_s: np.ndarray) -> np.ndarray:
     """Of the error of a Wiener smoother of white jerk, by its spectrum; 1 at lag 0."""
     w = np.linspace(0.0, 60.0, 6001)
     spectrum = 1.0 / (1.0 + w**6 * FIX_DENSITY / JERK_PSD)
+    spectrum[0] /= 2.0  # by the trapezoidal rule
     return np.cos(np.multiply.outer(lag_s, w)) @ spectrum / spectrum.sum()
 
 
@@ -47,6 +49,19 @@ def test_the_share_is_what_a_least_squares_correction_leaves(information):
     bandwidth = (density * information) ** 0.25
     assert share_left(bandwidth, noise_time(JERK_PSD, FIX_DENSITY)) == pytest.approx(left, abs=0.02)
     assert 0.02 < left < 0.95
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 5.0, 20.0])
+def test_rays_share_the_noise_of_positions_that_nothing_follows(rate_hz):
+    """The variance of the mean of many rays over that of as many independent ones."""
+    n, share = int(100.0 * rate_hz), 0.4
+    pairs = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    together = (share * noise_covariance(np.arange(n) / rate_hz)[pairs]).sum() / n + 1.0 - share
+    time_s = noise_time(JERK_PSD, FIX_DENSITY)
+    effect = design_effect(rate_hz, share, time_s, follows=False)
+    # one is the ray itself, which is in the integral as well
+    assert max(together, 1.0) <= effect <= together + share + 0.01
+    assert design_effect(rate_hz, share, time_s, follows=True) <= effect
 
 
 def test_each_direction_is_followed_by_its_own_information():

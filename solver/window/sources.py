@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.reduced_system import DenseFactor
+from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from .batch import Batch, Information, inverse_factors
 from .compensation import Compensation, Named, estimated
 from .control_or_ties import Drifts
@@ -36,6 +37,8 @@ SETTLED_S = 3.0
 AT_ONCE = 240
 #: Time between tests, s; unit of the drift, s.
 EVERY_S, DRIFT_S = 1.0, 10.0
+#: Integral of the correlation of that noise over all lags, in units of that at which it is 1/e (see `noise_time`).
+NOISE_INTEGRAL = 3.0 / NOISE_TIMES_BANDWIDTH
 #: How many times its last test value a drift explains at most by now.
 SINCE = 1.5
 #: Strips whose drifts are remembered.
@@ -49,6 +52,7 @@ class SourceMonitor:
     ----------
     groups_of : says source and CCD line of each ray of a batch
     noise_time_s : says for how long the noise of measured positions is correlated
+    follows : whether the corrections follow its slow part
     alpha : probability that a good group fails in one test
     """
 
@@ -56,9 +60,10 @@ class SourceMonitor:
         self,
         groups_of: Callable[[Batch], list[Group]],
         noise_time_s: Callable[[], float],
+        follows: bool = True,
         alpha: float = FALSE_ALARM,
     ) -> None:
-        self._groups_of, self._noise_time_s, self._alpha = groups_of, noise_time_s, alpha
+        self._groups_of, self._noise_time_s, self._follows, self._alpha = groups_of, noise_time_s, follows, alpha
         self._strip = -1
         self._next_s = -np.inf
         self._named: deque[Named] = deque(maxlen=MOST_NAMED)
@@ -249,19 +254,12 @@ class SourceMonitor:
             self._drift = (rows, *estimate)
 
     def _factor(self, now_s: float, rays: int, shared: float) -> float:
-        """By how much the variance of scores is larger than stated, where rays are dense.
-
-        Rays of one CCD line within the correlation time of the measured positions have their noise in common, which
-        the adjustment takes for white: the design effect of clusters of m rays with a correlation rho of their errors,
-        1 + (m - 1) rho. Without what corrections follow of that noise it is less; this is on the safe side.
-
-        Source: L. Kish, Survey Sampling, 1965, section 5.4.
-        """
+        """By how much the variance of scores is larger than stated."""
         if not rays:
             return 1.0
         lines = len({ccd for _, ccd in self._groups})
-        m = rays / lines / max(now_s - self._start_s, 1.0) * self._noise_time_s()
-        return 1.0 + max(m - 1.0, 0.0) * shared / rays
+        rate = rays / lines / max(now_s - self._start_s, 1.0)
+        return design_effect(rate, shared / rays, self._noise_time_s(), self._follows)
 
     def _in_border(self, batches: list[Batch]) -> dict[int, Cell]:
         """Of the batches, those that have been taken in and have lost no ray since."""
@@ -357,6 +355,26 @@ class SourceMonitor:
         score -= coupling @ solved[:, 0]
         V = normal - coupling @ solved[:, 1:]
         return Scores(score, 0.5 * (V + V.T), (now_s - self._start_s) / DRIFT_S, DRIFT_S), count
+
+
+def design_effect(rate_hz: float, share: float, noise_time_s: float, follows: bool) -> float:
+    """By how much the variance of a sum over rays is larger than that of independent ones, where rays are dense.
+
+    Rays of one CCD line have the noise of measured positions in common, which the adjustment takes for white: the
+    design effect of clusters of m rays with a correlation rho of their errors, 1 + (m - 1) rho. A cluster are those
+    within the correlation time where corrections follow the slow part of the noise. Where they do not, a ray has as
+    many others as come within the integral of the correlation, and it is 1 + m rho.
+
+    Source: L. Kish, Survey Sampling, 1965, section 5.4.
+
+    Parameters
+    ----------
+    rate_hz : rays of a CCD line a second
+    share : of the variance of a ray that is noise of the position
+    noise_time_s : lag at which that is correlated by 1/e
+    """
+    m = rate_hz * noise_time_s
+    return 1.0 + (max(m - 1.0, 0.0) if follows else NOISE_INTEGRAL * m) * share
 
 
 def _shared(batch: Batch, which: IntArray) -> float:

@@ -107,7 +107,9 @@ class Window:
         self._newest_ray_s = self._learnt_s = -np.inf
         self._duties = Duties()
         self._length_s = options.window_s
-        sources = SourceMonitor(self._intake.sources_of, lambda: self.trajectory.noise_time_s)
+        sources = SourceMonitor(
+            self._intake.sources_of, lambda: self.trajectory.noise_time_s, follows=options.model != "dgr"
+        )
         self._control_desk = ControlDesk(
             self.state, self.strips, self._batches, self._intake, self._block, options.critical, sources
         )
