@@ -17,7 +17,7 @@ from ..solver.adjustment.network import Control
 from ..solver.adjustment.reliability import reliability
 from ..solver.adjustment.snooping import control_tests
 from ..solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest_correlations
-from ..solver.selfcalibration import SelfCalibration
+from ..solver.selfcalibration import SelfCalibration, unit_of
 
 Array = NDArray[np.floating]
 
@@ -166,14 +166,6 @@ def parameters_of(result: BatchResult, full: SelfCalibration | None) -> dict[str
             entry |= {"criterion": str(r.criterion), "figure": r.figure, "limit": r.limit}
         found[name] = entry | {"unit": unit_of(name)}
     return found
-
-
-def unit_of(name: str) -> str:
-    """Unit of an additional parameter."""
-    kind = name.split("_")[0]
-    lengths = {"dc", "xp", "yp", "dx", "dy"}
-    powers = {"k1": "mm^-2", "k2": "mm^-4", "k3": "mm^-6", "p1": "mm^-1", "p2": "mm^-1", "b": "mm^-2", "th": "rad"}
-    return "mm" if kind in lengths else powers.get(kind, "")
 
 
 def accuracies(result: BatchResult) -> dict[str, Any]:

@@ -92,12 +92,13 @@ def _parameters(c: Content) -> Iterator[str]:
         return
     kept = {n: p for n, p in parameters.items() if p["status"] == "estimated"}
     yield f"additional parameters: {len(kept)} of {len(parameters)} estimated"
+    width = max(6, *(len(name) + 1 for name in parameters))
     for name, p in kept.items():
         reason = f"  {p['reason']}" if p["reason"] else ""
-        yield f"  {name:6s}{p['value']:13.4e} +- {p['sigma']:.1e} {p['unit']:6s} t {p['t']:8.1f}{reason}"
+        yield f"  {name:{width}s}{p['value']:13.4e} +- {p['sigma']:.1e} {p['unit']:6s} t {p['t']:8.1f}{reason}"
     for name, p in parameters.items():
         if p["status"] != "estimated":
-            yield f"  {name:6s}eliminated, {p['reason']}"
+            yield f"  {name:{width}s}eliminated, {p['reason']}"
 
 
 def _components(c: Content) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Additional parameters of self-calibration: TLS-18 [K 4.43], PRISM-30 [K 4.44], lens set [P].
+"""Additional parameters of self-calibration: TLS-18 [K 4.43], PRISM-30 [K 4.44], lens set [P], boresight.
 
 ``Dx, Dy`` are added to the projection: residual = measured - (projection + D). They are functions of the image
 coordinates, reduced to the principal point, and linear in the unknowns. Measured coordinates carry noise, on which the
@@ -34,7 +34,13 @@ SIGMA = {
     "s": 1e-2,
     "th": 1e-2,
     "b": 1e-5,
+    "boresight": 2e-3,
 }
+
+_UNITS = dict.fromkeys(("dc", "xp", "yp", "dx", "dy"), "mm") | {
+    "k1": "mm^-2", "k2": "mm^-4", "k3": "mm^-6", "p1": "mm^-1", "p2": "mm^-1", "b": "mm^-2",
+    "th": "rad", "boresight": "rad",
+}  # fmt: skip
 
 #: Default a-priori sigmas of the PRISM set: 0.02 mm, about three pixels, at the end of a line of 100 mm.
 PRISM_SIGMA = {"dx": 0.02, "dy": 0.02, "b": 2e-7, "s": 4e-4}
@@ -46,6 +52,7 @@ _TLS_COMMON = ("dc", "k1", "k2", "k3", "p1", "p2")
 _TLS_LINE = ("xp", "yp", "sy", "th")
 _LENS = ("dx", "dy", "dc", "k1", "k2", "p1", "p2", "sy", "th")
 _PRISM = ("dx", "dy", "b", "s")
+_TURNS = ("turn_x", "turn_y", "turn_z")
 
 
 @dataclass(frozen=True)
@@ -193,6 +200,9 @@ _EFFECT: dict[str, _Effect] = {
     "sy": lambda x, y, r2, c: (0.0, -y),
     "b": lambda x, y, r2, c: (y * r2, 0.0),
     "s": lambda x, y, r2, c: (0.0, y),
+    "turn_x": lambda x, y, r2, c: (-x * y / c, -c - y * y / c),
+    "turn_y": lambda x, y, r2, c: (c + x * x / c, x * y / c),
+    "turn_z": lambda x, y, r2, c: (y, -x),
 }
 
 
@@ -251,6 +261,17 @@ def lens(camera: LineCamera) -> SelfCalibration:
     return _set("lens", names, _LENS, columns, [(0,)] * len(camera.lines))
 
 
+def boresight(camera: LineCamera) -> SelfCalibration:
+    """Small rotations of the camera against the body about its own axes, rad: the same for all CCD lines and strips.
+
+    The true ``R_lc`` is the measured one times that of the angles omega, phi, kappa; to the first order, rays turn by
+    ``-(omega, phi, kappa) x f``. Of one strip alone it cannot be told from the shift of the attitude. TLS has it in
+    what xp, yp and th of the lines have in common.
+    """
+    names = [f"boresight_{angle}" for angle in ("omega", "phi", "kappa")]
+    return _set("boresight", names, _TURNS, [[0, 1, 2]] * len(camera.lines), [(0,)] * len(camera.lines))
+
+
 #: Self-calibration by the name the command line uses.
 SELF_CALIBRATIONS: dict[str, Callable[[LineCamera], SelfCalibration]] = {
     "tls18": tls,
@@ -258,7 +279,13 @@ SELF_CALIBRATIONS: dict[str, Callable[[LineCamera], SelfCalibration]] = {
     "tls12": lambda camera: tls(camera, 12),
     "prism30": prism,
     "lens": lens,
+    "boresight": boresight,
 }
+
+
+def unit_of(name: str) -> str:
+    """Unit of an additional parameter, by its name."""
+    return _UNITS.get(name.split("_")[0], "")
 
 
 def _set(

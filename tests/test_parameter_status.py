@@ -19,12 +19,15 @@ from triline.nodes.report.analysis import analyse
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
 from triline.nodes.simulator import Simulator
-from triline.solver.selfcalibration import tls
+from triline.solver.selfcalibration import boresight, tls
 from triline.solver.simulation.camera_errors import drawn_parameters, simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan
+from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.determinability import ESTIMATED, NOT_YET
+from triline.solver.window.results import WindowOptions
+from triline.solver.window.window import Window
 
 EPOCH = 1_700_000_000_000_000_000
 SEED = 2
@@ -148,3 +151,34 @@ def test_what_is_not_yet_determined_is_drawn_faint(flown):
     count = notes.curves["plots/parameters/determined/estimated"][1]
     assert count[0] < count[-1] == sum(p.status == ESTIMATED for p in kept[-1][0].parameters)
     assert "determined" in notes.layouts[-1].units
+
+
+def test_boresight_lives_on_from_strip_to_strip():
+    """Each strip has a shift of its own, known to 0.02 deg; the boresight is what all of them have in common."""
+    squares, ratio = [], []
+    for seed in range(1, 6):
+        plan = FlightPlan(
+            height_m=1000.0, strips=2, strip_s=14.0, turns=False, gap_s=8.0, lead_in_s=3.0, lead_out_s=2.0
+        )
+        stated = boresight(plan.camera).scaled(0.5)
+        ties = ObservationPlan(tie_points_per_s=4.0, check=5)
+        simulation = simulate_with_camera_errors(plan, seed, stated, ErrorModel(attitude_rate_hz=100.0), ties)
+        sigma = {}
+
+        def keep(now_s: float, window: Window, sigma=sigma) -> None:
+            if window.strips:
+                covariance = window.state.covariance(window._camera_columns)
+                sigma[list(window.strips)[-1]] = np.sqrt(np.diag(covariance))
+
+        found = adjust_online(
+            simulation, navigate(simulation), WindowOptions(grid_hz=5.0), stated, live=False, watch=keep
+        )
+        assert found.window is not None
+        off = found.window.state.values(found.window._camera_columns) - drawn_parameters(seed, stated)
+        squares.append((off / sigma["S2"]) ** 2)
+        ratio.append(sigma["S2"][:2] / sigma["S1"][:2])
+        if seed == 1:
+            assert stated.unknown_names == ("boresight_omega", "boresight_phi", "boresight_kappa")
+            assert (sigma["S1"][:2] > np.radians(0.018)).all()  # a strip alone knows it no better than its shift
+    assert np.mean(ratio) == pytest.approx(np.sqrt(0.5), abs=0.08)
+    assert 0.3 < np.mean(squares) < 2.2

@@ -12,7 +12,8 @@ from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.covariance import point_cofactors
 from triline.solver.camera import Lens, LineCamera, straight_line
 from triline.solver.models.dgr import DgrOptions
-from triline.solver.selfcalibration import SELF_CALIBRATIONS, lens, prism, tls
+from triline.solver.rotation import matrix_from_angles
+from triline.solver.selfcalibration import SELF_CALIBRATIONS, boresight, lens, prism, tls, unit_of
 from triline.solver.simulation.network import disturb_camera
 
 BLOCKS = Path(__file__).parents[2] / "shared" / "data" / "blocks"
@@ -41,7 +42,7 @@ def test_names_and_counts():
     three = LineCamera("prism", tuple(Lens(i, 2000.0) for i in "FNB"), tuple(triplet))
     assert prism(three).n_unknowns == 30 and prism(three).name == "prism30"
     assert lens(two_lenses()).n_unknowns == 18
-    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens"}
+    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens", "boresight"}
 
 
 def test_tls_formulas():
@@ -57,6 +58,17 @@ def test_tls_formulas():
     dx = value["xp_F"] + x * radial + (r2 + 2 * x * x) * value["p1"] + 2 * x * y * value["p2"] + y * value["th_F"]
     dy = value["yp_F"] + y * radial + (r2 + 2 * y * y) * value["p2"] + 2 * x * y * value["p1"] - y * value["sy_F"]
     np.testing.assert_allclose(got, [dx, dy], rtol=1e-12)
+
+
+def test_boresight_turns_the_camera_as_a_whole():
+    """Against rays turned by the rotation itself."""
+    aps, angles, c = boresight(CAMERA), np.array([3e-4, -5e-4, 8e-4]), 62.7
+    xy = np.array([[-30.0, 20.0], [0.0, 0.0], [12.0, -33.0]])
+    rays = np.column_stack([xy / c, -np.ones(3)]) @ matrix_from_angles(*angles)  # R^T f
+    turned = -c * rays[:, :2] / rays[:, 2:]
+    design = aps.design(np.array([0, 1, 2]), np.zeros(3), xy, np.full(3, c))
+    np.testing.assert_allclose(design.evaluate(angles).T, turned - xy, atol=5e-5)
+    assert np.abs(turned - xy).min() > 5e-3 and unit_of("boresight_phi") == "rad"
 
 
 def test_prism_parameters_go_by_chip_and_lens_parameters_by_lens():

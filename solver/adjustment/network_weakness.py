@@ -35,6 +35,9 @@ _WORDS = {
     "k3": "radial distortion k3",
     "p1": "decentring distortion p1",
     "p2": "decentring distortion p2",
+    "boresight_omega": "boresight omega",
+    "boresight_phi": "boresight phi",
+    "boresight_kappa": "boresight kappa",
 }
 _PARAMETERS = {
     "xp": "shift along flight",

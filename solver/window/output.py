@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..measured_trajectory import MeasuredTrajectory
 from ..models.base import COMPONENTS
 from ..rotation import corrected_angles
-from ..selfcalibration import SelfCalibration
+from ..selfcalibration import SelfCalibration, unit_of
 from .batch import Batch
 from .compensation import Compensation
 from .determinability import ESTIMATED, NOT_YET, Standing
@@ -185,7 +185,8 @@ def parameters(
         names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, np.asarray(strip_globals).tolist(), strict=True))
     if self_calibration is not None:
         for name, number in zip(self_calibration.unknown_names, camera_columns.tolist(), strict=True):
-            names.append((name, "mm" if name[:2] in ("dc", "xp", "yp", "dx", "dy") else "", number))
+            unit = "mm" if unit_of(name) == "mm" else "rad" if name.startswith("boresight") else ""
+            names.append((name, unit, number))
     numbers = np.array([number for _, _, number in names], dtype=np.int64)
     if not len(numbers) or (state.places(numbers) < 0).any():
         return ()
