@@ -173,16 +173,19 @@ class PlotsPart(Part):
             self._add("overview/integrity/limit", t, report.alert_limit_m, limit, gap_s)
 
     def _parameter(self, t: float, k: int, parameter: Any, gap_s: float) -> None:
-        """The value; faint as long as the network cannot see it."""
-        unit, scale = parameter.unit or "1", 1.0
+        """The value; faint as long as the network cannot see it. Lens distortions, each of which has a unit of its own,
+        in units of their sigmas."""
+        unit, value = parameter.unit or "1", parameter.value
         if unit.startswith("rad"):
-            unit, scale = "mdeg" + unit[3:], _MDEG
+            unit, value = "mdeg" + unit[3:], _MDEG * value
+        elif unit.startswith("mm^"):
+            unit, value = "sigma", parameter.t
         self._of_unit(unit)
         entity = f"parameters/{entity_name(unit)}/{entity_name(parameter.name)}"
         series = Series(parameter.name, _palette(k), 1.5)
         if parameter.status != ESTIMATED:
             entity, series = f"{entity}_open", Series(f"{parameter.name}, open", faded(_palette(k), 0.4), 1.0)
-        self._add(entity, t, scale * parameter.value, series, gap_s)
+        self._add(entity, t, value, series, gap_s)
 
     def _of_unit(self, unit: str) -> None:
         """There is a plot of this unit."""

@@ -35,9 +35,6 @@ _WORDS = {
     "k3": "radial distortion k3",
     "p1": "decentring distortion p1",
     "p2": "decentring distortion p2",
-    "boresight_omega": "boresight omega",
-    "boresight_phi": "boresight phi",
-    "boresight_kappa": "boresight kappa",
 }
 _PARAMETERS = {
     "xp": "shift along flight",
@@ -169,6 +166,8 @@ def word(name: str) -> str:
     if name in _WORDS:
         return _WORDS[name]
     kind, _, of = name.partition("_")
+    if of and kind == "boresight":
+        return f"{kind} {of}"
     if of and kind in _PARAMETERS:
         return f"{_PARAMETERS[kind]} of {'lens' if kind == 'dc' else 'line'} {of}"
     return name

@@ -122,8 +122,10 @@ def adjusted_points(
     w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
     source = batch.rays.source.tolist()
     first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
-    held = np.all(batch.control.weight > 0, axis=1)
-    known: list[bool] = (held if batch.ties is None else held | batch.ties.active).tolist()
+    known = np.all(batch.control.weight > 0, axis=1)
+    earlier = np.zeros(batch.n_points, dtype=np.int64)  # single looks of earlier strips
+    if batch.ties is not None:
+        known, earlier = known | batch.ties.placed, earlier + (batch.ties.active & batch.ties.single)
     out = []
     for i, name in enumerate(batch.names):
         if batch.normals.rank[i] < 3:
@@ -134,7 +136,7 @@ def adjusted_points(
         residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
         role = control[name].role if name in control else "tie"
         rays = int(used[i])
-        checked = checks(rays, len(residuals), known[i])
+        checked = checks(rays + int(earlier[i]), len(residuals) + int(earlier[i]), bool(known[i]))
         out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
     return out
 
@@ -185,8 +187,7 @@ def parameters(
         names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, np.asarray(strip_globals).tolist(), strict=True))
     if self_calibration is not None:
         for name, number in zip(self_calibration.unknown_names, camera_columns.tolist(), strict=True):
-            unit = "mm" if unit_of(name) == "mm" else "rad" if name.startswith("boresight") else ""
-            names.append((name, unit, number))
+            names.append((name, unit_of(name), number))
     numbers = np.array([number for _, _, number in names], dtype=np.int64)
     if not len(numbers) or (state.places(numbers) < 0).any():
         return ()
