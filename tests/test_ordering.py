@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from triline.nodes.ordering import MAX_JUMP_NS, REBASE_AFTER, Sequencer, StreamCheck, is_orderly, order_key
+from triline.nodes.rectifier import Rectifier
 from triline.schemas import topics
 from triline.schemas.envelope import Envelope
 
@@ -150,6 +151,22 @@ def test_reports_of_a_busy_adjuster_come_in_order_and_rare_ones_hold_nothing_up(
     assert out == sorted(out, key=lambda m: order_key(*m))
     assert sum(topic == "adjustment/report" for topic, _ in out) == len(told)
     assert max(w for (_, e), w in waited.items() if e.stamp_ns < begin + 2900 * MS) < 1600  # no longer than for live
+
+
+@pytest.mark.parametrize("topic", ["orientation/final", "point/object"])
+def test_the_orthoimage_may_get_the_end_of_a_strip_a_second_late(topic):
+    """The adjuster has flown a strip and is silent on what is live; what became final at its end comes later."""
+    begin = 10**18
+    lines = [(t, "sensor/lines/N", Envelope(begin + t * MS, "s", t // 50)) for t in range(0, 6000, 50)]
+    live = [(t + 20, "orientation/live", Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 3000, 50)]
+    for behind, lost in ((900, False), (1500, True)):
+        told = [(t + behind, topic, Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 4000, 50)]
+        sequencer: Sequencer = Sequencer(Rectifier.inputs)
+        late = []
+        for at, name, envelope in sorted([*lines, *live, *told], key=lambda m: (m[0], m[1])):
+            late += filter(None, [sequencer.push(name, envelope, (name, envelope), at * 1e-3)])
+            sequencer.pop(at * 1e-3)
+        assert bool(late) == lost
 
 
 ADJUSTER = (
