@@ -20,14 +20,15 @@ from ..adjustment.normal_equations import PointNormals
 from ..adjustment.reduced_system import DenseFactor
 from ..models.base import Design
 from .backward import LeftPoints, again
-from .batch import Batch, inverse_factors
+from .batch import Batch
 from .block_normals import LOOKED_UP, ROWS, BlockNormals
 from .block_solution import BlockSolution, Cost, Parts, Workspace, factorised, in_one_go, inverted, solved
 from .compensation import Border, Named
 from .drift_border import MOST_GROUPS, Cell, of_block
+from .kept_points import KeptPoint, SingleLook, eliminated
 from .output import checks
 from .points import ControlPoint
-from .results import AdjustedPoint, RefinedOrientation, WholeStrips
+from .results import TAKEN_BACK, AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
 from .suspects import EACH
 
 Array = NDArray[np.floating]
@@ -40,38 +41,8 @@ MOST_UNKNOWNS = 4200
 MOST_OF_STRIP = 1500
 #: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
 AGAIN, AGAIN_POINTS = 4e7, 8e6
-#: Object points kept; beyond that those of the oldest strip are forgotten.
-MOST_POINTS = 30000
-
-
-@dataclass
-class KeptPoint:
-    """A point that became final.
-
-    Attributes
-    ----------
-    left, place : where its coordinates come from, given the unknowns
-    strips : where it was seen
-    time_s : about when, in the last of them
-    control : (3,) weights of known coordinates that are in it
-    """
-
-    left: LeftPoints
-    place: int
-    strips: frozenset[str]
-    time_s: float
-    control: Array
-
-    @property
-    def with_control(self) -> bool:
-        """Whether known coordinates are in it."""
-        return bool(self.control.any())
-
-    @property
-    def root(self) -> tuple[Array, Array, Array]:
-        """``L^T`` (3, 3), ``D`` (3, u), ``y`` (3,) of ``L^T (p - origin) + D theta = y + noise(1)``."""
-        L_inv = inverse_factors(self.left.normals)[self.place]
-        return np.linalg.inv(L_inv).T, self.left.coupling[self.place], self.left.normals.y[:, self.place]
+#: Object points kept; beyond that those of the oldest strip are forgotten. Single looks beside them.
+MOST_POINTS, MOST_SINGLE = 30000, 4000
 
 
 @dataclass
@@ -130,8 +101,8 @@ class Archive:
         self.changed = True
         self._normals.add(columns, matrix, rhs)
 
-    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> None:
-        """A batch became final.
+    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> list[Refusal]:
+        """A batch became final; returns the single looks of earlier strips that count now.
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
         and of the earlier strip's coordinates, with all unknowns of that strip instead of what stood for it on line.
@@ -142,7 +113,7 @@ class Archive:
         cell : what drifts of its strip have to do with it, None if nothing
         """
         if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
-            return
+            return []
         if batch.ties is None:
             left = LeftPoints.of(batch, published)
             matrix, rhs = batch.information.matrix, batch.information.rhs
@@ -156,12 +127,19 @@ class Archive:
             for i, point in zip(left.order.tolist(), left.points, strict=True):
                 seen = frozenset(r.look.strip for r in point.residuals)
                 self._keep(point.name, KeptPoint(left, i, seen, float(time_s[i]), batch.control.weight[i]))
-            return
+            return []
         by_name = {p.name: p for p in published}
-        told = [self._tie(batch, i, by_name.get(name), cell) for i, name in enumerate(batch.names)]
-        told = [t for t in told if t is not None]
+        told, returned = [], []
+        for i, name in enumerate(batch.names):
+            old = self.points.get(name)
+            tie = self._tie(batch, i, by_name.get(name), cell)
+            if tie is None:
+                continue
+            told.append(tie)
+            if old is not None and old.single is not None and batch.ties.active[i]:
+                returned.append(Refusal(name, old.single.look, TAKEN_BACK))
         if not told:
-            return
+            return []
         columns = np.unique(np.concatenate([c for c, _, _ in told]))
         matrix, rhs = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
         for own, N, right in told:
@@ -169,6 +147,32 @@ class Archive:
             matrix[at[:, None], at] += N
             rhs[at] += right
         self.add(columns, matrix, rhs)
+        return returned
+
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
+        """Keep looks that found no partner in their strip: a batch of one each."""
+        for i, look in enumerate(looks if self.holds(batch.columns) else ()):
+            name = batch.names[i]
+            if name in self.points and self.points[name].single is None:
+                continue
+            single = SingleLook(batch, i, look, cell)
+            seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
+            self._keep(name, KeptPoint(single.left(), 0, seen, time_s, np.zeros(3), single))
+        names = [name for name, kept in self.points.items() if kept.single is not None]
+        for name in names[: max(len(names) - MOST_SINGLE, 0)]:
+            del self.points[name]
+
+    def linearise_single(self, solution: BlockSolution) -> Parts:
+        """Linearise single looks at a solution, so that what is said of them on line is as good as it; in parts."""
+        batches = {id(k.single.batch): k.single.batch for k in self.points.values() if k.single is not None}
+        for batch in batches.values():
+            theta, _ = solution.of(batch.columns)
+            batch.back_substitute(theta)
+            batch.linearise(theta, reweigh=True)
+            yield AGAIN_POINTS
+        for kept in self.points.values():
+            if kept.single is not None:
+                kept.left = kept.single.left()
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""
@@ -189,6 +193,8 @@ class Archive:
         old = self.points.get(name)
         if old is None or not self.holds(old.left.columns) or not batch.ties.active[i]:
             old = None
+        if old is not None and old.single is not None and not old.with_control:
+            old = replace(old, left=old.single.left(batch.points_l[i]))
         columns = np.union1d(own, [] if old is None else old.left.columns).astype(np.int64)
         rows, points, values = [_spread(A, own, columns)], [J], [residual]
         before = np.zeros(3) if old is None else old.control
@@ -207,11 +213,11 @@ class Archive:
         normal = J.T @ J
         if published is None or np.linalg.cond(normal) > 1e12:
             return None
-        left, matrix, rhs = _eliminated(A, J, residual, normal, columns, origin, published)
+        left, matrix, rhs = eliminated(A, J, residual, normal, columns, origin, published)
         seen = frozenset(r.look.strip for r in published.residuals)
         if old is not None:
             seen |= old.strips
-            then = old.left.points[list(old.left.order).index(old.place)]
+            then = old.point
             rays, looks = published.rays + then.rays, then.residuals + published.residuals
             merged = replace(
                 published, rays=rays, residuals=looks, checked=checks(rays, len(looks), bool(control.any()))
@@ -226,15 +232,15 @@ class Archive:
         kept, weight = self.points.get(name), control.weight
         if kept is None or kept.with_control or not weight.any() or not self.holds(kept.left.columns):
             return False
+        if kept.single is not None:
+            kept = replace(kept, left=kept.single.left(np.where(weight > 0, control.xyz_l, kept.point.xyz_l)))
         L, D, y = kept.root
         origin = kept.left.origin_l[kept.place]
         root, u = np.sqrt(weight), len(kept.left.columns)
         A, J = np.concatenate([D, np.zeros((3, u))]), np.concatenate([L, np.diag(root)])
         residual = np.concatenate([y, root * (np.nan_to_num(control.xyz_l) - origin)])
-        point = kept.left.points[list(kept.left.order).index(kept.place)]
-        left, matrix, rhs = _eliminated(
-            A, J, residual, J.T @ J, kept.left.columns, origin, replace(point, role=control.role)
-        )
+        point = replace(kept.point, role=control.role)
+        left, matrix, rhs = eliminated(A, J, residual, J.T @ J, kept.left.columns, origin, point)
         # the looks themselves are in already: they leave nothing but L^T p + D theta = y, which p takes up
         self.add(kept.left.columns, matrix, rhs)
         self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, weight)
@@ -256,8 +262,8 @@ class Archive:
         L_inv = np.linalg.inv(np.linalg.cholesky(normal))
         D_new, y_new = L_inv @ into, L_inv @ moment
         normals = PointNormals(L_inv[np.tril_indices(3)][:, None], y_new[:, None], np.array([3]))
-        point = kept.left.points[list(kept.left.order).index(kept.place)]
-        left = LeftPoints(kept.left.columns, origin[None], normals, D_new[None], np.zeros(1, dtype=np.int64), (point,))
+        order = np.zeros(1, dtype=np.int64)
+        left = LeftPoints(kept.left.columns, origin[None], normals, D_new[None], order, (kept.point,))
         self.add(kept.left.columns, D.T @ D - D_new.T @ D_new, D.T @ y - D_new.T @ y_new)
         control = np.where(np.arange(3) == axis, weight, kept.control)
         self.points[name] = replace(kept, left=left, place=0, control=control)
@@ -333,7 +339,7 @@ class Archive:
                     yield AGAIN
         groups: dict[int, tuple[LeftPoints, set[str]]] = {}
         for name, kept in self.points.items():
-            if kept.strips & wanted:
+            if kept.strips & wanted and kept.single is None:
                 groups.setdefault(id(kept.left), (kept.left, set()))[1].add(name)
         points = []
         for left, names in groups.values():
@@ -349,7 +355,8 @@ class Archive:
 
     def beyond(self) -> list[str]:
         """The strips that must be closed so that the block keeps its bounds, oldest first."""
-        unknowns, left, points = self.n_unknowns, list(self.strips), list(self.points.values())
+        unknowns, left = self.n_unknowns, list(self.strips)
+        points = [p for p in self.points.values() if p.single is None]
         found = []
         while len(left) > 1 and (unknowns > MOST_UNKNOWNS or len(points) > MOST_POINTS):
             id = left.pop(0)
@@ -399,18 +406,6 @@ def _spread(part: Array, columns: IntArray, wanted: IntArray) -> Array:
     result = np.zeros((len(part), len(wanted)))
     result[:, np.searchsorted(wanted, columns)] = part
     return result
-
-
-def _eliminated(
-    A: Array, J: Array, residual: Array, normal: Array, columns: IntArray, origin: Array, point: AdjustedPoint
-) -> tuple[LeftPoints, Array, Array]:
-    """A point with rows ``A theta + J (p - origin) = residual``: what is left of it, and its information."""
-    L_inv = np.linalg.inv(np.linalg.cholesky(normal))
-    D, y = L_inv @ (J.T @ A), L_inv @ (J.T @ residual)
-    lower = L_inv[np.tril_indices(3)]
-    normals = PointNormals(lower[:, None], y[:, None], np.array([3]))
-    left = LeftPoints(columns, origin[None], normals, D[None], np.zeros(1, dtype=np.int64), (point,))
-    return left, A.T @ A - D.T @ D, A.T @ residual - D.T @ y
 
 
 def _add_prior(N: Array, rhs: Array, numbers: IntArray, strip: KeptStrip) -> None:

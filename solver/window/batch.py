@@ -156,11 +156,11 @@ class Batch:
         self.active_control = int(self.control.weight.any(axis=1).sum())
         self.determined = int(normals.rank.sum())
         rows = 2 * self.active_rays + self.control.n_observations - self.determined
-        if tied is not None:
+        if tied is not None and self.ties is not None:
             matrix += np.einsum("pku,pkv->uv", tied.design, tied.design)
             rhs += np.einsum("pku,pk->u", tied.design, tied.residual)
             square += float(np.vdot(tied.residual, tied.residual))
-            rows += 3 * int(tied.active.sum())
+            rows += int(self.ties.observations[tied.active].sum())
         self.normals, self.information = normals, Information(matrix, rhs, square, rows)
         self.judged = None
         self._rows, self.coupling = A, D

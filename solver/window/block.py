@@ -23,7 +23,7 @@ from .block_solution import Parts
 from .compensation import Named
 from .drift_border import Cell
 from .points import ControlPoint
-from .results import AdjustedPoint, RefinedOrientation, WholeStrips
+from .results import AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
 from .state import WindowState
 from .strip import WindowStrip
 from .ties import EarlierStrips
@@ -71,12 +71,21 @@ class Block:
         """A strip begins."""
         self._archive.begin_strip(strip.id, strip.numbers)
 
-    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> None:
-        """A batch became final, with the points it published; ``cell``: what drifts have to do with it."""
+    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> list[Refusal]:
+        """A batch became final, with the points it published; ``cell``: what drifts have to do with it.
+
+        Returns the single looks of earlier strips that count now.
+        """
         self.conclude()
         names = list(self._strips)
-        self._archive.leave(batch, points, cell)
         self._touched.update(names[i] for i in batch.strips)
+        return self._archive.leave(batch, points, cell)
+
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
+        """Keep looks that found no partner in their strip, a batch of one each."""
+        self.conclude()
+        self._touched.update(look.strip for look in looks)
+        self._archive.keep_single(batch, looks, cell)
 
     def orientation(self, strip: WindowStrip, final: RefinedOrientation, design: Design, noise: Array) -> None:
         """Orientation that became final."""
@@ -190,6 +199,7 @@ class Block:
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))
         if not at_the_end:
+            yield from self._archive.linearise_single(solution)
             yield from self.earlier.learning(self._archive, solution, closing)
         for id in closing:
             yield from self._archive.closing(id, named)

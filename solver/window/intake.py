@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Mapping
 from math import isfinite
 
 import numpy as np
@@ -161,19 +162,29 @@ class Intake:
                 self._done.append((batch.newest_s, name, strip))
                 self._is_done.add((name, strip))
 
-    def forget(self, limit_s: float, done_before_s: float) -> list[Refusal]:
-        """Give up single looks older than the limit, and forget which points became final long ago."""
+    def without_partner(self, limits_s: Mapping[str, float]) -> list[str]:
+        """Points that wait for another look in vain: theirs are older than the limits of their strips."""
+        points = ((name, self.points[name]) for name in self._waiting)
+        return [
+            name
+            for name, point in points
+            if all(t <= limits_s[look.strip] for look, t in zip(point.looks, point.time_s, strict=True))
+        ]
+
+    def give_up(self, names: Iterable[str]) -> list[Refusal]:
+        """Wait no longer for other looks at points."""
         refused = []
-        for name in list(self._waiting):
-            point = self.points[name]
-            if not point.time_s or max(point.time_s) <= limit_s:
-                refused += [Refusal(name, look, "too few looks") for look in point.looks]
-                del self.points[name], self._waiting[name]
-                self._arrived.pop(name, None)
-        while self._done and self._done[0][0] < done_before_s:
+        for name in names:
+            refused += [Refusal(name, look, "too few looks") for look in self.points[name].looks]
+            del self.points[name], self._waiting[name]
+            self._arrived.pop(name, None)
+        return refused
+
+    def forget(self, before_s: float) -> None:
+        """Forget which points became final before a time."""
+        while self._done and self._done[0][0] < before_s:
             _, name, strip = self._done.popleft()
             self._is_done.discard((name, strip))
-        return refused
 
     @property
     def oldest_waiting_s(self) -> float:

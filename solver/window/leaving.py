@@ -19,6 +19,7 @@ from .intake import Intake
 from .integrity import Exposure
 from .output import Orienter, adjusted_points
 from .results import RefinedOrientation, WindowOptions, WindowUpdate
+from .single_looks import SingleLooks
 from .snooping import snoop
 from .state import WindowState
 from .strip import WindowStrip
@@ -48,6 +49,7 @@ class Leaver:
 
     Parameters
     ----------
+    single : takes care of looks without a partner
     control : weighs control
     apart : told the points that do not agree with earlier strips, and the result
     """
@@ -65,10 +67,13 @@ class Leaver:
         orienter: Orienter,
         control: ControlDesk,
         apart: Callable[[list[str], WindowUpdate], None],
+        single: SingleLooks,
     ) -> None:
         self.options, self._state, self._strips, self._batches = options, state, strips, batches
         self._intake, self._trajectory, self._block = intake, trajectory, block
-        self._watch, self._orienter, self._control, self._apart = watch, orienter, control, apart
+        self._watch, self._orienter, self._control, self._apart, self._single = (
+            watch, orienter, control, apart, single,
+        )  # fmt: skip
         self._steps: list[Step] = []
         self._left: list[LeftPoints] = []
         self._let_go_s = -np.inf
@@ -97,19 +102,20 @@ class Leaver:
                 self._state.solve()
             if rounds or failed:
                 self._orienter.forget()
+        gone = [(strip, *strip.leaving(limits[strip.id], self._state)) for strip in self._strips.values()]
+        result.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
         cells = self._watch.cells(leaving)
         for batch in leaving:
             drift = self._watch.on_points(batch, self._orienter.drift)
             points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, True, drift)
             result.points += points
             self._left.append(LeftPoints.of(batch, points))
-            self._block.leave(batch, points, cells.get(id(batch)))
+            result.refused += self._block.leave(batch, points, cells.get(id(batch)))
         self._watch.leaving(leaving, limit_s - length_s)
         for batch in leaving:
             self._batches.leave(batch)
             self._intake.finish(batch)
-        for strip in self._strips.values():
-            numbers, to_s = strip.leaving(limits[strip.id], self._state)
+        for strip, numbers, to_s in gone:
             if not len(numbers):
                 continue
             final = self._final(strip, to_s)
@@ -131,7 +137,7 @@ class Leaver:
         if self._block.quiet:
             result.events += self._block.take_events()
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
-        self._forget(limit_s, length_s, result)
+        self._forget(limit_s, length_s)
 
     def _is_settled(self, strip: WindowStrip, now_s: float) -> bool:
         """Whether a strip is over and nothing is waited for: late tie points, and smoothed poses under its rays."""
@@ -197,11 +203,11 @@ class Leaver:
         """With protection levels as the middle of the times is exposed."""
         return _protected(orientation, self._watch.exposure_at(strip, middle(orientation)))
 
-    def _forget(self, limit_s: float, length_s: float, result: WindowUpdate) -> None:
-        """Drop what nothing can need any more: single looks that found no partner, old poses, strips that are over."""
+    def _forget(self, limit_s: float, length_s: float) -> None:
+        """Drop what nothing can need any more: names of points long final, old poses."""
         if not np.isfinite(limit_s) and limit_s < 0:
             return
-        result.refused += self._intake.forget(limit_s, limit_s - length_s)
+        self._intake.forget(limit_s - length_s)
         used = min((b.oldest_s for b in self._batches), default=np.inf)
         waiting = self._intake.oldest_waiting_s
         finals = min((s.final_to_s for s in self._strips.values() if not s.is_gone(self._state)), default=np.inf)

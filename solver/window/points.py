@@ -29,6 +29,10 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 
+#: Rounds in which the known point nearest to where a ray meets the ground is looked for.
+NEAREST = 3
+
+
 @dataclass
 class ControlPoint:
     """Known coordinates: (3,) m with sigma (3,), infinite where not given; role as in the messages."""
@@ -142,6 +146,31 @@ class BatchMaker:
         known : coordinates of points that were placed before
         """
         return self.make_each([Draft(names, points)], known)[0]
+
+    def make_single(self, names: list[str], points: list[PointLooks], ground_l: Array) -> Batch | None:
+        """A batch of points of one look each, linearised where its ray meets the ground at the height of the nearest
+        known point.
+
+        Parameters
+        ----------
+        ground_l : (m, 3) points on the ground
+        """
+        rays, *_ = self.rays(points)
+        image = np.column_stack([rays.xy_mm, -rays.focal_length_mm])
+        direction = np.einsum("nij,nj->ni", matrix_from_angles(*rays.angles.T), image)
+        direction /= direction[:, 2:]
+        height = np.full(len(names), np.median(ground_l[:, 2]))
+        for _ in range(NEAREST):
+            place = rays.position_l + (height - rays.position_l[:, 2])[:, None] * direction
+            apart = ((ground_l[:, :2] - place[:, None, :2]) ** 2).sum(axis=2)
+            height = ground_l[np.argmin(apart, axis=1), 2]
+        place = rays.position_l + (height - rays.position_l[:, 2])[:, None] * direction
+        batch, _ = self.make_each([Draft(names, points)], dict(zip(names, place, strict=True)))[0]
+        if batch is not None:  # onto the ray as it is corrected
+            theta = self.state.values(batch.columns)
+            batch.back_substitute(theta)
+            batch.linearise(theta, reweigh=True)
+        return batch
 
     def make_each(self, drafts: list[Draft], known: dict[str, Array]) -> list[tuple[Batch | None, list[str]]]:
         """Batches as `make` makes them, one of each draft; what their rays need is looked up for all at once."""

@@ -50,6 +50,11 @@ class WindowOptions:
     retest: int = 4
     alert_limit_m: float = 0.0
 
+    @property
+    def follows_wander(self) -> bool:
+        """Whether the model has a place for what wanders."""
+        return self.model != "dgr"
+
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise ValueError(f"unknown trajectory model {self.model!r}; known: {', '.join(MODELS)}")

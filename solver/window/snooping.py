@@ -15,6 +15,7 @@ from .entry import DECISIVE, entry_weight
 from .points import PointLooks
 from .results import TAKEN_BACK, Refusal
 from .state import WindowState
+from .tie_snooping import contradicting
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -146,15 +147,20 @@ def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks], 
         return False
     again, w = entry_weight(batch, state, RETURNING)
     weight = np.where(lost[batch.rays.point], again, batch.weight)
-    back = np.flatnonzero((weight > 0) & (batch.weight == 0))
-    if not len(back):
+    if not ((weight > 0) & (batch.weight == 0)).any():
         return False
+    before = batch.weight
     state.add(batch.columns, batch.information, -1)
     batch.weight = weight
+    if batch.ties is not None:  # of the lost points nothing is in the state, of their ties neither
+        batch.eliminate()
+        wrong = lost & contradicting(batch, state)
+        batch.weight = np.where(wrong[batch.rays.point], 0.0, weight)
+    back = np.flatnonzero((batch.weight > 0) & (before == 0))
     changes += _note(batch, points, back[:0], back, w)
     batch.eliminate()
     state.add(batch.columns, batch.information)
-    return True
+    return len(back) > 0
 
 
 def _judge(batch: Batch, state: WindowState) -> tuple[Array, Array, Array, Array]:

@@ -138,6 +138,10 @@ class SourceMonitor:
         """Borders of batches as they are, by identity."""
         return {id(b): cell for b in self._mine(batches) if (cell := self._up_to_date(b, state)) is not None}
 
+    def cell_of_single(self, batch: Batch, state: WindowState) -> Cell | None:
+        """Border of a batch of points with one look each, which is no part of the window."""
+        return self._cell(batch, state, self._groups_of(batch), 2) if self._mine([batch]) else None
+
     def leave(self, batches: list[Batch], state: WindowState) -> dict[int, Cell]:
         """Batches leave the window; call before they are fixed. Returns their borders, by identity."""
         left = {}
@@ -196,12 +200,12 @@ class SourceMonitor:
         else:
             self._cells.pop(id(batch), None)
 
-    def _cell(self, batch: Batch, state: WindowState, groups: list[Group]) -> Cell | None:
+    def _cell(self, batch: Batch, state: WindowState, groups: list[Group], rank: int = 3) -> Cell | None:
         for group in groups:
             if group not in self._groups and len(self._groups) < MOST_GROUPS:
                 self._groups[group] = len(self._groups)
         numbers = np.array([self._groups.get(g, -1) for g in groups])
-        use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] == 3) & (numbers >= 0))
+        use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] >= rank) & (numbers >= 0))
         if not len(use):
             return None
         v_px = batch.residuals_px(state)

@@ -97,7 +97,7 @@ class WindowStrip:
         self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
         self.lines = lines
         self.slow = slow
-        self.followed = slow.wander_density if options.model != "dgr" else np.zeros(6)
+        self.followed = slow.wander_density if options.follows_wander else np.zeros(6)
         self.ended = False
         self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
         length = lines / line_rate_hz if lines else UNKNOWN_LENGTH_S

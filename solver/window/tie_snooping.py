@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from ..adjustment.normal_equations import ControlWeights
 from .batch import Batch, inverse_factors
 from .state import WindowState
+from .ties import without_point
 
 Array = NDArray[np.floating]
 
@@ -22,44 +23,52 @@ TOGETHER = 0.5
 
 
 def admit_ties(batch: Batch, state: WindowState) -> list[str]:
-    """Drop the ties of a batch that is not in the state which contradict its rays; names of their points.
+    """Drop the ties of a batch that is not in the state which contradict its rays; names of their points."""
+    return _drop(batch, contradicting(batch, state, AT_THE_DOOR))
 
-    The place where the new rays meet, with the orientation as known, is compared with that of the earlier strips; where
-    they do not meet, as a single one, they are compared with the place itself.
+
+def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE) -> NDArray[np.bool_]:
+    """Which points (p,) have ties that their rays contradict, neither of which are in the state; a good one is called
+    so with probability ``alpha``.
+
+    The place where the new rays meet, with the orientation as known, is compared with what the earlier strips say of
+    it; where they do not meet, as a single one, the rays and what these strips say must agree on some place.
     """
     ties = batch.ties
     if ties is None or not ties.active.any():
-        return []
+        return np.zeros(batch.n_points, dtype=bool)
     theta, Q = state.values(batch.columns), state.covariance(batch.columns)
     fails = np.zeros(batch.n_points, dtype=bool)
-    m = len(ties.columns)
+    tied = ties.rows(batch.origin_l, len(batch.columns))
     for i in np.flatnonzero(ties.active):
-        A, J, residual, origin = batch.equations(int(i))
+        A, J, residual, _ = batch.equations(int(i))
+        used = (J != 0).any(axis=1)
+        A, J, residual = A[used], J[used], residual[used]
+        m = ties.observations[i]
+        D, P, off = tied.design[i, :m], tied.point[i, :m], tied.residual[i, :m]
         N = J.T @ J
-        if np.linalg.cond(N) > 1e12:
-            G = A.copy()
-            G[:, -m:] += J @ ties.modes[i]
-            off = residual - J @ (ties.xyz_l[i] - origin) - G @ theta
-            C = np.eye(len(J)) + J @ np.linalg.inv(ties.root[i].T @ ties.root[i]) @ J.T + G @ Q @ G.T
-            fails[i] = off @ np.linalg.solve(C, off) > chi2.isf(AT_THE_DOOR, len(J))
-            continue
-        spread = np.linalg.inv(N)
-        G = -spread @ J.T @ A
-        G[:, -m:] -= ties.modes[i]
-        off = origin + spread @ (J.T @ residual) - ties.xyz_l[i] + G @ theta
-        C = spread + np.linalg.inv(ties.root[i].T @ ties.root[i]) + G @ Q @ G.T
-        fails[i] = off @ np.linalg.solve(C, off) > chi2.isf(AT_THE_DOOR, 3)
-    return _drop(batch, fails)
+        if len(J) < 3 or np.linalg.cond(N) > 1e12:
+            D, off = without_point(np.concatenate([A, D]), np.concatenate([J, P]), np.concatenate([residual, off]))
+            C = np.eye(len(off))
+        else:
+            through = P @ np.linalg.inv(N) @ J.T
+            D, off = D - through @ A, off - through @ residual
+            C = np.eye(m) + through @ through.T
+        off = off - D @ theta
+        C = C + D @ Q @ D.T
+        fails[i] = len(off) > 0 and off @ np.linalg.solve(C, off) > chi2.isf(alpha, len(off))
+    return fails
 
 
 def snoop_ties(batches: Sequence[Batch], state: WindowState) -> list[str]:
     """Drop ties of batches in the state that fail; names of their points. The state has to be solved again if any."""
-    limit = float(chi2.isf(INSIDE, 3))
+    limits = {n: float(chi2.isf(INSIDE, n)) for n in (2, 3)}
     values = [_joint(b, state) for b in batches]
     worst = max((float(v.max(initial=0.0)) for v in values), default=0.0)
     names = []
     for batch, value in zip(batches, values, strict=True):
-        fails = value > max(limit, TOGETHER * worst)
+        limit = 0.0 if batch.ties is None else np.where(batch.ties.single, limits[2], limits[3])
+        fails = value > np.maximum(limit, TOGETHER * worst)
         if fails.any():
             state.add(batch.columns, batch.information, -1)
             names += _drop(batch, fails)
@@ -85,8 +94,7 @@ def _joint(batch: Batch, state: WindowState) -> Array:
 
 def _drop(batch: Batch, fails: NDArray[np.bool_]) -> list[str]:
     """Take the weight from ties; known coordinates that they stood for count themselves."""
-    assert batch.ties is not None
-    if not fails.any():
+    if batch.ties is None or not fails.any():
         return []
     batch.ties = replace(batch.ties, active=batch.ties.active & ~fails)
     weight = np.where(fails[:, None], batch.ties.control, batch.control.weight)

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.linearisation import Linearisation
-from .archive import Archive, BlockSolution, KeptPoint
+from .archive import Archive, BlockSolution
 from .batch import inverse_factors
 from .block_solution import Parts
+from .kept_points import KeptPoint
 from .points import ControlPoint
 from .state import WindowState
 
@@ -41,6 +42,8 @@ NEGLIGIBLE, MOST_MODES = 0.05, 32
 MOST_PRESENT = 240
 #: What it costs to find the modes of a patch, for each of its points, in operations.
 PATCH_COST = 4e6
+#: Singular value, of the largest one, from which a point is determined in a direction.
+DETERMINED = 1e-6
 #: Variance of a mode given those present, at least: of what all but follows from them.
 FLOOR = 1e-6
 
@@ -69,13 +72,17 @@ class Patch:
 
 @dataclass(frozen=True)
 class EarlierPoint:
-    """``p = xyz_l + modes @ s + e``, and ``root`` (3, 3) with ``root^T root`` the weight of e."""
+    """``p = xyz_l + modes @ s + e``, and ``root`` (3, 3) with ``root^T root`` the weight of e.
+
+    ``single``: of one look, which says where the point is but along its ray; the last row of its root is zero.
+    """
 
     patch: int
     xyz_l: Array
     modes: Array
     root: Array
     with_control: bool
+    single: bool
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,7 @@ class PointTies:
     xyz_l, modes, root : (p, 3), (p, 3, m), (p, 3, 3) see `EarlierPoint`
     control : (p, 3) weights of known coordinates, whether or not an earlier strip has used them
     active : (p,) False where the tie failed its test
+    single : (p,) of one look
     """
 
     columns: IntArray
@@ -119,6 +127,17 @@ class PointTies:
     root: Array
     control: Array
     active: Bools
+    single: Bools
+
+    @property
+    def placed(self) -> Bools:
+        """Which points (p,) have a place from earlier strips."""
+        return self.active & ~self.single
+
+    @property
+    def observations(self) -> IntArray:
+        """How many each tie stands for (p,), active or not: that of a single look two."""
+        return np.where(self.single, 2, 3)
 
     def rows(self, origin_l: Array, n_unknowns: int) -> TieRows:
         """Equations of all points, zero where they are not active."""
@@ -177,7 +196,7 @@ class EarlierStrips:
             functionals.append(M)
             size = len(M[1])
             for (name, k), (xyz, B, root) in zip(kept, found, strict=True):
-                points[name] = EarlierPoint(len(patches), xyz, B, root, k.with_control)
+                points[name] = EarlierPoint(len(patches), xyz, B, root, k.with_control, k.single is not None)
             patches.append(Patch(strip, len(patches), slice(first, first + size), np.empty(0, dtype=np.int64)))
             first += size
             yield PATCH_COST * len(kept)
@@ -255,7 +274,7 @@ class EarlierStrips:
             modes[i, :, starts[p.patch] : starts[p.patch] + p.modes.shape[1]] = p.modes
         return PointTies(
             numbers, np.array([p.xyz_l for p in points]), modes, np.array([p.root for p in points]), control,
-            np.ones(len(points), dtype=bool),
+            np.ones(len(points), dtype=bool), np.array([p.single for p in points]),
         )  # fmt: skip
 
     def with_control(self, names: Sequence[str]) -> Bools:
@@ -265,18 +284,20 @@ class EarlierStrips:
     def add_control(self, name: str, control: ControlPoint) -> bool:
         """Known coordinates of a point of an earlier strip that came late; whether they count in the window now."""
         point, weight = self.points.get(name), control.weight
-        if point is None or point.with_control or not weight.any() or not self.enter(name, -np.inf):
+        if point is None or point.with_control or not weight.any():
             return False
-        axes = np.flatnonzero(weight > 0)
-        spread = np.linalg.inv(point.root.T @ point.root)
-        noise = spread[np.ix_(axes, axes)] + np.diag(1.0 / weight[axes])
-        root = np.linalg.inv(np.linalg.cholesky(noise))
-        numbers = self._patches[point.patch].numbers
-        off = np.nan_to_num(control.xyz_l)[axes] - point.xyz_l[axes]
-        columns = np.tile(numbers, (len(axes), 1)).astype(np.int32)
-        self._state.observe(columns, root @ point.modes[axes], root @ off, np.ones(len(axes)))
         own = point.root.T @ point.root
         N = own + np.diag(weight)
+        if np.linalg.cond(N) > 1e12 or not self.enter(name, -np.inf):  # a single look, straight down
+            return False
+        axes = np.flatnonzero(weight > 0)
+        root = point.root[: 2 if point.single else 3]
+        given = np.sqrt(weight[axes])[:, None] * np.eye(3)[axes]
+        design = np.concatenate([-root @ point.modes, np.zeros((len(axes), point.modes.shape[1]))])
+        off = np.concatenate([np.zeros(len(root)), given @ (np.nan_to_num(control.xyz_l) - point.xyz_l)])
+        rows, value = without_point(design, np.concatenate([root, given]), off)
+        columns = np.tile(self._patches[point.patch].numbers, (len(rows), 1)).astype(np.int32)
+        self._state.observe(columns, rows, value, np.ones(len(rows)))
         target = own @ point.xyz_l + weight * np.nan_to_num(control.xyz_l)
         self.points[name] = EarlierPoint(
             point.patch,
@@ -284,6 +305,7 @@ class EarlierStrips:
             np.linalg.solve(N, own @ point.modes),
             np.linalg.cholesky(N).T,
             True,
+            False,
         )
         return True
 
@@ -316,7 +338,9 @@ def _patch(
         own.append(L @ L.T)
         rows.append(-L @ D)
     P, noise = np.array(rows), np.array(own)
-    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), SAMPLED)).astype(int))
+    sure = np.flatnonzero([k.single is None for _, k in kept])
+    sure = sure if len(sure) else np.arange(len(kept))
+    chosen = sure[np.unique(np.linspace(0, len(sure) - 1, min(len(sure), SAMPLED)).astype(int))]
     weight = 1.0 / np.sqrt(np.einsum("pii->pi", noise[chosen])).reshape(-1, 1)
     sample = P[chosen].reshape(-1, len(columns)) * weight
     values, vectors = np.linalg.eigh(sample @ Q @ sample.T)
@@ -326,9 +350,19 @@ def _patch(
     through = (P.reshape(-1, len(columns)) @ Q).reshape(P.shape)
     B = (through.reshape(-1, len(columns)) @ M.T).reshape(len(P), 3, r)
     rest = through @ np.swapaxes(P, 1, 2) + noise - B @ np.swapaxes(B, 1, 2)
-    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(rest)), 1, 2)
+    root = np.linalg.inv(np.linalg.cholesky(rest))
+    for i in np.flatnonzero([k.single is not None for _, k in kept]):  # nothing is known along the ray
+        values, vectors = np.linalg.eigh(root[i].T @ root[i])
+        root[i] = np.sqrt(np.append(values[1:], 0.0))[:, None] * np.column_stack([vectors[:, 1:], vectors[:, 0]]).T
     own = columns >= 0  # drifts are of one strip alone
     return list(zip(xyz, B, root, strict=True)), (solution.places(columns[own]), M[:, own])
+
+
+def without_point(design: Array, point: Array, residual: Array) -> tuple[Array, Array]:
+    """What equations (m, u), (m, 3), (m,) of unit weight say when nothing is known of their point (r, u), (r,)."""
+    U, s, _ = np.linalg.svd(point)
+    left = U[:, int((s > DETERMINED * s[0]).sum()) :]
+    return left.T @ design, left.T @ residual
 
 
 def _covariance_rows(functionals: Sequence[tuple[IntArray, Array]], cofactors: Array) -> Iterator[Array]:

@@ -269,6 +269,10 @@ class Watch:
         """What drifts have to do with batches, by identity."""
         return self._sources.cells(batches, self._state)
 
+    def cell_of_single(self, batch: Batch) -> Cell | None:
+        """The same of a batch of points with one look each."""
+        return self._sources.cell_of_single(batch, self._state)
+
     def _drift_covariance(self, strip: WindowStrip | None, time_s: float, batches: list[Batch]) -> Array:
         """(6, 6) of the orientation at a time, for tie points that drift."""
         drift = self.compensation(batches) if strip is not None else None

@@ -37,6 +37,7 @@ from .points import BatchMaker, ControlPoint
 from .pose_noise import PoseNoise
 from .results import Look, Parameter, RefinedOrientation, WindowOptions, WindowReport, WindowUpdate
 from .settle import Settler, settle
+from .single_looks import SingleLooks
 from .snooping import reweigh, snoop
 from .sources import SourceMonitor
 from .state import WindowState
@@ -108,7 +109,7 @@ class Window:
         self._duties = Duties()
         self._length_s = options.window_s
         sources = SourceMonitor(
-            self._intake.sources_of, lambda: self.trajectory.noise_time_s, follows=options.model != "dgr"
+            self._intake.sources_of, lambda: self.trajectory.noise_time_s, follows=options.follows_wander
         )
         self._control_desk = ControlDesk(
             self.state, self.strips, self._batches, self._intake, self._block, options.critical, sources
@@ -128,9 +129,12 @@ class Window:
         self._follower = Follower(
             self._batches, self.state, self._maker, self.trajectory, self._intake, step_s, self._watch.drop
         )
+        single = SingleLooks(
+            self.state, self.strips, self.trajectory, self._intake, self._maker, self._batches, self._block, self._watch
+        )
         self._leaver = Leaver(
             options, self.state, self.strips, self._batches, self._intake, self.trajectory, self._block, self._watch,
-            self._orienter, self._control_desk, self._arrivals.apart,
+            self._orienter, self._control_desk, self._arrivals.apart, single,
         )  # fmt: skip
 
     # -- input ---------------------------------------------------------------------------------------------------------
