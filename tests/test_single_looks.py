@@ -152,10 +152,10 @@ def test_what_a_drift_does_to_a_single_look_is_known(flight, monkeypatch):
 
 def test_no_more_than_so_many_are_kept(flight, monkeypatch):
     monkeypatch.setattr(archive, "MOST_SINGLE", 3)
-    found = []
+    told = []
 
     def watch(now, window):
-        found.append(sum(k.single is not None for k in window._block._archive.points.values()))
+        told.append(sum(point.single for point in window._block.earlier.points.values()))
 
     adjust_online(*flight, OPTIONS, live=False, update_s=0.5, watch=watch)
-    assert max(found) == 3
+    assert max(told) == 3

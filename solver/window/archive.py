@@ -158,21 +158,27 @@ class Archive:
             single = SingleLook(batch, i, look, cell)
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
             self._keep(name, KeptPoint(single.left(), 0, seen, time_s, np.zeros(3), single))
+
+    def linearise_single(self, solution: BlockSolution) -> Parts:
+        """Linearise single looks at a solution, so that what is said of them on line is as good as it; in parts.
+
+        Of too many the oldest are forgotten.
+        """
         names = [name for name, kept in self.points.items() if kept.single is not None]
         for name in names[: max(len(names) - MOST_SINGLE, 0)]:
             del self.points[name]
-
-    def linearise_single(self, solution: BlockSolution) -> Parts:
-        """Linearise single looks at a solution, so that what is said of them on line is as good as it; in parts."""
-        batches = {id(k.single.batch): k.single.batch for k in self.points.values() if k.single is not None}
-        for batch in batches.values():
+        batches: dict[int, list[tuple[KeptPoint, SingleLook]]] = {}
+        for kept in self.points.values():
+            if kept.single is not None:
+                batches.setdefault(id(kept.single.batch), []).append((kept, kept.single))
+        for members in batches.values():
+            batch = members[0][1].batch
             theta, _ = solution.of(batch.columns)
             batch.back_substitute(theta)
             batch.linearise(theta, reweigh=True)
+            for kept, single in members:
+                kept.left = single.left()
             yield AGAIN_POINTS
-        for kept in self.points.values():
-            if kept.single is not None:
-                kept.left = kept.single.left()
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""
@@ -193,7 +199,7 @@ class Archive:
         old = self.points.get(name)
         if old is None or not self.holds(old.left.columns) or not batch.ties.active[i]:
             old = None
-        if old is not None and old.single is not None and not old.with_control:
+        if old is not None and old.single is not None:
             old = replace(old, left=old.single.left(batch.points_l[i]))
         columns = np.union1d(own, [] if old is None else old.left.columns).astype(np.int64)
         rows, points, values = [_spread(A, own, columns)], [J], [residual]
