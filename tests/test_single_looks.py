@@ -10,7 +10,7 @@ import pytest
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
 from triline.solver.window import archive
 from triline.solver.window.kept_points import SingleLook
 from triline.solver.window.points import BatchMaker
@@ -95,6 +95,57 @@ def test_two_single_looks_that_contradict_each_other_place_no_point(flight, onli
     told = [r for r in result.refused if r.point == name]
     assert {(r.look.strip, r.reason) for r in told} == {("S1", ALONE), ("S2", "snooping")}
     assert result.whole_points[name].rays == 3  # those of the last strip
+
+
+def test_a_slightly_wrong_single_look_does_not_take_good_ones_with_it(flight, online):
+    """It passes at the door; the looks of the next strip are refused for it, come back together, and it goes."""
+    simulation, poses = flight
+    name, wrong = next((n, k) for n, k in looks_of(online, TAKEN_BACK) if n == "T00264")
+    images = simulation.images
+    at = (images.line == wrong.line) & (images.sample == wrong.sample)
+    spoilt = replace(simulation, images=replace(images, sample=np.where(at, images.sample + 2.2, images.sample)))
+    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    refused = [r.look for r in result.refused if r.point == name and r.reason == "snooping"]
+    assert len(refused) == 3 and {r.look for r in result.refused if r.reason == TAKEN_BACK} >= set(refused)
+    assert result.whole_points[name].rays == 3
+    assert any("do not agree with earlier strips" in text and name in text for text in result.events)
+
+
+def test_single_looks_of_a_strip_flown_again_leave_it_consistent():
+    """Every fourth point has one look of the same CCD line in each, 45 m apart."""
+    plan = replace(PLAN, strips=3, cross_strips=0, sidelap=0.97)
+    simulation = simulate(plan, 11, SENSORS, replace(TIES, tie_points_per_s=8.0, control=0, check=0))
+    looks, rng = simulation.images.looks, np.random.default_rng(3)
+    keep = np.ones(len(looks.point), dtype=bool)
+    for point in np.unique(looks.point):
+        first, last = (np.flatnonzero((looks.point == point) & (looks.strip == k)) for k in (0, 2))
+        both = set(looks.ccd[first]) & set(looks.ccd[last])
+        if both and rng.random() < 0.25:
+            ccd = min(both)
+            keep[looks.point == point] = False
+            keep[[first[looks.ccd[first] == ccd][0], last[looks.ccd[last] == ccd][0]]] = True
+    simulation = replace(simulation, images=simulation.images.select(keep))
+    result = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+    assert len(looks_of(result, TAKEN_BACK)) > 100
+    again = orientation_errors(simulation, [o for o in result.final if o.strip == "S3"])
+    assert 0.4 < again.nees.mean() < 1.2  # 1.4 where errors they share count as independent
+    assert 0.4 < orientation_errors(simulation, result.whole).nees.mean() < 1.2
+
+
+def test_a_look_without_ground_near_it_is_given_up(flight):
+    """One point, whose looks contradict each other, and a single look at another: it is told, nothing fails."""
+    simulation, poses = flight
+    images = simulation.images
+    of_first = images.looks.strip == 0
+    seen = np.bincount(images.looks.point[of_first], minlength=len(simulation.points.id))
+    pair, other = np.flatnonzero(seen == 2)[0], np.flatnonzero(seen > 2)[0]
+    keep = of_first & (images.looks.point == pair)
+    keep[np.flatnonzero(of_first & (images.looks.point == other))[0]] = True
+    few = images.select(keep)
+    few = replace(few, sample=few.sample + 300.0 * (np.arange(len(few.sample)) == np.argmax(few.looks.point == pair)))
+    spoilt = replace(simulation, images=few)
+    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    assert [n for n, _ in looks_of(result, ALONE)] == [str(simulation.points.id[other])]
 
 
 def test_control_that_comes_late_places_a_single_look(flight, online):

@@ -42,7 +42,7 @@ MOST_OF_STRIP = 1500
 #: What it costs to refine a second or so of orientation, and the points of a batch, in operations.
 AGAIN, AGAIN_POINTS = 4e7, 8e6
 #: Object points kept; beyond that those of the oldest strip are forgotten. Single looks beside them.
-MOST_POINTS, MOST_SINGLE = 30000, 4000
+MOST_POINTS, MOST_SINGLE = 30000, 1500
 
 
 @dataclass
@@ -150,7 +150,7 @@ class Archive:
         return returned
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
-        """Keep looks that found no partner in their strip: a batch of one each."""
+        """Keep looks that found no partner in their strip: a batch of points with one each."""
         for i, look in enumerate(looks if self.holds(batch.columns) else ()):
             name = batch.names[i]
             if name in self.points and self.points[name].single is None:
@@ -190,6 +190,8 @@ class Archive:
     ) -> tuple[IntArray, Array, Array] | None:
         """Keep a point of a batch that ties strips; its information (u, u), (u,) about unknowns (u,), if it has any."""
         assert batch.ties is not None
+        if published is None:
+            return None
         name, own = batch.names[i], batch.columns[: len(batch.columns) - batch.n_tied]
         A, J, residual, origin = batch.equations(i)
         A = A[:, : len(own)]
@@ -217,7 +219,7 @@ class Archive:
             values.append(root * (batch.control.xyz_l[i] - origin))
         A, J, residual = np.concatenate(rows), np.concatenate(points), np.concatenate(values)
         normal = J.T @ J
-        if published is None or np.linalg.cond(normal) > 1e12:
+        if np.linalg.cond(normal) > 1e12:
             return None
         left, matrix, rhs = eliminated(A, J, residual, normal, columns, origin, published)
         seen = frozenset(r.look.strip for r in published.residuals)
@@ -239,7 +241,10 @@ class Archive:
         if kept is None or kept.with_control or not weight.any() or not self.holds(kept.left.columns):
             return False
         if kept.single is not None:
-            kept = replace(kept, left=kept.single.left(np.where(weight > 0, control.xyz_l, kept.point.xyz_l)))
+            place_l = kept.single.place_at(control)
+            if place_l is None:
+                return False
+            kept = replace(kept, left=kept.single.left(place_l))
         L, D, y = kept.root
         origin = kept.left.origin_l[kept.place]
         root, u = np.sqrt(weight), len(kept.left.columns)

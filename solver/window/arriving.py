@@ -16,7 +16,7 @@ from .points import BatchMaker, Draft
 from .results import WindowUpdate
 from .snooping import admit
 from .state import WindowState
-from .tie_snooping import admit_ties
+from .tie_snooping import admit_ties, drop_weak
 
 Array = NDArray[np.floating]
 
@@ -82,6 +82,7 @@ class Arrivals:
         for batch in fresh:
             for name in batch.names:
                 self._intake.place(name, batch)
+            drop_weak(batch)
         if self._snoop:
             self._state.expect(sum(len(batch.columns) for batch in fresh))
             for batch in fresh:

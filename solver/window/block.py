@@ -180,7 +180,8 @@ class Block:
         if alone and steps:
             self._state.solve()
             chain = backward(steps, self._state)
-            points = [p for p in chain.points if p.name not in self._archive.points]
+            told = {name for name, kept in self._archive.points.items() if kept.single is None}
+            points = [p for p in chain.points if p.name not in told]
             self._tell(WholeStrips([o for o in chain.orientation if o.strip in alone], points))
         steps.clear()
         if over and (self._archive.changed or at_the_end or set(new) & set(over)):

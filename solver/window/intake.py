@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from math import isfinite
 
 import numpy as np
@@ -179,6 +179,13 @@ class Intake:
             del self.points[name], self._waiting[name]
             self._arrived.pop(name, None)
         return refused
+
+    def without_place(self, batch: Batch, placed: Collection[str]) -> list[Refusal]:
+        """Looks of a batch that leaves which nothing has placed: single ones that were to tie strips and did not."""
+        points = ((name, self.points[name]) for name in batch.names if name not in placed)
+        return [
+            Refusal(name, p.looks[0], "too few looks") for name, p in points if len(p.looks) == 1 and p.weight[0] > 0
+        ]
 
     def forget(self, before_s: float) -> None:
         """Forget which points became final before a time."""

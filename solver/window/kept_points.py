@@ -11,10 +11,14 @@ from ..adjustment.normal_equations import PointNormals
 from .backward import LeftPoints
 from .batch import Batch, inverse_factors
 from .drift_border import Cell
+from .points import ControlPoint
 from .results import AdjustedPoint, Look, RayResidual
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
+
+#: Known coordinates tell how far along a ray a point is where the sine of the angle between them and it is as large.
+LEAST_ACROSS = 0.1
 
 
 @dataclass
@@ -63,7 +67,7 @@ class SingleLook:
 
     Attributes
     ----------
-    batch, place : the look is a point of its own in a batch of such points
+    batch, place : the look is that of a point in a batch of points with one look each
     look : as it came
     cell : what drifts of its strip have to do with the batch, None if nothing
     """
@@ -72,6 +76,16 @@ class SingleLook:
     place: int
     look: Look
     cell: Cell | None
+
+    def place_at(self, control: ControlPoint) -> Array | None:
+        """Where along its ray (3,) it meets known coordinates best; None if these do not tell it well."""
+        known = control.weight > 0
+        ray = self.batch.points_l[self.place] - self.batch.rays.position_l[self.place]
+        ray = ray / np.linalg.norm(ray)
+        if np.linalg.norm(ray[known]) < LEAST_ACROSS:
+            return None
+        off = control.xyz_l[known] - self.batch.points_l[self.place][known]
+        return self.batch.points_l[self.place] + ray * (ray[known] @ off) / (ray[known] @ ray[known])
 
     def left(self, place_l: Array | None = None) -> LeftPoints:
         """What is kept of it, linearised anew where its point (3,) is if that is known.

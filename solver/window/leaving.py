@@ -93,8 +93,10 @@ class Leaver:
         old = [b for b in self._batches if b.oldest_s <= latest]
         leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
         if self.options.snoop and leaving:
-            control = partial(self._control.look, now_s)
-            refused, rounds = snoop(leaving, self._state, self._intake.points, self.options.critical, serial, control)
+            refused, rounds = snoop(
+                leaving, self._state, self._intake.points, self.options.critical, serial,
+                partial(self._control.look, now_s), lambda names: self._apart(names, result),
+            )  # fmt: skip
             result.refused += refused
             failed = snoop_ties([b for b in leaving if b.ties is not None], self._state)
             self._apart(failed, result)
@@ -109,6 +111,7 @@ class Leaver:
             drift = self._watch.on_points(batch, self._orienter.drift)
             points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, True, drift)
             result.points += points
+            result.refused += self._intake.without_place(batch, {p.name for p in points})
             self._left.append(LeftPoints.of(batch, points))
             result.refused += self._block.leave(batch, points, cells.get(id(batch)))
         self._watch.leaving(leaving, limit_s - length_s)

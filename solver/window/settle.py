@@ -127,6 +127,8 @@ def settle(batches: list[Batch], state: WindowState) -> list[Array] | None:
         state.add(batch.columns, batch.information)
     state.solve()
     c = _Conditions.of(batches, state)
+    if c is None:
+        return None
     now = c.agreeing(state.theta)
     theta = _consensus(c, N, rhs)
     then = c.agreeing(theta)
@@ -185,7 +187,8 @@ class _Conditions:
     limit: Array
 
     @classmethod
-    def of(cls, batches: list[Batch], state: WindowState) -> _Conditions:
+    def of(cls, batches: list[Batch], state: WindowState) -> _Conditions | None:
+        """None where there are no conditions: all points have one look."""
         point: list[int] = []
         left_out: list[tuple[int, ...]] = []
         rows: list[int] = []
@@ -217,6 +220,8 @@ class _Conditions:
                     left_out.append(out)
                     rows.append(k)
             number += batch.n_points
+        if not rows:
+            return None
         rows_ = np.array(rows, dtype=np.int64)
         return cls(
             np.array(point, dtype=np.int64),
@@ -248,12 +253,16 @@ class _Conditions:
         return result
 
     def weights(self, theta: Array, batches: list[Batch]) -> list[Array]:
-        """Weights of the rays of the batches: 1 in sets that agree, else 0."""
+        """Weights of the rays of the batches: 1 in sets that agree, else 0; without conditions as they are."""
+        tested = set(self.point.tolist())
         taken = {int(self.point[i]): self.left_out[i] for i in np.flatnonzero(self.agreeing(theta))}
         result, number = [], 0
         for batch in batches:
             weight = np.zeros(len(batch.rays))
             for p in range(batch.n_points):
+                if number + p not in tested:
+                    own = slice(batch.first_ray[p], batch.first_ray[p + 1])
+                    weight[own] = batch.weight[own]
                 if number + p in taken:
                     weight[batch.first_ray[p] : batch.first_ray[p + 1]] = 1.0
                     weight[batch.first_ray[p] + np.array(taken[number + p], dtype=np.int64)] = 0.0

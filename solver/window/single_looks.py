@@ -25,6 +25,8 @@ Array = NDArray[np.floating]
 
 #: Time between two looks for looks that wait in vain, s, unless unknowns leave.
 EVERY_S = 1.0
+#: Looks that are kept together.
+TOGETHER = 12
 #: Batches whose points say about how far away the ground is.
 ASKED = 32
 
@@ -66,7 +68,8 @@ class SingleLooks:
             if len(point.looks) == 1 and not point.alone and self._trajectory.covers(point.time_s)[0]:
                 by_strip.setdefault(point.looks[0].strip, []).append(name)
         for id, single in by_strip.items():
-            self._keep(self._strips[id], single)
+            for begin in range(0, len(single), TOGETHER):
+                self._keep(self._strips[id], single[begin : begin + TOGETHER])
         return self._intake.give_up(names)
 
     def _keep(self, strip: WindowStrip, names: list[str]) -> None:
@@ -78,7 +81,8 @@ class SingleLooks:
         if not ground or strip.is_gone(self._state) or (self._state.places(_needed(strip, times)) < 0).any():
             return
         ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
-        batch = self._maker.make_single(names, points, _placed(ground[:ASKED]))
+        near = _placed(ground[:ASKED])
+        batch = self._maker.make_single(names, points, near) if len(near) else None
         if batch is not None:
             looks = [p.looks[0] for p in points]
             self._block.keep_single(batch, looks, self._watch.cell_of_single(batch))

@@ -15,7 +15,7 @@ from .entry import DECISIVE, entry_weight
 from .points import PointLooks
 from .results import TAKEN_BACK, Refusal
 from .state import WindowState
-from .tie_snooping import contradicting
+from .tie_snooping import contradicting, drop_ties
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -35,6 +35,7 @@ def snoop(
     critical: float,
     serial: int,
     control: Callable[[list[Refusal]], bool],
+    apart: Callable[[list[str]], None],
 ) -> tuple[list[Refusal], int]:
     """Leave out looks and control coordinates that fail; take back looks that agree with the rest after all.
 
@@ -48,6 +49,7 @@ def snoop(
     batches : to be tested; those that change go through further rounds
     serial : number of the update, noted in the batches
     control : weighs all control, notes what it refuses, and says whether the state has changed
+    apart : told the points that do not agree with earlier strips
 
     Returns
     -------
@@ -58,7 +60,7 @@ def snoop(
     refused: list[Refusal] = []
     rounds = 0
     for batch in batches:
-        if batch.tested >= 0 and _try_again(batch, state, points, refused):
+        if batch.tested >= 0 and _try_again(batch, state, points, refused, apart):
             rounds = 1
         batch.tested = serial
     if rounds:
@@ -140,27 +142,41 @@ def reweigh(
     return changes
 
 
-def _try_again(batch: Batch, state: WindowState, points: dict[str, PointLooks], changes: list[Refusal]) -> bool:
-    """Let points in that were left out as a whole if the orientation as known now agrees with them."""
+def _try_again(
+    batch: Batch,
+    state: WindowState,
+    points: dict[str, PointLooks],
+    changes: list[Refusal],
+    apart: Callable[[list[str]], None],
+) -> bool:
+    """Let points in that were left out as a whole if the orientation as known now agrees with them.
+
+    Looks that agree with each other, but not with what earlier strips say of their point, come without that; a single
+    one stays out.
+    """
     lost = np.bincount(batch.rays.point, batch.weight, batch.n_points) == 0
     if not lost.any():
         return False
     again, w = entry_weight(batch, state, RETURNING)
-    weight = np.where(lost[batch.rays.point], again, batch.weight)
-    if not ((weight > 0) & (batch.weight == 0)).any():
+    before, information = batch.weight, batch.information
+    weight = np.where(lost[batch.rays.point], again, before)
+    if not (weight > before).any():
         return False
-    before = batch.weight
-    state.add(batch.columns, batch.information, -1)
     batch.weight = weight
-    if batch.ties is not None:  # of the lost points nothing is in the state, of their ties neither
+    if batch.ties is not None and (batch.ties.active & lost).any():
         batch.eliminate()
-        wrong = lost & contradicting(batch, state)
-        batch.weight = np.where(wrong[batch.rays.point], 0.0, weight)
+        wrong = contradicting(batch, state, which=lost)
+        several = np.bincount(batch.rays.point, weight > 0, batch.n_points) >= 2
+        apart(drop_ties(batch, wrong & several))
+        batch.weight = np.where((wrong & ~several)[batch.rays.point], 0.0, weight)
     back = np.flatnonzero((batch.weight > 0) & (before == 0))
     changes += _note(batch, points, back[:0], back, w)
     batch.eliminate()
-    state.add(batch.columns, batch.information)
-    return len(back) > 0
+    if not len(back):  # nothing of these points is in the state
+        batch.information = information
+        return False
+    state.exchange(batch.columns, information, batch.information)
+    return True
 
 
 def _judge(batch: Batch, state: WindowState) -> tuple[Array, Array, Array, Array]:

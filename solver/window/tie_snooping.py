@@ -20,16 +20,35 @@ Array = NDArray[np.floating]
 AT_THE_DOOR, INSIDE = 1e-5, 1e-3
 #: Ties of one batch that are dropped before it is solved again: those that fail by this share of the worst, at least.
 TOGETHER = 0.5
+#: Sigma along the rays, of the distance, up to which two of them place a point well.
+WELL = 0.02
 
 
 def admit_ties(batch: Batch, state: WindowState) -> list[str]:
     """Drop the ties of a batch that is not in the state which contradict its rays; names of their points."""
-    return _drop(batch, contradicting(batch, state, AT_THE_DOOR))
+    return drop_ties(batch, contradicting(batch, state, AT_THE_DOOR))
 
 
-def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE) -> NDArray[np.bool_]:
+def drop_weak(batch: Batch) -> None:
+    """Drop the ties of points that one ray and a single look of an earlier strip, nearly parallel to it, place badly:
+    linearised far off they would tell what they do not know."""
+    if batch.ties is None:
+        return
+    rows = batch.ties.rows(batch.origin_l, len(batch.columns))
+    weak = np.zeros(batch.n_points, dtype=bool)
+    for i in np.flatnonzero(batch.ties.active & batch.ties.single & (np.diff(batch.first_ray) == 1)):
+        _, J, _, origin = batch.equations(int(i))
+        least = np.linalg.eigvalsh(J.T @ J + rows.point[i].T @ rows.point[i])[0]
+        away = np.linalg.norm(origin - batch.rays.position_l[batch.first_ray[i]])
+        weak[i] = least < (WELL * away) ** -2
+    drop_ties(batch, weak)
+
+
+def contradicting(
+    batch: Batch, state: WindowState, alpha: float = INSIDE, which: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Which points (p,) have ties that their rays contradict, neither of which are in the state; a good one is called
-    so with probability ``alpha``.
+    so with probability ``alpha``. Of some points (p,), if these are given.
 
     The place where the new rays meet, with the orientation as known, is compared with what the earlier strips say of
     it; where they do not meet, as a single one, the rays and what these strips say must agree on some place.
@@ -40,7 +59,7 @@ def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE) -> ND
     theta, Q = state.values(batch.columns), state.covariance(batch.columns)
     fails = np.zeros(batch.n_points, dtype=bool)
     tied = ties.rows(batch.origin_l, len(batch.columns))
-    for i in np.flatnonzero(ties.active):
+    for i in np.flatnonzero(ties.active if which is None else ties.active & which):
         A, J, residual, _ = batch.equations(int(i))
         used = (J != 0).any(axis=1)
         A, J, residual = A[used], J[used], residual[used]
@@ -71,7 +90,7 @@ def snoop_ties(batches: Sequence[Batch], state: WindowState) -> list[str]:
         fails = value > np.maximum(limit, TOGETHER * worst)
         if fails.any():
             state.add(batch.columns, batch.information, -1)
-            names += _drop(batch, fails)
+            names += drop_ties(batch, fails)
             state.add(batch.columns, batch.information)
     return names
 
@@ -92,7 +111,7 @@ def _joint(batch: Batch, state: WindowState) -> Array:
     return np.where(rows.active & (batch.normals.rank == 3), value, 0.0)
 
 
-def _drop(batch: Batch, fails: NDArray[np.bool_]) -> list[str]:
+def drop_ties(batch: Batch, fails: NDArray[np.bool_]) -> list[str]:
     """Take the weight from ties; known coordinates that they stood for count themselves."""
     if batch.ties is None or not fails.any():
         return []

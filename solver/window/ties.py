@@ -327,7 +327,7 @@ def _patch(
 ) -> tuple[list[tuple[Array, Array, Array]], tuple[IntArray, Array]]:
     """Points of a patch as (place, modes, root of the weight of the rest), and the modes as functions (r, u) of the
     unknowns at places (u,) of the solution."""
-    xyz, own, rows = [], [], []
+    xyz, own, rows, white = [], [], [], []
     columns = np.unique(np.concatenate([k.left.columns for _, k in kept]))
     theta, Q = solution.of(columns)
     for _, k in kept:
@@ -337,12 +337,10 @@ def _patch(
         xyz.append(k.left.origin_l[k.place] + L @ (k.left.normals.y[:, k.place] - D @ theta))
         own.append(L @ L.T)
         rows.append(-L @ D)
+        white.append(-D)
     P, noise = np.array(rows), np.array(own)
-    sure = np.flatnonzero([k.single is None for _, k in kept])
-    sure = sure if len(sure) else np.arange(len(kept))
-    chosen = sure[np.unique(np.linspace(0, len(sure) - 1, min(len(sure), SAMPLED)).astype(int))]
-    weight = 1.0 / np.sqrt(np.einsum("pii->pi", noise[chosen])).reshape(-1, 1)
-    sample = P[chosen].reshape(-1, len(columns)) * weight
+    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), SAMPLED)).astype(int))
+    sample = np.concatenate([white[i] for i in chosen])
     values, vectors = np.linalg.eigh(sample @ Q @ sample.T)
     r = min(int((values * len(kept) / len(chosen) > NEGLIGIBLE).sum()), MOST_MODES)
     r = max(r, 1)

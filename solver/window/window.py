@@ -297,8 +297,10 @@ class Window:
 
     def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
         """Test batches; number of solutions computed."""
-        control = partial(self._control_desk.look, self._now_s)
-        refused, rounds = snoop(batches, self.state, self._points, self.options.critical, self._serial, control)
+        refused, rounds = snoop(
+            batches, self.state, self._points, self.options.critical, self._serial,
+            partial(self._control_desk.look, self._now_s), lambda names: self._arrivals.apart(names, result),
+        )  # fmt: skip
         result.refused += refused
         return rounds
 
