@@ -17,7 +17,7 @@ from .results import AdjustedPoint, Look, RayResidual
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
-#: Known coordinates tell how far along a ray a point is where the sine of the angle between them and it is as large.
+#: Known coordinates tell how far along its ray a point is where a metre along it changes them by as much, m.
 LEAST_ACROSS = 0.1
 
 
