@@ -6,30 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from three_strips import OPTIONS, PLAN, TIES, flown
 
-from triline.solver.simulation.error_models import ErrorModel
-from triline.solver.simulation.flight import FlightPlan
-from triline.solver.simulation.scenario import ObservationPlan, simulate
-from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
 from triline.solver.window import archive
 from triline.solver.window.kept_points import SingleLook
 from triline.solver.window.points import BatchMaker
-from triline.solver.window.results import TAKEN_BACK, WindowOptions
+from triline.solver.window.results import TAKEN_BACK
 
-#: Two strips side by side, and one across them.
-PLAN = FlightPlan(
-    strips=2, cross_strips=1, strip_s=24.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0
-)
-SENSORS = ErrorModel(attitude_rate_hz=100.0)
-TIES = ObservationPlan(tie_points_per_s=4.0, control=4, check=6)
-OPTIONS = WindowOptions(snoop=False, settle_s=1.0, grid_hz=4.0)
 ALONE = "too few looks"
 
 
 @pytest.fixture(scope="module")
 def flight():
-    simulation = simulate(PLAN, 11, SENSORS, TIES)
-    return simulation, navigate(simulation)
+    return flown()
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +46,7 @@ def test_a_single_look_counts_when_another_strip_sees_its_point(flight, online):
 
 
 def test_how_far_away_its_point_is_need_not_be_known_beforehand(flight, online, monkeypatch):
-    """Linearised 300 m from it and not anew, they would tell positions from attitudes (the rest is 0.3 sigma)."""
+    """Linearised 300 m from it, and not anew where it is found, looks would tell positions from attitudes."""
     make = BatchMaker.make_single
     monkeypatch.setattr(BatchMaker, "make_single", lambda *a: make(*a[:-1], a[-1] + [0.0, 0.0, 300.0]))
     far = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
@@ -114,7 +104,7 @@ def test_a_slightly_wrong_single_look_does_not_take_good_ones_with_it(flight, on
 def test_single_looks_of_a_strip_flown_again_leave_it_consistent():
     """Every fourth point has one look of the same CCD line in each, 45 m apart."""
     plan = replace(PLAN, strips=3, cross_strips=0, sidelap=0.97)
-    simulation = simulate(plan, 11, SENSORS, replace(TIES, tie_points_per_s=8.0, control=0, check=0))
+    simulation, poses = flown(plan, replace(TIES, tie_points_per_s=8.0, control=0, check=0))
     looks, rng = simulation.images.looks, np.random.default_rng(3)
     keep = np.ones(len(looks.point), dtype=bool)
     for point in np.unique(looks.point):
@@ -125,7 +115,7 @@ def test_single_looks_of_a_strip_flown_again_leave_it_consistent():
             keep[looks.point == point] = False
             keep[[first[looks.ccd[first] == ccd][0], last[looks.ccd[last] == ccd][0]]] = True
     simulation = replace(simulation, images=simulation.images.select(keep))
-    result = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+    result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5)
     assert len(looks_of(result, TAKEN_BACK)) > 100
     again = orientation_errors(simulation, [o for o in result.final if o.strip == "S3"])
     assert 0.4 < again.nees.mean() < 1.2  # 1.4 where errors they share count as independent

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from three_strips import OPTIONS, PLAN, SENSORS, TIES, flown
 
-from triline.solver.simulation.error_models import ErrorModel
-from triline.solver.simulation.flight import FlightPlan
-from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.simulation.scenario import simulate
 from triline.solver.simulation.window_study import (
     adjust_at_once,
     adjust_online,
@@ -21,21 +20,11 @@ from triline.solver.simulation.window_study import (
 )
 from triline.solver.window import archive as window_archive
 from triline.solver.window import block as window_block
-from triline.solver.window.results import WindowOptions
-
-#: Two strips side by side, and one across them.
-PLAN = FlightPlan(
-    strips=2, cross_strips=1, strip_s=24.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0
-)
-SENSORS = ErrorModel(attitude_rate_hz=100.0)
-TIES = ObservationPlan(tie_points_per_s=4.0, control=4, check=6)
-OPTIONS = WindowOptions(snoop=False, settle_s=1.0, grid_hz=4.0)
 
 
 @pytest.fixture(scope="module")
 def flight():
-    simulation = simulate(PLAN, 11, SENSORS, TIES)
-    return simulation, navigate(simulation)
+    return flown()
 
 
 @pytest.fixture(scope="module")
