@@ -1,0 +1,135 @@
+"""What the readers of satellite metadata have in common: the scene they return, and checks of its parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....solver.geometry.earth import ROTATION_RATE
+from ....solver.location.pushbroom import PushbroomSensor
+from ....solver.location.rpc import Rpc
+from ....solver.location.uncertainty import Sigmas
+from ....solver.orbit.ephemeris import InterpolatedOrbit
+from ....solver.orbit.time_scales import iso_utc
+from ....solver.scene_adjustment.rigorous import LensView
+from ...errors import UserError
+
+Array = NDArray[np.floating]
+
+#: A step between nodes that is this much longer than the usual one is a gap. Tuned: single nodes may be missing.
+GAP_STEPS = 3.5
+#: Largest difference between stated velocities and the slope of the positions at which they count as the same, m/s.
+#: Tuned: velocities against the stars differ by hundreds.
+SAME_VELOCITY_M_S = 1.0
+
+
+@dataclass(frozen=True)
+class SatelliteScene:
+    """A scene as its metadata describe it.
+
+    Attributes
+    ----------
+    kind : of the file, a name in `read.KINDS`
+    sensor : rigorous model, None where the file has none
+    rpc : rational polynomials, None where the file has none
+    notes : remarks for the user
+    sensors : one for each line of detectors, by its name, where the file has several
+    sigmas : accuracies that the file states
+    views : image frame of each line of detectors in the body, where the file has its camera
+    camera : its name, "" where the file has none
+    """
+
+    kind: str
+    sensor: PushbroomSensor | None
+    rpc: Rpc | None = None
+    notes: list[str] = field(default_factory=list)
+    sensors: dict[str, PushbroomSensor] = field(default_factory=dict)
+    sigmas: Sigmas = field(default_factory=Sigmas)
+    views: dict[str, LensView] = field(default_factory=dict)
+    camera: str = ""
+
+    def model(self, which: str | None = None, ccd: str | None = None) -> PushbroomSensor | Rpc:
+        """The model to locate with: "rigorous", "rpc", or None for the better one that is there.
+
+        Raises
+        ------
+        UserError : there is none of that kind, or no line of detectors of that name
+        """
+        if ccd is not None and ccd not in self.sensors:
+            have = ", ".join(self.sensors) or "one without a name"
+            raise UserError(f"line of detectors {ccd!r}: not in the scene, which has {have}")
+        sensor = self.sensor if ccd is None else self.sensors[ccd]
+        chosen = self.rpc if which == "rpc" or sensor is None else sensor
+        if chosen is None or (which == "rigorous" and sensor is None):
+            raise UserError(f"no {which or 'rigorous'} model in a file of the kind {self.kind}")
+        return chosen
+
+
+def orbit_of(path: Path, where: str, tai_ns: list[int], position: Array, velocity: Array | None,
+             reference_ns: int, notes: list[str]) -> InterpolatedOrbit:  # fmt: skip
+    """Earth-fixed orbit through the nodes of an ephemeris; repeated nodes are dropped.
+
+    Eight positions or more are interpolated without velocities (Lagrange, as makers of satellites define it). With
+    fewer, velocities are used if they are the slope of the positions, or become it without the rotation of the Earth.
+
+    Raises
+    ------
+    UserError : fewer than two nodes
+    """
+    order = np.argsort(tai_ns, kind="stable")
+    stamps = np.array(tai_ns, dtype=np.int64)[order]
+    keep = np.concatenate([[True], np.diff(stamps) > 0]) if len(stamps) else np.empty(0, dtype=bool)
+    if not keep.all():
+        notes.append(f"{path.name}: {where}: {int((~keep).sum())} nodes at a time that an earlier one has were dropped")
+    order, stamps = order[keep], stamps[keep]
+    if len(order) < 2:
+        raise UserError(f"{path}: {where}: {len(order)} positions at different times, wanted at least 2")
+    t = (stamps - reference_ns) * 1e-9
+    P = position[order]
+    if len(order) >= 8 or velocity is None:
+        return InterpolatedOrbit(t, P)
+    V = velocity[order]
+    turning = np.cross([0.0, 0.0, ROTATION_RATE], P)
+    misfit = [velocity_misfit(t, P, v) for v in (V, V - turning)]
+    if misfit[1] < misfit[0]:
+        V = V - turning
+        notes.append(f"{path.name}: {where}: velocities are against the stars, the rotation of the Earth was taken off")
+    if min(misfit) > SAME_VELOCITY_M_S:
+        notes.append(f"{path.name}: {where}: velocities are not the slope of the positions and were not used")
+        return InterpolatedOrbit(t, P)
+    return InterpolatedOrbit(t, P, V)
+
+
+def velocity_misfit(time_s: Array, position: Array, velocity: Array) -> float:
+    """Largest difference, m/s, between velocities (n, 3) and the slope of positions (n, 3), but for the outer nodes.
+
+    With four nodes or fewer the slope is too uncertain to tell; then it is 0.
+    """
+    n = len(time_s)
+    if n <= 4:
+        return 0.0
+    slope = InterpolatedOrbit(time_s, position).at(time_s)[1]
+    return float(np.abs((velocity - slope)[n // 4 : n - n // 4]).max())
+
+
+def refuse_gap(path: Path, where: str, tai_ns: list[int], first_ns: int, last_ns: int) -> None:
+    """Refuse nodes that leave out a part of the time in which lines were taken.
+
+    Raises
+    ------
+    UserError : telling the gap
+    """
+    t = np.sort(np.array(tai_ns, dtype=np.int64))
+    steps = np.diff(t)
+    if len(steps) < 3:
+        return
+    gap = (steps > GAP_STEPS * np.median(steps)) & (t[:-1] < last_ns) & (t[1:] > first_ns)
+    if gap.any():
+        k = int(np.argmax(gap))
+        raise UserError(
+            f"{path}: {where}: gap from {iso_utc(int(t[k]))} to {iso_utc(int(t[k + 1]))} while lines were taken, "
+            f"wanted a value every {np.median(steps) * 1e-9:g} s"
+        )

@@ -1,0 +1,1 @@
+"""Geometry without a camera: rotations, the Earth, reference frames, trajectories, intersection of rays."""

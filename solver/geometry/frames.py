@@ -1,0 +1,230 @@
+"""Between coordinate reference systems, the local frame and the platform's navigation frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import earth
+from .ellipsoid import Ellipsoid
+from .rotation import (
+    R_BC_NOMINAL,
+    R_ENU_NED,
+    angles_from_matrix,
+    angles_jacobian,
+    matrix_from_navigation,
+    navigation_from_matrix,
+)
+
+Array = NDArray[np.floating]
+
+#: Coordinates that need no PROJ, see `BodyFrame`.
+GEOGRAPHIC = "geographic"
+
+
+class CrsError(ValueError):
+    """A coordinate reference system that PROJ does not know, or cannot transform here."""
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """Topocentric east-north-up frame at an origin on the ellipsoid.
+
+    Parameters
+    ----------
+    lat_deg, lon_deg, height_m : origin (WGS 84, ellipsoidal height)
+    crs : what project files are written in: ``"local"`` (already this frame) or anything PROJ understands
+    """
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    crs: str = "local"
+
+    @cached_property
+    def origin_e(self) -> Array:
+        return earth.ecef_from_geodetic(np.radians(self.lat_deg), np.radians(self.lon_deg), self.height_m)
+
+    @cached_property
+    def R_el(self) -> Array:
+        """Local to Earth-fixed."""
+        return earth.R_en(np.radians(self.lat_deg), np.radians(self.lon_deg)) @ R_ENU_NED.T
+
+    def from_geodetic(self, lat_deg: ArrayLike, lon_deg: ArrayLike, height_m: ArrayLike) -> Array:
+        """Local coordinates (..., 3) in metres of WGS 84 latitude, longitude (degrees) and ellipsoidal height."""
+        return (
+            earth.ecef_from_geodetic(np.radians(lat_deg), np.radians(lon_deg), height_m) - self.origin_e
+        ) @ self.R_el
+
+    def to_geodetic(self, position_l: ArrayLike) -> Array:
+        """``(lat_deg, lon_deg, height_m)``, (..., 3), of local coordinates (..., 3)."""
+        g = earth.geodetic_from_ecef(np.asarray(position_l) @ self.R_el.T + self.origin_e)
+        g[..., :2] = np.degrees(g[..., :2])
+        return g
+
+    def R_ln(self, position_l: ArrayLike) -> Array:
+        """North-east-down at a position (..., 3) to the local frame; includes meridian convergence and curvature."""
+        g = self.to_geodetic(position_l)
+        return self.R_el.T @ earth.R_en(np.radians(g[..., 0]), np.radians(g[..., 1]))
+
+    def from_crs(self, xyz: ArrayLike) -> Array:
+        """Local coordinates of points (n, 3) in the project CRS (east, north, height order; degrees if geographic).
+
+        Raises
+        ------
+        CrsError : PROJ does not know the CRS or a point lies outside its area
+        """
+        xyz = np.asarray(xyz, dtype=float)
+        if self.crs == "local":
+            return xyz.copy()
+        lon, lat, h = self._to_wgs84.transform(xyz[..., 0], xyz[..., 1], xyz[..., 2])
+        out = self.from_geodetic(lat, lon, h)
+        if not np.isfinite(out).all() or np.any(np.abs(lat) > 90.0):
+            raise CrsError(f"coordinates outside the area of {self.crs!r}")
+        return out
+
+    def to_crs(self, position_l: ArrayLike) -> Array:
+        """Project CRS coordinates of local points (n, 3)."""
+        position_l = np.asarray(position_l, dtype=float)
+        if self.crs == "local":
+            return position_l.copy()
+        g = self.to_geodetic(position_l)
+        x, y, z = self._to_wgs84.transform(g[..., 1], g[..., 0], g[..., 2], direction="INVERSE")
+        return np.stack([x, y, z], axis=-1)
+
+    def R_l_crs(self, xyz: ArrayLike) -> Array:
+        """Rotation (n, 3, 3) from the CRS axes at points (n, 3) to the local frame: scale removed, convergence kept."""
+        xyz = np.atleast_2d(np.asarray(xyz, dtype=float))
+        if self.crs == "local":
+            return np.broadcast_to(np.eye(3), (len(xyz), 3, 3)).copy()
+        step = 1e-5 if self.is_geographic else 1.0
+        columns = []
+        for axis in range(3):
+            d = np.zeros(3)
+            d[axis] = 1.0 if axis == 2 else step
+            v = self.from_crs(xyz + d) - self.from_crs(xyz - d)
+            columns.append(v / np.linalg.norm(v, axis=-1, keepdims=True))
+        U, _, Vt = np.linalg.svd(np.stack(columns, axis=-1))
+        return U @ Vt
+
+    @property
+    def is_geographic(self) -> bool:
+        return self.crs != "local" and self._crs.is_geographic
+
+    @cached_property
+    def _crs(self):
+        return _parse_crs(self.crs)
+
+    @cached_property
+    def _to_wgs84(self):
+        return _transformer(self._crs)
+
+    @classmethod
+    def around(cls, xyz: ArrayLike, crs: str) -> LocalFrame:
+        """Frame at the middle of points (n, 3) given in ``crs``, on the ellipsoid below them (height 0)."""
+        if crs == "local":
+            return cls(0.0, 0.0, 0.0)
+        middle = np.mean(np.atleast_2d(np.asarray(xyz, dtype=float)), axis=0)
+        lon, lat, _ = _transformer(_parse_crs(crs)).transform(*middle)
+        if not np.isfinite([lon, lat]).all():
+            raise CrsError(f"coordinates outside the area of {crs!r}")
+        return cls(round(float(lat), 6), round(float(lon), 6), 0.0, crs)
+
+
+@dataclass(frozen=True)
+class BodyFrame:
+    """Body-fixed axes, with files in longitude, latitude (degrees) and height on an ellipsoid: of any planet, no PROJ.
+
+    Parameters
+    ----------
+    ellipsoid : of the coordinates
+    """
+
+    ellipsoid: Ellipsoid
+    crs: str = GEOGRAPHIC
+    is_geographic: bool = True
+
+    @property
+    def origin_e(self) -> Array:
+        return np.zeros(3)
+
+    @property
+    def R_el(self) -> Array:
+        return np.eye(3)
+
+    def from_crs(self, xyz: ArrayLike) -> Array:
+        """Positions (n, 3) of longitude, latitude (degrees) and height.
+
+        Raises
+        ------
+        CrsError : a latitude beyond 90 degrees
+        """
+        x = np.asarray(xyz, dtype=float)
+        if np.any(np.abs(x[..., 1]) > 90.0):
+            raise CrsError("a latitude beyond 90 degrees")
+        return self.ellipsoid.cartesian(np.radians(x[..., 1]), np.radians(x[..., 0]), x[..., 2])
+
+    def to_crs(self, position_l: ArrayLike) -> Array:
+        """Longitude, latitude (degrees) and height (n, 3) of positions."""
+        g = self.ellipsoid.geodetic(position_l)
+        return np.stack([np.degrees(g[..., 1]), np.degrees(g[..., 0]), g[..., 2]], axis=-1)
+
+    def R_l_crs(self, xyz: ArrayLike) -> Array:
+        """East, north and up (n, 3, 3) at points (n, 3)."""
+        x = np.radians(np.atleast_2d(np.asarray(xyz, dtype=float)))
+        return earth.R_en(x[:, 1], x[:, 0]) @ R_ENU_NED.T
+
+
+#: A Cartesian frame with the coordinates that files are written in.
+Frame = LocalFrame | BodyFrame
+
+
+def _parse_crs(crs: str):
+    import pyproj.exceptions
+
+    try:
+        return pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise CrsError(f"PROJ does not know the CRS {crs!r}: {str(error).splitlines()[0]}") from None
+
+
+def _transformer(crs):
+    import pyproj.exceptions
+
+    target = pyproj.CRS.from_epsg(4979)
+    try:
+        return pyproj.Transformer.from_crs(crs.to_3d() if len(crs.axis_info) < 3 else crs, target, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise CrsError(f"PROJ cannot transform {crs.name!r} to WGS 84: {str(error).splitlines()[0]}") from None
+
+
+def R_lc_from_navigation(
+    frame: LocalFrame, position_l: ArrayLike, rpy: ArrayLike, R_bc: ArrayLike = R_BC_NOMINAL
+) -> Array:
+    """Image-to-local rotation (n, 3, 3) from roll, pitch, heading (n, 3) in radians at local positions (n, 3)."""
+    rpy = np.asarray(rpy, dtype=float)
+    return frame.R_ln(position_l) @ matrix_from_navigation(rpy[..., 0], rpy[..., 1], rpy[..., 2]) @ np.asarray(R_bc)
+
+
+def navigation_from_R_lc(
+    frame: LocalFrame, position_l: ArrayLike, R_lc: ArrayLike, R_bc: ArrayLike = R_BC_NOMINAL
+) -> Array:
+    """Roll, pitch, heading (n, 3) in radians of image-to-local rotations; inverse of `R_lc_from_navigation`."""
+    R_nl = np.swapaxes(frame.R_ln(position_l), -1, -2)
+    return navigation_from_matrix(R_nl @ np.asarray(R_lc) @ np.asarray(R_bc).T)
+
+
+def opk_covariance_from_navigation(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike, cov_rpy: ArrayLike) -> Array:
+    """Covariance (..., 3, 3) of omega, phi, kappa from that of roll, pitch, heading; all radians."""
+    rpy = np.asarray(rpy, dtype=float)
+    sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])
+    sh, ch = np.sin(rpy[..., 2]), np.cos(rpy[..., 2])
+    axes_n = np.zeros((*rpy.shape[:-1], 3, 3))  # columns: where roll, pitch and heading turn about
+    axes_n[..., 0, 0], axes_n[..., 1, 0], axes_n[..., 2, 0] = ch * cp, sh * cp, -sp
+    axes_n[..., 0, 1], axes_n[..., 1, 1] = -sh, ch
+    axes_n[..., 2, 2] = 1.0
+    J = angles_jacobian(angles_from_matrix(R_lc)) @ np.asarray(R_ln) @ axes_n
+    return J @ np.asarray(cov_rpy) @ np.swapaxes(J, -1, -2)

@@ -1,0 +1,106 @@
+"""The ellipsoid, the local frame and coordinate reference systems, against PROJ and round trips."""
+
+import numpy as np
+import pyproj
+import pytest
+
+from triline.solver.geometry import earth
+from triline.solver.geometry.frames import (
+    CrsError,
+    LocalFrame,
+    R_lc_from_navigation,
+    navigation_from_R_lc,
+    opk_covariance_from_navigation,
+)
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_navigation
+
+RNG = np.random.default_rng(11)
+LAT, LON, H = RNG.uniform(-89, 89, 60), RNG.uniform(-180, 180, 60), RNG.uniform(-100, 12000, 60)
+ZURICH = LocalFrame(47.4, 8.5, 500.0)
+
+
+def test_earth_fixed_coordinates_agree_with_proj():
+    proj = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    expected = np.column_stack(proj.transform(LON, LAT, H))
+    ours = earth.ecef_from_geodetic(np.radians(LAT), np.radians(LON), H)
+    np.testing.assert_allclose(ours, expected, atol=1e-7)
+    back = earth.geodetic_from_ecef(expected)
+    np.testing.assert_allclose(np.degrees(back[:, 0]), LAT, atol=1e-12)
+    np.testing.assert_allclose(np.degrees(back[:, 1]), LON, atol=1e-12)
+    np.testing.assert_allclose(back[:, 2], H, atol=1e-7)
+
+
+def test_normal_gravity_at_known_places():
+    assert earth.normal_gravity(0.0, 0.0) == pytest.approx(9.7803253359, abs=1e-10)
+    assert earth.normal_gravity(np.pi / 2, 0.0) == pytest.approx(9.8321849378, abs=1e-9)
+    # GRS 80/WGS 84 value at 45 degrees and the free-air gradient
+    assert earth.normal_gravity(np.pi / 4, 0.0) == pytest.approx(9.806197769, abs=1e-8)
+    gradient = (earth.normal_gravity(np.pi / 4, 1000.0) - earth.normal_gravity(np.pi / 4, 0.0)) / 1000.0
+    assert gradient == pytest.approx(-3.085e-6, rel=1e-3)
+
+
+def test_curvature_radii_are_arc_lengths_of_proj():
+    geod = pyproj.Geod(ellps="WGS84")
+    lat = np.radians(47.0)
+    R_N, R_E = earth.curvature_radii(lat)
+    step = 1e-4
+    _, _, north = geod.inv(8.0, 47.0 - step, 8.0, 47.0 + step)
+    _, _, east = geod.inv(8.0 - step, 47.0, 8.0 + step, 47.0)
+    assert north / np.radians(2 * step) == pytest.approx(float(R_N), rel=1e-7)
+    assert east / np.radians(2 * step) == pytest.approx(float(R_E) * np.cos(lat), rel=1e-7)
+
+
+def test_local_frame_agrees_with_proj_topocentric_and_round_trips():
+    pipeline = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        "+step +proj=topocentric +ellps=WGS84 +lon_0=8.5 +lat_0=47.4 +h_0=500"
+    )
+    lat, lon, h = 47.4 + RNG.normal(0, 0.1, 30), 8.5 + RNG.normal(0, 0.1, 30), RNG.uniform(300, 3000, 30)
+    expected = np.column_stack(pipeline.transform(lon, lat, h))
+    local = ZURICH.from_geodetic(lat, lon, h)
+    np.testing.assert_allclose(local, expected, atol=1e-6)
+    np.testing.assert_allclose(ZURICH.to_geodetic(local), np.column_stack([lat, lon, h]), atol=1e-8)
+
+
+def test_projected_crs_round_trip_and_convergence():
+    frame = LocalFrame(47.4, 8.5, 0.0, "EPSG:32632")
+    xyz = np.array([[465000.0, 5250000.0, 450.0], [460000.0, 5245000.0, 900.0]])
+    local = frame.from_crs(xyz)
+    np.testing.assert_allclose(frame.to_crs(local), xyz, atol=1e-5)
+    # grid north lies off true north by the meridian convergence
+    convergence = pyproj.Proj("EPSG:32632").get_factors(8.5, 47.4).meridian_convergence
+    R = frame.R_l_crs(frame.to_crs(np.zeros((1, 3))))[0]
+    grid_north = R[:, 1]
+    assert np.degrees(np.arctan2(grid_north[0], grid_north[1])) == pytest.approx(convergence, abs=1e-4)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_unknown_crs_is_named():
+    with pytest.raises(CrsError, match="EPSG:999999"):
+        LocalFrame(0, 0, 0, "EPSG:999999").from_crs(np.zeros((1, 3)))
+
+
+def test_navigation_angles_to_local_and_back_include_convergence():
+    position = np.array([[30000.0, 20000.0, 2000.0], [0.0, 0.0, 1500.0]])
+    rpy = np.radians([[1.0, -2.0, 135.0], [0.5, 0.3, 10.0]])
+    R_lc = R_lc_from_navigation(ZURICH, position, rpy)
+    np.testing.assert_allclose(navigation_from_R_lc(ZURICH, position, R_lc), rpy, atol=1e-12)
+    # level flight to the north at the origin: x forward = north, y left = west, z up
+    R = R_lc_from_navigation(ZURICH, np.zeros((1, 3)), np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(R, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    # heading east at 30 km east: kappa = 0 at the origin, off by the convergence out there
+    kappa = angles_from_matrix(R_lc_from_navigation(ZURICH, position[:1], np.radians([[0, 0, 90.0]])))[0, 2]
+    convergence = (ZURICH.to_geodetic(position[:1])[0, 1] - 8.5) * np.sin(np.radians(47.4))
+    assert np.degrees(kappa) == pytest.approx(convergence, abs=2e-3)
+
+
+def test_attitude_covariance_by_sampling():
+    position, rpy = np.zeros(3), np.radians([2.0, -3.0, 130.0])
+    cov = np.diag(np.radians([0.01, 0.02, 0.05]) ** 2)
+    R_ln = ZURICH.R_ln(position)
+    R_lc = R_lc_from_navigation(ZURICH, position, rpy)
+    J_cov = opk_covariance_from_navigation(rpy, R_lc, R_ln, cov)
+    samples = rpy + RNG.multivariate_normal(np.zeros(3), cov, 20000)
+    R = R_ln @ matrix_from_navigation(*samples.T) @ np.diag([1.0, -1, -1])
+    empirical = np.cov(angles_from_matrix(R).T)
+    np.testing.assert_allclose(empirical, J_cov, rtol=0.05, atol=0.05 * J_cov.max())
