@@ -1,0 +1,145 @@
+"""Data snooping in a block of scenes: as `triline.solver.adjustment.snooping`, whose tests and limits it takes.
+
+Of an object point at most one image point goes in a round, and none that fails by much less than the worst of all. What
+was left out and agrees with the rest returns once. A control coordinate goes only where it fails clearly while the
+image points fit. Where too many image points would go, model or sigmas are wrong, and nothing is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..adjustment.reliability import CRITICAL_W
+from ..adjustment.snooping import (
+    CONTROL_CLEAR,
+    CONTROL_FIT,
+    MOST_LEFT_OUT,
+    MOST_ROUNDS,
+    TOGETHER,
+    failing_w,
+    largest_of_group,
+)
+from .solution import SceneSolution, adjust
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class SceneSnooping:
+    """Outcome.
+
+    Attributes
+    ----------
+    solution : without what was left out
+    rays : (k,) image points left out, in order of their test values, the largest first
+    w : (k,) their normalised residuals, the larger of line and sample: against the final adjustment without them; when
+        they were left out where nothing controls them now
+    coordinates : (point, axis) of control coordinates left out
+    rounds : of tests
+    given_up : share of the image points that would have gone where that is too many; then nothing is left out
+    """
+
+    solution: SceneSolution
+    rays: NDArray[np.int64]
+    w: Array
+    coordinates: tuple[tuple[int, int], ...]
+    rounds: int
+    given_up: float = 0.0
+
+
+def snoop(solution: SceneSolution, critical: float = CRITICAL_W) -> SceneSnooping:
+    """Leave out image points and control coordinates that contradict the rest.
+
+    Raises
+    ------
+    ValueError : a critical value that is not positive
+    """
+    if not critical > 0:
+        raise ValueError(f"critical value {critical}, wanted more than 0")
+    beginning, point = solution, solution.problem.block.rays.point
+    use, given = np.ones(len(point), dtype=bool), solution.given.copy()
+    returned = np.zeros(len(point), dtype=bool)
+    returned_given: set[tuple[int, int]] = set()
+    rounds, w_then = 0, np.zeros(len(point))
+    for rounds in range(1, MOST_ROUNDS + 1):
+        before = use.copy(), given.copy()
+        _leave_out(solution, critical, use, given)
+        gone = before[0] & ~use
+        w_then[gone] = _larger(solution.test[gone])
+        if (use == before[0]).all() and (given == before[1]).all():
+            _bring_back(solution, critical, use, given, returned, returned_given)
+        if (use == before[0]).all() and (given == before[1]).all():
+            break
+        share = float((~use).sum()) / len(use)
+        if share > MOST_LEFT_OUT:
+            return SceneSnooping(beginning, np.empty(0, dtype=np.int64), np.empty(0), (), rounds, share)
+        solution = adjust(solution.problem, solution.state, use, given)
+    out = np.flatnonzero(~use)
+    w = _larger(solution.test)
+    w = np.where(w != 0.0, w, w_then)
+    out = out[np.argsort(-np.abs(w[out]), kind="stable")]
+    p, axis = np.nonzero(beginning.given & ~given)
+    return SceneSnooping(solution, out, w[out], tuple(zip(p.tolist(), axis.tolist(), strict=True)), rounds)
+
+
+def _larger(test: Array) -> Array:
+    """The larger of two test values (n, 2), with its sign."""
+    return np.take_along_axis(test, np.abs(test).argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _leave_out(solution: SceneSolution, critical: float, use: NDArray[np.bool_], given: NDArray[np.bool_]) -> None:
+    """Take out of the masks what fails most."""
+    point = solution.problem.block.rays.point
+    largest = np.abs(solution.test).max(axis=1, initial=0.0)
+    w = np.where(solution.ray_weight, failing_w(largest, solution.joint, critical), 0.0)
+    w_given = np.abs(solution.given_test) * given
+    usual = largest[solution.ray_weight & (largest > 0)]
+    one = np.abs(solution.test[solution.ray_weight])
+    scale = float(np.median(one[one > 0])) / 0.6745 if len(usual) else 1.0
+    if scale > CONTROL_FIT:
+        w_given = np.zeros_like(w_given)
+    worst = max(float(w.max(initial=0.0)), float(w_given.max(initial=0.0)))
+    limit = max(critical, TOGETHER * worst)
+    failing = np.flatnonzero(w > limit)
+    first = failing[largest_of_group(point[failing], solution.joint[failing])]
+    of_point = w_given.max(axis=1, initial=0.0)
+    clear = max(limit, CONTROL_CLEAR * critical)
+    p, axis = np.nonzero((w_given > clear) & (w_given == of_point[:, None]))
+    of_ray = np.zeros(len(of_point))
+    of_ray[point[first]] = np.sqrt(solution.joint[first])
+    takes = of_point[p] >= of_ray[p]
+    p, axis = p[takes], axis[takes]
+    use[first[~np.isin(point[first], p)]] = False
+    given[p, axis] = False
+
+
+def _bring_back(
+    solution: SceneSolution,
+    critical: float,
+    use: NDArray[np.bool_],
+    given: NDArray[np.bool_],
+    returned: NDArray[np.bool_],
+    returned_given: set[tuple[int, int]],
+) -> None:
+    """Put back into the masks what agrees with the adjustment without it, each once."""
+    point = solution.problem.block.rays.point
+    largest = np.abs(solution.test).max(axis=1, initial=0.0)
+    agrees = ~use & ~returned & solution.determined[point] & (largest > 0)
+    agrees &= failing_w(largest, solution.joint, critical) <= critical
+    candidates = np.flatnonzero(agrees)
+    first = candidates[largest_of_group(point[candidates], -solution.joint[candidates])]
+    use[first], returned[first] = True, True
+    if len(first):
+        return
+    problem = solution.problem
+    for p, axis in zip(*np.nonzero(problem.given & ~given), strict=True):
+        if (int(p), int(axis)) in returned_given or not solution.determined[p]:
+            continue
+        miss = problem.R_e_enu[p][:, axis] @ (problem.given_e[p] - solution.state.position_e[p])
+        variance = problem.covariance_enu[p, axis, axis] + solution.points_covariance[p, axis, axis]
+        if miss**2 <= critical**2 * variance:
+            given[p, axis] = True
+            returned_given.add((int(p), int(axis)))

@@ -1,0 +1,130 @@
+"""A located pixel as a function of what its location is computed from: pushbroom satellites and airborne strips.
+
+Results are metres east, north and up from where the pixel is located without errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ..geometry.earth import R_en
+from ..geometry.rotation import R_ENU_NED, matrix_from_angles
+from ..location.pushbroom import PushbroomSensor, Rays, without_aberration
+from ..location.uncertainty import Sigmas
+from .inputs import Normal
+
+Array = NDArray[np.floating]
+
+#: Results of every function here.
+RESULTS = ("east", "north", "up")
+#: Parameters of a satellite, in the order of `Sigmas`, and their units.
+SATELLITE = {
+    "along": "m", "across": "m", "radial": "m", "roll": "rad", "pitch": "rad", "yaw": "rad", "time": "s",
+    "line": "px", "sample": "px", "height": "m",
+}  # fmt: skip
+#: Parameters of an aircraft, and their units.
+AIRCRAFT = {
+    "X0": "m", "Y0": "m", "Z0": "m", "omega": "rad", "phi": "rad", "kappa": "rad", "c": "mm", "x": "px", "y": "px",
+    "height": "m",
+}  # fmt: skip
+
+
+def satellite_inputs(sigmas: Sigmas) -> Normal:
+    """Errors of a satellite scene, independent and normal about zero."""
+    values = [*sigmas.position_m, *sigmas.attitude_rad, sigmas.time_s, *sigmas.pixel, sigmas.height_m]
+    return Normal(np.zeros(10), values, tuple(SATELLITE))
+
+
+class SatellitePixel:
+    """One pixel of a pushbroom scene.
+
+    Parameters
+    ----------
+    sensor : rigorous model, with refraction or without
+    line, sample, height_m : the pixel and the height of the ground above the ellipsoid
+
+    Raises
+    ------
+    ValueError : a pixel whose ray misses the ground, a line that orbit and attitude do not cover
+    """
+
+    def __init__(self, sensor: PushbroomSensor, line: float, sample: float, height_m: float):
+        self._sensor, self._line, self._sample, self._height = sensor, line, sample, height_m
+        self._ground = sensor.ground(line, sample, height_m)[0]
+        if not np.isfinite(self._ground).all():
+            raise ValueError(f"line {line:g}, sample {sample:g}: the ray misses the ground at {height_m:g} m")
+        lat, lon, _ = sensor.ellipsoid.geodetic(self._ground)
+        self._R_ne = R_ENU_NED @ R_en(lat, lon).T
+
+    def __call__(self, errors: Array) -> Array:
+        """Metres east, north, up (n, 3) by errors (n, 10) of the parameters `SATELLITE`; NaN where a ray misses."""
+        errors = np.asarray(errors, dtype=float)
+        sensor = self._sensor
+        time = sensor.line_times.time_of(np.array([self._line])) + errors[:, 6]
+        line = sensor.line_times.line_of(time) + errors[:, 7]
+        low, high = sensor.covered_lines
+        inside = (line >= low) & (line <= high)
+        pose = sensor.pose(np.clip(line, low, high))
+        C, velocity = pose.position_e, sensor.motion.inertial_velocity(pose.position_e, pose.velocity_e)
+        up = C / np.linalg.norm(C, axis=1, keepdims=True)
+        across = np.cross(velocity, up)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        axes = np.stack([np.cross(up, across), across, up], axis=-1)
+        look = sensor.look.at(self._sample + errors[:, 8])[0]
+        look = np.einsum("nij,nj->ni", Rotation.from_rotvec(errors[:, 3:6]).as_matrix(), look)
+        d = np.einsum("nij,nj->ni", pose.R_eb, look)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        if sensor.aberration:
+            d = without_aberration(d, velocity)
+        moved = C + np.einsum("nij,nj->ni", axes, errors[:, :3])
+        P = sensor.reach(Rays(moved, d), self._height + errors[:, 9])
+        return np.where(inside[:, None], (P - self._ground) @ self._R_ne.T, np.nan)
+
+
+@dataclass(frozen=True)
+class AircraftPixel:
+    """One pixel of a line camera on an aircraft, over ground of constant height in a local frame.
+
+    Attributes
+    ----------
+    position_m : (3,) perspective centre: east, north, up
+    angles_rad : (3,) omega, phi, kappa
+    xy_mm : (2,) of the pixel, reduced to the principal point; x along the flight
+    focal_length_mm : of the lens
+    pixel_mm : size of a pixel
+    height_m : of the ground
+    """
+
+    position_m: tuple[float, float, float]
+    angles_rad: tuple[float, float, float]
+    xy_mm: tuple[float, float]
+    focal_length_mm: float
+    pixel_mm: float
+    height_m: float
+
+    def __call__(self, errors: Array) -> Array:
+        """Metres east, north, up (n, 3) by errors (n, 10) of the parameters `AIRCRAFT`; NaN where a ray misses."""
+        errors = np.asarray(errors, dtype=float)
+        return self._located(errors) - self._located(np.zeros((1, 10)))
+
+    def _located(self, errors: Array) -> Array:
+        C = np.asarray(self.position_m) + errors[:, :3]
+        angles = np.asarray(self.angles_rad) + errors[:, 3:6]
+        x = self.xy_mm[0] + self.pixel_mm * errors[:, 7]
+        y = self.xy_mm[1] + self.pixel_mm * errors[:, 8]
+        image = np.stack([x, y, -(self.focal_length_mm + errors[:, 6])], axis=1)
+        d = np.einsum("nij,nj->ni", matrix_from_angles(*angles.T), image)
+        scale = (self.height_m + errors[:, 9] - C[:, 2]) / d[:, 2]
+        return C + np.where(scale > 0, scale, np.nan)[:, None] * d
+
+
+def aircraft_inputs(
+    position_m: ArrayLike, attitude_rad: ArrayLike, focal_length_mm: float, pixel_px: ArrayLike, height_m: float
+) -> Normal:
+    """Errors of an airborne strip, independent and normal about zero; three, three, one, two and one sigmas."""
+    parts = [*np.broadcast_to(position_m, 3), *np.broadcast_to(attitude_rad, 3), focal_length_mm]
+    return Normal(np.zeros(10), [*parts, *np.broadcast_to(pixel_px, 2), height_m], tuple(AIRCRAFT))

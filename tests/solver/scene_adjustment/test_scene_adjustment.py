@@ -1,0 +1,283 @@
+"""Blocks of scenes: against a second estimator, errors as large as their sigmas, mixed models, gross errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from triline.solver.camera.self_calibration import lens, prism
+from triline.solver.location.rpc_fit import fit_to_model
+from triline.solver.models.dgr import DgrOptions
+from triline.solver.scene_adjustment.block import GIVEN, KnownGround, SceneBlock
+from triline.solver.scene_adjustment.functional import ProjectiveImage, RpcImage
+from triline.solver.scene_adjustment.snooping import snoop
+from triline.solver.scene_adjustment.solution import NotAdjustableError, adjust, points_enu, prepare
+from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
+from triline.solver.simulation.satellite_block import rigorous_images, scattered_points, simulate_block
+from triline.solver.simulation.scene_study import CONFIGURATIONS, SENSORS, error_over_sigma
+
+DGR = DgrOptions((2.0,) * 3, (0.01,) * 3, (0.002,) * 3)
+
+
+def simulated(sensor="alos-prism", points=40, model=DGR, calibration=None, seed=1, **settings):
+    rng = np.random.default_rng(seed)
+    images = rigorous_images([overpass(ORBITAL_SENSORS[sensor], 36.0, 139.6)], model, calibration)
+    P = scattered_points(images, points, rng)
+    return simulate_block(images, P, range(min(6, points)), range(min(6, points), min(12, points)), rng, **settings)
+
+
+def misses(solution, simulation):
+    points = np.arange(len(simulation.position_e))
+    return points_enu(solution.problem, solution.state.position_e, simulation.position_e, points)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "calibration"),
+    [
+        ("spot5-hrs", None),
+        *(pytest.param(s, c, marks=pytest.mark.study) for s, c in (("alos-prism", prism), ("spot5-hrs", lens))),
+    ],
+)
+def test_scipy_finds_the_same_with_numerical_derivatives_of_the_inverse_location(sensor, calibration):
+    """Another estimator on other functions: full inverse locations of adjusted sensors, no derivative of ours."""
+    simulation = simulated(sensor, points=4, calibration=calibration, seed=4)
+    problem = prepare(simulation.block)
+    solution = adjust(problem)
+    assert solution.converged
+    block, layout = problem.block, problem.block.layout
+    scale = np.sqrt(np.diag(solution.values_covariance))
+    spread = np.sqrt(np.einsum("pii->pi", solution.points_covariance))
+    A, b = layout.prior()
+
+    def residuals(x):
+        # beginning a sigma or more away, in units of the sigmas, so that the step of the derivative suits all
+        values = solution.state.values + scale * x[: layout.n_unknowns]
+        local = spread * x[layout.n_unknowns :].reshape(-1, 3)
+        P = solution.state.position_e + np.einsum("pij,pj->pi", problem.R_e_enu, local)
+        parts = [A @ values - b]
+        for image, mine, columns in zip(block.images, block.rays_of, layout.columns, strict=True):
+            pixel = image.located(values[columns]).ground_to_pixel(P[block.rays.point[mine]], margin_px=100.0)
+            measured = np.stack([block.rays.line[mine], block.rays.sample[mine]], axis=1)
+            parts.append(((measured - pixel) / block.rays.sigma_px[mine, None]).ravel())
+        d = points_enu(problem, P, block.known.position_e, block.known.point)
+        sigma = np.sqrt(np.einsum("kii->ki", block.known.covariance_enu))
+        parts.append((d / np.where(sigma > 0, sigma, 1.0))[block.known.given])
+        return np.concatenate(parts)
+
+    def derivatives(x):
+        steps = 0.05 * np.eye(len(x))
+        return np.stack([(residuals(x + d) - residuals(x - d)) / 0.1 for d in steps], axis=1)
+
+    x0 = np.random.default_rng(0).normal(0.0, 0.1, layout.n_unknowns + 3 * len(block.point_ids))
+    found = least_squares(residuals, x0, jac=derivatives, xtol=1e-12, ftol=1e-12, gtol=1e-9, max_nfev=3)
+    np.testing.assert_allclose(found.x, 0.0, atol=1e-4)
+    np.testing.assert_allclose(2.0 * found.cost, solution.weighted_squares, rtol=1e-6)
+    # its sigmas, too, which are 1 in units of ours
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 1.0, rtol=2e-3)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_errors_are_as_large_as_their_sigmas(sensor):
+    """A few seeds: points, orientation; the band is that of so few. The studies below have fifty."""
+    ratio = error_over_sigma(sensor, "dgr", "selfcal", seeds=range(2), points=40)
+    assert 0.7 < ratio.points < 1.3
+    assert 0.7 < ratio.unknowns < 1.3
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_errors_are_as_large_as_their_sigmas_over_fifty_seeds(sensor, configuration):
+    model, calibration = configuration
+    ratio = error_over_sigma(sensor, model, calibration, seeds=range(50))
+    assert 0.95 < ratio.points < 1.05
+    assert 0.95 < ratio.unknowns < 1.05
+    # continuity of the pieces is drawn with them and not a second time: PPM has fewer random observations than counted
+    assert (0.95 if model == "dgr" else 0.88) < ratio.sigma0 < 1.05
+
+
+def test_corrections_of_a_whole_overpass_share_one_set():
+    rng = np.random.default_rng(2)
+    scenes = [overpass(ORBITAL_SENSORS["spot5-hrs"], 36.0, 139.6)]
+    images = rigorous_images(scenes, DGR, lens, per_lens=False)
+    simulation = simulate_block(images, scattered_points(images, 40, rng), range(6), (), rng)
+    solution = adjust(prepare(simulation.block))
+    groups = simulation.block.layout.groups
+    assert [(g.kind, g.key) for g in groups] == [
+        ("orientation", "1"), ("camera", "spot5-hrs/F"), ("camera", "spot5-hrs/B"),
+    ]  # fmt: skip
+    z = (solution.state.values - simulation.values) / np.sqrt(np.diag(solution.values_covariance))
+    assert np.abs(z).max() < 4.0
+
+
+def test_a_strip_of_thousands_of_kilometres():
+    """Flat-Earth frames would be off by hundreds of kilometres; points have axes of their own."""
+    sensor = replace(ORBITAL_SENSORS["misr"], lines=8000)  # 2 200 km
+    images = rigorous_images([overpass(sensor, 30.0, 179.0)], DGR)[2:6]
+    rng = np.random.default_rng(3)
+    P = scattered_points(images, 60, rng, (0.0, 6000.0))
+    assert np.linalg.norm(P[:, None] - P[None], axis=2).max() > 1.5e6
+    simulation = simulate_block(images, P, range(12), (), rng)
+    solution = adjust(prepare(simulation.block))
+    assert solution.converged
+    ratio = misses(solution, simulation) / np.sqrt(np.einsum("pii->pi", solution.points_covariance))
+    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3
+
+
+def mixed(simulation, kinds):
+    """The images of a simulation, some of them with another model that was made from the sensor as given."""
+    images = []
+    for image, kind in zip(simulation.block.images, kinds, strict=True):
+        if kind == "rpc":
+            rpc = fit_to_model(image.sensor, -500.0, 2500.0).rpc
+            images.append(RpcImage(image.name, rpc, shift_sigma_px=100.0, slope_sigma_px=10.0))
+        elif kind in ("affine", "dlt"):
+            images.append(ProjectiveImage(image.name, kind, (image.sensor.lines, image.sensor.samples)))
+        else:
+            images.append(image)
+    return replace(simulation.block, images=tuple(images))
+
+
+def test_rigorous_rpc_and_dlt_images_in_one_block():
+    """PRISM: forward rigorous, nadir by RPC with an affine correction, backward by DLT from control."""
+    small = DgrOptions((2.0,) * 3, (0.003,) * 3, (1e-5,) * 3)
+    simulation = simulated(points=80, model=small, seed=5)
+    block = simulation.block
+    known = KnownGround(
+        np.arange(30), simulation.position_e[:30], np.tile(0.25 * np.eye(3), (30, 1, 1)), ("control",) * 30
+    )
+    block = replace(block, known=known)
+    solution = adjust(prepare(replace(mixed(simulation, ("rigorous", "rpc", "rigorous")), known=known)))
+    assert solution.converged and 0.8 < solution.sigma0 < 1.25
+    d = misses(solution, simulation)[30:]
+    sigma = np.sqrt(np.einsum("pii->pi", solution.points_covariance))[30:]
+    assert 0.7 < np.sqrt(np.mean((d / sigma) ** 2)) < 1.3
+    # a DLT leaves some pixels in an image this large: it must not be weighted as if it did not
+    all_kinds = replace(mixed(simulation, ("rigorous", "rpc", "dlt")), known=known)
+    weights = np.where(all_kinds.rays.image == 2, 5.0, all_kinds.rays.sigma_px)
+    all_kinds = replace(all_kinds, rays=replace(all_kinds.rays, sigma_px=weights))
+    solution = adjust(prepare(all_kinds))
+    assert solution.converged and not solution.undetermined
+    assert solution.sigma0 < 1.25
+    assert np.sqrt(np.mean(misses(solution, simulation)[30:] ** 2)) < 2.0
+    assert all(np.isfinite(solution.residual_px).ravel())
+
+
+def test_affine_images_alone_take_their_start_from_control():
+    simulation = simulated(points=60, seed=6)
+    known = KnownGround(
+        np.arange(20), simulation.position_e[:20], np.tile(0.25 * np.eye(3), (20, 1, 1)), ("control",) * 20
+    )
+    block = replace(mixed(simulation, ("affine",) * 3), known=known)
+    block = replace(block, rays=replace(block.rays, sigma_px=np.full(len(block.rays), 5.0)))
+    solution = adjust(prepare(block))
+    assert solution.converged
+    assert np.sqrt(np.mean(misses(solution, simulation)[20:] ** 2)) < 20.0
+    with pytest.raises(NotAdjustableError, match="no image that can locate, and no control points"):
+        prepare(replace(block, known=KnownGround.none()))
+
+
+def test_relative_orientation_of_rpcs_without_control():
+    """Shift and affine of two RPCs from tie points alone: residuals vanish, the datum is a-priori knowledge."""
+    simulation = simulated("spot5-hrs", points=60, seed=7)
+    block = replace(mixed(simulation, ("rpc", "rpc")), known=KnownGround.none())
+    solution = adjust(prepare(block))
+    assert solution.converged and not solution.undetermined
+    assert np.sqrt(np.mean(solution.residual_px**2)) < 0.3
+    assert np.linalg.norm(misses(solution, simulation), axis=1).min() > 5.0, "nothing tells where the block lies"
+
+
+def test_gross_errors_are_found_and_named():
+    simulation = simulated(points=60, seed=8)
+    block = simulation.block
+    rng = np.random.default_rng(0)
+    wrong = np.sort(rng.choice(np.flatnonzero(block.rays.point >= 12), 8, replace=False))
+    wrong = wrong[np.diff(block.rays.point[wrong], prepend=-1) != 0]
+    sample = block.rays.sample.copy()
+    sample[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(5.0, 40.0, len(wrong))
+    position = block.known.position_e.copy()
+    position[2] += 40.0 * position[2] / np.linalg.norm(position[2])  # control of 0.5 m, 40 m too high
+    block = replace(block, rays=replace(block.rays, sample=sample), known=replace(block.known, position_e=position))
+    before = adjust(prepare(block))
+    after = snoop(before)
+    assert before.sigma0 > 2.0 and 0.8 < after.solution.sigma0 < 1.2
+    assert after.coordinates == ((2, 2),)
+    lost = set(after.rays) - set(wrong)
+    # across the track; along it three rays that disagree do not tell which of them is wrong
+    assert set(wrong) <= set(after.rays) and len(lost) <= 2
+    clean = adjust(prepare(simulation.block))
+    np.testing.assert_allclose(
+        misses(after.solution, simulation)[12:].std(), misses(clean, simulation)[12:].std(), rtol=0.25
+    )
+
+
+def test_snooping_gives_up_where_sigmas_are_wrong():
+    simulation = simulated(points=30, seed=9)
+    block = simulation.block
+    tight = replace(block, rays=replace(block.rays, sigma_px=np.full(len(block.rays), 0.01)))
+    found = snoop(adjust(prepare(tight)))
+    assert found.given_up > 0.35 and not len(found.rays)
+    assert found.solution.ray_weight.all()
+
+
+def test_normalised_residuals_are_standard_normal():
+    tests = [adjust(prepare(simulated(points=40, seed=seed).block)).test for seed in range(20, 22)]
+    w = np.concatenate(tests).ravel()
+    assert 0.9 < w[w != 0].std() < 1.1
+
+
+def test_redundancy_numbers_sum_up():
+    """Redundancy numbers of rays, control and a-priori knowledge: together the redundancy."""
+    simulation = simulated(points=30, seed=10)
+    solution = adjust(prepare(simulation.block))
+    A = solution.problem.prior
+    of_prior = len(A) - np.einsum("mu,uv,mv->", A, solution.values_covariance, A)
+    known = solution.problem.block.known
+    control = known.point[known.given.all(axis=1)]
+    C, given = solution.points_covariance[control], known.covariance_enu[known.given.all(axis=1)]
+    of_control = 3 * len(control) - np.einsum("pij,pji->", C, np.linalg.inv(given))
+    total = solution.redundancy_numbers.sum() + of_prior + of_control
+    np.testing.assert_allclose(total, solution.redundancy, rtol=1e-6)
+
+
+def test_points_with_one_ray_are_left_out_and_planimetric_and_height_control_count():
+    simulation = simulated(points=30, seed=11)
+    block = simulation.block
+    alone = block.rays.point == 20
+    keep = ~alone | (block.rays.image == 0)
+    rays = replace(
+        block.rays, **{k: getattr(block.rays, k)[keep] for k in ("image", "point", "line", "sample", "sigma_px")}
+    )
+    roles = ("planimetric", "height", "control", "planimetric", "height", "control")
+    assert set(roles) < set(GIVEN)
+    known = replace(block.known, role=(*roles, *block.known.role[6:]))
+    solution = adjust(prepare(replace(block, rays=rays, known=known)))
+    assert solution.converged and not solution.determined[20]
+    assert np.isnan(solution.points_covariance[20]).all()
+    assert solution.n_observations == 2 * (len(rays) - 1) + 27 + 2 * 2 + 2 * 1 + 2 * 3
+    assert solution.n_unknowns == 27 + 3 * 29
+
+
+def test_blocks_that_cannot_be_adjusted_are_refused_in_one_line():
+    simulation = simulated(points=12, seed=12)
+    block = simulation.block
+    none = replace(
+        block.rays, **{k: getattr(block.rays, k)[:0] for k in ("image", "point", "line", "sample", "sigma_px")}
+    )
+    with pytest.raises(NotAdjustableError, match=r"^no image points$"):
+        prepare(replace(block, rays=none))
+    line = block.rays.line.copy()
+    line[3] = 1e9
+    with pytest.raises(NotAdjustableError, match=r"^image 1/F: .*lies outside"):
+        prepare(replace(block, rays=replace(block.rays, line=line)))
+    with pytest.raises(ValueError, match="two images of a block have the same name"):
+        SceneBlock((block.images[0],) * 2, block.point_ids, block.rays, block.known)
+    single = replace(block.rays, **{
+        k: getattr(block.rays, k)[block.rays.image == 0] for k in ("image", "point", "line", "sample", "sigma_px")
+    })  # fmt: skip
+    with pytest.raises(NotAdjustableError, match="no point is determined"):
+        adjust(prepare(replace(block, rays=single, known=KnownGround.none())))
