@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..frames import LocalFrame
+from ..geometry.frames import LocalFrame
 from .surface import HeightField
 
 Array = NDArray[np.floating]

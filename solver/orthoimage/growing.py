@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..measured_trajectory import MeasuredTrajectory
-from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from ..geometry.measured_trajectory import MeasuredTrajectory
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
 from .ground_grid import GroundGrid
 from .mosaic import Mosaic
 from .strip import Rays, StripRectifier

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
-from ..trajectory import Trajectory
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from ..geometry.trajectory import Trajectory
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import LineCamera
+from ..camera.line_camera import LineCamera
 from .ground_grid import GroundGrid
 from .resampling import TAPS, resample
 from .surface import Surface

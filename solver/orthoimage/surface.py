@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import earth
-from ..frames import LocalFrame
+from ..geometry import earth
+from ..geometry.frames import LocalFrame
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

@@ -1,0 +1,148 @@
+"""Pixel to terrain to cell to pixel, for frame and pushbroom, oblique and bent by the air, over high relief."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from relief import Waves
+from satellite_scenes import Truth, cartesian, write_dimap2
+
+from triline.nodes.formats.satellite.read import read_scene
+from triline.solver.geometry.ellipsoid import WGS84
+from triline.solver.geometry.frames import LocalFrame
+from triline.solver.geometry.rotation import matrix_from_angles
+from triline.solver.location.frame_camera import FrameCamera
+from triline.solver.location.refraction import Refraction
+from triline.solver.rectification.cell_to_pixel import Tile, pixels_of_tile
+from triline.solver.rectification.grid import MapGrid, default_crs
+from triline.solver.rectification.pixel_to_cell import meet_terrain, mesh_cells
+
+
+def frame_camera(tilt_deg=50.0, **kwargs) -> FrameCamera:
+    """A camera on a satellite that looks aside, with a lens that distorts by some pixels."""
+    frame = LocalFrame(39.0, 32.0, 0.0)
+    C = WGS84.cartesian(np.radians(39.0), np.radians(32.0), 686e3)
+    R = frame.R_el @ matrix_from_angles(np.radians(tilt_deg), np.radians(3.0), np.radians(20.0))
+    distortion = (3e-6, -1e-9, 0.0, 2e-6, -1e-6)
+    return FrameCamera(C, R, 150.0, 0.006, 900, 1100, principal_point_mm=(0.1, -0.2), distortion=distortion, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def pushbroom(tmp_path_factory):
+    truth = Truth(lines=1200, samples=900, gsd=1.6e-5, period_s=2.5e-3, tilt_deg=(51.0, -5.0, 2.0))
+    return read_scene(write_dimap2(tmp_path_factory.mktemp("scene") / "scene.xml", truth)).model()
+
+
+def models(pushbroom):
+    return {
+        "frame": frame_camera(refraction=Refraction()),
+        "pushbroom": pushbroom.with_refraction(Refraction()),
+    }
+
+
+def zenith_deg(model) -> float:
+    """Zenith angle of the ray in the middle of the image, on the ground, from two heights of it."""
+    u, v = np.array([0.5 * model.lines]), np.array([0.5 * model.samples])
+    low, high = (cartesian(model.direct(u, v, np.array([h])))[0] for h in (0.0, 1000.0))
+    lat, lon, _ = model.direct(u, v, np.array([0.0]))[0]
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    d = high - low
+    return float(np.degrees(np.arccos(d @ up / np.linalg.norm(d))))
+
+
+@pytest.mark.parametrize("kind", ["frame", "pushbroom"])
+def test_pixel_to_terrain_to_pixel(pushbroom, kind):
+    model = models(pushbroom)[kind]
+    assert 58.0 < zenith_deg(model) < 70.0
+    relief = Waves.under(model)
+    rng = np.random.default_rng(1)
+    line, sample = rng.uniform(0, model.lines - 1, 2000), rng.uniform(0, model.samples - 1, 2000)
+    ground = meet_terrain(model, line, sample, relief, 0.0, 1000.0)
+    assert np.isfinite(ground.lat).mean() > 0.99
+    met = np.isfinite(ground.lat)
+    height = relief.at(ground.lat[met], ground.lon[met])
+    assert np.ptp(height) > 950.0
+    # the point lies on the terrain, and the model sees it in the pixel it came from
+    assert np.abs(ground.height_m[met] - height).max() < 0.02
+    back = model.inverse(ground.lat[met], ground.lon[met], ground.height_m[met], 1.0)
+    assert np.abs(back - np.stack([line, sample], axis=1)[met]).max() < 0.01
+
+
+@pytest.mark.parametrize("kind", ["frame", "pushbroom"])
+def test_cells_see_the_pixels_that_the_model_says_and_both_ways_agree(pushbroom, kind):
+    model = models(pushbroom)[kind]
+    relief = Waves.under(model)
+    middle = model.direct(np.array([0.5 * model.lines]), np.array([0.5 * model.samples]), np.array([500.0]))[0]
+    grid = MapGrid(default_crs(middle[0], middle[1]), 0.0, 0.0, 30.0, 0, 0)
+    x, y = grid.map(middle[:1], middle[1:2])
+    grid = grid.over(np.array([x[0] - 3000, x[0] + 3000]), np.array([y[0] - 3000, y[0] + 3000]))
+    whole = np.full((2, grid.rows, grid.columns), np.nan)
+    for tile, pixels in pixels_of_tile(model, Tile(0, 0, grid.rows, grid.columns), grid.where, relief):
+        here = slice(tile.row, tile.row + tile.rows), slice(tile.column, tile.column + tile.columns)
+        whole[0][here] = pixels.line + np.float64(pixels.origin[0])
+        whole[1][here] = pixels.sample + np.float64(pixels.origin[1])
+    assert np.isfinite(whole).all()
+    rng = np.random.default_rng(2)
+    i, j = rng.integers(0, grid.rows, 500), rng.integers(0, grid.columns, 500)
+    lat, lon = grid.where(j, i)
+    true = model.inverse(lat, lon, relief.at(lat, lon), 1.0)
+    assert np.abs(whole[:, i, j].T - true).max() < 0.01
+
+    # the direct way over the same cells: a mesh of every pixel
+    u0, v0 = np.floor(whole.min(axis=(1, 2))) - 1
+    u1, v1 = np.ceil(whole.max(axis=(1, 2))) + 1
+    mesh = mesh_cells(model, grid, np.arange(u0, u1 + 1), np.arange(v0, v1 + 1), relief, 0.0, 1000.0)
+    assert mesh is not None and mesh.line.shape == (grid.rows, grid.columns)
+    # no ground is hidden here: slopes are gentler than the rays
+    apart = np.maximum(np.abs(mesh.line - whole[0]), np.abs(mesh.sample - whole[1]))
+    assert apart.max() < 0.05
+    assert np.percentile(apart, 90) < 0.002
+
+
+def test_frame_camera_derivatives_by_its_orientation():
+    camera = frame_camera(30.0)
+    line, sample, height = (
+        np.array([10.0, 500.0, 880.0]),
+        np.array([1000.0, 20.0, 555.0]),
+        np.array([0.0, 300.0, 900.0]),
+    )
+    located = camera.direct(line, sample, height)
+    J = camera.image_derivatives(line, sample, height)
+    lat, lon, _ = WGS84.geodetic(camera.position_e)
+    axes = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+    for k in range(6):
+        step = 1.0 if k < 3 else 1e-6
+        C, R = camera.position_e, camera.R_ec
+        if k < 3:
+            C = C + step * axes[:, k]
+        else:
+            from scipy.spatial.transform import Rotation
+
+            R = Rotation.from_rotvec(step * axes[:, k - 3]).as_matrix() @ R
+        moved = FrameCamera(
+            C, R, 150.0, 0.006, 900, 1100, principal_point_mm=camera.principal_point_mm, distortion=camera.distortion
+        )
+        change = (moved.inverse(*located.T, 50.0) - np.stack([line, sample], axis=1)) / step
+        # the lens is left out of the derivatives: it bends by a percent
+        assert np.allclose(J[:, :, k], change, rtol=0.02, atol=0.02 * np.abs(change).max())
+
+
+def test_an_image_smaller_than_a_tile_without_anything_around_it(tmp_path):
+    truth = Truth(lines=40, samples=30, gsd=1.6e-5, period_s=2.5e-3)
+    model = read_scene(write_dimap2(tmp_path / "s.xml", truth)).model()
+    located = model.direct(np.array([20.0]), np.array([15.0]), np.array([0.0]))[0]
+    grid = MapGrid(default_crs(located[0], located[1]), 0.0, 0.0, 25.0, 0, 0)
+    x, y = grid.map(located[:1], located[1:2])
+    # not in the middle of the tile, where a node is
+    grid = grid.over(np.array([x[0] - 2000, x[0] + 3500]), np.array([y[0] - 3300, y[0] + 2100]))
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(40.0), np.arange(30.0)))
+    ground = model.direct(u, v, np.zeros(len(u)))
+    footprint = np.stack(grid.cells(ground[:, 0], ground[:, 1]), axis=1)
+    seen = 0
+    for _, pixels in pixels_of_tile(model, Tile(0, 0, grid.rows, grid.columns), grid.where, 0.0, footprint=footprint):
+        line, sample = pixels.line + pixels.origin[0], pixels.sample + pixels.origin[1]
+        with np.errstate(invalid="ignore"):
+            seen += int(((line >= -0.5) & (line <= 39.5) & (sample >= -0.5) & (sample <= 29.5)).sum())
+    row, column = np.mgrid[0 : grid.rows, 0 : grid.columns]
+    true = model.inverse(*grid.where(column.ravel(), row.ravel()), 0.0, 0.0)
+    assert seen == np.isfinite(true[:, 0]).sum() > 200
