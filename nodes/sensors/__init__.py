@@ -1,0 +1,1 @@
+"""Sensors onto the bus: one small program each, started by ``triline fly`` from the flight folder."""

@@ -1,0 +1,403 @@
+"""A line camera whose lines come as files: raw or ENVI BIL that grow, or a folder of blocks."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.image_lines import LineBlock
+from ...solver.camera.line_camera import LineCamera
+from ..convert import SECOND_NS
+from ..errors import UserError
+from ..formats.envi import header_integer, header_of, read_header
+from ..formats.keys import Keys
+from ..formats.time_columns import instant_ns
+from ..node import Message
+from .blocks import BLOCK_S, block_message, pixels_of, strip_message
+from .program import LOOK_S, SILENT_S, Clock, Sensor, publish, refuse_unknown
+
+if TYPE_CHECKING:
+    from ..bus.program import ProgramOptions
+
+KEYS = ("images", "folder", "samples", "type", "strip", "first_time", "line_times", "line_rate_hz")
+TYPES = {"u1": np.dtype("u1"), "u2": np.dtype("<u2"), ">u2": np.dtype(">u2")}
+#: Types of ENVI images whose values are grey values as they are.
+_ENVI = {1: "u1", 12: "u2"}
+#: CCD line, number of its first line in the strip, UTC of that line in ns.
+_BLOCK_NAME = re.compile(r"(?:(?P<strip>[^_]+)_)?(?P<ccd>[^_]+)_(?P<first>\d+)_(?P<time>\d{15,19})\.raw")
+#: Most lines of a block where a file has grown by many at once.
+_MOST_LINES = 4096
+
+
+@dataclass(frozen=True)
+class LineCameraSettings:
+    """What a table says; see docs/flight-folder.md.
+
+    Attributes
+    ----------
+    images : CCD line -> file and band (from 0; of a raw file 0)
+    folder : of blocks, in place of images
+    samples : pixels of a line of raw files
+    kind : of their values
+    strip : id
+    first_ns : UTC of line 0, or None where the lines have times of their own
+    line_times : file that grows with them, or None
+    rate_hz : nominal line rate
+    """
+
+    id: str
+    images: dict[str, tuple[Path, int]]
+    folder: Path | None
+    samples: int
+    kind: str
+    strip: str
+    first_ns: int | None
+    line_times: Path | None
+    rate_hz: float
+    clock: Clock
+
+    @classmethod
+    def read(cls, keys: Keys, folder: Path) -> LineCameraSettings:
+        """From a table of a flight.toml or of a configuration.
+
+        Raises
+        ------
+        UserError : a key that is not known, or a value that cannot be; no files, or no times
+        """
+        refuse_unknown(keys, KEYS)
+        if keys.has("images") == keys.has("folder"):
+            raise UserError(
+                f'{keys.path}: {keys.where}: wanted either images = {{N = "nadir.bil"}} or folder = "blocks"'
+            )
+        table = keys.table("images")
+        images = {ccd: _file(folder, table.text(ccd)) for ccd in table.values}
+        given = keys.has("first_time") + keys.has("line_times")
+        if images and given != 1:
+            raise UserError(f"{keys.path}: {keys.where}: times of the lines: wanted either first_time or line_times")
+        if keys.has("folder") and given:
+            raise UserError(f"{keys.path}: {keys.where}: the names of the blocks say their times, not the table")
+        first = None
+        if keys.has("first_time"):
+            value = keys.raw("first_time")
+            text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
+            first = instant_ns(text, f"{keys.path}: {keys.name('first_time')}")
+        kind = keys.text("type", "u1")
+        if kind not in TYPES:
+            raise keys.refuse("type", f"one of {', '.join(TYPES)}")
+        return cls(
+            keys.text("id", "lines"),
+            images,
+            folder / keys.text("folder") if keys.has("folder") else None,
+            keys.integer("samples", 0),
+            kind,
+            keys.text("strip", "S1"),
+            first,
+            folder / keys.text("line_times") if keys.has("line_times") else None,
+            keys.number("line_rate_hz", positive=True),
+            Clock.of(keys),
+        )
+
+    def in_full(self) -> dict[str, Any]:
+        """What a table has to say in another folder."""
+        out: dict[str, Any] = {}
+        if self.images:
+            out["images"] = {ccd: f"{path.resolve()}@{band + 1}" for ccd, (path, band) in self.images.items()}
+            out["samples"] = self.samples
+        if self.folder is not None:
+            out["folder"] = str(self.folder.resolve())
+        if self.line_times is not None:
+            out["line_times"] = str(self.line_times.resolve())
+        return out
+
+    def check_camera(self, keys: Keys, camera: LineCamera) -> None:
+        """Raise UserError where the CCD lines are not those of the camera, or have another number of pixels."""
+        lines = {line.id: line.pixels for line in camera.lines}
+        for ccd in self.images:
+            if ccd not in lines:
+                raise UserError(f"{keys.path}: {keys.name('images')}: CCD line {ccd!r}, wanted {', '.join(lines)}")
+            if self.samples and self.samples != lines[ccd]:
+                raise keys.refuse("samples", f"{lines[ccd]} as CCD line {ccd} of the camera has pixels")
+
+
+def _file(folder: Path, text: str) -> tuple[Path, int]:
+    name, sign, band = text.rpartition("@")
+    if sign and band.isdigit() and int(band) >= 1:
+        return folder / name, int(band) - 1
+    return folder / text, 0
+
+
+class GrowingImage:
+    """Whole lines of a raw file, or of one band of an ENVI BIL, that is still being written.
+
+    Parameters
+    ----------
+    path : of the data; it may not be there yet
+    band : from 0
+    samples, kind : of a raw file; an ENVI header beside it says them itself
+
+    Raises
+    ------
+    UserError : while it is read: a header of another kind of image
+    """
+
+    def __init__(self, path: Path, band: int, samples: int, kind: str) -> None:
+        self.path, self._band = path, band
+        self._samples, self._kind, self._bands, self._offset = samples, TYPES[kind], 1, 0
+        self._file: BinaryIO | None = None
+        self.lines = 0  # given out
+
+    def read(self, most: int) -> NDArray[Any] | None:
+        """The next lines that are whole, (n, samples); None where there is none yet."""
+        if self._file is None:
+            if not self.path.is_file():
+                return None
+            self._open()
+        assert self._file is not None
+        line_bytes = self._bands * self._samples * self._kind.itemsize
+        whole = (self.path.stat().st_size - self._offset) // line_bytes - self.lines
+        count = min(whole, most)
+        if count < 1:
+            return None
+        self._file.seek(self._offset + self.lines * line_bytes)
+        data = self._file.read(count * line_bytes)
+        count = len(data) // line_bytes
+        if not count:
+            return None
+        self.lines += count
+        values = pixels_of(data[: count * line_bytes], self._samples, self._kind)
+        return np.ascontiguousarray(values.reshape(count, self._bands, self._samples)[:, self._band])
+
+    def _open(self) -> None:
+        path = header_of(self.path)
+        if path is not None:
+            header = read_header(path)
+            code = header_integer(path, header, "data type", low=1)
+            if code not in _ENVI:
+                raise UserError(f"{path}: data type: {code}, wanted 1 or 12 (grey values of 8 or 16 bits)")
+            self._samples = header_integer(path, header, "samples", low=1)
+            self._bands = header_integer(path, header, "bands", 1, low=1)
+            interleave = header.get("interleave", "bil" if self._bands == 1 else "").lower()
+            if self._bands > 1 and interleave != "bil":
+                raise UserError(f"{path}: interleave: {interleave or 'missing'}, wanted bil for an image that grows")
+            if self._band >= self._bands:
+                raise UserError(f"{path}: band {self._band + 1}, wanted 1 to {self._bands}")
+            order = header_integer(path, header, "byte order", 0)
+            self._kind = np.dtype(_ENVI[code]).newbyteorder(">" if order else "<")
+            self._offset = header_integer(path, header, "header offset", 0)
+        elif not self._samples:
+            raise UserError(f"{self.path}: neither an ENVI header beside it nor samples, wanted one of them")
+        self._file = open(self.path, "rb")  # noqa: SIM115  # for as long as it grows
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+class GrowingTimes:
+    """UTC of lines from a CSV ``line,time`` or ``line,time_s`` that grows with the image."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._position = self._row = 0
+        self._column = ""
+        self.time_ns: list[int] = []
+
+    def read(self) -> None:
+        """Take in what has been added.
+
+        Raises
+        ------
+        UserError : ``file:line: what is wrong``
+        """
+        if not self.path.is_file():
+            return
+        with open(self.path, "rb") as file:
+            file.seek(self._position)
+            data = file.read()
+        whole = data.rfind(b"\n") + 1
+        self._position += whole
+        for text in data[:whole].decode("utf-8-sig", "replace").splitlines():
+            self._row += 1
+            if text.strip():
+                self._take(text)
+
+    def _take(self, text: str) -> None:
+        where = f"{self.path}:{self._row}"
+        cells = [cell.strip() for cell in text.split(",")]
+        if not self._column:
+            if len(cells) != 2 or cells[0] != "line" or cells[1] not in ("time", "time_s"):
+                raise UserError(f"{where}: {text.strip()[:40]!r}, wanted the columns line,time or line,time_s")
+            self._column = cells[1]
+            return
+        if len(cells) != 2 or cells[0] != str(len(self.time_ns)):
+            raise UserError(f"{where}: {text.strip()[:40]!r}, wanted line {len(self.time_ns)} and its time")
+        try:
+            time_ns = _seconds_ns(cells[1]) if self._column == "time_s" else instant_ns(cells[1], where)
+        except ValueError:
+            raise UserError(f"{where}: {cells[1]!r}, wanted seconds since the Unix epoch") from None
+        if self.time_ns and time_ns <= self.time_ns[-1]:
+            raise UserError(f"{where}: {cells[1]!r} does not come after the line before it")
+        self.time_ns.append(time_ns)
+
+
+def _seconds_ns(text: str) -> int:
+    whole, _, fraction = text.partition(".")
+    if not whole.isdigit() or (fraction and not fraction.isdigit()):
+        raise ValueError(text)
+    return int(whole) * SECOND_NS + int((fraction + "0" * 9)[:9])
+
+
+class LineFiles(Sensor):
+    """Lines from files that grow, or from a folder of blocks."""
+
+    outputs = ("configuration/strip", "sensor/lines/*")
+
+    def __init__(self, settings: LineCameraSettings) -> None:
+        super().__init__(settings.id)
+        self._settings = settings
+        self._period_ns = round(SECOND_NS / settings.rate_hz)
+        self._strips: dict[str, tuple[int, int, int]] = {}  # first line time, lines, last stamp; of those not ended
+        self._newest_s = 0.0
+
+    def messages(self, stop: Event) -> Iterator[Message | None]:
+        yield from self._blocks(stop) if self._settings.folder is not None else self._growing(stop)
+        yield from self._end_strips()
+
+    # ---- files that grow
+
+    def _growing(self, stop: Event) -> Iterator[Message | None]:
+        s = self._settings
+        images = {ccd: GrowingImage(path, band, s.samples, s.kind) for ccd, (path, band) in s.images.items()}
+        times = GrowingTimes(s.line_times) if s.line_times is not None else None
+        most = min(max(round(BLOCK_S * s.rate_hz), 1), _MOST_LINES)
+        silent = Silence(stop)
+        try:
+            while not stop.is_set():
+                came = False
+                if times is not None:
+                    times.read()
+                for ccd, image in images.items():
+                    room = most if times is None else min(most, len(times.time_ns) - image.lines)
+                    first = image.lines
+                    pixels = image.read(room) if room > 0 else None
+                    if pixels is None:
+                        continue
+                    came = True
+                    known = None if times is None else times.time_ns[first : first + len(pixels)]
+                    yield from self._lines(s.strip, ccd, first, pixels, self._first_ns(first, known), known)
+                if not came:
+                    yield None
+                    if silent.long():
+                        yield from self._end_strips()
+                    stop.wait(LOOK_S / 2)
+                else:
+                    silent.broken()
+        finally:
+            for image in images.values():
+                image.close()
+
+    def _first_ns(self, first: int, known: list[int] | None) -> int:
+        if known is not None:
+            return known[0]
+        assert self._settings.first_ns is not None
+        return self._settings.first_ns + round(first * SECOND_NS / self._settings.rate_hz)
+
+    # ---- folder of blocks
+
+    def _blocks(self, stop: Event) -> Iterator[Message | None]:
+        s = self._settings
+        assert s.folder is not None
+        done: set[str] = set()
+        silent = Silence(stop)
+        if not s.samples:
+            raise UserError(f"{s.folder}: samples of the lines missing, wanted samples = the pixels of a CCD line")
+        while not stop.is_set():
+            found = []
+            for path in s.folder.iterdir() if s.folder.is_dir() else ():
+                if path.name in done or path.suffix != ".raw":
+                    continue
+                match = _BLOCK_NAME.fullmatch(path.name)
+                if match is None:
+                    done.add(path.name)
+                    self.problem("name of a block", f"{path.name}, wanted CCD_FIRSTLINE_TIMENS.raw as N_000200_17..ns")
+                    continue
+                found.append((int(match["time"]), path, match))
+            for time_ns, path, match in sorted(found, key=lambda entry: entry[:2]):
+                done.add(path.name)
+                data, line_bytes = path.read_bytes(), s.samples * TYPES[s.kind].itemsize
+                if not data or len(data) % line_bytes:
+                    self.problem("size of a block", f"{path.name}: {len(data)} bytes, wanted lines of {line_bytes}")
+                    continue
+                pixels = pixels_of(data, s.samples, TYPES[s.kind])
+                strip = match["strip"] or s.strip
+                yield from self._lines(strip, match["ccd"], int(match["first"]), pixels, time_ns, None)
+            if not found:
+                yield None
+                if silent.long():
+                    yield from self._end_strips()
+                stop.wait(LOOK_S)
+            else:
+                silent.broken()
+
+    # ---- both
+
+    def _lines(
+        self, strip: str, ccd: str, first: int, pixels: NDArray[Any], time_ns: int, known: list[int] | None
+    ) -> Iterator[Message]:
+        """The block, after the announcement of a strip that begins with it."""
+        clock, rate_hz = self._settings.clock, self._settings.rate_hz
+        time_ns = clock.utc(time_ns)
+        times = None if known is None else np.array(known, dtype=np.int64) - clock.offset_ns
+        message = block_message(
+            clock, LineBlock(pixels, ccd, strip, first, time_ns, 0 if known is not None else self._period_ns, times)
+        )
+        if strip not in self._strips:
+            yield from self._end_strips()
+            first_ns = time_ns - round(first * SECOND_NS / rate_hz)
+            self._strips[strip] = first_ns, 0, message.stamp_ns
+            yield strip_message(strip, first_ns, rate_hz, message.stamp_ns)
+        first_ns, lines, newest_ns = self._strips[strip]
+        self._strips[strip] = first_ns, max(lines, first + len(pixels)), max(newest_ns, message.stamp_ns)
+        yield message
+
+    def _end_strips(self) -> Iterator[Message]:
+        for id, (first_ns, lines, newest_ns) in self._strips.items():
+            yield strip_message(id, first_ns, self._settings.rate_hz, newest_ns, lines)
+        self._strips.clear()
+
+
+class Silence:
+    """How long nothing has come, in turns of waiting."""
+
+    def __init__(self, stop: Event) -> None:
+        self._stop = stop
+        self._begun: float | None = None
+
+    def long(self) -> bool:
+        """Whether nothing has come for `SILENT_S`; true once."""
+        now = time.monotonic()
+        if self._begun is None:
+            self._begun = now
+        if now - self._begun > SILENT_S:
+            self._begun = float("inf")
+            return True
+        return False
+
+    def broken(self) -> None:
+        """Something has come."""
+        self._begun = None
+
+
+def run(options: ProgramOptions) -> int:
+    """Publish lines from files until told to stop."""
+    settings = LineCameraSettings.read(Keys(Path("configuration"), options.table, options.name), Path.cwd())
+    return publish(options, LineFiles(settings))

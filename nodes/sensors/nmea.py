@@ -1,0 +1,248 @@
+"""NMEA 0183: GGA, RMC, ZDA, GST and HDT become ``sensor/gnss`` and, where it is wanted, ``sensor/attitude``.
+
+A fix goes out with its GGA. Its date is that of the last RMC or ZDA, its accuracy that of the last GST; without GST it
+follows from the quality and the HDOP of the GGA. Sentences are decoded by pynmeagps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from datetime import time as time_of_day
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pynmeagps import GET, VALCKSUM, NMEAReader
+
+from ..convert import SECOND_NS, attitude_message, gnss_message
+from ..formats.keys import Keys
+from ..node import Message
+from .bytes_in import check_address, read_bytes
+from .program import Clock, Sensor, publish, refuse_unknown
+
+if TYPE_CHECKING:
+    from ..bus.program import ProgramOptions
+
+KEYS = ("address", "baud", "date", "heading_sigma_deg", "level_sigma_deg", "velocity_sigma_m_s")
+#: Sentences that are read; others pass by.
+READ = ("GGA", "RMC", "ZDA", "GST", "HDT")
+#: Horizontal sigma, m, at HDOP 1, by the quality of a GGA (SPS, DGPS, PPS, RTK fixed, RTK float, simulator); usual
+#: figures of such solutions. Heights are taken to be twice as poor.
+QUALITY_SIGMA_M = {1: 2.5, 2: 1.0, 3: 2.5, 4: 0.02, 5: 0.3, 8: 2.5}
+#: A GST holds for fixes so long after it, s.
+GST_HOLDS_S = 5.0
+#: A vertical velocity that no sentence tells is taken as 0 with this sigma, m/s.
+UNKNOWN_CLIMB_M_S = 20.0
+#: No sentence is longer (82 by the standard; some receivers write more), bytes.
+LONGEST = 512
+KNOT_M_S = 1852.0 / 3600.0
+
+
+@dataclass(frozen=True)
+class NmeaSettings:
+    """What a table says; see docs/flight-folder.md."""
+
+    id: str
+    address: str
+    baud: int
+    clock: Clock
+    day: date | None
+    heading_sigma_deg: float
+    level_sigma_deg: float
+    velocity_sigma_m_s: float
+
+    @classmethod
+    def read(cls, keys: Keys, folder: Path) -> NmeaSettings:
+        """From a table of a flight.toml or of a configuration.
+
+        Raises
+        ------
+        UserError : a key that is not known, or a value that cannot be
+        """
+        refuse_unknown(keys, KEYS)
+        try:
+            address = check_address(keys.text("address"), folder)
+        except ValueError as error:
+            raise keys.refuse("address", str(error)) from None
+        day = keys.raw("date")
+        if day is not None and (not isinstance(day, date) or isinstance(day, datetime)):
+            raise keys.refuse("date", "a day as 2024-05-17, without quotes")
+        return cls(
+            keys.text("id", "nmea"), address, keys.integer("baud", 115200, low=300), Clock.of(keys), day,
+            *(keys.number(key, 0.0 if key != "level_sigma_deg" else 5.0, positive=keys.has(key)) for key in KEYS[3:]),
+        )  # fmt: skip
+
+    def in_full(self) -> dict[str, Any]:
+        """What a table has to say in another folder."""
+        return {"address": self.address}
+
+
+class NmeaParser:
+    """Bytes in, messages out.
+
+    Parameters
+    ----------
+    settings : see `NmeaSettings`
+    problem : counts what cannot be used: kind, text
+    """
+
+    def __init__(self, settings: NmeaSettings, problem: Any) -> None:
+        self._settings, self._problem = settings, problem
+        self._rest = b""
+        self._newest: datetime | None = None
+        self._last_ns = self._last_heading_ns = -1
+        self._epoch_ns = -1  # of the newest GGA or RMC
+        self._stated: tuple[int, tuple[float, float, float]] | None = None  # sigmas, of a GST
+        self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that follow from more bytes."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > LONGEST:
+            self._problem("not NMEA", f"{len(self._rest)} bytes without an end of line: {_shown(self._rest)}")
+            self._rest = b""
+        return [message for line in lines for message in self._line(line.strip())]
+
+    def _line(self, line: bytes) -> list[Message]:
+        if not line:
+            return []
+        start = line.find(b"$")
+        if start < 0 or len(line) - start > LONGEST:
+            self._problem("not NMEA", _shown(line))
+            return []
+        line = line[start:]
+        kind = line.split(b",", 1)[0][-3:].decode("ascii", "replace")
+        if kind not in READ:
+            return []
+        if b"*" not in line:
+            self._problem("no checksum", _shown(line))
+            return []
+        try:
+            sentence: Any = NMEAReader.parse(line + b"\r\n", msgmode=GET, validate=VALCKSUM)
+        except Exception as error:  # of several classes, some of them not the library's
+            kind = "bad checksum" if "checksum" in str(error).lower() else "not readable"
+            self._problem(kind, f"{_shown(line)}: {error}")
+            return []
+        try:
+            return getattr(self, "_" + kind.lower())(sentence)
+        except (TypeError, ValueError, AttributeError):  # a field that is empty or no number
+            self._problem("field missing", _shown(line))
+            return []
+
+    # ---- sentences
+
+    def _rmc(self, s: Any) -> list[Message]:
+        if isinstance(s.date, date):
+            self._newest = _at(s.date, s.time)
+        if s.status != "A":
+            return []
+        utc_ns = self._utc(s.time)
+        if utc_ns is not None:
+            self._epoch_ns = utc_ns
+            if s.spd != "" and s.cog != "":
+                speed, course = float(s.spd) * KNOT_M_S, np.radians(float(s.cog))
+                self._motion = utc_ns, (float(speed * np.sin(course)), float(speed * np.cos(course)))
+        return []
+
+    def _zda(self, s: Any) -> list[Message]:
+        self._newest = _at(date(int(s.year), int(s.month), int(s.day)), s.time)
+        return []
+
+    def _gst(self, s: Any) -> list[Message]:
+        utc_ns = self._utc(s.time)
+        east, north, up = float(s.stdLong), float(s.stdLat), float(s.stdAlt)
+        if utc_ns is not None and min(east, north, up) > 0:
+            self._stated = utc_ns, (east, north, up)
+        return []
+
+    def _gga(self, s: Any) -> list[Message]:
+        quality = int(s.quality)
+        if quality not in QUALITY_SIGMA_M:
+            self._problem("no fix", f"GGA of quality {quality}")
+            return []
+        if s.sep == "" or s.alt == "":
+            self._problem("no geoid separation", "GGA without height above the ellipsoid")
+            return []
+        utc_ns = self._utc(s.time)
+        if utc_ns is None:
+            self._problem("no date yet", "GGA before the first RMC or ZDA; or give date")
+            return []
+        if utc_ns <= self._last_ns:
+            self._problem("time does not go on", f"GGA of {s.time} does not come after the one before")
+            return []
+        self._last_ns = self._epoch_ns = utc_ns
+        sigma = self._sigma(utc_ns, quality, s.HDOP)
+        velocity: tuple[Any, ...] = ()
+        if self._settings.velocity_sigma_m_s and self._motion is not None and self._motion[0] == utc_ns:
+            level = self._settings.velocity_sigma_m_s
+            velocity = (*self._motion[1], 0.0), (level, level, UNKNOWN_CLIMB_M_S)
+        place = float(s.lat), float(s.lon), float(s.alt) + float(s.sep)
+        body = gnss_message(utc_ns, place, sigma, *velocity)
+        return [Message("sensor/gnss", self._settings.clock.stamp(utc_ns), body)]
+
+    def _hdt(self, s: Any) -> list[Message]:
+        heading_deg = float(s.headingT)
+        settings = self._settings
+        if not settings.heading_sigma_deg or self._epoch_ns <= self._last_heading_ns:
+            return []
+        self._last_heading_ns = self._epoch_ns
+        sigma = np.radians([settings.level_sigma_deg, settings.level_sigma_deg, settings.heading_sigma_deg])
+        body = attitude_message(self._epoch_ns, np.radians([0.0, 0.0, heading_deg]), sigma)
+        return [Message("sensor/attitude", settings.clock.stamp(self._epoch_ns), body)]
+
+    # ---- time and accuracy
+
+    def _utc(self, time: time_of_day) -> int | None:
+        """UTC in ns of a time of day, on the day that brings it next to the newest time; None before a day is known."""
+        if self._newest is None:
+            if self._settings.day is None:
+                return None
+            self._newest = _at(self._settings.day, time)
+        newest = self._newest
+        day = newest.date()
+        near = min((_at(day + timedelta(days=d), time) for d in (-1, 0, 1)), key=lambda t: abs(t - newest))
+        self._newest = max(near, newest)
+        whole = near.replace(microsecond=0)
+        utc_ns = round(whole.timestamp()) * SECOND_NS + near.microsecond * 1000
+        return self._settings.clock.utc(utc_ns)
+
+    def _sigma(self, utc_ns: int, quality: int, hdop: Any) -> tuple[float, float, float]:
+        """East, north, up, m."""
+        if self._stated is not None and 0 <= utc_ns - self._stated[0] <= GST_HOLDS_S * SECOND_NS:
+            return self._stated[1]
+        level = QUALITY_SIGMA_M[quality] * max(float(hdop or 1.0), 0.5)
+        return level, level, 2.0 * level
+
+
+def _at(day: date, time: time_of_day) -> datetime:
+    return datetime.combine(day, time, UTC)
+
+
+def _shown(line: bytes) -> str:
+    text = line[:80].decode("ascii", "replace")
+    return "".join(c if c.isprintable() else "." for c in text)
+
+
+class Nmea(Sensor):
+    """A receiver that speaks NMEA 0183."""
+
+    outputs = ("sensor/gnss", "sensor/attitude")
+
+    def __init__(self, settings: NmeaSettings) -> None:
+        super().__init__(settings.id)
+        self._settings = settings
+        self.parser = NmeaParser(settings, self.problem)
+
+    def messages(self, stop: Event) -> Iterator[Message | None]:
+        for data in read_bytes(self._settings.address, stop, self.problem, self._settings.baud):
+            yield None
+            yield from self.parser.feed(data)
+
+
+def run(options: ProgramOptions) -> int:
+    """Publish what a receiver says until told to stop."""
+    settings = NmeaSettings.read(Keys(Path("configuration"), options.table, options.name), Path.cwd())
+    return publish(options, Nmea(settings))

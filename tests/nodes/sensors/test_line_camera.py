@@ -1,0 +1,164 @@
+"""Image lines from files that grow and from folders of blocks."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from envi_files import write_camera
+
+from triline.nodes.errors import UserError
+from triline.nodes.formats.camera_json import read_camera
+from triline.nodes.formats.keys import Keys
+from triline.nodes.sensors.line_camera import LineCameraSettings, LineFiles
+
+T = 1_795_339_670_000_000_000
+START = "2026-11-22T09:27:50Z"
+RATE = 100.0
+IMAGE = np.random.default_rng(1).integers(0, 60000, (40, 3, 7)).astype("<u2")  # lines, bands, samples
+
+
+def settings(at: Path, **table) -> LineCameraSettings:
+    values = {"strip": "S7", "line_rate_hz": RATE, "samples": 7, "type": "u2", **table}
+    return LineCameraSettings.read(Keys(at / "flight.toml", values, "sensor[0]"), at)
+
+
+def header(path: Path, **keys) -> None:
+    known = {"samples": 7, "lines": 0, "bands": 3, "data type": 12, "interleave": "bil", "byte order": 0} | keys
+    path.with_suffix(".hdr").write_text("ENVI\n" + "".join(f"{key} = {value}\n" for key, value in known.items()))
+
+
+def read(sensor: LineFiles, n: int):
+    """The first messages, and the end of the strip."""
+    stop, out = threading.Event(), []
+    for message in sensor.messages(stop):
+        out += [] if message is None else [message]
+        if len(out) == n:
+            stop.set()
+    return out
+
+
+def test_a_bil_that_grows_gives_the_lines_of_all_its_bands(tmp_path):
+    path = tmp_path / "all.bil"
+    header(path)
+    given = settings(tmp_path, images={"F": "all.bil@1", "N": "all.bil@2", "B": "all.bil@3"}, first_time=START)
+    data, written = IMAGE.tobytes(), [0]
+
+    def grow():
+        """A piece that ends inside a line."""
+        size = min(written[0] + 317, len(data))
+        with path.open("ab") as file:
+            file.write(data[written[0] : size])
+        written[0] = size
+
+    sensor = LineFiles(given)
+    messages, stop = [], threading.Event()
+    for message in sensor.messages(stop):
+        grow() if message is None else messages.append(message)
+        if sum(len(m.body.pixels) for m in messages if m.topic.startswith("sensor")) == 120:
+            stop.set()
+    begin, end = messages[0].body, messages[-1].body
+    assert (begin.id, begin.first_line_time_ns, begin.line_rate_hz, begin.ended) == ("S7", T, RATE, False)
+    assert (end.id, end.lines, end.ended) == ("S7", 40, True)
+    for band, ccd in enumerate("FNB"):
+        blocks = [m.body for m in messages if m.topic == f"sensor/lines/{ccd}"]
+        np.testing.assert_array_equal(np.concatenate([b.pixels for b in blocks]), IMAGE[:, band])
+        times = np.concatenate([b.times_ns() for b in blocks])
+        np.testing.assert_array_equal(times, T + np.arange(40) * 10_000_000)
+        assert len(blocks) > 3
+    assert all(m.stamp_ns == m.body.times_ns()[-1] for m in messages if m.topic.startswith("sensor"))
+
+
+def test_a_raw_file_with_its_own_line_times(tmp_path):
+    (tmp_path / "n.raw").write_bytes(IMAGE[:20, 0].astype(">u2").tobytes())
+    times = T + np.arange(20) * 10_000_000 + np.random.default_rng(2).integers(0, 999, 20)
+    text = "line,time_s\n" + "".join(f"{i},{t // 10**9}.{t % 10**9:09d}\n" for i, t in enumerate(times))
+    (tmp_path / "times.csv").write_text(text)
+    given = settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv", type=">u2", clock_offset_s=0.5)
+    strip, *blocks = read(LineFiles(given), 3)[:3]
+    np.testing.assert_array_equal(np.concatenate([m.body.pixels for m in blocks]), IMAGE[:20, 0])
+    np.testing.assert_array_equal(np.concatenate([m.body.times_ns() for m in blocks]), times - 500_000_000)
+    assert strip.body.first_line_time_ns == times[0] - 500_000_000
+
+
+def test_a_folder_of_blocks(tmp_path):
+    folder = tmp_path / "blocks"
+    folder.mkdir()
+    for first in (0, 10, 20):
+        for ccd, band in (("F", 0), ("N", 1)):
+            path = folder / f"{ccd}_{first:06d}_{T + first * 10_000_000}.raw"
+            path.write_bytes(IMAGE[first : first + 10, band].tobytes())
+    (folder / "N_000030_1795339670300000000.raw.part").write_bytes(b"not yet whole")
+    (folder / "nonsense.raw").write_bytes(b"1")
+    (folder / f"N_000099_{T + 990_000_000}.raw").write_bytes(b"12345")
+    sensor = LineFiles(settings(tmp_path, folder="blocks"))
+    messages = read(sensor, 7)
+    blocks = [m.body for m in messages if m.topic == "sensor/lines/N"]
+    np.testing.assert_array_equal(np.concatenate([b.pixels for b in blocks]), IMAGE[:30, 1])
+    assert [m.topic for m in messages[:3]] == ["configuration/strip", "sensor/lines/F", "sensor/lines/N"]
+    assert messages[-1].body.ended and messages[-1].body.lines == 30
+    assert dict(sensor.counters) == {"name of a block": 1, "size of a block": 1}
+
+
+@pytest.mark.parametrize(
+    ("table", "wanted"),
+    [
+        ({}, "sensor[0]: wanted either images"),
+        ({"images": {"N": "n.raw"}}, "sensor[0]: times of the lines: wanted either first_time or line_times"),
+        ({"folder": "b", "first_time": START}, "sensor[0]: the names of the blocks say their times"),
+        ({"folder": "b", "type": "f4"}, "sensor[0].type: 'f4', wanted one of u1, u2, >u2"),
+        ({"folder": "b", "line_rate_hz": 0}, "sensor[0].line_rate_hz: 0, wanted a number above 0"),
+        ({"images": {"N": "n"}, "first_time": "noon"}, "sensor[0].first_time: 'noon', wanted an ISO 8601 time"),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path, table, wanted):
+    with pytest.raises(UserError) as error:
+        settings(tmp_path, **table)
+    assert str(error.value).startswith(f"{tmp_path / 'flight.toml'}: {wanted}")
+
+
+def test_the_camera_must_have_the_lines(tmp_path):
+    write_camera(tmp_path / "camera.json")
+    camera = read_camera(tmp_path / "camera.json", [])
+    for images, samples, wanted in (({"X": "n.raw"}, 7, "CCD line 'X', wanted F, N, B"), ({"N": "n"}, 9, "wanted 7")):
+        given = settings(tmp_path, images=images, first_time=START, samples=samples)
+        keys = Keys(tmp_path / "flight.toml", {"images": images, "samples": samples}, "sensor[0]")
+        with pytest.raises(UserError, match=wanted):
+            given.check_camera(keys, camera)
+
+
+@pytest.mark.parametrize(
+    ("keys", "wanted"),
+    [
+        ({"data type": 4}, "data type: 4, wanted 1 or 12"),
+        ({"interleave": "bsq"}, "interleave: bsq, wanted bil for an image that grows"),
+        ({"bands": 1}, "band 2, wanted 1 to 1"),
+        ({"samples": "x"}, "samples: 'x', wanted an integer"),
+    ],
+)
+def test_headers_that_cannot_be(tmp_path, keys, wanted):
+    path = tmp_path / "n.bil"
+    header(path, **keys)
+    path.write_bytes(IMAGE.tobytes())
+    with pytest.raises(UserError, match=wanted):
+        read(LineFiles(settings(tmp_path, images={"N": "n.bil@2"}, first_time=START)), 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("a,b\n0,1\n", "times.csv:1: 'a,b', wanted the columns line,time or line,time_s"),
+        ("line,time_s\n1,5\n", "times.csv:2: '1,5', wanted line 0 and its time"),
+        ("line,time_s\n0,x\n", "times.csv:2: 'x', wanted seconds since the Unix epoch"),
+        ("line,time\n0,x\n", "times.csv:2: 'x', wanted an ISO 8601 time"),
+        ("line,time_s\n0,7\n1,7\n", "times.csv:3: '7' does not come after the line before it"),
+    ],
+)
+def test_line_times_that_cannot_be(tmp_path, text, wanted):
+    (tmp_path / "n.raw").write_bytes(IMAGE[:20, 0].tobytes())
+    (tmp_path / "times.csv").write_text(text)
+    with pytest.raises(UserError) as error:
+        read(LineFiles(settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv")), 1)
+    assert wanted in str(error.value) and "\n" not in str(error.value)

@@ -1,0 +1,207 @@
+"""NMEA 0183 to messages: times, heights, accuracies, and what is wrong with a sentence."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections import Counter
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_rig import free_port
+
+from triline.nodes.convert import time_ns
+from triline.nodes.errors import UserError
+from triline.nodes.formats.keys import Keys
+from triline.nodes.sensors.nmea import Nmea, NmeaParser, NmeaSettings
+
+#: 2026-11-22 09:27:50 UTC.
+T0 = 1795339670_000_000_000
+
+
+def sentence(body: str) -> bytes:
+    """A sentence with its checksum: the exclusive or of all characters between $ and *."""
+    total = 0
+    for character in body:
+        total ^= ord(character)
+    return f"${body}*{total:02X}\r\n".encode()
+
+
+RMC = sentence("GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00,090.00,221126,,,A")
+GST = sentence("GNGST,092750.20,0.9,0.03,0.02,10.0,0.021,0.034,0.055")
+
+
+def gga(clock: str, quality=4, lat="5321.680200", sep="55.2", hdop="0.8") -> bytes:
+    return sentence(f"GNGGA,{clock},{lat},N,00630.337200,W,{quality},18,{hdop},61.7,M,{sep},M,1.0,0000")
+
+
+def settings(tmp_path: Path, **table) -> NmeaSettings:
+    return NmeaSettings.read(Keys(Path("flight.toml"), {"address": "udp://:4001", **table}, "sensor[0]"), tmp_path)
+
+
+def parse(tmp_path, *data: bytes, **table):
+    counts: Counter[str] = Counter()
+    parser = NmeaParser(settings(tmp_path, **table), lambda kind, text: counts.update([kind]))
+    return [message for part in data for message in parser.feed(part)], counts
+
+
+def test_a_fix_has_time_place_and_accuracy(tmp_path):
+    messages, counts = parse(tmp_path, RMC + GST + gga("092750.20"))
+    (message,) = messages
+    assert not counts and message.topic == "sensor/gnss"
+    body = message.body
+    assert time_ns(body.timestamp) == message.stamp_ns == T0 + 200_000_000
+    assert body.latitude == pytest.approx(53 + 21.6802 / 60, abs=1e-10)
+    assert body.longitude == pytest.approx(-(6 + 30.3372 / 60), abs=1e-10)
+    assert body.altitude == pytest.approx(61.7 + 55.2)  # above the ellipsoid
+    sigma = np.sqrt(np.array(body.position_covariance)[::4])
+    np.testing.assert_allclose(sigma, [0.034, 0.021, 0.055])  # east, north, up; GST has latitude first
+
+
+def test_without_gst_the_quality_says_how_good_a_fix_is(tmp_path):
+    messages, _ = parse(tmp_path, RMC, gga("092751.00", quality=1, hdop="2.0"), gga("092752.00", quality=4, hdop="1.0"))
+    sigmas = [np.sqrt(np.array(m.body.position_covariance)[::4]) for m in messages]
+    np.testing.assert_allclose(sigmas[0], [5.0, 5.0, 10.0])
+    np.testing.assert_allclose(sigmas[1], [0.02, 0.02, 0.04])
+
+
+def test_sentences_may_come_in_pieces(tmp_path):
+    data = RMC + gga("092750.20") + gga("092750.40")
+    messages, counts = parse(tmp_path, *(data[i : i + 7] for i in range(0, len(data), 7)))
+    assert len(messages) == 2 and not counts
+
+
+def test_midnight(tmp_path):
+    before = sentence("GNRMC,235959.50,A,5321.6802,N,00630.3372,W,0.0,,311226,,,A")
+    messages, counts = parse(tmp_path, before + gga("235959.80") + gga("000000.00") + gga("000000.20"))
+    stamps = np.array([message.stamp_ns for message in messages])
+    np.testing.assert_array_equal(np.diff(stamps), [200_000_000, 200_000_000])
+    assert stamps[1] == 1798761600_000_000_000 and not counts  # 2027-01-01
+    late, _ = parse(tmp_path, gga("235959.80") + gga("000000.00"), date=date(2026, 12, 31))
+    assert [message.stamp_ns for message in late] == stamps[:2].tolist()
+
+
+def test_clock_offset_and_delay(tmp_path):
+    messages, _ = parse(tmp_path, RMC + gga("092750.20"), clock_offset_s=0.05, delay_s=0.15)
+    assert time_ns(messages[0].body.timestamp) == T0 + 150_000_000
+    assert messages[0].stamp_ns == T0 + 300_000_000
+
+
+def test_heading_and_velocity_where_they_are_wanted(tmp_path):
+    data = RMC + gga("092750.00") + sentence("GPHDT,123.456,T")
+    assert [m.topic for m in parse(tmp_path, data)[0]] == ["sensor/gnss"]
+    fix, heading = parse(tmp_path, data, heading_sigma_deg=0.2, velocity_sigma_m_s=0.05)[0]
+    assert heading.topic == "sensor/attitude" and heading.stamp_ns == T0
+    assert heading.body.heading == pytest.approx(np.radians(123.456))
+    np.testing.assert_allclose(np.degrees(np.sqrt(heading.body.covariance[::4])), [5.0, 5.0, 0.2])
+    v = fix.body.velocity_enu  # 120 knots to the east
+    np.testing.assert_allclose([v.x, v.y, v.z], [61.7333, 0.0, 0.0], atol=1e-3)
+    assert np.sqrt(fix.body.velocity_covariance[8]) == 20.0  # the climb is not told
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [
+        (gga("092750.20")[:-4] + b"00\r\n", "bad checksum"),
+        (gga("092750.20").split(b"*")[0] + b"\r\n", "no checksum"),
+        (b"hello\r\n", "not NMEA"),
+        (b"\xff" * 600, "not NMEA"),
+        (gga("092750.20", quality=0), "no fix"),
+        (gga("092750.20", sep=""), "no geoid separation"),
+        (gga("092750.20", lat=""), "field missing"),
+        (gga("092750.20") * 2, "time does not go on"),
+    ],
+)
+def test_what_cannot_be_used_is_counted_and_the_next_fix_comes(tmp_path, data, kind):
+    messages, counts = parse(tmp_path, RMC + data + b"\r\n" + gga("092751.00"))
+    assert counts == {kind: 1}
+    assert messages[-1].stamp_ns == T0 + 1_000_000_000
+
+
+def test_without_a_date_there_is_no_time(tmp_path):
+    messages, counts = parse(tmp_path, gga("092750.20") + RMC + gga("092750.40"))
+    assert len(messages) == 1 and counts == {"no date yet": 1}
+
+
+def test_from_a_file_that_grows_and_from_a_connection_that_breaks(tmp_path):
+    path = tmp_path / "gnss.nmea"
+    path.write_bytes(RMC + gga("092750.20"))
+    stop = threading.Event()
+    sensor = Nmea(settings(tmp_path, address="file:gnss.nmea"))
+    come = (message for message in sensor.messages(stop) if message is not None)
+    assert next(come).stamp_ns == T0 + 200_000_000
+    with path.open("ab") as file:
+        file.write(gga("092750.40"))
+    assert next(come).stamp_ns == T0 + 400_000_000
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        sensor = Nmea(settings(tmp_path, address=address))
+        come = (message for message in sensor.messages(stop) if message is not None)
+
+        def serve(data: bytes) -> None:
+            connection, _ = server.accept()
+            connection.sendall(data)
+            connection.close()
+
+        for i, data in enumerate((RMC + gga("092750.20"), gga("092751.00"))):
+            thread = threading.Thread(target=serve, args=(data,))
+            thread.start()
+            assert next(come).stamp_ns == T0 + (200_000_000, 1_000_000_000)[i]
+            thread.join()
+        assert sensor.counters["connection closed"] == 1
+    stop.set()
+
+
+def first_fix(sensor: Nmea, send) -> int:
+    """Stamp of the first fix; ``send`` is called until there is one."""
+    stop = threading.Event()
+    for message in sensor.messages(stop):
+        if message is not None:
+            stop.set()
+            return message.stamp_ns
+        send()
+    raise AssertionError
+
+
+def test_from_a_serial_port(tmp_path):
+    pytest.importorskip("serial")
+    pty = pytest.importorskip("pty")
+    ours, theirs = pty.openpty()
+    try:
+        sensor = Nmea(settings(tmp_path, address=f"serial:{os.ttyname(theirs)}", baud=9600))
+        data = (RMC + gga("092750.20")).replace(b"\r", b"")  # the terminal adds it
+        sent = []
+        assert first_fix(sensor, lambda: sent or sent.append(os.write(ours, data))) == T0 + 200_000_000
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_from_udp(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        address = f"127.0.0.1:{free_port()}"
+        sensor = Nmea(settings(tmp_path, address=f"udp://{address}"))
+        host, port = address.split(":")
+        stamp = first_fix(sensor, lambda: sender.sendto(RMC + gga("092750.20"), (host, int(port))))
+    assert stamp == T0 + 200_000_000
+
+
+@pytest.mark.parametrize(
+    ("table", "wanted"),
+    [
+        ({"address": "ftp://x"}, "sensor[0].address: 'ftp://x', wanted serial:PORT, tcp://HOST:PORT"),
+        ({"address": "tcp://host"}, "sensor[0].address: 'tcp://host', wanted a port from 1 to 65535"),
+        ({"baut": 9600}, "sensor[0].baut: not known, wanted id, kind"),
+        ({"date": "today"}, "sensor[0].date: 'today', wanted a day as 2024-05-17"),
+        ({"delay_s": 60}, "sensor[0].delay_s: 60, wanted 0 to 5 seconds"),
+        ({"heading_sigma_deg": 0}, "sensor[0].heading_sigma_deg: 0, wanted a number above 0"),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path, table, wanted):
+    with pytest.raises(UserError) as error:
+        settings(tmp_path, **table)
+    assert str(error.value).startswith(f"flight.toml: {wanted}") and "\n" not in str(error.value)

@@ -1,0 +1,219 @@
+"""Sensor tables of a flight folder, the programs they start, and what is said of sensors that do not come."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from bus_rig import free_port, wait_for
+from envi_files import write_camera
+
+from triline.nodes.bus.program import ProgramOptions
+from triline.nodes.bus.session import Bus
+from triline.nodes.cli import main
+from triline.nodes.cli.fly import FirstData
+from triline.nodes.cli.node import _value
+from triline.nodes.convert import gnss_message
+from triline.nodes.formats.flight_folder import live_configuration, read_flight
+from triline.nodes.monitor.sensor_watch import SensorWatch
+from triline.nodes.sensors.settings import read_sensors
+from triline.nodes.sensors.stream import run
+from triline.schemas import messages as m
+from triline.schemas.codec import decode, encode
+from triline.schemas.envelope import Envelope, RawMessage
+
+TOML = """
+[flight]
+name = "live"
+platform = "live1"
+crs = "EPSG:32632"
+vertical_datum = "ellipsoid"
+ground_height_m = 300.0
+[camera]
+file = "camera.json"
+[navigation]
+gnss = "RTK"
+imu = "tactical"
+[[strips]]
+id = "S1"
+first_time = 2026-11-22T09:30:00Z
+line_rate_hz = 100
+[[sensor]]
+kind = "nmea"
+address = "file:gnss.nmea"
+date = 2026-11-22
+[[sensor]]
+kind = "stream"
+id = "camera"
+address = "listen://127.0.0.1:5555"
+clock_offset_s = -0.5
+[[sensor]]
+kind = "lines"
+images = {N = "n.bil@2"}
+line_rate_hz = 100
+first_time = 2026-11-22T09:30:00Z
+[nodes.matcher]
+ground_m = 5.0
+"""
+T = 1_795_339_800_000_000_000
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "flight.toml").write_text(TOML)
+    write_camera(tmp_path / "camera.json")
+    return tmp_path
+
+
+def test_a_folder_of_a_live_flight(folder, capsys):
+    assert main(["check", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "`triline fly` starts the sensors nmea (nmea), camera (stream), lines (lines)" in said
+    flight = read_flight(folder)
+    nmea, camera, lines = read_sensors(flight)
+    assert nmea.settings["address"] == f"file:{(folder / 'gnss.nmea').resolve()}"
+    assert camera.settings["imu_noise"] == [flight.grade.gyro_noise, flight.grade.accel_noise]
+    # what goes to a program comes back from its command line
+    for program in (nmea, camera, lines):
+        words = program.arguments()[1::2]
+        assert {w.partition("=")[0]: _value(w.partition("=")[2]) for w in words} == program.settings
+    assert lines.settings["images"] == {"N": f"{(folder / 'n.bil').resolve()}@2"}
+
+
+def test_what_is_published_before_a_live_flight(folder):
+    flight = read_flight(folder)
+    messages = live_configuration(flight, (48.0, 9.0), T, "flight")
+    assert [(m.topic, m.stamp_ns, m.source) for m in messages] == [
+        (f"configuration/{name}", T, "flight") for name in ("project", "camera", "strip")
+    ]
+    project, strip = messages[0].body, messages[2].body
+    assert (project.origin_latitude, project.origin_longitude, project.origin_height) == (48.0, 9.0, 300.0)
+    np.testing.assert_allclose(project.offset_sigma_m, [0.03, 0.03, 0.05])  # RTK
+    assert (strip.id, strip.first_line_time_ns, strip.line_rate_hz, strip.ended) == ("S1", T, 100.0, False)
+
+
+WRONG = {
+    "kind": ('kind = "nmea"', 'kind = "nema"', "sensor[0].kind: 'nema', wanted one of nmea, lines, ros2, stream"),
+    "no kind": ('kind = "nmea"\n', "", "sensor[0].kind: missing, wanted a text"),
+    "key": ("clock_offset_s", "clock_ofset_s", "sensor[1].clock_ofset_s: not known, wanted id, kind"),
+    "id": ('id = "camera"', 'id = "my camera"', "sensor[1].id: 'my camera', wanted a word of letters"),
+    "twice": ('id = "camera"', 'id = "nmea"', "sensor[1].id: 'nmea', wanted another name for each sensor"),
+    "CCD line": ("{N =", "{Q =", "sensor[2].images: CCD line 'Q', wanted F, N, B"),
+    "band": ('"file:gnss.nmea"', '"gnss.nmea"', "sensor[0].address: 'gnss.nmea', wanted serial:PORT"),
+    "time": ("09:30:00Z\nline_rate_hz = 100\n[[sensor]]", "\n[[sensor]]", "not valid TOML"),
+    "rate": (
+        "line_rate_hz = 100\n[[sensor]]",
+        "[[sensor]]",
+        "strips[0].line_rate_hz: missing, wanted a number above 0",
+    ),
+    "origin": ("ground_height_m", "origin_deg = [148, 9]\nground_height_m", "flight.origin_deg: [148, 9], wanted lat"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_said_in_one_line(folder, what, capsys):
+    old, new, wanted = WRONG[what]
+    assert TOML.count(old) >= 1
+    (folder / "flight.toml").write_text(TOML.replace(old, new, 1))
+    assert main(["fly", str(folder)]) == 1
+    said = capsys.readouterr().err
+    assert wanted in said and said.count("\n") == 1
+
+
+def test_a_flight_is_not_written_over(folder, capsys):
+    out = folder / "out"
+    out.mkdir()
+    (out / "flight.mcap").write_bytes(b"")
+    assert main(["fly", str(folder), "-o", str(out)]) == 1
+    assert "holds a flight already, wanted another folder" in capsys.readouterr().err
+    assert main(["fly", str(folder / "nowhere")]) == 1
+    assert "no flight.toml" in capsys.readouterr().err
+
+
+def test_a_program_publishes_under_its_id_and_tells_what_it_refuses(tmp_path):
+    port, device = free_port(), free_port()
+    said, received, statuses = [], [], []
+    table = {"id": "imu1", "address": f"listen://127.0.0.1:{device}", "imu_noise": [1e-5, 1e-3]}
+    options = ProgramOptions("stream", "here", port, tables={"stream": table}, report=said.append)
+    with Bus("here", source="test", port=port) as bus:
+        bus.subscribe("sensor/imu", received.append)
+        bus.subscribe("status/*", lambda raw: statuses.append(decode(raw.topic, raw.data)))
+        thread = threading.Thread(target=run, args=(options,))
+        thread.start()
+        try:
+            wait_for(lambda: "imu1" in bus.alive(), 60, "the program")
+            wait_for(lambda: bus.peers(), 60, "the link")
+            with socket.create_connection(("127.0.0.1", device)) as driver:
+                text = "".join(f"IMU {T + i} 10000000 0 0 -9.8 0 0 0\n" for i in range(5))
+                driver.sendall(text.encode() + b"rubbish\nrubbish\n")
+            wait_for(lambda: len(received) >= 5, 60, "the samples")
+            wait_for(lambda: statuses and "2 refused" in statuses[-1].state, 60, "the status")
+        finally:
+            options.stop.set()
+            thread.join(60)
+    assert [(r.envelope.source, r.envelope.sequence, r.envelope.stamp_ns) for r in received] == [
+        ("imu1", i, T + i) for i in range(5)
+    ]
+    body = decode("sensor/imu", received[0].data)
+    np.testing.assert_allclose([body.rate_sigma, body.force_sigma], [1e-4, 1e-2])  # over 10 ms
+    assert statuses[-1].state == "5 messages, 2 refused"
+    assert [(c.name, c.value) for c in statuses[-1].counters] == [("not a record", 2)]
+    assert len([line for line in said if "not a record: rubbish, wanted GNSS, IMU" in line]) == 1
+
+
+def test_first_data():
+    first = FirstData()
+    first.take(RawMessage("sensor/imu", Envelope(T + 7, "imu", 0), encode(m.Imu(time_ns=T + 7, force_z=-9.8))))
+    assert (first.newest_ns, first.place) == (T + 7, None)
+    first.take(RawMessage("sensor/imu", Envelope(T + 9, "imu", 0), b"\xff"))  # not decodable
+    fix = encode(gnss_message(T, (48.1234567, 9.0, 500.0), (1.0, 1.0, 2.0)))
+    first.take(RawMessage("sensor/gnss", Envelope(T, "gnss", 0), fix))
+    assert (first.newest_ns, first.place) == (T + 7, (48.123457, 9.0))
+
+
+def test_clocks_that_are_apart_are_told():
+    first = FirstData()
+    fix = encode(gnss_message(T, (48.1, 9.0, 500.0), (1.0, 1.0, 2.0)))
+    first.take(RawMessage("sensor/lines/N", Envelope(T - 18_000_000_000, "camera", 0), b"", T + 5))
+    assert first.apart() == {} and not first.newest_ns
+    first.take(RawMessage("sensor/gnss", Envelope(T, "gnss", 0), fix, T + 200_000_000))
+    first.take(RawMessage("sensor/imu", Envelope(T, "imu", 0), b"", T + 900_000_000))
+    (text,) = first.apart().values()
+    assert text.startswith("sensor/lines/N is stamped -17.8 s against sensor/gnss that came at the same time")
+
+
+def test_what_comes_in_and_what_is_missing():
+    now = [0.0]
+    watch = SensorWatch([("sensor/gnss",), ("sensor/imu", "sensor/attitude"), ("sensor/lines/N",)], lambda: now[0])
+
+    def look(seconds: float, **received: int) -> list[str]:
+        lines = []
+        for _ in range(round(seconds * 2)):
+            now[0] += 0.5
+            for name in received:
+                counted[name] = counted.get(name, 0) + received[name] // 2
+            topics = [
+                SimpleNamespace(topic=f"sensor/{name.replace('_', '/')}", received=n, gaps=0, malformed=0)
+                for name, n in counted.items()
+            ]
+            lines += watch.look({"recorder": SimpleNamespace(topics=topics)})
+        return lines
+
+    counted: dict[str, int] = {}
+    assert look(1) == [] and watch.never == ["sensor/gnss", "sensor/imu or sensor/attitude", "sensor/lines/N"]
+    assert look(6, gnss=4, attitude=100) == ["sensor/gnss comes in", "sensor/attitude comes in"]
+    assert watch.line().startswith("sensor/gnss 4.0/s, sensor/attitude 100.0/s; sensor/lines/N never seen")
+    (stopped,) = look(8, attitude=100)
+    assert stopped.startswith("sensor/gnss stopped") and watch.never == ["sensor/lines/N"]
+    assert look(2, gnss=4, attitude=100) == ["sensor/gnss comes in"]
+    # a recorder that is started again counts from 0
+    before = {row.name: row.received for row in watch.rows()}
+    counted.clear()
+    look(2, gnss=4, attitude=100)
+    after = {row.name: row.received for row in watch.rows()}
+    assert after["sensor/gnss"] == before["sensor/gnss"] + 8 and watch.never == ["sensor/lines/N"]
+    watch.tell("gnss has ended: no such port")
+    assert look(0.5, gnss=4) == ["gnss has ended: no such port"]

@@ -1,0 +1,131 @@
+"""Records of somebody's own driver, and the C program of the documentation as one."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import threading
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_rig import free_port
+from places import ROOT
+
+from triline.nodes.convert import time_ns
+from triline.nodes.errors import UserError
+from triline.nodes.formats.keys import Keys
+from triline.nodes.sensors.program import Clock
+from triline.nodes.sensors.stream import Stream, StreamParser, StreamSettings
+
+T = 1_795_339_670_000_000_000
+PIXELS = np.arange(12, dtype="<u2").reshape(3, 4) * 1000
+
+
+def parse(data: bytes, size: int = 0, clock: Clock | None = None):
+    counts: Counter[str] = Counter()
+    parser = StreamParser(clock or Clock(), lambda kind, text: counts.update([kind]))
+    parts = [data[i : i + size] for i in range(0, len(data), size)] if size else [data]
+    return [message for part in parts for message in parser.feed(part)], counts
+
+
+ALL = (
+    f"GNSS {T} 47.9 11.1 1500 0.02 0.03 0.05\nIMU {T + 5} 5000000 0.1 0.2 -9.8 0.01 0.02 0.03\n"
+    f"ATTITUDE {T + 6} 0.01 0.02 1.5 0.001 0.001 0.002\n"
+    f"LINES N S1 40 {T} 5000000 3 4 16\n"
+).encode() + PIXELS.tobytes()
+
+
+@pytest.mark.parametrize("size", [0, 1, 7])
+def test_records_become_messages(size):
+    (gnss, imu, attitude, lines), counts = parse(ALL * 2, size)[0][:4], parse(ALL * 2, size)[1]
+    assert not counts and [m.topic for m in (gnss, imu, attitude, lines)] == [
+        "sensor/gnss", "sensor/imu", "sensor/attitude", "sensor/lines/N"
+    ]  # fmt: skip
+    assert time_ns(gnss.body.timestamp) == gnss.stamp_ns == T
+    np.testing.assert_allclose(np.sqrt(gnss.body.position_covariance[::4]), [0.02, 0.03, 0.05])
+    b = imu.body
+    values = [b.force_x, b.force_y, b.force_z, b.rate_x, b.rate_y, b.rate_z]
+    assert values == [0.1, 0.2, -9.8, 0.01, 0.02, 0.03] and (b.time_ns, b.interval_ns) == (T + 5, 5_000_000)
+    assert (attitude.body.roll, attitude.body.pitch, attitude.body.heading) == (0.01, 0.02, 1.5)
+    block = lines.body
+    np.testing.assert_array_equal(block.pixels, PIXELS)
+    assert (block.ccd, block.strip, block.first_line, block.time_ns) == ("N", "S1", 40, T)
+    assert lines.stamp_ns == T + 10_000_000  # when the last of its lines has been read
+    assert len(parse(ALL * 2, size)[0]) == 8
+
+
+def test_the_clock_of_a_driver():
+    messages, _ = parse(ALL, clock=Clock(offset_ns=1_000_000, delay_ns=300))
+    assert [m.stamp_ns - T for m in messages] == [-999_700, -999_695, -999_694, 9_000_300]
+    assert messages[3].body.time_ns == T - 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("bad", "kind"),
+    [
+        (b"HELLO 1 2\n", "not a record"),
+        (b"\x00" * 2000 + b"\n", "not a record"),
+        (b"GNSS 1 2 3\n", "not readable"),
+        (b"IMU x 5000000 0 0 0 0 0 0\n", "not readable"),
+        (b"GNSS %d 47.9 nan 1500 1 1 1\n" % T, "not readable"),
+        (b"LINES N S1 0 %d 5000000 3 4 12\n" % T, "not readable"),
+        (b"LINES N S1 0 %d 5000000 0 4 16\n" % T, "not readable"),
+    ],
+)
+def test_what_cannot_be_read_is_counted_and_the_next_record_comes(bad, kind):
+    messages, counts = parse(bad + ALL)
+    assert len(messages) == 4 and counts == {kind: 1}
+
+
+def test_address():
+    def read(address):
+        return StreamSettings.read(Keys(Path("flight.toml"), {"address": address}, "sensor[0]"), Path()).address
+
+    assert read("listen://127.0.0.1:5555") == "listen://127.0.0.1:5555"
+    for wrong in ("listen://127.0.0.1", "5555", "listen://x:99999"):
+        with pytest.raises(UserError, match=r"sensor\[0\].address: .* wanted listen://HOST:PORT, serial"):
+            read(wrong)
+    with socket.create_server(("127.0.0.1", 0)) as held, pytest.raises(UserError, match="address already in use"):
+        settings = StreamSettings("s", f"listen://127.0.0.1:{held.getsockname()[1]}", 115200, Clock())
+        next(Stream(settings).messages(threading.Event()))
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_program_in_c(tmp_path):
+    program, port, stop = tmp_path / "publish_sensors", free_port(), threading.Event()
+    source = ROOT / "docs" / "examples" / "publish_sensors.c"
+    compiled = subprocess.run(
+        ["cc", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-o", program, source, "-lm"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert compiled.returncode == 0, compiled.stderr
+    sensor = Stream(StreamSettings("camera", f"listen://127.0.0.1:{port}", 115200, Clock()))
+    come = sensor.messages(stop)
+    assert next(come) is None  # it listens
+    driver = subprocess.Popen([program, "127.0.0.1", str(port), "1"])
+    messages = []
+    while len(messages) < 200 + 5 + 10:
+        message = next(come)
+        messages += [] if message is None else [message]
+    assert driver.wait(60) == 0 and not sensor.counters
+    stop.set()
+    counts = Counter(message.topic for message in messages)
+    assert counts == {"sensor/imu": 200, "sensor/gnss": 5, "sensor/lines/N": 10}
+    blocks = [message.body for message in messages if message.topic == "sensor/lines/N"]
+    assert [block.first_line for block in blocks] == list(range(0, 200, 20))
+    np.testing.assert_array_equal(blocks[1].pixels[0], 20 * 7 + np.arange(64))
+    steps = np.diff([message.stamp_ns for message in messages if message.topic == "sensor/imu"])
+    assert set(steps.tolist()) == {5_000_000}
+    assert np.ptp(np.diff(np.concatenate([block.times_ns() for block in blocks]))) == 0
+
+
+def test_the_program_in_c_says_when_nobody_listens(tmp_path):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    source = ROOT / "docs" / "examples" / "publish_sensors.c"
+    subprocess.run(["cc", "-std=gnu11", "-o", tmp_path / "p", source, "-lm"], check=True)
+    done = subprocess.run([tmp_path / "p", "127.0.0.1", str(free_port()), "1"], capture_output=True, text=True)
+    assert done.returncode == 1 and "nobody listens" in done.stderr
