@@ -45,6 +45,8 @@ def decode(topic: str, data: bytes | memoryview) -> Any:
     ValueError : it cannot be decoded, or holds values no publisher may send (not finite, of the wrong size)
     KeyError : the topic is not in the topic table
     """
+    if not len(data) and topics.find(topic).family in (topics.Family.CONFIGURATION, topics.Family.SENSOR):
+        raise ValueError(f"empty, wanted a {topics.find(topic).type_name}")
     body = parse(topic, data)
     if not isinstance(body, LineBlock):
         validate(body)
@@ -108,6 +110,8 @@ def validate(body: Any) -> None:
         _find_fault(body)
     if isinstance(body, m.LocationFix) and not abs(body.latitude) <= 90:
         raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
+    if isinstance(body, m.Camera) and not (body.lenses and body.lines):
+        raise ValueError(f"camera {body.name!r} with {len(body.lenses)} lenses and {len(body.lines)} CCD lines")
     if isinstance(body, m.PoseInFrame):
         q = body.pose.orientation
         norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)

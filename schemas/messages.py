@@ -21,22 +21,6 @@ def message_class(full_name: str) -> Any:
     return message_factory.GetMessageClass(_POOL.FindMessageTypeByName(full_name))
 
 
-def file_descriptor_set(full_name: str) -> bytes:
-    """The serialised descriptors a reader needs for one type: its file and all it imports (for MCAP schemas)."""
-    wanted: dict[str, descriptor_pb2.FileDescriptorProto] = {}
-
-    def add(descriptor: Any) -> None:
-        if descriptor.name not in wanted:
-            for dependency in descriptor.dependencies:
-                add(dependency)
-            proto = descriptor_pb2.FileDescriptorProto()
-            descriptor.CopyToProto(proto)
-            wanted[descriptor.name] = proto
-
-    add(_POOL.FindMessageTypeByName(full_name).file)
-    return descriptor_pb2.FileDescriptorSet(file=list(wanted.values())).SerializeToString(deterministic=True)
-
-
 LocationFix = message_class("foxglove.LocationFix")
 PoseInFrame = message_class("foxglove.PoseInFrame")
 RawImage = message_class("foxglove.RawImage")

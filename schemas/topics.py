@@ -116,6 +116,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic("matching/pace", m.Pace, Family.DECISION, 0),
     Topic("truth/trajectory", m.PoseInFrame, Family.TRUTH, 20),
     Topic("truth/point", m.GroundPoint, Family.TRUTH, 0, latched=True),
+    # by what the world of a simulation differs from what is said of it; absent where it does not
+    Topic("truth/world", m.Log, Family.TRUTH, 0, latched=True),
     Topic("event/log", m.Log, Family.STATUS, 0),
     Topic("status/*", m.NodeStatus, Family.STATUS, 2, queue=Queue.NEWEST),
 )

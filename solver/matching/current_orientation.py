@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..measured_trajectory import GrowingTrajectory
-from ..rotation import corrected_angles, matrix_from_angles
+from ..geometry.measured_trajectory import GrowingTrajectory
+from ..geometry.rotation import corrected_angles, matrix_from_angles
 from .pose_smoothing import PoseSmoother
 from .steady_positions import SteadyPositions
 

@@ -18,17 +18,17 @@ Mask = NDArray[np.bool_]
 CONVERGED_PX = 0.003
 #: Gaussian weight of the window: its standard deviation as a share of the side.
 WEIGHT_SHARE = 0.3
-#: Residuals are alike over so many pixels, at most.
+#: Residuals are alike over so many pixels, px, at most. Tuned.
 BOX = 7
 #: The eight unknowns take out of the residuals what moves them: over boxes of this size, white noise then shows only
-#: 1 / 1.7 of what it does (derived by `tests/test_least_squares_matching.py`).
+#: 1 / 1.7 of what it does (derived by `tests/solver/matching/test_least_squares_matching.py`).
 SHORTFALL = 1.7
 #: Share of white noise's variance that is left in residuals of patches that were resampled: bicubic values keep 0.81
 #: along and 0.81 across (mean of the squared weights over all phases). The searched patch is taken from where it was
 #: found, so that interpolating it again changes nothing; of the master, whose samples are those of the grid, only the
-#: lines are interpolated: (0.66 + 0.81) / 2. What moves a patch, the low frequencies of the noise, stays.
+#: lines are interpolated: (0.66 + 0.81) / 2 (derived). What moves a patch, the low frequencies of the noise, stays.
 SMOOTHED = 0.73
-#: Difference of bicubic values half a pixel to either side.
+#: Difference of bicubic values half a pixel to either side (derived).
 GRADIENT_TAPS = np.array([-1.0, 10.0, 0.0, -10.0, 1.0]) / 16.0
 #: Scale and shear stay within this of none.
 LARGEST_SHEAR = 0.35

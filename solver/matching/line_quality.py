@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 #: A line is dark if nine tenths of it lie below this share of full scale, saturated if nine tenths lie above;
 #: if a third does, it is told of, but what is left of it is used.
 DARK, SATURATED = 0.02, 0.995
+#: Places in `REASONS` (definition).
 GOOD, IS_DARK, IS_SATURATED, IS_FROZEN, IS_PARTLY_SATURATED = 0, 1, 2, 3, 4
 REASONS = ("good", "dark", "saturated", "frozen", "partly saturated")
-#: So many samples of a line are looked at.
+#: So many samples of a line are looked at. Tuned, for speed.
 SAMPLES = 512
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import LineCamera
+from ..camera.line_camera import LineCamera
 
 Array = NDArray[np.floating]
 

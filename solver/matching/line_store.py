@@ -17,7 +17,7 @@ LANE = 512
 FEWEST_LANES = 4
 #: Gaps of no more lines than this are closed: what lies between the lines around them is put in, and marked.
 LONGEST_FILLED = 8
-#: What a ring knows of a line.
+#: What a ring knows of a line (definition).
 NOTHING, SEEN, FILLED = 0, 1, 2
 
 

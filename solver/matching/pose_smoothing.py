@@ -12,7 +12,12 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rotation import quaternion_conjugate, quaternion_from_vector, quaternion_multiply, vector_from_quaternion
+from ..geometry.rotation import (
+    quaternion_conjugate,
+    quaternion_from_vector,
+    quaternion_multiply,
+    vector_from_quaternion,
+)
 
 Array = NDArray[np.floating]
 
@@ -20,7 +25,7 @@ Array = NDArray[np.floating]
 REACHES = (8, 4, 2)
 #: What is learnt is an average over so many poses. Motion is smooth enough if it adds less than this to the noise.
 MEMORY, LARGEST_EXCESS = 200, 1.5
-#: Fourth differences of white noise have 70 times its variance; those of smooth motion vanish.
+#: Fourth differences of white noise have 70 times its variance; those of smooth motion vanish (derived).
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70.0)
 
 

@@ -28,8 +28,10 @@ LEAST_TEMPLATE, LEAST_SEARCH = 0.7, 0.4
 #: Share of a template's weight in least squares that must have been measured in both images.
 LEAST_MEASURED = 0.6
 #: So often the searched patch is taken anew from where least squares found it; iterations of least squares before, and
-#: with the last patch; the furthest that all of them go, px.
-AGAIN, FIRST_ITERATIONS, ITERATIONS, FURTHEST = 2, 4, 8, 2.0
+#: with the last patch. Tuned.
+AGAIN, FIRST_ITERATIONS, ITERATIONS = 2, 4, 8
+#: The furthest that all these iterations go, px. Tuned.
+FURTHEST = 2.0
 #: The template of least squares in a patch with its margin.
 INNER = slice(MARGIN, MARGIN + 2 * LEAST_SQUARES_HALF + 1)
 #: Along a row of a grid every so many pixels are computed exactly; a patch covers at most so many times its size.

@@ -17,12 +17,12 @@ Array = NDArray[np.floating]
 #: A parabola is laid through the positions within so many seconds of a knot, with normal weights of that sigma, s.
 REACH_S, WEIGHT_S = 0.75, 0.375
 #: Distance of the knots, s.
-KNOT_S = 0.1
+POSITION_KNOT_S = 0.1
 #: With fewer positions about a knot than this they are taken as they are.
 FEWEST = 12
 #: What is learnt is the median over so many blocks of so many seconds; nothing is known before there are so many.
 BLOCKS, BLOCK_S, FEWEST_BLOCKS = 15, 1.0, 2
-#: Fourth differences, and how large they get at a step: 1, -3, 3, -1 times it.
+#: Fourth differences, and how large they get at a step: 1, -3, 3, -1 times it (derived).
 FOURTH, HIGHEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]), 3.0
 #: Motion is smooth enough if what positions leave the curve by is no more than this share of the largest steps of a
 #: block (mean squares). Noise of fixes, 1 to 10 a second, comes to 0.1 to 0.2.
@@ -63,13 +63,13 @@ class SteadyPositions:
         self._size = n + 1
         self._open.clear()
         if n < 4:
-            self._next = int(np.floor(self._time[0] / KNOT_S))
+            self._next = int(np.floor(self._time[0] / POSITION_KNOT_S))
             return
         steps = np.diff(self._time[n - 4 : n + 1])
         if np.ptp(steps) <= 0.05 * steps.mean():
             self._fourth.append(FOURTH @ self._position[n - 4 : n + 1])
         assert self._next is not None
-        while self._next * KNOT_S + REACH_S <= time_s:
+        while self._next * POSITION_KNOT_S + REACH_S <= time_s:
             self._settle(self._next)
             self._next += 1
 
@@ -77,15 +77,15 @@ class SteadyPositions:
         """The curve (n, 3) at times (n,), inside the positions; ``position_l`` is what stands where there is none."""
         if not self.smooth or not len(time_s):
             return position_l
-        number = np.floor(time_s / KNOT_S).astype(int)
+        number = np.floor(time_s / POSITION_KNOT_S).astype(int)
         first = int(number.min())
         knots = [self._knot(k) for k in range(first, int(number.max()) + 2)]
         there = np.array([knot is not None for knot in knots])
         value, slope = (np.stack([np.zeros(3) if knot is None else knot[i] for knot in knots]) for i in (0, 1))
         i = number - first
-        s = (time_s / KNOT_S - number)[:, None]
+        s = (time_s / POSITION_KNOT_S - number)[:, None]
         before, after = 1 - s * s * (3 - 2 * s), s * s * (3 - 2 * s)
-        turn, turn_after = KNOT_S * s * (1 - s) ** 2, -KNOT_S * s * s * (1 - s)
+        turn, turn_after = POSITION_KNOT_S * s * (1 - s) ** 2, -POSITION_KNOT_S * s * s * (1 - s)
         curve = before * value[i] + after * value[i + 1] + turn * slope[i] + turn_after * slope[i + 1]
         return np.where((there[i] & there[i + 1])[:, None], curve, position_l)
 
@@ -94,7 +94,7 @@ class SteadyPositions:
         if number in self._knots:
             return self._knots[number]
         if number not in self._open:
-            self._open[number] = self._fit(number * KNOT_S)
+            self._open[number] = self._fit(number * POSITION_KNOT_S)
         return self._open[number]
 
     def _fit(self, at_s: float) -> tuple[Array, Array] | None:
@@ -113,19 +113,19 @@ class SteadyPositions:
 
     def _settle(self, number: int) -> None:
         """All positions about a knot have come."""
-        at_s = number * KNOT_S
+        at_s = number * POSITION_KNOT_S
         knot = self._knots[number] = self._fit(at_s)
-        self._knots.pop(number - round(KEPT_S / KNOT_S), None)
+        self._knots.pop(number - round(KEPT_S / POSITION_KNOT_S), None)
         if knot is None:
             return
         i = int(np.searchsorted(self._time[: self._size], at_s))
         value, slope = knot
         left = self._position[i] - value - slope * (self._time[i] - at_s)
         self._left.append(left)
-        if number * KNOT_S >= (self._block + 1) * BLOCK_S:
+        if number * POSITION_KNOT_S >= (self._block + 1) * BLOCK_S:
             # steps are those of the newest positions; blocks need not be the same
             self._blocks.append((float(np.square(self._left).mean()), _steps_m2(np.array(self._fourth))))
-            self._block = int(number * KNOT_S / BLOCK_S)
+            self._block = int(number * POSITION_KNOT_S / BLOCK_S)
             self._fourth.clear()
             self._left.clear()
 

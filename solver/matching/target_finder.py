@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ..camera import LineCamera
+from ..camera.line_camera import LineCamera
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles
 from ..ranges import check_ranges
-from ..rotation import angles_from_matrix, matrix_from_angles
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
 from .line_store import LineRing, Stretch

@@ -10,7 +10,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import LineCamera
+from ..camera.line_camera import LineCamera
 from .chips import ChipStore
 from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake

@@ -22,7 +22,7 @@ PATIENCE_S = 5.0
 SOON_S = 0.3
 #: Looks that complete a point are matched together: at most so many; fewer than `ENOUGH` wait until lines of so many
 #: seconds have come.
-BATCH, ENOUGH, BATCH_S = 64, 12, 0.08
+BATCH, FULL_BATCH, BATCH_S = 64, 12, 0.08
 #: The others have time: so many at once, which wait for company so long.
 EARLY_BATCH, EARLY_S = 12, 0.4
 #: Places within so many lines lie beside each other.
@@ -166,7 +166,7 @@ class WaitingRoom:
         if j in self._early:
             waits = len(ready) < EARLY_BATCH and here - due[ready[0]] < EARLY_S * p.rate
             return ready[:0] if waits else ready[:EARLY_BATCH]
-        if len(ready) < ENOUGH and until < self._matched_to[j] + BATCH_S * p.rate:
+        if len(ready) < FULL_BATCH and until < self._matched_to[j] + BATCH_S * p.rate:
             return ready[:0]
         self._matched_to[j] = until
         return ready[:BATCH]

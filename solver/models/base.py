@@ -11,7 +11,7 @@ Order of the six corrections everywhere: X, Y, Z (metres), omega, phi, kappa (ra
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
@@ -68,6 +68,20 @@ class Design:
         padded = np.append(np.asarray(theta, dtype=float), 0.0)  # column -1 reads the zero
         return np.einsum("nk,nkc->nc", self.coefficients, padded[self.columns])
 
+    def unknowns(self) -> NDArray[np.int64]:
+        """The unknowns (u,) that the corrections depend on, ascending."""
+        numbers = np.unique(self.columns)
+        return numbers[numbers >= 0].astype(np.int64)
+
+    def functions(self) -> tuple[NDArray[np.int64], Array]:
+        """The same, and the corrections as linear functions (n, 6, u) of them."""
+        numbers = self.unknowns()
+        n, u = len(self.columns), len(numbers)
+        local = np.where(self.columns >= 0, np.searchsorted(numbers, self.columns), u)
+        A = np.zeros((n, 6, u + 1))
+        A[np.arange(n)[:, None, None], np.arange(6), local] += self.coefficients[:, :, None]
+        return numbers, A[:, :, :-1]
+
 
 @dataclass(frozen=True)
 class PseudoObservations:
@@ -89,6 +103,24 @@ class PseudoObservations:
 
     def __len__(self) -> int:
         return len(self.value)
+
+
+#: Groups of slow errors whose a-priori sigmas are right or wrong together: what is constant over a strip, or drifts
+#: over it, and what wanders.
+OFFSET, SHIFT, POSITION_WANDER, ATTITUDE_WANDER = range(4)
+ERROR_GROUPS = ("offset", "shift and drift", "wander of position", "wander of attitude")
+_ANGLES = ("omega", "phi", "kappa")
+
+
+def error_groups(labels: Sequence[str]) -> NDArray[np.int64]:
+    """Group (m,) of each a-priori equation, by the words of its label: a place in `ERROR_GROUPS`."""
+    groups = np.empty(len(labels), dtype=np.int64)
+    for i, label in enumerate(labels):
+        words = label.partition(" of strip")[0]
+        angle = any(name in words for name in _ANGLES)
+        constant = any(word in words for word in ("offset", "shift", "drift"))
+        groups[i] = angle if constant else POSITION_WANDER + angle
+    return groups
 
 
 def direct_observations(sigma: ArrayLike, labels: tuple[str, ...]) -> PseudoObservations:

@@ -9,7 +9,6 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..slow_errors import SlowErrors
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -21,7 +20,7 @@ from .base import (
     join_observations,
     three,
 )
-from .process import (
+from .piecewise_weights import (
     BEFORE,
     constant_names,
     constants_stated,
@@ -33,6 +32,7 @@ from .process import (
     wander_sigma,
     with_constants,
 )
+from .slow_errors import SlowErrors
 from .wander import GLOBALS
 
 Array = NDArray[np.floating]
@@ -51,7 +51,7 @@ class LimOptions(ModelOptions):
         errors are known: as close as their correlation time asks for
     merge : whether fixes are merged at all
     offset_sigma_m, shift_sigma_deg : of the zero observations of every fix
-    slow : the slow errors, where they are known as a process (see `process`): instead of zero observations
+    slow : the slow errors, where they are known as a process (see `piecewise_weights`): instead of zero observations
     """
 
     name: ClassVar[str] = "lim"

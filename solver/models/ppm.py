@@ -9,8 +9,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..slow_errors import SlowErrors
-from ..wander import damping_rate, second_order_gauss_markov
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -22,7 +20,8 @@ from .base import (
     join_observations,
     three,
 )
-from .process import (
+from .gauss_markov import damping_rate, second_order_gauss_markov
+from .piecewise_weights import (
     constant_names,
     constants_stated,
     describe_constants,
@@ -32,6 +31,7 @@ from .process import (
     wander_sigma,
     with_constants,
 )
+from .slow_errors import SlowErrors
 from .wander import GLOBALS
 
 Array = NDArray[np.floating]
@@ -60,8 +60,8 @@ class PpmOptions(ModelOptions):
     first_sigma_m, first_sigma_deg : of the first-order terms: change over a segment
     second_sigma_m, second_sigma_deg : of the second-order terms
     continuity_sigma_m, continuity_sigma_deg : of C0; per second of C1; per second squared of C2
-    slow : the slow errors, where they are known as a process (see `process`): C0 then holds, and how value and slope go
-        on from border to border has the weight that the process gives it, instead of all these sigmas
+    slow : the slow errors, where they are known as a process (see `piecewise_weights`): C0 then holds, and how value
+        and slope go on from border to border has the weight that the process gives it, instead of all these sigmas
     """
 
     name: ClassVar[str] = "ppm"

@@ -9,7 +9,8 @@ The errors of a filter do not stay as large as they were: they grow while GNSS i
 From a border on the process can therefore be stated anew (`Wander.restate`): what grows is the old error made larger;
 what becomes smaller is another error, since observations have taken the place of the old one.
 
-Source: the process in `wander`; interpolation as in T. D. Barfoot, State Estimation for Robotics, 2017, section 3.4.
+Source: the process in `gauss_markov`; interpolation as in T. D. Barfoot, State Estimation for Robotics, 2017, section
+3.4.
 """
 
 from __future__ import annotations
@@ -21,8 +22,6 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..slow_errors import SlowErrors
-from ..wander import damping_rate, second_order_gauss_markov
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -34,6 +33,8 @@ from .base import (
     join_observations,
     three,
 )
+from .gauss_markov import damping_rate, second_order_gauss_markov
+from .slow_errors import SlowErrors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int_]

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import earth
-from ..rotation import (
+from ..geometry import earth
+from ..geometry.rotation import (
     matrix_from_navigation,
     navigation_from_matrix,
     quaternion_from_matrix,
@@ -38,11 +38,16 @@ from .strapdown import OMEGA_IE, State, rotation_matrix
 
 Array = NDArray[np.floating]
 
-HEADING_SIGMA = np.radians(2.0)  # an alignment is good enough below this
+#: Standard deviation of heading, rad, below which an alignment is good enough. Tuned.
+HEADING_SIGMA = np.radians(2.0)
+#: Below this speed, m/s, the course over ground says nothing about heading. Tuned.
 SLOWEST_COURSE_M_S = 4.0
+#: Lengths of data, s, from which an alignment is tried, shortest first. Tuned: each is about half as long again.
 _WINDOWS_S = (6.0, 10.0, 16.0, 25.0, 40.0, 60.0, 90.0, 130.0, 190.0, 280.0)
-LARGEST_CHI2 = 25.0  # squares of a fit may be so many times what they should be
-_WIDER = 3.0  # the filter sees the window's data again: sigmas are widened so that they count little twice
+#: Mean square of normalised residuals (1 expected) above which a fit is no alignment. Tuned.
+LARGEST_CHI2 = 25.0
+#: Factor on the sigmas of the alignment. The filter sees the same data again, which then count little twice. Tuned.
+_WIDER = 3.0
 
 
 class AlignmentError(ValueError):

@@ -18,23 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from ..rotation import quaternion_from_matrix, skew, vector_from_quaternion
-from ..wander import damping_rate
+from ..geometry.rotation import quaternion_from_matrix, skew, vector_from_quaternion
+from ..models.gauss_markov import damping_rate
 from .carried import gravitation
 from .error_state import NavigationSettings, bias_variances
 from .filter_pass import rates_at
 from .inertial_data import GnssData, InertialData, cut
-from .strapdown import OMEGA_IE, Block, earth_rotation, integrate_one, rotation_matrix
+from .strapdown import OMEGA_IE, IncrementBlock, earth_rotation, integrate_one, rotation_matrix
 
 Array = NDArray[np.floating]
 
-COURSE_SIGMA = np.radians(12.0)  # drift angle: how far a vehicle's nose may be off its course
-SUSPICIOUS_CHI2 = 2.2  # squares of a fit that are so many times too large have a cause
+#: Standard deviation of the drift angle between heading and course, rad. Tuned.
+COURSE_SIGMA = np.radians(12.0)
+#: Mean square of normalised residuals (1 expected) above which a cause is looked for. Tuned.
+SUSPICIOUS_CHI2 = 2.2
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Body integrals from ``t0`` to the m fixes of a window (see `strapdown.Block`), and what GNSS says there."""
+    """Body integrals from ``t0`` to the m fixes of a window (see `strapdown`), and what GNSS says there."""
 
     tau: Array  # (m,)
     R: Array  # (m, 3, 3)
@@ -69,7 +71,7 @@ def curve(inertial: InertialData, gnss: GnssData, t0: float) -> Curve:
     pieces = cut(inertial, np.concatenate([[t0], gnss.time_s]))[0]
     middle = pieces.time_s - 0.5 * pieces.dt_s
     zero = np.zeros(3)
-    blocks, total, last = [], Block.empty(), int(np.searchsorted(middle, t0))
+    blocks, total, last = [], IncrementBlock.empty(), int(np.searchsorted(middle, t0))
     for t in gnss.time_s:
         end = int(np.searchsorted(middle, t))
         if end > last:

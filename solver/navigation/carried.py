@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import earth
-from ..frames import LocalFrame
-from ..rotation import (
+from ..geometry import earth
+from ..geometry.frames import LocalFrame
+from ..geometry.rotation import (
     R_BC_NOMINAL,
     angles_from_matrix,
     angles_jacobian,

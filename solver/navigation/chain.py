@@ -13,14 +13,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rotation import quaternion_from_matrix
+from ..geometry.rotation import quaternion_from_matrix
 from .carried import NavigationTrajectory
-from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Start
+from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Observation, Start
 from .filter_pass import Carried, Estimates
 from .inertial_data import GnssData, InertialData, cut
-from .observations import AntennaPosition, AntennaVelocity, Observation
+from .observations import AntennaPosition, AntennaVelocity
 from .smoother import corrected, gains, recurse
-from .strapdown import Block, State, integrate_one, integrate_to, propagate
+from .strapdown import IncrementBlock, State, integrate_one, integrate_to, propagate
 
 Array = NDArray[np.floating]
 
@@ -30,7 +30,7 @@ class Chunk:
     """Inertial pieces between two poses, and their integrals where they have been needed."""
 
     pieces: InertialData
-    block: Block | None
+    block: IncrementBlock | None
 
     @property
     def end_s(self) -> float:
@@ -44,10 +44,10 @@ class Span:
     gyro: Array
     accel: Array
     chunks: list[Chunk] = field(default_factory=list)
-    running: list[Block] = field(default_factory=list)
+    running: list[IncrementBlock] = field(default_factory=list)
 
     @property
-    def total(self) -> Block:
+    def total(self) -> IncrementBlock:
         return self.running[-1]
 
     def append(self, chunk: Chunk) -> None:

@@ -11,20 +11,21 @@ on the rotation group stand around it here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from .. import earth
-from ..wander import damping_rate, second_order_gauss_markov
+from ..geometry import earth
+from ..models.gauss_markov import damping_rate, second_order_gauss_markov
 from .inertial_data import TACTICAL, InertialGrade
-from .observations import Observation
-from .strapdown import Block, State, process_noise, propagate, rotation_matrix, transition
+from .strapdown import IncrementBlock, State, process_noise, propagate, rotation_matrix, transition
 
 Array = NDArray[np.floating]
 
+#: Places in the error state (definition).
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
@@ -37,8 +38,8 @@ class NavigationSettings:
     grade : error model of the inertial sensor
     lever_arm_b : (3,) antenna from the inertial sensor, body axes, metres
     lever_arm_sigma_m : standard deviation of the lever arm; 0 takes it as known, else it is estimated
-    wander_sigma_ned_m : slow errors of GNSS positions north, east, down (see `wander`); zero has none, else they are
-        estimated beside the position
+    wander_sigma_ned_m : slow errors of GNSS positions north, east, down (see `models.gauss_markov`); zero has none,
+        else they are estimated beside the position
     wander_time_s : their correlation time
     scale_factors : estimate scale factors (their sigmas are in the grade)
     step_s : longest time between two covariances
@@ -65,12 +66,14 @@ class NavigationSettings:
     longest_gap_s: float = 10.0
 
     @property
-    def layout(self) -> Layout:
-        return Layout(6 if self.scale_factors else 3, self.lever_arm_sigma_m > 0.0, max(self.wander_sigma_ned_m) > 0.0)
+    def layout(self) -> StateLayout:
+        return StateLayout(
+            6 if self.scale_factors else 3, self.lever_arm_sigma_m > 0.0, max(self.wander_sigma_ned_m) > 0.0
+        )
 
 
 @dataclass(frozen=True)
-class Layout:
+class StateLayout:
     """Where the errors stand in the vector."""
 
     k: int  # per sensor: 3 biases, or 3 biases and 3 scale factors
@@ -119,13 +122,35 @@ class Estimate:
     lever_arm_b: Array
     wander_e: Array = field(default_factory=lambda: np.zeros(6))
 
-    def corrected(self, x: Array, layout: Layout) -> Estimate:
+    def corrected(self, x: Array, layout: StateLayout) -> Estimate:
         """The estimate with errors (n,) put in."""
         s = self.state
         state = State(s.r_e + x[POSITION], s.v_e + x[VELOCITY], rotation_matrix(x[ATTITUDE]) @ s.R_eb)
         arm = self.lever_arm_b + x[layout.lever_arm] if layout.with_lever_arm else self.lever_arm_b
         wander = self.wander_e + x[layout.wander] if layout.with_wander else self.wander_e
         return Estimate(self.time_s, state, self.gyro + x[layout.gyro], self.accel + x[layout.accel], arm, wander)
+
+
+class Observation(Protocol):
+    """An observation at the time of an estimate.
+
+    Attributes
+    ----------
+    kind : its name
+    axes : (3, 3) from the axes of the innovation to those it is shown in, or None
+    gated : whether an innovation that is too large is weighted down or rejected
+    """
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def axes(self) -> Array | None: ...
+    @property
+    def gated(self) -> bool: ...
+
+    def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
+        """Innovation (m,), its derivative (m, n) with respect to the errors, and the noise covariance (m, m)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +252,7 @@ class ErrorStateFilter:
         self.estimate, self.kf.P = estimate, P
         self.rejections, self._doubts, self._doubted_s = memory
 
-    def predict(self, block: Block, gyro_ref: Array, accel_ref: Array) -> Array:
+    def predict(self, block: IncrementBlock, gyro_ref: Array, accel_ref: Array) -> Array:
         """Over a block that was integrated with given sensor errors taken off; returns the transition matrix (n, n)."""
         e = self.estimate
         gyro, accel = e.gyro, e.accel
@@ -243,7 +268,7 @@ class ErrorStateFilter:
         self.estimate = Estimate(e.time_s + block.duration_s, new, gyro, accel, e.lever_arm_b, wander)
         return F
 
-    def transition(self, state: State, block: Block) -> tuple[Array, Array, float]:
+    def transition(self, state: State, block: IncrementBlock) -> tuple[Array, Array, float]:
         """Transition matrix (n, n), process noise (n, n) and what is left of a bias after a block."""
         g, lay = self.settings.grade, self.layout
         T = block.duration_s

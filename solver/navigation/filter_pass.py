@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Start
+from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Observation, Start
 from .inertial_data import GnssData, InertialData, cut
-from .observations import AntennaPosition, AntennaVelocity, Observation
+from .observations import AntennaPosition, AntennaVelocity
 from .strapdown import integrate, without_errors
 
 Array = NDArray[np.floating]
 
-_CHUNK_S = 20.0  # sensor errors are taken off anew so often; in between to first order
+#: Estimated sensor errors are taken off the raw data anew after so long, s; in between to first order. Tuned.
+_CHUNK_S = 20.0
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..frames import LocalFrame
+from ..geometry.frames import LocalFrame
 from .inertial_data import GnssData
 
 

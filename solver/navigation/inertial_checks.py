@@ -22,10 +22,12 @@ from .inertial_windows import DataWindow, best_fit, data_windows, misfit, misfit
 
 Array = NDArray[np.floating]
 
+#: Misfit (mean square of normalised residuals, 1 expected) above which a cause is looked for.
 _BAD = SUSPICIOUS_CHI2
-_GOOD = 1.5  # a cause is named if it brings them down to this,
-_BETTER = 10.0  # or makes them so many times smaller
-_CLEARLY = 1.3  # another cause whose misfit is less than so many times that of the best is named beside it
+#: A cause is named if it brings the misfit down to the first of these, or makes it so many times smaller. Tuned.
+_GOOD, _BETTER = 1.5, 10.0
+#: Another cause whose misfit is less than so many times that of the best is named beside it. Tuned.
+_CLEARLY = 1.3
 _NAMES = ("forward", "right", "down")
 
 

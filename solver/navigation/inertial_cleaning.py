@@ -33,7 +33,7 @@ class Finding:
     place: tuple[int, int] | None = None
 
 
-#: A value beyond these (rad/s, m/s^2) and so many times what nearly all others stay below is no measurement.
+#: A value beyond these, rad/s and m/s^2, and so many times what nearly all others stay below is no measurement.
 _RATE_LIMIT, _FORCE_LIMIT, _TIMES = 35.0, 500.0, 20.0
 
 

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import earth
+from ..geometry import earth
 
 Array = NDArray[np.floating]
 
-#: A sample that comes later than this share of the sampling interval has lost something before it.
+#: A sample that comes later than this share of the sampling interval has lost something before it. Tuned.
 GAP_FACTOR = 1.6
 
 
@@ -311,7 +311,7 @@ class InertialGrade:
         return replace(like, gyro_noise=gyro_noise or like.gyro_noise, accel_noise=accel_noise or like.accel_noise)
 
 
-#: Fibre-optic or ring-laser unit of an airborne mapping system.
+#: Fibre-optic or ring-laser unit of an airborne mapping system; derived from data sheets.
 TACTICAL = InertialGrade.from_datasheet(0.003, 0.03, 0.005, 15.0)
-#: Good industrial MEMS unit.
+#: Good industrial MEMS unit; derived from data sheets.
 MEMS = InertialGrade.from_datasheet(0.2, 20.0, 0.05, 2000.0)

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..frames import LocalFrame
+from ..geometry.frames import LocalFrame
 from .alignment import AttitudePrior
 from .carried import CameraMount, NavigationStates, passed_over
 from .chain import NavigationChain

@@ -18,9 +18,9 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
-from ..frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from ..rotation import angles_from_matrix, quaternion_from_matrix
-from ..wander import second_order_gauss_markov
+from ..geometry.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
+from ..geometry.rotation import angles_from_matrix, quaternion_from_matrix
+from ..models.gauss_markov import second_order_gauss_markov
 from .kinematic_model import N_STATES, WD, A, KinematicOptions, P, V, W, noise_time, quintic, transition
 from .pose import AttitudeHistory, NavigationEvent, NavigationPose, PoseMaker
 
@@ -41,9 +41,9 @@ class _Epoch:
     accepted: bool
 
 
-#: While coasting, an epoch without a fix is put in after this time, so that the smoother has states to lean on.
+#: While coasting, an epoch without a fix is put in after this time, s, so that the smoother has states to lean on.
 COAST_STEP_S = 0.5
-#: Times after an epoch for which the position covariance is computed; linear between them.
+#: Times after an epoch for which the position covariance is computed, s; linear between them. Tuned.
 _AHEAD_S = np.array([0.0, 0.1, 0.2, 0.35, 0.55])
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rotation import R_BC_NOMINAL
-from ..wander import second_order_gauss_markov
+from ..geometry.rotation import R_BC_NOMINAL
+from ..models.gauss_markov import second_order_gauss_markov
 
 Array = NDArray[np.floating]
 
-#: States: position, velocity, acceleration, slow GNSS error and its rate; three axes each, axis fastest.
+#: States: position, velocity, acceleration, slow GNSS error and its rate; three axes each, axis fastest (definition).
 P, V, A, W, WD = (slice(3 * i, 3 * i + 3) for i in range(5))
 N_STATES = 15
-#: Lag in units of 1 / w_s at which the error of the smoothed position is correlated by 1/e, see `noise_time`.
+#: Lag in units of 1 / w_s at which the error of the smoothed position is correlated by 1/e; derived in `noise_time`.
 NOISE_TIMES_BANDWIDTH = 1.963
 
 

@@ -3,42 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import earth
-from ..rotation import skew
+from ..geometry import earth
+from ..geometry.rotation import skew
+from .error_state import Estimate, StateLayout
 from .inertial_data import _cross
 from .strapdown import OMEGA_IE
 
-if TYPE_CHECKING:
-    from .error_state import Estimate, Layout
-
 Array = NDArray[np.floating]
-
-
-class Observation(Protocol):
-    """An observation at the time of an estimate.
-
-    Attributes
-    ----------
-    kind : its name
-    axes : (3, 3) from the axes of the innovation to those it is shown in, or None
-    gated : whether an innovation that is too large is weighted down or rejected
-    """
-
-    @property
-    def kind(self) -> str: ...
-    @property
-    def axes(self) -> Array | None: ...
-    @property
-    def gated(self) -> bool: ...
-
-    def linearise(self, estimate: Estimate, layout: Layout) -> tuple[Array, Array, Array]:
-        """Innovation (m,), its derivative (m, n) with respect to the errors, and the noise covariance (m, m)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +33,7 @@ class AntennaPosition:
     kind: str = "position"
     gated: bool = True
 
-    def linearise(self, estimate: Estimate, layout: Layout) -> tuple[Array, Array, Array]:
+    def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
         s = estimate.state
         arm = s.R_eb @ estimate.lever_arm_b
         H = np.zeros((3, layout.n))
@@ -92,7 +67,7 @@ class AntennaVelocity:
     kind: str = "velocity"
     gated: bool = True
 
-    def linearise(self, estimate: Estimate, layout: Layout) -> tuple[Array, Array, Array]:
+    def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
         s, arm = estimate.state, estimate.lever_arm_b
         rate = self.rate_ib - estimate.gyro[:3]
         if layout.k == 6:
@@ -123,7 +98,7 @@ class ZeroVelocity:
     gated: bool = True
     axes: Array | None = None
 
-    def linearise(self, estimate: Estimate, layout: Layout) -> tuple[Array, Array, Array]:
+    def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
         H = np.zeros((3, layout.n))
         H[0, 3] = H[1, 4] = H[2, 5] = 1.0
         return -estimate.state.v_e, H, np.eye(3) * self.sigma_m_s**2
@@ -139,7 +114,7 @@ class Heading:
     gated: bool = True
     axes: Array | None = None
 
-    def linearise(self, estimate: Estimate, layout: Layout) -> tuple[Array, Array, Array]:
+    def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
         s = estimate.state
         g = earth.geodetic_from_ecef(s.r_e)
         R_ne = earth.R_en(g[0], g[1]).T

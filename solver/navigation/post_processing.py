@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import earth
+from ..geometry import earth
 from .alignment import AlignmentError, AttitudePrior, align
 from .carried import NavigationTrajectory
-from .error_state import Innovation, NavigationSettings, Start, sensor_covariance
+from .error_state import Innovation, NavigationSettings, Observation, Start, sensor_covariance
 from .filter_pass import FilterPass, run_filter
 from .inertial_checks import check
 from .inertial_cleaning import Finding, gap_findings, outage_findings
 from .inertial_data import GnssData, InertialData, InertialGrade
-from .observations import Heading, Observation, ZeroVelocity
+from .observations import Heading, ZeroVelocity
 from .smoother import smooth
 
 Array = NDArray[np.floating]
@@ -128,9 +128,12 @@ def navigate(
 
 
 #: Changes of the biases that are tried where innovations are too large: correlation time (s), factor on the sigmas.
+#: Tuned: mildest first.
 _FASTER = ((600.0, 1.0), (60.0, 1.0), (60.0, 3.0), (60.0, 10.0), (60.0, 30.0))
+#: Mean normalised innovation squared (1 expected) above which they are tried. Tuned.
 _TUNE_ABOVE = 1.3
-_LARGEST_NIS = 25.0  # beyond this an innovation says nothing about inertial noise
+#: A normalised innovation squared beyond this is an outlier that says nothing about inertial noise. Tuned.
+_LARGEST_NIS = 25.0
 
 
 def _disagrees(forward: FilterPass) -> bool:

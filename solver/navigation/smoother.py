@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rotation import matrix_from_quaternion, quaternion_from_vector
-from .error_state import Layout
+from ..geometry.rotation import matrix_from_quaternion, quaternion_from_vector
+from .error_state import StateLayout
 from .filter_pass import Estimates, FilterPass
 from .inertial_data import _cross
 
@@ -67,7 +67,7 @@ def recurse(G: Array, P_posterior: Array, P_prior: Array, x: Array) -> tuple[Arr
     return d, P
 
 
-def corrected(estimates: Estimates, d: Array, layout: Layout) -> Estimates:
+def corrected(estimates: Estimates, d: Array, layout: StateLayout) -> Estimates:
     """Estimates with errors (N, n) put in."""
     turn = matrix_from_quaternion(quaternion_from_vector(d[:, 6:9]))
     arm = estimates.lever_arm_b

@@ -26,15 +26,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import earth
-from ..rotation import matrix_from_quaternion, quaternion_from_vector, skew
+from ..geometry import earth
+from ..geometry.rotation import matrix_from_quaternion, quaternion_from_vector, skew
 from .inertial_data import InertialData, _cross
 
 Array = NDArray[np.floating]
 
 _EYE = np.eye(3)
+#: Rotation of the Earth in axes fixed to it, rad/s.
 OMEGA_IE = np.array([0.0, 0.0, earth.ROTATION_RATE])
 _OMEGA_X = skew(OMEGA_IE)
+#: Rotation squared, rad^2/s^2; semi-minor axis, m; second eccentricity squared; ratio of centrifugal force to gravity.
 _WIE2 = earth.ROTATION_RATE**2
 _B = earth.SEMI_MAJOR_M * (1.0 - earth.FLATTENING)
 _EP2 = earth.ECCENTRICITY2 / (1.0 - earth.ECCENTRICITY2)
@@ -66,7 +68,7 @@ def gravitation_e(position_e: Array) -> Array:
 
 
 @dataclass(slots=True)
-class Block:
+class IncrementBlock:
     """Integrals over a block, in the body axes of its start.
 
     ``k`` is 3 (biases) or 6 (biases, scale factors).
@@ -95,11 +97,11 @@ class Block:
     gyro_variance: float = 0.0
     accel_variance: float = 0.0
 
-    def then(self, b: Block) -> Block:
+    def then(self, b: IncrementBlock) -> IncrementBlock:
         """Integrals over this block and the one that follows it."""
         R, vb, pb, T = self.R, self.R @ b.v, self.R @ b.p, b.duration_s
         RB = R @ b.B
-        return Block(
+        return IncrementBlock(
             self.duration_s + T,
             R @ b.R,
             self.v + vb,
@@ -114,7 +116,7 @@ class Block:
         )
 
     @classmethod
-    def empty(cls, k: int = 3) -> Block:
+    def empty(cls, k: int = 3) -> IncrementBlock:
         z = np.zeros
         return cls(0.0, np.eye(3), z(3), z(3), z((3, k)), z((3, k)), z((3, k)), z((3, k)), z((3, k)))
 
@@ -132,7 +134,7 @@ class Integrals:
     ----------
     duration_s : (b, m) time since the start of the block at the end of each piece
     quaternion, v, p : (b, m, 4), (b, m, 3), (b, m, 3) running values
-    R, A, B, Jv : (b, m, 3, 3), (b, m, 3, k) the same of the others (see `Block`)
+    R, A, B, Jv : (b, m, 3, 3), (b, m, 3, k) the same of the others (see `IncrementBlock`)
     Jp, Bp : (b, m, 3, k) what each piece adds to the totals
     variances : (b, m, 2) the same of gyro and accelerometer variance
     blocks : the totals
@@ -149,15 +151,15 @@ class Integrals:
     Jp: Array
     Bp: Array
     variances: Array
-    blocks: list[Block]
+    blocks: list[IncrementBlock]
 
-    def running(self, ends: Sequence[int]) -> list[Block]:
+    def running(self, ends: Sequence[int]) -> list[IncrementBlock]:
         """Integrals of the first block from its start to several ends (numbers of pieces)."""
         Jp, Bp, variances = (np.cumsum(x[0], axis=0) for x in (self.Jp, self.Bp, self.variances))
         durations, noise = self.duration_s[0].tolist(), variances.tolist()
         R, v, p, A, B, Jv = (x[0] for x in (self.R, self.v, self.p, self.A, self.B, self.Jv))
         return [
-            Block(durations[i], R[i], v[i], p[i], A[i], B[i], Jv[i], Jp[i], Bp[i], *noise[i])
+            IncrementBlock(durations[i], R[i], v[i], p[i], A[i], B[i], Jv[i], Jp[i], Bp[i], *noise[i])
             for i in (end - 1 for end in ends)
         ]
 
@@ -209,7 +211,7 @@ def integrate(
             variances[:, :, i] = psd * dt
     vg, va = variances.sum(axis=1).T
     blocks = [
-        Block(
+        IncrementBlock(
             float(duration[i, -1]),
             R_end[i, -1],
             v[i, -1],
@@ -227,12 +229,12 @@ def integrate(
     return Integrals(duration, q, v, p, R_end, At, Bt, Jt, dJp, dBp, variances, blocks)
 
 
-def integrate_one(pieces: InertialData, gyro: Array, accel: Array) -> Block:
+def integrate_one(pieces: InertialData, gyro: Array, accel: Array) -> IncrementBlock:
     """Integrals over one block of pieces (corrected), with sensor errors (k,) taken off."""
     return _integrated(pieces, gyro, accel).blocks[0]
 
 
-def integrate_to(pieces: InertialData, ends: Sequence[int], gyro: Array, accel: Array) -> list[Block]:
+def integrate_to(pieces: InertialData, ends: Sequence[int], gyro: Array, accel: Array) -> list[IncrementBlock]:
     """The same from the start of the pieces to each of several ends (numbers of pieces)."""
     return _integrated(pieces, gyro, accel).running(ends)
 
@@ -274,7 +276,7 @@ def _apply(R: Array, v: Array) -> Array:
 
 
 def rotation_matrix(theta: Array) -> Array:
-    """Rotation matrix (3, 3) of one rotation vector (3,); scalar arithmetic."""
+    """Rotation matrix (3, 3) of one rotation vector (3,); a seventh of SciPy's time (``python bench/rotation.py``)."""
     x, y, z = theta.tolist()
     n2 = x * x + y * y + z * z
     if n2 < 1e-8:
@@ -331,7 +333,7 @@ def propagate(state: State, duration_s: float, R: Array, v: Array, p: Array) -> 
     return State(r1, v1, R1)
 
 
-def transition(state: State, block: Block) -> Array:
+def transition(state: State, block: IncrementBlock) -> Array:
     """Transition matrix of the errors ``(dr, dv, psi, gyro errors, accelerometer errors)`` over a block.
 
     ``r = r_hat + dr``, ``v = v_hat + dv`` (Earth-fixed), ``R_eb = exp([psi]) R_eb_hat``; exact to first order but for
@@ -365,7 +367,7 @@ def transition(state: State, block: Block) -> Array:
     return F
 
 
-def process_noise(state: State, block: Block, gyro_psd: float, accel_psd: float) -> Array:
+def process_noise(state: State, block: IncrementBlock, gyro_psd: float, accel_psd: float) -> Array:
     """Covariance (9, 9) that white noise of gyros and accelerometers adds over a block; force taken as constant.
 
     Parameters

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..slow_errors import SlowErrors
-from ..wander import autocorrelation, second_order_gauss_markov
 from .base import COMPONENTS, Extent, PseudoObservations, direct_observations
+from .gauss_markov import autocorrelation, second_order_gauss_markov
+from .slow_errors import SlowErrors
 from .wander import GLOBALS, NOTHING, SEGMENT_SHARE, WanderOptions
 
 Array = NDArray[np.floating]

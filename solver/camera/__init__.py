@@ -1,0 +1,1 @@
+"""The line camera: its sensor lines, the collinearity equations and self-calibration."""

@@ -1,0 +1,329 @@
+"""Additional parameters of self-calibration: TLS-18 [K 4.43], PRISM-30 [K 4.44], lens set [P], boresight.
+
+``Dx, Dy`` are added to the projection: residual = measured - (projection + D). They are functions of the image
+coordinates, reduced to the principal point, and linear in the unknowns. Measured coordinates carry noise, on which the
+parameters must not act: an adjustment takes them where the ray meets its CCD line by what is known of it
+(`adjustment.linearisation.fit_rays`). Units: millimetres for lengths, radians for angles, powers of mm for distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .line_camera import LineCamera
+
+Array = NDArray[np.floating]
+
+#: Default a-priori sigmas by kind: about 0.1 mm at the edge of an airborne sensor's image.
+SIGMA = {
+    "dc": 0.1,
+    "k1": 1e-5,
+    "k2": 1e-8,
+    "k3": 1e-11,
+    "p1": 1e-4,
+    "p2": 1e-4,
+    "xp": 0.1,
+    "yp": 0.1,
+    "dx": 0.1,
+    "dy": 0.1,
+    "sy": 1e-2,
+    "s": 1e-2,
+    "th": 1e-2,
+    "b": 1e-5,
+    "boresight": 2e-3,
+}
+
+_UNITS = dict.fromkeys(("dc", "xp", "yp", "dx", "dy"), "mm") | {
+    "k1": "mm^-2", "k2": "mm^-4", "k3": "mm^-6", "p1": "mm^-1", "p2": "mm^-1", "b": "mm^-2",
+    "th": "rad", "boresight": "rad",
+}  # fmt: skip
+
+#: Default a-priori sigmas of the PRISM set: 0.02 mm, about three pixels, at the end of a line of 100 mm.
+PRISM_SIGMA = {"dx": 0.02, "dy": 0.02, "b": 2e-7, "s": 4e-4}
+
+#: An a-priori sigma that leaves a parameter free, times its default, and one that fixes it.
+FREE, FIXED = 1e4, 1e-9
+
+_TLS_COMMON = ("dc", "k1", "k2", "k3", "p1", "p2")
+_TLS_LINE = ("xp", "yp", "sy", "th")
+_LENS = ("dx", "dy", "dc", "k1", "k2", "p1", "p2", "sy", "th")
+_PRISM = ("dx", "dy", "b", "s")
+_TURNS = ("turn_x", "turn_y", "turn_z")
+
+
+@dataclass(frozen=True)
+class CameraDesign:
+    """Effect of additional parameters on n rays: ``D[c, i] = sum_s coefficients[c, s, i] ap[columns[pattern[i], s]]``.
+
+    Attributes
+    ----------
+    pattern : (n,) which row of `columns` a ray uses
+    columns : (patterns, slots) int32 index of the parameter; -1 where it is not estimated
+    coefficients : (2, slots, n) mm per unit of the parameter
+    kinds : (slots) of parameter
+    focal_length_mm : (n,)
+    """
+
+    pattern: NDArray[np.int64]
+    columns: NDArray[np.int32]
+    coefficients: Array
+    kinds: tuple[str, ...] = field(repr=False)
+    focal_length_mm: Array = field(repr=False)
+
+    def evaluate(self, values: Array, rays: slice = slice(None)) -> Array:
+        """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
+        of_slot = np.append(values, 0.0)[self.columns].T  # (slots, patterns)
+        return np.einsum("csn,sn->cn", self.coefficients[:, :, rays], of_slot[:, self.pattern[rays]])
+
+    def coefficients_at(self, xy_mm: Array) -> Array:
+        """Coefficients (2, slots, n) where the rays have image coordinates (2, n), mm."""
+        return _coefficients(self.kinds, xy_mm, self.focal_length_mm)
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """A set of additional parameters of one camera.
+
+    Attributes
+    ----------
+    name : of the set
+    names : (m,) parameters of the set, ``dc k1 .. th_F``
+    sigma : (m,) a-priori sigma of each
+    slots : kinds of parameter that act on one ray, in order
+    columns : (patterns, slots) int32 parameter behind each slot, for each pattern (CCD line or chip); -1 none
+    estimated : (m,) which are unknowns; the others are zero
+    chips : per CCD line the first sample of each of its patterns
+    """
+
+    name: str
+    names: tuple[str, ...]
+    sigma: Array
+    slots: tuple[str, ...]
+    columns: NDArray[np.int32]
+    estimated: NDArray[np.bool_]
+    chips: tuple[tuple[int, ...], ...] = field(repr=False)
+
+    @property
+    def unknown_names(self) -> tuple[str, ...]:
+        """Names of the estimated parameters, in the order of the unknowns."""
+        return tuple(name for name, on in zip(self.names, self.estimated, strict=True) if on)
+
+    @property
+    def n_unknowns(self) -> int:
+        return int(self.estimated.sum())
+
+    @property
+    def apriori_sigma(self) -> Array:
+        """(n_unknowns,) of the estimated parameters."""
+        return self.sigma[self.estimated]
+
+    def without(self, names: Sequence[str]) -> SelfCalibration:
+        """The set with some parameters no longer estimated.
+
+        Raises
+        ------
+        ValueError : a name that the set does not have
+        """
+        estimated = self.estimated.copy()
+        for name in names:
+            estimated[self._place(name)] = False
+        return replace(self, estimated=estimated)
+
+    def with_sigma(self, sigma: Mapping[str, float]) -> SelfCalibration:
+        """The set with other a-priori sigmas, by parameter or by kind (``{"k1": 1e-6, "th": 1e-4}``)."""
+        values = self.sigma.copy()
+        for name, value in sigma.items():
+            if not value > 0:
+                raise ValueError(f"a-priori sigma of {name} must be positive, got {value}")
+            of_kind = [i for i, n in enumerate(self.names) if n.split("_")[0] == name]
+            values[of_kind if of_kind else [self._place(name)]] = value
+        return replace(self, sigma=values)
+
+    def scaled(self, share: float) -> SelfCalibration:
+        """The set with all a-priori sigmas times a factor.
+
+        Raises
+        ------
+        ValueError : a factor that is not positive
+        """
+        if not share > 0:
+            raise ValueError(f"factor of the a-priori sigmas must be positive, got {share}")
+        return replace(self, sigma=share * self.sigma)
+
+    def free(self) -> SelfCalibration:
+        """The set with a-priori sigmas so large that they carry no weight."""
+        return replace(self, sigma=self.sigma * FREE)
+
+    def design(self, ccd: NDArray[np.int64], sample: Array, xy_mm: Array, focal_length_mm: Array) -> CameraDesign:
+        """Coefficients for rays (n,) at image coordinates (n, 2) reduced to the principal point."""
+        first = np.cumsum([0, *(len(chips) for chips in self.chips)])
+        pattern = first[ccd]
+        for k, chips in enumerate(self.chips):
+            if len(chips) > 1:
+                mine = ccd == k
+                pattern[mine] += np.searchsorted(chips, sample[mine] + 0.5, side="right") - 1
+        coefficients = _coefficients(self.slots, xy_mm.T, focal_length_mm)
+        unknown = np.where(self.estimated, np.cumsum(self.estimated) - 1, -1)
+        columns = np.append(unknown, -1)[self.columns].astype(np.int32)
+        return CameraDesign(pattern, columns, coefficients, self.slots, focal_length_mm)
+
+    def expand(self, values: Array, fill: float = 0.0) -> Array:
+        """Values of the estimated parameters (n_unknowns,) put in their places among all (m,)."""
+        full = np.full(len(self.names), fill)
+        full[self.estimated] = values
+        return full
+
+    def _place(self, name: str) -> int:
+        if name not in self.names:
+            raise ValueError(f"no additional parameter {name!r} in {self.name}: {' '.join(self.names)}")
+        return self.names.index(name)
+
+
+_Effect = Callable[[Array, Array, Array, Array], tuple[Array | float, Array | float]]
+#: Displacement (Dx, Dy) per unit of each kind of parameter, from x, y, r2, c.
+_EFFECT: dict[str, _Effect] = {
+    "dc": lambda x, y, r2, c: (-x / c, -y / c),
+    "k1": lambda x, y, r2, c: (x * r2, y * r2),
+    "k2": lambda x, y, r2, c: (x * r2**2, y * r2**2),
+    "k3": lambda x, y, r2, c: (x * r2**3, y * r2**3),
+    "p1": lambda x, y, r2, c: (r2 + 2 * x * x, 2 * x * y),
+    "p2": lambda x, y, r2, c: (2 * x * y, r2 + 2 * y * y),
+    "xp": lambda x, y, r2, c: (1.0, 0.0),
+    "yp": lambda x, y, r2, c: (0.0, 1.0),
+    "dx": lambda x, y, r2, c: (1.0, 0.0),
+    "dy": lambda x, y, r2, c: (0.0, 1.0),
+    "th": lambda x, y, r2, c: (y, 0.0),
+    "sy": lambda x, y, r2, c: (0.0, -y),
+    "b": lambda x, y, r2, c: (y * r2, 0.0),
+    "s": lambda x, y, r2, c: (0.0, y),
+    "turn_x": lambda x, y, r2, c: (-x * y / c, -c - y * y / c),
+    "turn_y": lambda x, y, r2, c: (c + x * x / c, x * y / c),
+    "turn_z": lambda x, y, r2, c: (y, -x),
+}
+
+
+def _coefficients(kinds: tuple[str, ...], xy_mm: Array, focal_length_mm: Array) -> Array:
+    """Displacement (2, kinds, n) in mm per unit of each kind, at image coordinates (2, n)."""
+    x, y = xy_mm
+    coefficients = np.empty((2, len(kinds), len(x)))
+    r2 = x * x + y * y
+    for s, kind in enumerate(kinds):
+        coefficients[0, s], coefficients[1, s] = _EFFECT[kind](x, y, r2, focal_length_mm)
+    return coefficients
+
+
+def tls(camera: LineCamera, parameters: int = 18) -> SelfCalibration:
+    """The 18 parameters of three-line scanners [K 4.43] and the subsets of the 2006 paper.
+
+    16: without the principal point of the line nearest nadir, which goes with the orientation. 12: also without camera
+    constant, ``k3``, and scale and inclination of that line.
+
+    Raises
+    ------
+    ValueError : a count other than 18, 16, 12
+    """
+    lines = [line.id for line in camera.lines]
+    names = list(_TLS_COMMON) + [f"{kind}_{line}" for kind in _TLS_LINE for line in sorted(lines)]
+    columns = [[*range(6), *(names.index(f"{kind}_{line}") for kind in _TLS_LINE)] for line in lines]
+    full = _set(f"tls{parameters}", names, _TLS_COMMON + _TLS_LINE, columns, [(0,)] * len(lines))
+    if parameters == 18:
+        return full
+    nadir = camera.nadir_line.id
+    if parameters == 16:
+        return full.without([f"xp_{nadir}", f"yp_{nadir}"])
+    if parameters == 12:
+        return full.without(["dc", "k3", *(f"{kind}_{nadir}" for kind in _TLS_LINE)])
+    raise ValueError(f"TLS sets have 18, 16 or 12 parameters, not {parameters}")
+
+
+def prism(camera: LineCamera) -> SelfCalibration:
+    """Shifts of every chip, and bending and scale of every line [K 4.44]; 30 for three lines of four chips."""
+    names: list[str] = []
+    columns: list[list[int]] = []
+    chips = [line.chips or (0,) for line in camera.lines]
+    for line, starts in zip(camera.lines, chips, strict=True):
+        shifts = [f"{kind}_{line.id}{n + 1}" for n in range(len(starts)) for kind in ("dx", "dy")]
+        names += [*shifts, f"b_{line.id}", f"s_{line.id}"]
+        shape = [names.index(f"b_{line.id}"), names.index(f"s_{line.id}")]
+        columns += [[names.index(shifts[2 * n]), names.index(shifts[2 * n + 1]), *shape] for n in range(len(starts))]
+    name = "prism30" if len(names) == 30 else f"prism{len(names)}"
+    return _set(name, names, _PRISM, columns, chips).with_sigma(PRISM_SIGMA)
+
+
+def lens(camera: LineCamera) -> SelfCalibration:
+    """Nine parameters of every lens [P]."""
+    names = [f"{kind}_{lens.id}" for lens in camera.lenses for kind in _LENS]
+    columns = [list(range(9 * i, 9 * i + 9)) for i in camera.lens_of_line]
+    return _set("lens", names, _LENS, columns, [(0,)] * len(camera.lines))
+
+
+def boresight(camera: LineCamera) -> SelfCalibration:
+    """Small rotations of the camera against the body about its own axes, rad: the same for all CCD lines and strips.
+
+    The true ``R_lc`` is the measured one times that of the angles omega, phi, kappa; to the first order, rays turn by
+    ``-(omega, phi, kappa) x f``. Of one strip alone it cannot be told from the shift of the attitude. TLS has it in
+    what xp, yp and th of the lines have in common.
+    """
+    names = [f"boresight_{angle}" for angle in ("omega", "phi", "kappa")]
+    return _set("boresight", names, _TURNS, [[0, 1, 2]] * len(camera.lines), [(0,)] * len(camera.lines))
+
+
+#: Self-calibration by the name the command line uses.
+SELF_CALIBRATIONS: dict[str, Callable[[LineCamera], SelfCalibration]] = {
+    "tls18": tls,
+    "tls16": lambda camera: tls(camera, 16),
+    "tls12": lambda camera: tls(camera, 12),
+    "prism30": prism,
+    "lens": lens,
+    "boresight": boresight,
+}
+
+
+def calibrated(camera: LineCamera, parameters: SelfCalibration, values: Mapping[str, float]) -> LineCamera:
+    """The camera with additional parameters taken into the centres of its pixels: where a ray without them arrives.
+
+    Distortions of lenses are dropped, since the tables have them.
+
+    Parameters
+    ----------
+    values : by name of the parameter; what is not named is zero
+
+    Raises
+    ------
+    ValueError : a name that the set does not have
+    """
+    full = np.zeros(len(parameters.names))
+    for name, value in values.items():
+        full[parameters._place(name)] = value
+    every = replace(parameters, estimated=np.ones(len(parameters.names), dtype=bool))
+    lines = []
+    for k, line in enumerate(camera.lines):
+        sample = np.arange(line.pixels, dtype=float)
+        measured = line.xy_mm - camera.principal_point_mm[k]
+        ccd = np.full(line.pixels, k, dtype=np.int64)
+        c = np.full(line.pixels, camera.focal_length_mm[k])
+        # the design takes them at the pixel centres, so one step is exact: centre - D(centre) = projection
+        xy = measured - every.design(ccd, sample, measured, c).evaluate(full).T
+        lines.append(replace(line, xy_mm=xy + camera.principal_point_mm[k]))
+    return replace(camera, lenses=tuple(replace(lens, distortion=()) for lens in camera.lenses), lines=tuple(lines))
+
+
+def unit_of(name: str) -> str:
+    """Unit of an additional parameter, by its name."""
+    return _UNITS.get(name.split("_")[0], "")
+
+
+def _set(
+    name: str,
+    names: Sequence[str],
+    slots: tuple[str, ...],
+    columns: Sequence[Sequence[int]],
+    chips: Sequence[tuple[int, ...]],
+) -> SelfCalibration:
+    sigma = np.array([SIGMA[n.split("_")[0]] for n in names])
+    table = np.array(columns, dtype=np.int32)
+    return SelfCalibration(name, tuple(names), sigma, slots, table, np.ones(len(names), dtype=bool), tuple(chips))
