@@ -22,11 +22,11 @@ c    image: x along flight, y to the left across, z up; the projection centre li
 With no boresight ``R_bc = diag(1, -1, -1)``.
 
 **Attitude.** Photogrammetric angles: ``R_lc = Rx(omega) Ry(phi) Rz(kappa)``, image to object [K A.20].
-Navigation angles: ``R_nb = Rz(heading) Ry(pitch) Rx(roll)``. `frames` converts between the two, through the local
-frame, so that meridian convergence is included. Quaternions are scalar last (``xyzw``).
+Navigation angles: ``R_nb = Rz(heading) Ry(pitch) Rx(roll)``. `geometry.frames` converts between the two, through the
+local frame, so that meridian convergence is included. Quaternions are scalar last (``xyzw``).
 
 **Pose covariance.** 6x6, order ``X, Y, Z, omega, phi, kappa``, metres and radians, of the *errors of these six values*
-(not of a rotation vector). `rotation.angles_jacobian` goes between the two.
+(not of a rotation vector). `geometry.rotation.angles_jacobian` goes between the two.
 
 **Pixels.** Line ``u`` and sample ``v`` are 0-based and integer at the pixel and line centre. Line ``u`` of a strip is
 imaged at ``first_line_time + u / line_rate``. Time stamps are integer nanoseconds since the Unix epoch (UTC);
@@ -36,7 +36,7 @@ computations use float seconds from a reference stamp that the caller chooses (`
 ``omega0 = omega_measured(t) + domega(t)`` and so on [K 4.4-4.7]. Residual = measured minus computed. Where the
 attitude is that of an inertial system (recordings, the sliding window; not block folders) ``dkappa`` is a correction of
 heading, about the vertical: it turns the measured tilt as well, which counts where it is a tenth of a degree or more
-(`rotation.corrected_angles`; the simulated sensors err in the same way).
+(`geometry.rotation.corrected_angles`; the simulated sensors err in the same way).
 
 **Weights.** Everything is whitened with its own sigma, so that the a-priori sigma0 is 1 (times the a-priori image
 sigma where it is given in pixels).

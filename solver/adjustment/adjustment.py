@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
-from ..selfcalibration import SelfCalibration
 from .gauss_newton import Descent
 from .network import Network
 from .problem import (

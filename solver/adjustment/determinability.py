@@ -14,12 +14,14 @@ its absence, and removing it would move its effect into the orientation and the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.line_camera import LineCamera
 from .statistics import correlations, fisher_limit, fisher_value, student_limit
 
 Array = NDArray[np.floating]
@@ -96,6 +98,36 @@ class Evidence:
         """(m,) Student's t."""
         s = self.sigma
         return np.divide(self.values, s, out=np.zeros_like(s), where=s > 0)
+
+
+def strongest_correlations(cross: Array, variance: Array, q: Array) -> tuple[NDArray[np.int64], Array]:
+    """With which of k other unknowns each of m parameters is most correlated: its place (m,), and r (m,).
+
+    Parameters
+    ----------
+    cross, variance, q : (k, m) cofactors between both, (k,) of the other unknowns, (m,) of the parameters
+    """
+    scale = np.sqrt(np.maximum(variance, 0.0))[:, None] * np.sqrt(q)
+    r = np.divide(cross, scale, out=np.zeros_like(cross), where=scale > 0)
+    strongest = np.argmax(np.abs(r), axis=0)
+    return strongest, r[strongest, np.arange(len(q))]
+
+
+def point_sigmas(cross: Array, q: Array) -> Array:
+    """What parameters with cofactors q (m,) add to the sigma of X, Y and Z, (m, 3); see `Evidence.point_sigma_m`.
+
+    ``cross`` (p, 3, m) are the cofactors between object points and parameters.
+    """
+    effect = np.divide(cross**2, q, out=np.zeros_like(cross), where=q > 0)
+    return np.sqrt(effect.mean(axis=0)).T
+
+
+def ranks(names: Sequence[str], camera: LineCamera) -> NDArray[np.int64]:
+    """See `Evidence.rank`: the parameter of the nadir line of a lens, to which those of its other lines then refer, and
+    of powers the highest."""
+    nadir = camera.nadir_line.id if len(camera.lenses) == 1 else None
+    power = {"k2": 1, "k3": 2, "p2": 1}
+    return np.array([power.get(n.split("_")[0], int(n.partition("_")[2] == nadir)) for n in names], np.int64)
 
 
 @dataclass(frozen=True)

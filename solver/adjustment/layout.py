@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.self_calibration import CameraDesign, SelfCalibration
 from ..models.base import CorrectionModel, Extent, ModelOptions, PseudoObservations, join_observations
-from ..selfcalibration import CameraDesign, SelfCalibration
 from .network import Network
 
 Array = NDArray[np.floating]

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collinearity import collinearity
-from ..rotation import corrected_angles
+from ..camera.collinearity import collinearity
+from ..geometry.rotation import corrected_angles
 from .layout import Layout, RayShift
 from .network import Rays
 

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..camera import LineCamera
-from ..intersection import intersect_rays
-from ..rotation import matrix_from_angles
-from ..trajectory import Trajectory, noise_between
+from ..camera.line_camera import LineCamera
+from ..geometry.ray_intersection import intersect_rays
+from ..geometry.rotation import matrix_from_angles
+from ..geometry.trajectory import Trajectory, noise_between
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]

@@ -19,11 +19,14 @@ from .layout import Layout
 from .linearisation import Linearisation
 from .network import Control
 from .normal_matrix import NormalMatrix
+from .reliability import normalised_residuals
 
 Array = NDArray[np.floating]
 
 #: A pivot of a point's 3x3 matrix below this share of its diagonal counts as zero: that direction is not determined.
 POINT_PIVOT = 1e-10
+#: A singular value of a point's equations below this share of the largest counts as zero.
+DETERMINED = 1e-6
 #: Rays for which products are formed at a time.
 BATCH = 16384
 #: Rays that clusters are joined up to while their rays are worked on.
@@ -69,6 +72,12 @@ class ControlWeights:
     def residual(self, points_l: Array) -> Array:
         """Whitened (p, 3): given minus estimated."""
         return np.sqrt(self.weight) * (self.xyz_l - points_l)
+
+    def normalised(self, points_l: Array, cofactors: Array) -> Array:
+        """Normalised residuals (p, 3), estimated minus given, with cofactors (p, 3, 3) of the points; 0 where nothing
+        is given or nothing else controls a coordinate."""
+        q = 1.0 - self.weight * np.einsum("pii->pi", cofactors)
+        return np.where(self.weight > 0, normalised_residuals(-self.residual(points_l), q), 0.0)
 
 
 def weigh_control(control: Control, n_points: int) -> ControlWeights:
@@ -116,6 +125,13 @@ def inverse_factors(normals: PointNormals) -> Array:
     return np.stack([a, zero, zero, b, c, zero, d, e, f], axis=1).reshape(-1, 3, 3)
 
 
+def without_point(design: Array, point: Array, residual: Array) -> tuple[Array, Array]:
+    """What whitened equations (m, u), (m, 3), (m,) of one point say of the unknowns alone: (r, u), (r,), whitened."""
+    U, s, _ = np.linalg.svd(point)
+    left = U[:, int((s > DETERMINED * s[0]).sum()) :]
+    return left.T @ design, left.T @ residual
+
+
 @dataclass(frozen=True)
 class Reduced:
     """The reduced system ``matrix @ d_theta = rhs`` and what leads back to the points."""
@@ -126,10 +142,9 @@ class Reduced:
 
 
 def point_normals(
-    lin: Linearisation, elimination: Elimination, control: ControlWeights, points_l: Array, damping: float = 0.0
+    lin: Linearisation, index: NDArray[np.int64], p: int, control: ControlWeights, points_l: Array, damping: float = 0.0
 ) -> PointNormals:
-    """Normal matrices of all points, factorised."""
-    p, index = elimination.n_points, elimination.point
+    """Normal matrices of p points, factorised; ``index`` (n,) is the point of each ray."""
     j, r = lin.point, lin.residual
 
     def total(values: Array) -> Array:
@@ -180,7 +195,7 @@ def reduce_normals(
     if damping:
         matrix.damp(damping)
     matrix.keep_scale()
-    points = point_normals(lin, elimination, control, points_l, damping)
+    points = point_normals(lin, elimination.point, elimination.n_points, control, points_l, damping)
     for cluster, D in couplings(lin, layout, elimination, points):
         rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
         block = D.T @ D

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .adjustment import AdjustmentOptions, Problem, Solution, State, pose_problem, solve
 from .covariance import point_cofactors, point_unknown_cofactors
-from .determinability import Evidence, Limits, Removal, examine
+from .determinability import Evidence, Limits, Removal, examine, point_sigmas, ranks, strongest_correlations
 from .network import Network
 from .network_weakness import PART, describe
 
@@ -44,37 +44,24 @@ def gather_evidence(solution: Solution) -> Evidence:
     unit[columns, np.arange(m)] = 1.0
     Q = solution.factor.solve(unit)
     q = np.maximum(np.diagonal(Q[columns]), 0.0)
-    everything = solution.factor.variances()
-    of_orientation = _correlation(Q[:first], everything[:first], q)
-    point_sigma = np.sqrt(np.maximum(np.einsum("pii->pi", point_cofactors(solution)), 0.0))
-    to_points = point_unknown_cofactors(solution, columns).reshape(-1, m)
-    of_points = _correlation(to_points, point_sigma.ravel() ** 2, q)
-    partner, strongest = _partners(solution, of_orientation, of_points)
-    effect = np.divide(to_points**2, q, out=np.zeros_like(to_points), where=q > 0).reshape(-1, 3, m)
+    to_points = point_unknown_cofactors(solution, columns)
+    of_points = np.einsum("pii->pi", point_cofactors(solution)).ravel()
+    cross = np.concatenate([Q[:first], to_points.reshape(-1, m)])
+    strongest, r = strongest_correlations(cross, np.concatenate([solution.factor.variances()[:first], of_points]), q)
     sigma0 = solution.sigma0 if solution.redundancy > 0 else 1.0
     return Evidence(
         layout.names[first:],
         solution.camera_parameters,
         Q[columns],
         _pivots(solution, q),
-        partner,
-        strongest,
-        np.sqrt(effect.mean(axis=0)).T,
+        _partners(solution, strongest),
+        r,
+        point_sigmas(to_points, q),
         sigma0,
         max(solution.redundancy, 0),
         ground_sample_distance(solution.network),
-        _ranks(solution),
+        ranks(layout.names[first:], solution.network.camera),
     )
-
-
-def _ranks(solution: Solution) -> NDArray[np.int64]:
-    """Which of a group to do without first: the parameter of the nadir line, to which those of the other lines then
-    refer; of powers the highest."""
-    camera = solution.network.camera
-    nadir = min(camera.lines, key=lambda line: abs(float(line.centre_mm[0]))).id if len(camera.lenses) == 1 else None
-    names = solution.layout.names[solution.layout.n_model :]
-    power = {"k2": 1, "k3": 2, "p2": 1}
-    return np.array([power.get(name.split("_")[0], int(name.partition("_")[2] == nadir)) for name in names])
 
 
 def eliminate(
@@ -146,26 +133,14 @@ def _pivots(solution: Solution, q: Array) -> Array:
     return np.minimum(pivot, 1.0)
 
 
-def _correlation(cross: Array, variance: Array, q: Array) -> Array:
-    """Correlation coefficients (k, m) from cross-cofactors (k, m) and variances (k,) and (m,)."""
-    scale = np.sqrt(np.maximum(variance, 0.0))[:, None] * np.sqrt(q)
-    return np.divide(cross, scale, out=np.zeros_like(cross), where=scale > 0)
-
-
-def _partners(solution: Solution, of_orientation: Array, of_points: Array) -> tuple[tuple[str, ...], Array]:
-    """The unknown with the largest correlation for each parameter, by name, and the coefficient."""
-    m = of_orientation.shape[1]
-    names, network = solution.layout.names, solution.network
-    partner, value = [], np.zeros(m)
-    for i in range(m):
-        e = int(np.argmax(np.abs(of_orientation[:, i])))
-        p = int(np.argmax(np.abs(of_points[:, i])))
-        if abs(of_points[p, i]) > abs(of_orientation[e, i]):
-            value[i] = of_points[p, i]
-            partner.append(f"{'XYZ'[p % 3]} of point {network.point_ids[p // 3]}")
-        else:
-            value[i] = of_orientation[e, i]
-            partner.append(describe((names[e],), 0))
+def _partners(solution: Solution, strongest: NDArray[np.int64]) -> tuple[str, ...]:
+    """Names of the unknowns (m,) that the parameters are most correlated with: of the orientation, then coordinates."""
+    first, m = solution.layout.n_model, len(strongest)
+    names, points = solution.layout.names, solution.network.point_ids
+    partner = [
+        describe((names[k],), 0) if k < first else f"{'XYZ'[(k - first) % 3]} of point {points[(k - first) // 3]}"
+        for k in strongest.tolist()
+    ]
     null = solution.factor.undetermined.vectors
     for i in range(m):  # where the system is singular, what the parameter cannot be told from
         own = np.abs(null[len(names) - m + i])
@@ -174,4 +149,4 @@ def _partners(solution: Solution, of_orientation: Array, of_points: Array) -> tu
             part[len(names) - m + i] = 0.0
             members = [k for k in np.argsort(-part, kind="stable")[:3] if part[k] > PART]
             partner[i] = describe(tuple(names[k] for k in members), 0) if members else "nothing"
-    return tuple(partner), value
+    return tuple(partner)

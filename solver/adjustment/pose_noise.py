@@ -23,6 +23,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.measured_trajectory import MeasuredPoses, MeasuredTrajectory
 from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from .linearisation import Linearisation
 from .network import Network, Rays
@@ -121,3 +122,80 @@ def _follow(left: Array, rays: Rays, mine: IntArray, information: Array, density
     piece = np.floor(rays.time_s[mine] / PIECE_S).astype(np.int64)
     for k, of_piece in information_by_pieces(rays.time_s[mine], information).items():
         left[mine[piece == k]] = followed(of_piece, density, noise_time_s)
+
+
+#: Information is kept so long, s.
+KEPT_S = 200.0
+#: The noise that is left has to differ by so much of its standard deviation for rays to be weighted again.
+NOISE_CHANGED = 0.15
+
+
+class PoseNoise:
+    """What corrections leave of the noise of poses as rays come in: counts their information as time goes on.
+
+    Attributes
+    ----------
+    usual : (6, 6) as `followed` gives it, where all rays have come; for the weights of rays that have just come
+    version : how often that has changed clearly
+    vibration : noise of the attitude from look to look beyond what is stated, rad
+    """
+
+    def __init__(self, trajectory: MeasuredTrajectory) -> None:
+        self._trajectory = trajectory
+        self._pieces: dict[int, Array] = {}
+        self.usual = np.eye(6)
+        self.version = 0
+        self.vibration = 0.0
+
+    def count(self, time_s: Array, information: Array) -> None:
+        """Rays (n,) have come, with their information (n, 6, 6) (see `ray_information`)."""
+        for k, of_piece in information_by_pieces(time_s, information).items():
+            self._pieces[k] = self._pieces.get(k, 0.0) + of_piece
+
+    def learn(self, density: Array, now_s: float) -> bool:
+        """Look at all that has been counted; whether rays are to be weighted again.
+
+        Parameters
+        ----------
+        density : (6,) of the wander, see `followed`
+        """
+        self._pieces = {k: i for k, i in self._pieces.items() if k * PIECE_S > now_s - KEPT_S}
+        left = [followed(i, density, self._trajectory.noise_time_s) for i in self._pieces.values()]
+        if not left:
+            return False
+        least = min(left, key=_size)
+        if abs(_size(least) - _size(self.usual)) <= NOISE_CHANGED * _size(self.usual):
+            return False
+        self.usual = least
+        self.version += 1
+        return True
+
+    def of_rays(self, measured: MeasuredPoses) -> Array:
+        """Covariance (n, 6, 6) of the noise of orientation under rays."""
+        return self._vibrating(_with_left(measured, np.broadcast_to(self.usual, measured.covariance.shape)))
+
+    def at(self, measured: MeasuredPoses, density: Array) -> Array:
+        """Covariance (n, 6, 6) of the noise of corrected orientation."""
+        piece = np.floor(measured.poses.time_s / PIECE_S).astype(np.int64)
+        left = np.empty_like(measured.covariance)
+        for k in np.unique(piece).tolist():
+            information = self._pieces.get(k)
+            of_piece = np.eye(6)
+            if information is not None:
+                of_piece = followed(information, density, self._trajectory.noise_time_s)
+            left[piece == k] = of_piece
+        return self._vibrating(_with_left(measured, left))
+
+    def _vibrating(self, covariance: Array) -> Array:
+        """With the noise of the attitude from look to look."""
+        return covariance + self.vibration**2 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+
+
+def _size(left: Array) -> float:
+    return float(np.linalg.norm(left[:, :3]))
+
+
+def _with_left(measured: MeasuredPoses, left: Array) -> Array:
+    """What is left of the noise of smoothed poses; filtered ones keep theirs."""
+    rest = left_of_noise(measured.covariance, left)
+    return np.where(measured.smoothed[:, None, None], rest, measured.covariance)

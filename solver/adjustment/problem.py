@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
-from ..selfcalibration import SelfCalibration
 from .elimination import Elimination, plan_elimination
 from .layout import Layout, build_layout
 from .linearisation import Linearisation, Whitening, corrected

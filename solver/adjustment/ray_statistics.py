@@ -46,19 +46,26 @@ class RayStatistics:
 
 
 def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
-    """Whitened residuals of a solution turned back into lines and samples.
+    """`statistics_of_rays` of a solution."""
+    rays, lin = solution.network.rays, solution.linearisation
+    return statistics_of_rays(rays, lin, solution.whitening, solution.ray_weight, cofactors)
+
+
+def statistics_of_rays(
+    rays: Rays, lin: Linearisation, whitening: Whitening, weight: Array, cofactors: Cofactors
+) -> RayStatistics:
+    """Whitened residuals of rays with weights (n,) turned back into lines and samples.
 
     The covariance of a residual is ``M M^T``, where the columns of M are what one sigma of the line and one sigma of
     the sample move it by; so ``M^-1 v`` are the residuals of line and sample in their sigmas.
     """
-    rays, lin = solution.network.rays, solution.linearisation
     # robust weights fade away; what hardly has any is as good as left out
-    weight = np.where(solution.ray_weight > 1e-6, solution.ray_weight, 0.0)
+    weight = np.where(weight > 1e-6, weight, 0.0)
     Qvv = cofactors.residuals(weight)
     # a ray with part of its weight: P^-1 - A Q A^T, in the units of full weight
     part = np.where((weight > 0) & (weight < 1), 1.0 / np.where(weight > 0, weight, 1.0) - 1.0, 0.0)
     Qvv = Qvv + part[:, None, None] * np.eye(2)
-    back = _in_sigmas(rays, lin, solution.whitening)
+    back = _in_sigmas(rays, lin, whitening)
     v = np.einsum("nij,jn->ni", back, lin.residual)
     C = back @ Qvv @ np.swapaxes(back, 1, 2)
     q = np.einsum("nii->ni", C)
@@ -77,17 +84,22 @@ def residuals_px(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
     return v * np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
 
 
-def _in_sigmas(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
-    """What turns whitened residuals into line and sample in their sigmas (n, 2, 2)."""
-    g = whitening.g
+def whitened_pixels(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
+    """What moves the whitened residuals (n, 2, 2): one pixel in the line, the first column, or in the sample."""
+    g, pitch = whitening.g, rays.pitch_mm.T
     rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
     M = np.empty((len(rays), 2, 2))
     # a later line lets the computed point move on: the residual goes against the image motion
-    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * (rays.line_period_s * rays.sigma_line_px)).T
-    pitch = rays.pitch_mm.T * rays.sigma_sample_px
+    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * rays.line_period_s).T
     M[:, 0, 1] = g[0] * pitch[0]
     M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
-    return _inverse(M)
+    return M
+
+
+def _in_sigmas(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
+    """What turns whitened residuals into line and sample in their sigmas (n, 2, 2)."""
+    sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
+    return _inverse(whitened_pixels(rays, lin, whitening) * sigma[:, None])
 
 
 def _inverse(M: Array) -> Array:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from .covariance import Cofactors, cofactors
 from .normal_equations import weigh_control
 from .point_consensus import consensus_of_points
 from .ray_statistics import RayStatistics, ray_statistics
-from .reliability import CRITICAL_W, normalised_residuals
+from .reliability import CRITICAL_W
 
 Array = NDArray[np.floating]
 
@@ -89,18 +90,30 @@ class Snooping:
     given_up: float = 0.0
 
 
+@cache
 def joint_limit(critical: float) -> float:
     """Limit of the joint test value of line and sample with the same error probability as one |w| (13.8 for 3.29)."""
     return float(stats.chi2.isf(2.0 * stats.norm.sf(critical), 2))
 
 
+def failing_w(largest_w: Array, joint: Array, critical: float) -> Array:
+    """Larger |w| (n,) of the rays that fail the joint test (n,), 0 of the others.
+
+    A ray contradicts the others if this exceeds the critical value: one of its w and the joint test have to fail, which
+    keeps the share of good rays lost at that of a single test.
+    """
+    return np.where(joint > joint_limit(critical), largest_w, 0.0)
+
+
+def largest_of_group(group: NDArray[np.int64], value: Array) -> NDArray[np.int64]:
+    """Places of the largest value in each group."""
+    order = np.lexsort((-value, group))
+    return order[np.diff(group[order], prepend=-1) != 0]
+
+
 def control_tests(solution: Solution, cofactors: Cofactors) -> Array:
     """Normalised residuals (p, 3) of the control coordinates, adjusted minus given; 0 where nothing is given."""
-    control = solution.problem.control
-    root = np.sqrt(control.weight)
-    q = 1.0 - control.weight * np.einsum("pii->pi", cofactors.points)
-    v = -control.residual(solution.state.points_l)
-    return np.where(root > 0, normalised_residuals(v, q), 0.0)
+    return solution.problem.control.normalised(solution.state.points_l, cofactors.points)
 
 
 def snoop(
@@ -112,9 +125,8 @@ def snoop(
 ) -> Snooping:
     """Leave out image points and control coordinates whose normalised residual exceeds the critical value.
 
-    An image point goes with both its coordinates, and so is judged by both: one of its w must fail, and the joint test
-    of the two at the same error probability, which keeps the share of good points lost at that of a single test. Of
-    several rays at one object point the one with the largest joint value goes.
+    An image point goes with both its coordinates, and so is judged by both (`failing_w`). Of several rays at one object
+    point the one with the largest joint value goes.
 
     Parameters
     ----------
@@ -154,7 +166,6 @@ class _Search:
 
     def __init__(self, solution: Solution, critical: float, before: Snooping | None):
         self.critical = critical
-        self.joint_limit = joint_limit(critical)
         self.point = solution.network.rays.point
         self.weight = solution.ray_weight.copy()
         self.control_weight = solution.problem.control.weight.copy()
@@ -190,7 +201,7 @@ class _Search:
         """Largest |w| of what takes part, and how many observations go."""
         in_use = self.weight > 0
         joint = self.statistics.joint
-        w = np.where(in_use & (joint > self.joint_limit), self.statistics.largest_w, 0.0)
+        w = np.where(in_use, failing_w(self.statistics.largest_w, joint, self.critical), 0.0)
         control_w = np.abs(self.control_w)
         if image_scale(self.statistics, self.weight) > CONTROL_FIT:
             control_w = np.zeros_like(control_w)
@@ -199,7 +210,7 @@ class _Search:
         largest = max(float(self.statistics.largest_w[in_use].max(initial=0.0)), of_control)
         failing = np.flatnonzero(w > limit)
         worst_control = control_w.max(axis=1)
-        first = failing[_largest_of_group(self.point[failing], joint[failing])]
+        first = failing[largest_of_group(self.point[failing], joint[failing])]
         # a control coordinate goes instead of a ray of its point if it fails more clearly
         clearly = max(limit, CONTROL_CLEAR * self.critical)
         p, axis = np.nonzero((control_w > clearly) & (control_w == worst_control[:, None]))
@@ -243,9 +254,9 @@ class _Search:
             return 0
         known = self.solution.points.rank[self.point[candidates]] == 3
         w, joint = self.statistics.largest_w[candidates], self.statistics.joint[candidates]
-        agrees = (w <= self.critical) | (joint <= self.joint_limit)
-        candidates = candidates[known & agrees]
-        first = candidates[_largest_of_group(self.point[candidates], -self.statistics.joint[candidates])]
+        good = known & (failing_w(w, joint, self.critical) <= self.critical)
+        candidates = candidates[good]
+        first = candidates[largest_of_group(self.point[candidates], -joint[good])]
         for i in first:
             del self.out[int(i)]
             self.returned.add(int(i))
@@ -261,7 +272,7 @@ class _Search:
         points = np.array([p for p in np.flatnonzero(mostly) if int(p) not in self.exchanged], dtype=np.int64)
         self.exchanged.update(points.tolist())
         back = 0
-        for p, (chosen, rival) in consensus_of_points(self.solution, points, self.joint_limit).items():
+        for p, (chosen, rival) in consensus_of_points(self.solution, points, joint_limit(self.critical)).items():
             own = np.flatnonzero(self.point == p)
             kept = own[self.weight[own] > 0]
             if rival or len(chosen) < 3 or len(chosen) <= len(kept):
@@ -293,9 +304,3 @@ class _Search:
         rejected += [Rejected(-1, i, a, w, "snooping") for (i, a), w in self.control_out.items()]
         rejected.sort(key=lambda r: -abs(r.w))
         return Snooping(self.solution, self.cofactors, self.statistics, tuple(rejected), rounds)
-
-
-def _largest_of_group(group: NDArray[np.int64], value: Array) -> NDArray[np.int64]:
-    """Places of the largest value in each group."""
-    order = np.lexsort((-value, group))
-    return order[np.concatenate([[True], np.diff(group[order]) != 0])] if len(order) else order

@@ -1,4 +1,4 @@
-"""Variance components of image, control, position and attitude, in the style of Helmert and Foerstner.
+"""Variance components of image, control and slow errors, in the style of Helmert and Foerstner.
 
 For each group of observations the squares of its residuals are compared with its share of the redundancy,
 ``s_g^2 = v_g^T P_g v_g / r_g`` with ``r_g = n_g - tr(P_g A_g Q A_g^T)``; its sigma is multiplied by ``s_g`` and the
@@ -14,7 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.stats import chi2
 
+from ..models.base import ERROR_GROUPS, error_groups
 from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
 from .covariance import Cofactors, cofactors
 from .linearisation import Whitening
@@ -22,10 +24,13 @@ from .normal_equations import Prior
 
 Array = NDArray[np.floating]
 
-GROUPS = ("image", "control", "position", "attitude")
+GROUPS = ("image", "control", *ERROR_GROUPS)
 
-#: A group with less redundancy keeps its a-priori sigma: the estimate would be chance.
-LEAST_REDUNDANCY = 5.0
+#: A group with less redundancy keeps its a-priori sigma: the estimate would be chance, unless the squares are beyond
+#: what has this probability. The estimate is then that of so many more observations that are as stated.
+LEAST_REDUNDANCY, BY_CHANCE, AS_STATED = 5.0, 1e-4, 2.0
+#: No estimate with less redundancy than this.
+HARDLY_ANY = 0.5
 
 #: Converged when no factor changes by more than this share of itself.
 TOLERANCE = 0.01
@@ -40,7 +45,7 @@ class Component:
 
     Attributes
     ----------
-    group : image, control, position or attitude
+    group : of `GROUPS`
     n : observations with weight
     redundancy : their share of the redundancy
     factor : what the a-priori sigmas were multiplied by
@@ -76,7 +81,7 @@ class Scales:
         return Scales({g: f * change.get(g, 1.0) for g, f in self.factor.items()})
 
     def apply(self, problem: Problem) -> Problem:
-        """A problem posed with a-priori sigmas, with control, position and attitude scaled (the image is scaled in the
+        """A problem posed with a-priori sigmas, with control and slow errors scaled (the image is scaled in the
         solution)."""
         f = np.ones(problem.prior.n_observations)
         for group, rows in prior_groups(problem).items():
@@ -88,13 +93,12 @@ class Scales:
 
 
 def prior_groups(problem: Problem) -> dict[str, NDArray[np.int64]]:
-    """Rows of the a-priori equations that belong to position and attitude, by the words of their labels."""
+    """Rows of the a-priori equations that belong to each group of slow errors, by the words of their labels."""
     given = problem.layout.prior
     labels = [label for label, s in zip(given.labels, given.sigma, strict=True) if np.isfinite(s)]
     of_model = given.columns[np.isfinite(given.sigma)].max(axis=1) < problem.layout.n_model
-    words = [label.split(" of strip")[0] for label in labels]
-    angle = np.array([any(word in text for word in ("omega", "phi", "kappa")) for text in words], dtype=bool)
-    return {"position": np.flatnonzero(of_model & ~angle), "attitude": np.flatnonzero(of_model & angle)}
+    group = error_groups(labels)
+    return {name: np.flatnonzero(of_model & (group == g)) for g, name in enumerate(ERROR_GROUPS)}
 
 
 def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float, float]]:
@@ -124,8 +128,11 @@ def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float,
 def _can_be_estimated(sums: dict[str, tuple[int, float, float]], group: str) -> bool:
     """Enough redundancy in the group and in the image points; a-priori values that nothing contradicts do not count."""
     n, squares, redundancy = sums[group]
-    enough = redundancy >= LEAST_REDUNDANCY and sums["image"][2] >= LEAST_REDUNDANCY
-    return bool(n) and enough and squares > SMALLEST**2 * redundancy
+    if not n or sums["image"][2] < LEAST_REDUNDANCY or redundancy < HARDLY_ANY:
+        return False
+    if redundancy < LEAST_REDUNDANCY:
+        return group in ERROR_GROUPS and bool(squares > chi2.isf(BY_CHANCE, redundancy))
+    return squares > SMALLEST**2 * redundancy
 
 
 def _row_variances(solution: Solution) -> Array:
@@ -172,7 +179,9 @@ def estimate_components(
         change = {}
         for group in groups:
             _, squares, redundancy = sums[group]
-            total = scales.factor[group] * np.sqrt(max(squares, 0.0) / max(redundancy, 1e-6))
+            more = AS_STATED if redundancy < LEAST_REDUNDANCY else 0.0
+            ratio = (max(squares, 0.0) + more / scales.factor[group] ** 2) / (max(redundancy, 1e-6) + more)
+            total = scales.factor[group] * np.sqrt(ratio)
             change[group] = float(np.clip(total, SMALLEST, LARGEST)) / scales.factor[group]
         if all(abs(f - 1.0) <= TOLERANCE for f in change.values()):
             converged = True

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..selfcalibration import SelfCalibration
+from ..camera.self_calibration import SelfCalibration
 from .error_models import ErrorModel
 from .flight import FlightPlan
 from .network import disturb_camera

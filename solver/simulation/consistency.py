@@ -13,12 +13,12 @@ from ..adjustment.adjustment import adjust
 from ..adjustment.covariance import cofactors
 from ..adjustment.statistics import global_test
 from ..adjustment.variance_components import group_sums
+from ..camera.self_calibration import tls
+from ..camera.sensors import preset
 from ..models.base import ModelOptions
 from ..models.dgr import DgrOptions
 from ..models.lim import LimOptions
 from ..models.ppm import PpmOptions
-from ..selfcalibration import tls
-from ..sensors import preset
 from .network import regular_block
 
 Array = NDArray[np.floating]

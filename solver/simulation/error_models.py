@@ -2,7 +2,7 @@
 
 A slow error is, for each strip, ``offset + wander(t)`` in X, Y, Z and ``shift + drift s + wander(t)`` in omega, phi,
 kappa, ``s`` going from 0 at the first line to 1 at the last. Offset, shift, drift are drawn for each strip; between
-two they pass smoothly from one to the next. The wander is one process over the whole flight (`wander`).
+two they pass smoothly from one to the next. The wander is one process over the whole flight (`models.gauss_markov`).
 
 Measured = true + error, for positions in the local frame and for omega, phi, kappa; a correction that an adjustment
 estimates is minus the error. An error of kappa is one of heading, about the vertical: omega and phi, right about level
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from ..frames import LocalFrame, navigation_from_R_lc
-from ..rotation import matrix_from_angles, measured_angles
-from ..trajectory import Trajectory
-from ..wander import second_order_gauss_markov
+from ..geometry.frames import LocalFrame, navigation_from_R_lc
+from ..geometry.rotation import matrix_from_angles, measured_angles
+from ..geometry.trajectory import Trajectory
+from ..models.gauss_markov import second_order_gauss_markov
 
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
@@ -40,7 +40,7 @@ class ErrorModel:
     shift_sigma_deg : omega, phi, kappa, constant over a strip
     drift_sigma_deg : omega, phi, kappa, change over a strip
     wander_sigma_deg : omega, phi, kappa
-    wander_time_s : correlation time of both wanders (see `wander`)
+    wander_time_s : correlation time of both wanders (see `models.gauss_markov`)
     gnss_noise_m : X, Y, Z, white
     gnss_rate_hz :
     attitude_noise_deg : roll, pitch, heading, white

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.network import Strip
-from ..camera import LineCamera
-from ..frames import LocalFrame, R_lc_from_navigation
-from ..rotation import quaternion_from_matrix
-from ..sensors import preset
-from ..trajectory import Trajectory
+from ..camera.line_camera import LineCamera
+from ..camera.sensors import preset
+from ..geometry.frames import LocalFrame, R_lc_from_navigation
+from ..geometry.rotation import quaternion_from_matrix
+from ..geometry.trajectory import Trajectory
 from .path import Leg, Track, fly_legs
 from .spectra import band_limited_noise
 from .terrain import EARTH_RADIUS_M, Terrain, fractal_terrain
@@ -152,6 +152,7 @@ class Flight:
     truth : true orientation of the image frame
     strips : the strips with `truth` as their trajectory
     covered_s : (k, 2) times from which to which the sensors measure; nothing is known between them
+    recorded : the truth is a recorded motion, of which nothing is known between its samples
     """
 
     name: str
@@ -161,6 +162,7 @@ class Flight:
     truth: Trajectory
     strips: tuple[Strip, ...]
     covered_s: Array
+    recorded: bool = False
 
     @property
     def strip_times_s(self) -> Array:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjustment.batch import BatchResult
+from ..adjustment.job import BatchResult
 from ..adjustment.network import Control, Measurements, Network, Strip, build_network
 from ..adjustment.refined_orientation import corrections_at
-from ..rotation import corrected_angles
-from ..trajectory import Trajectory
+from ..geometry.rotation import corrected_angles
+from ..geometry.trajectory import Trajectory
 from .scenario import Simulation
 from .window_study import TimedPose, slow_errors_of
 

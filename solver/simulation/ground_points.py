@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.network import Strip
-from ..rotation import matrix_from_angles
+from ..geometry.rotation import matrix_from_angles
 from .flight import Flight, view_tangents
 
 Array = NDArray[np.floating]

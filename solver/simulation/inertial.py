@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
-from .. import earth
-from ..navigation.inertial_data import GnssData, InertialData, InertialGrade
-from ..rotation import (
+from ..geometry import earth
+from ..geometry.rotation import (
     matrix_from_navigation,
     matrix_from_quaternion,
     navigation_from_matrix,
@@ -18,6 +17,7 @@ from ..rotation import (
     quaternion_from_matrix,
     quaternion_multiply,
 )
+from ..navigation.inertial_data import GnssData, InertialData, InertialGrade
 
 Array = NDArray[np.floating]
 

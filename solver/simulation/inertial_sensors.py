@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import R_ENU_NED
 from ..navigation.inertial_data import InertialGrade
-from ..rotation import R_ENU_NED
 from .error_models import Three, antenna_position
 from .flight import Flight
 from .inertial import TrueMotion, with_errors

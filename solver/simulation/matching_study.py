@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ..matching.options import MatchedTie, MatchingOptions
 from ..matching.tie_matcher import TieMatcher
-from ..rotation import matrix_from_angles, quaternion_from_matrix
 from .flight import Flight
 from .observations import Looks, find_looks
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..adjustment.network import Control, Measurements, Network, Strip, build_network
-from ..camera import CcdLine, LineCamera
-from ..collinearity import collinearity
+from ..camera.collinearity import collinearity
+from ..camera.line_camera import CcdLine, LineCamera
+from ..camera.self_calibration import SelfCalibration
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
+from ..geometry.trajectory import Trajectory
 from ..models.base import CorrectionModel, Extent, ModelOptions
-from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
-from ..selfcalibration import SelfCalibration
-from ..trajectory import Trajectory
 from .spectra import band_limited_noise
 
 Array = NDArray[np.floating]

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..adjustment.network import Strip
-from ..camera import LineCamera
-from ..collinearity import project
-from ..rotation import matrix_from_angles
-from ..trajectory import Trajectory
+from ..camera.collinearity import project
+from ..camera.line_camera import LineCamera
+from ..geometry.rotation import matrix_from_angles
+from ..geometry.trajectory import Trajectory
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int_]

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from ..adjustment.network import Strip
-from ..camera import LineCamera, three_line_camera
-from ..frames import LocalFrame, R_lc_from_navigation
-from ..rotation import matrix_from_angles, measured_angles, quaternion_from_matrix
-from ..trajectory import Trajectory
+from ..camera.line_camera import LineCamera, three_line_camera
+from ..geometry.frames import LocalFrame, R_lc_from_navigation
+from ..geometry.rotation import matrix_from_angles, measured_angles, quaternion_from_matrix
+from ..geometry.trajectory import Trajectory
 from .error_models import ErrorModel, ErrorRealisation
 from .flight import Flight, line_rate
 from .terrain import fractal_terrain
@@ -149,7 +149,7 @@ def fly_real_motion(
     lines = int((truth.end_s - MARGIN_S - first) * rate) + 1
     strip = Strip("S1", truth, first, rate, lines)
     covered = np.array([[truth.start_s, truth.end_s]])
-    return Flight("real motion", motion.frame, camera, terrain, truth, (strip,), covered)
+    return Flight("real motion", motion.frame, camera, terrain, truth, (strip,), covered, recorded=True)
 
 
 def degrade(

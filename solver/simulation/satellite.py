@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..adjustment.network import Control, Measurements, Strip, build_network
-from ..camera import LineCamera
-from ..collinearity import collinearity
+from ..camera.collinearity import collinearity
+from ..camera.line_camera import LineCamera
+from ..camera.self_calibration import SelfCalibration
+from ..camera.sensors import lens_rotation
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
+from ..geometry.trajectory import Trajectory
 from ..models.base import Extent, ModelOptions
-from ..rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
-from ..selfcalibration import SelfCalibration
-from ..sensors import lens_rotation
-from ..trajectory import Trajectory
 from .network import Noise, SimulatedNetwork, disturb_camera, draw_unknowns
 
 Array = NDArray[np.floating]

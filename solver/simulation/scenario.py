@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import LineCamera
-from ..rotation import R_BC_NOMINAL, matrix_from_navigation
-from ..trajectory import Trajectory
+from ..camera.line_camera import LineCamera
+from ..geometry.rotation import R_BC_NOMINAL, matrix_from_navigation
+from ..geometry.trajectory import Trajectory
 from .error_models import ErrorModel, ErrorRealisation, Three, draw_slow_errors, measure_attitude, measure_gnss
 from .flight import Flight, FlightPlan, fly
 from .ground_points import GroundPoints, place_points
 from .inertial_sensors import InertialMeasurements, InertialPlan, measure_inertial
+from .misstated import AS_STATED, MisstatedErrors, World, as_believed, looks_through
 from .observations import Looks, find_looks
 from .real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for, degrade, fly_real_motion
 from .streams import stream
@@ -38,6 +39,14 @@ class Mounting:
     @property
     def R_bc(self) -> Array:
         return matrix_from_navigation(*np.radians(self.boresight_deg)) @ R_BC_NOMINAL
+
+    def true(self, world: World) -> Mounting:
+        """How it truly sits in a world where this is what is stated."""
+        lever, boresight = (
+            (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            for a, b in ((self.lever_arm_m, world.lever_arm_m), (self.boresight_deg, world.boresight_deg))
+        )
+        return Mounting(lever, boresight)
 
 
 @dataclass(frozen=True)
@@ -112,13 +121,14 @@ class Simulation:
 
     Attributes
     ----------
-    flight : the truth
+    flight : the truth, with the camera as stated
     mounting, errors, observation_plan : what was assumed
     slow : the slow errors of the trajectory sensors
     attitude_time_s, attitude_rpy : (n,), (n, 3) radians; empty if a trajectory is given instead
     gnss_time_s, gnss_geodetic : (g,), (g, 3) degrees, degrees, metres
     inertial : inertial measurements and GNSS velocities, given instead of attitude
     trajectory : degraded trajectory of the camera, given instead of attitude and GNSS
+    world : by how much the world differs from what was assumed
     points : ground points
     surveyed_l : (m, 3) their coordinates as surveyed (control: with error; others: true)
     images : image measurements, sorted by point and time
@@ -138,6 +148,12 @@ class Simulation:
     images: ImageMeasurements
     inertial: InertialMeasurements | None = None
     trajectory: Trajectory | None = None
+    world: World = AS_STATED
+
+    @property
+    def seen_flight(self) -> Flight:
+        """The flight with the true camera: what image lines are rendered from."""
+        return replace(self.flight, camera=self.world.camera(self.flight.camera))
 
 
 def simulate(
@@ -147,19 +163,28 @@ def simulate(
     observation_plan: ObservationPlan | None = None,
     mounting: Mounting | None = None,
     inertial: InertialPlan | None = None,
+    world: World | None = None,
 ) -> Simulation:
     """Fly a plan and measure: attitude at its rate, GNSS at its rate, tie, control and check points.
 
     With an inertial plan, inertial measurements and GNSS velocities take the place of attitude.
+
+    Raises
+    ------
+    ValueError : a world that cannot be; a sine in it where no attitude is measured
     """
     flight = fly(plan, stream(seed, "motion"), stream(seed, "terrain"))
-    errors, mounting = errors or ErrorModel(), mounting or Mounting()
+    errors, mounting, world = errors or ErrorModel(), mounting or Mounting(), world or AS_STATED
+    observation_plan = observation_plan or ObservationPlan()
     if inertial is None:
-        return measure(flight, seed, errors, observation_plan or ObservationPlan(), mounting)
-    measured = measure(flight, seed, errors, observation_plan or ObservationPlan(), mounting, np.empty(0))
-    lever, gnss_s = np.array(mounting.lever_arm_m), measured.gnss_time_s
+        return measure(flight, seed, errors, observation_plan, mounting, world=world)
+    if world.sines:
+        raise ValueError("true world: a sine is an error of measured attitude; an inertial unit measures none")
+    measured = measure(flight, seed, errors, observation_plan, mounting, np.empty(0), world=world)
+    true, gnss_s = mounting.true(world), measured.gnss_time_s
     rate = measured.slow.rate(gnss_s)[:, :3]
-    imu = measure_inertial(flight, mounting.R_bc, lever, gnss_s, rate, inertial, stream(seed, "imu"))
+    stamped, lever = replace(flight, truth=world.stamped(flight.truth)), np.array(true.lever_arm_m)
+    imu = measure_inertial(stamped, true.R_bc, lever, gnss_s, rate, inertial, stream(seed, "imu"))
     return replace(measured, inertial=imu)
 
 
@@ -171,19 +196,23 @@ def measure(
     mounting: Mounting,
     attitude_time_s: Array | None = None,
     gnss_time_s: Array | None = None,
+    world: World | None = None,
 ) -> Simulation:
     """Measurements of a flight by attitude and GNSS sensors (at given times, or at their rates) and in the images."""
-    slow = slow_errors(flight, seed, errors)
+    world = world or AS_STATED
+    slow = slow_errors(flight, seed, errors, world)
     attitude_s = flight.sample_times(errors.attitude_rate_hz) if attitude_time_s is None else attitude_time_s
     gnss_s = flight.sample_times(errors.gnss_rate_hz) if gnss_time_s is None else gnss_time_s
-    args = flight.truth, flight.frame, mounting.R_bc
+    true = mounting.true(world)
+    args = world.stamped(flight.truth), flight.frame, true.R_bc
     rpy = measure_attitude(*args, attitude_s, slow, errors.attitude_noise_deg, stream(seed, "attitude noise"))
-    lever = np.array(mounting.lever_arm_m)
+    lever = np.array(true.lever_arm_m)
     geodetic = measure_gnss(*args, lever, gnss_s, slow, errors.gnss_noise_m, stream(seed, "gnss noise"))
-    points, surveyed, images = measure_points(flight, seed, observation_plan)
+    points, surveyed, images = measure_points(flight, seed, observation_plan, world)
     return Simulation(
-        flight, mounting, errors, observation_plan, slow, attitude_s, rpy, gnss_s, geodetic, points, surveyed, images
-    )
+        flight, mounting, errors, observation_plan, slow, attitude_s, rpy, gnss_s, geodetic, points, surveyed, images,
+        world=world,
+    )  # fmt: skip
 
 
 def simulate_real_motion(
@@ -195,6 +224,7 @@ def simulate_real_motion(
     camera: LineCamera | None = None,
     relief_m: float = 150.0,
     as_sensors: bool = False,
+    world: World | None = None,
 ) -> Simulation:
     """A simulation over a recorded motion, which is its truth.
 
@@ -202,38 +232,47 @@ def simulate_real_motion(
     GNSS at every other one.
     """
     plan = observation_plan or ObservationPlan(control=control_for(motion.trajectory.end_s))
-    mounting = mounting or Mounting()
+    mounting, world = mounting or Mounting(), world or AS_STATED
     flight = fly_real_motion(motion, stream(seed, "terrain"), camera, relief_m)
     if as_sensors:
-        return measure(flight, seed, errors, plan, mounting, flight.truth.time_s, flight.truth.time_s[::2])
+        return measure(flight, seed, errors, plan, mounting, flight.truth.time_s, flight.truth.time_s[::2], world)
     nothing = np.empty(0)
-    simulation = measure(flight, seed, errors, plan, mounting, nothing, nothing)
+    simulation = measure(flight, seed, errors, plan, mounting, nothing, nothing, world)
     noise = stream(seed, "gnss noise"), stream(seed, "attitude noise")
-    return replace(simulation, trajectory=degrade(flight.truth, simulation.slow, errors, *noise))
+    true = mounting.true(world)
+    mounted = true.R_bc, np.array(true.lever_arm_m), mounting.R_bc, np.array(mounting.lever_arm_m)
+    believed = as_believed(world.stamped(flight.truth), *mounted)
+    return replace(simulation, trajectory=degrade(believed, simulation.slow, errors, *noise))
 
 
-def slow_errors(flight: Flight, seed: int, errors: ErrorModel) -> ErrorRealisation:
-    """The slow errors of a flight's trajectory sensors."""
-    return draw_slow_errors(
-        errors,
+def slow_errors(flight: Flight, seed: int, errors: ErrorModel, world: World | None = None) -> ErrorRealisation:
+    """The slow errors of a flight's trajectory sensors, with all that is not stated of them."""
+    world = world or AS_STATED
+    drawn = draw_slow_errors(
+        world.errors(errors),
         flight.strip_times_s,
         flight.truth.start_s,
         flight.truth.end_s,
         stream(seed, "gnss slow"),
         stream(seed, "attitude slow"),
     )
+    unstated = world.unstated(flight.strip_times_s, flight.truth.start_s, flight.truth.end_s, seed)
+    return drawn if unstated is None else MisstatedErrors.over(drawn, unstated)
 
 
-def measure_points(flight: Flight, seed: int, plan: ObservationPlan) -> tuple[GroundPoints, Array, ImageMeasurements]:
+def measure_points(
+    flight: Flight, seed: int, plan: ObservationPlan, world: World | None = None
+) -> tuple[GroundPoints, Array, ImageMeasurements]:
     """Ground points, their surveyed coordinates (m, 3), and their images; points with fewer than two rays drop out."""
+    world = world or AS_STATED
     control_rng = stream(seed, "control")
     points = place_points(flight, plan.tie_points_per_s, plan.control, plan.check, stream(seed, "points"), control_rng)
     looks = find_looks(points.xyz_l, flight.strips, flight.camera)
-    images = measure_images(flight, points, looks, plan, stream(seed, "image noise"), stream(seed, "outliers"))
+    images = measure_images(flight, points, looks, plan, stream(seed, "image noise"), stream(seed, "outliers"), world)
 
     rays = np.bincount(images.looks.point, minlength=len(points))
     kept = rays >= 2
-    survey_error = control_rng.standard_normal((len(points), 3)) * plan.control_sigma_m
+    survey_error = control_rng.standard_normal((len(points), 3)) * plan.control_sigma_m + world.control_datum_m
     surveyed = points.xyz_l + np.where((points.role == "control")[:, None], survey_error, 0.0)
     images = images.select(kept[images.looks.point])
     number = np.cumsum(kept) - 1
@@ -249,10 +288,19 @@ def measure_images(
     plan: ObservationPlan,
     noise_rng: np.random.Generator,
     outlier_rng: np.random.Generator,
+    world: World | None = None,
 ) -> ImageMeasurements:
-    """Lines and samples with noise, and with blunders in a share of the tie rays; off the image nothing is measured."""
-    n = len(looks)
-    noise = plan.image_sigma_px * noise_rng.standard_normal((n, 2))
+    """Lines and samples with noise, and with blunders in a share of the tie rays; off the image nothing is measured.
+
+    Parameters
+    ----------
+    looks : of the camera as stated; in a world with another one each is taken where that one sees it
+    """
+    world = world or AS_STATED
+    n, seen, camera = len(looks), np.ones(len(looks), dtype=bool), world.camera(flight.camera)
+    if camera is not flight.camera:
+        looks, seen = looks_through(looks, find_looks(points.xyz_l, flight.strips, camera))
+    noise = plan.image_sigma_px * world.image_noise(noise_rng.standard_normal((n, 2)))
     line, sample = looks.line + noise[:, 0], looks.sample + noise[:, 1]
     chance, size, direction = outlier_rng.uniform(size=(n, 3)).T
     outlier = (chance < plan.outlier_share) & (points.role[looks.point] == "tie")
@@ -261,4 +309,4 @@ def measure_images(
     lines = np.array([strip.lines for strip in flight.strips])[looks.strip]
     pixels = np.array([ccd.pixels for ccd in flight.camera.lines])[looks.ccd]
     inside = (line >= 0) & (line <= lines - 1) & (sample >= 0) & (sample <= pixels - 1)
-    return ImageMeasurements(looks, line, sample, outlier).select(inside)
+    return ImageMeasurements(looks, line, sample, outlier).select(inside & seen)

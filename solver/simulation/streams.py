@@ -21,6 +21,8 @@ STREAMS = (
     "illumination",
     "sensor noise",
     "camera",
+    "random walk",
+    "sine",
 )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjustment.batch import Job, run
+from ..adjustment.job import Job, run
 from ..adjustment.network import Control
 from ..adjustment.statistics import planimetric
 from .testfields import Configuration, Testfield

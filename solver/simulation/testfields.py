@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjustment.batch import Job
-from ..camera import LineCamera
+from ..adjustment.job import Job
+from ..camera.line_camera import LineCamera
+from ..camera.self_calibration import SelfCalibration, prism, tls
+from ..camera.sensors import lens_views_deg, preset
 from ..models.base import ModelOptions
 from ..models.dgr import DgrOptions
 from ..models.lim import LimOptions
-from ..selfcalibration import SelfCalibration, prism, tls
-from ..sensors import lens_views_deg, preset
 from .network import FlightLine, Noise, SimulatedNetwork, parallel_and_cross, scatter_points, simulate_network
 from .satellite import Scene, simulate_scene
 

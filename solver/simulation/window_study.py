@@ -9,22 +9,15 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.self_calibration import SelfCalibration
+from ..geometry.space_intersection import ImageRays, intersect
+from ..geometry.trajectory import Trajectory
+from ..models.slow_errors import SlowErrors
 from ..navigation.kinematic import KinematicFilter
 from ..navigation.kinematic_model import KinematicOptions
 from ..navigation.pose import NavigationPose
-from ..selfcalibration import SelfCalibration
-from ..slow_errors import SlowErrors
-from ..space_intersection import ImageRays, intersect
-from ..trajectory import Trajectory
-from ..window.results import (
-    AdjustedPoint,
-    Look,
-    RefinedOrientation,
-    Refusal,
-    WindowOptions,
-    WindowReport,
-    WindowUpdate,
-)
+from ..window.output import WindowReport, WindowUpdate
+from ..window.results import AdjustedPoint, Look, RefinedOrientation, Refusal, WindowOptions
 from ..window.window import Window
 from .error_models import ErrorModel
 from .scenario import Simulation

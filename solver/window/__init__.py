@@ -1,7 +1,7 @@
-"""The sliding-window adjustment; start at ``window.py``.
+"""The sliding-window adjustment; start at ``window.py``, whose update is one line a phase.
 
-``arriving.py`` makes batches of what has come, ``following.py`` keeps them linearised where the window is,
-``leaving.py`` lets go. ``batch.py`` takes points with their rays to equations, ``state.py`` holds the unknowns,
-``block.py`` and ``archive.py`` join strips, ``backward.py`` refines what left early, ``watch.py`` and its parts judge
-how far the result holds.
+Rooms, each importing only from those before it: ``results.py`` (what the window takes and gives), ``state/`` (unknowns,
+points and equations of the network in the window), ``datum/`` (control, tie points that drift), ``block/`` (what strips
+leave behind), ``screening/`` (which looks count), ``quality/`` (how far the result holds), ``output.py``,
+``leaving.py``, ``window.py``. See docs/architecture.md.
 """

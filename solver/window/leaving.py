@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..measured_trajectory import MeasuredTrajectory
-from ..models.base import Design
-from .backward import LeftPoints, Step
-from .batches import Batches
-from .block import Block
-from .control import ControlDesk
-from .intake import Intake
-from .integrity import Exposure
-from .output import Orienter, adjusted_points
-from .results import RefinedOrientation, WindowOptions, WindowUpdate
-from .single_looks import SingleLooks
-from .snooping import snoop
-from .state import WindowState
-from .strip import WindowStrip
-from .tie_snooping import snoop_ties
-from .watch import Watch, middle
+from ..geometry.measured_trajectory import SMOOTHED_LATE_S
+from .block.backward import LeftOrientation, LeftPoints, Step
+from .block.block import Block
+from .datum.control import ControlTests
+from .datum.drift_monitor import DriftMonitor
+from .output import OrientationOutput, adjusted_points
+from .quality.quality_control import QualityControl
+from .results import AdjustedPoint, RefinedOrientation, Refusal, WholeStrips, WindowOptions
+from .screening.snooping import snoop
+from .screening.ties import snoop_ties
+from .state.batch import Batch
+from .state.maker import BatchMaker
+from .state.network import LiveNetwork
+from .state.strip import WindowStrip
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -38,126 +35,146 @@ LEAVING_S, LEAST_LEAVING = 1.0, 100
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
-#: A strip waits so long beyond its time, s, for smoothed poses of its end where there are smoothed ones: longer than a
-#: smoother lags behind. Filtered ones differ by more than any wander explains while a filter learns, and where they
-#: follow smoothed ones is a step that no correction can take.
-SMOOTHED_LATE_S = 12.0
 
 
-class Leaver:
-    """Lets go.
+@dataclass
+class Left:
+    """What became final in an update.
 
-    Parameters
+    Attributes
     ----------
-    single : takes care of looks without a partner
-    control : weighs control
-    apart : told the points that do not agree with earlier strips, and the result
+    final, points : orientation and points that have left the window
+    whole : orientation and points with the information of whole strips, from the backward pass
+    refused : looks left out at the last test, those that found no partner, and those that count after all
+    alone : points that do not agree with what earlier strips say of them
+    events : lines for the operator
     """
+
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    whole: WholeStrips | None = None
+    refused: list[Refusal] = field(default_factory=list)
+    alone: list[str] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+
+
+class Leaving:
+    """Makes final what is older than the window, and hands it to the block."""
 
     def __init__(
         self,
         options: WindowOptions,
-        state: WindowState,
-        strips: dict[str, WindowStrip],
-        batches: Batches,
-        intake: Intake,
-        trajectory: MeasuredTrajectory,
+        network: LiveNetwork,
         block: Block,
-        watch: Watch,
-        orienter: Orienter,
-        control: ControlDesk,
-        apart: Callable[[list[str], WindowUpdate], None],
-        single: SingleLooks,
+        control: ControlTests,
+        quality: QualityControl,
+        orientation: OrientationOutput,
     ) -> None:
-        self.options, self._state, self._strips, self._batches = options, state, strips, batches
-        self._intake, self._trajectory, self._block = intake, trajectory, block
-        self._watch, self._orienter, self._control, self._apart, self._single = (
-            watch, orienter, control, apart, single,
-        )  # fmt: skip
+        self.options, self._network, self._block = options, network, block
+        self._control, self._quality, self._orientation = control, quality, orientation
+        self._single = SingleLooks(network, block, control.sources)
         self._steps: list[Step] = []
         self._left: list[LeftPoints] = []
         self._let_go_s = -np.inf
 
-    def let_go(
-        self, now_s: float, limit_s: float, length_s: float, serial: int, result: WindowUpdate, at_the_end: bool = False
-    ) -> None:
+    def let_go(self, now_s: float, limit_s: float, length_s: float, serial: int, at_the_end: bool = False) -> Left:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
-        limits = {}
-        bearable_s = self._bearable_s(limit_s, now_s - self._let_go_s)
-        self._let_go_s = now_s
-        for strip in self._strips.values():
-            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
-            limits[strip.id] = max(settled_s, bearable_s)
-        by_index = [limits[id] for id in self._strips]
-        latest = max(by_index, default=-np.inf)
-        old = [b for b in self._batches if b.oldest_s <= latest]
-        leaving = [b for b in old if b.oldest_s <= max(by_index[i] for i in b.strips)]
+        found, network = Left(), self._network
+        limits = self._limits(now_s, limit_s)
+        leaving = self._older_than(list(limits.values()))
         if self.options.snoop and leaving:
-            refused, rounds = snoop(
-                leaving, self._state, self._intake.points, self.options.critical, serial,
-                partial(self._control.look, now_s), lambda names: self._apart(names, result),
-            )  # fmt: skip
-            result.refused += refused
-            failed = snoop_ties([b for b in leaving if b.ties is not None], self._state)
-            self._apart(failed, result)
-            if failed:
-                self._state.solve()
-            if rounds or failed:
-                self._orienter.forget()
-        gone = [(strip, *strip.leaving(limits[strip.id], self._state)) for strip in self._strips.values()]
-        result.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
-        cells = self._watch.cells(leaving)
-        for batch in leaving:
-            drift = self._watch.on_points(batch, self._orienter.drift)
-            points = adjusted_points(batch, self._state, self._intake.points, self._intake.control, True, drift)
-            result.points += points
-            result.refused += self._intake.without_place(batch, {p.name for p in points})
-            self._left.append(LeftPoints.of(batch, points))
-            result.refused += self._block.leave(batch, points, cells.get(id(batch)))
-        self._watch.leaving(leaving, limit_s - length_s)
-        for batch in leaving:
-            self._batches.leave(batch)
-            self._intake.finish(batch)
+            self._last_test(leaving, now_s, serial, found)
+        gone = [(strip, *strip.leaving(limits[strip.id], network.state)) for strip in network.strips.values()]
+        found.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
+        self._release_points(leaving, limit_s - length_s, found)
         for strip, numbers, to_s in gone:
-            if not len(numbers):
-                continue
-            final = self._final(strip, to_s)
-            design = noise = None
-            if final is not None:
-                result.final.append(final)
-                design, noise = strip.design(final.time_s), self._orienter.noise(strip, final.time_s)
-                self._block.orientation(strip, final, design, noise)
-            strip.final_to_s = to_s
-            self._step(numbers, final, design, noise)
-            if strip.ended and strip.is_gone(self._state):
-                self._block.gone(strip)
-                strip.release()
+            if len(numbers):
+                self._release_orientation(strip, numbers, to_s, found)
         over = min(limits.values(), default=limit_s)
-        modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in self._batches))
+        modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in network.batches))
         if len(modes):
-            self._step(modes)
-        result.whole = self._block.refined(now_s, self._steps, at_the_end)
+            self._marginalise(modes)
+        found.whole = self._block.refined(now_s, self._steps, at_the_end)
         if self._block.quiet:
-            result.events += self._block.take_events()
+            found.events += self._block.take_events()
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s)
+        return found
+
+    def _limits(self, now_s: float, limit_s: float) -> dict[str, float]:
+        """By strip, the time before which all leaves."""
+        bearable_s = self._bearable_s(limit_s, now_s - self._let_go_s)
+        self._let_go_s = now_s
+        limits = {}
+        for strip in self._network.strips.values():
+            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
+            limits[strip.id] = max(settled_s, bearable_s)
+        return limits
+
+    def _older_than(self, limits: list[float]) -> list[Batch]:
+        """Batches with rays older than the limit of one of their strips."""
+        latest = max(limits, default=-np.inf)
+        old = [b for b in self._network.batches if b.oldest_s <= latest]
+        return [b for b in old if b.oldest_s <= max(limits[i] for i in b.strips)]
+
+    def _last_test(self, leaving: list[Batch], now_s: float, serial: int, found: Left) -> None:
+        snooped = snoop(leaving, self._network, self._control, now_s, serial)
+        self._block.reweigh_control(snooped.control)
+        failed = snoop_ties([b for b in leaving if b.ties is not None], self._network)
+        self._network.intake.set_apart(failed)
+        found.refused += snooped.refused
+        found.alone = snooped.alone + failed
+        if failed:
+            self._network.state.solve()
+        if snooped.rounds or failed:
+            self._orientation.forget()
+
+    def _release_points(self, leaving: list[Batch], forget_s: float, found: Left) -> None:
+        """Publish the points of batches, and fix what these know."""
+        network, sources = self._network, self._control.sources
+        cells = sources.cells(leaving)
+        for batch in leaving:
+            points = adjusted_points(batch, network, True, sources.on_points(batch, self._orientation.drift))
+            found.points += points
+            found.refused += network.intake.without_place(batch, {p.name for p in points})
+            self._left.append(LeftPoints.of(batch, points))
+            found.refused += self._block.leave(batch, points, cells.get(id(batch)))
+        self._quality.integrity.leave(leaving, forget_s)
+        self._control.leaving(leaving, sources.leave(leaving))
+        for batch in leaving:
+            network.batches.leave(batch)
+            network.intake.finish(batch)
+
+    def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, found: Left) -> None:
+        """Publish the orientation of a strip up to a time, and marginalise unknowns that no later time needs."""
+        final = self._final(strip, to_s)
+        left = None
+        if final is not None:
+            found.final.append(final)
+            noise = self._orientation.noise(strip, final.time_s) + self._network.sigmas.doubt
+            left = LeftOrientation(final, strip.design(final.time_s), noise)
+            self._block.orientation(strip, left)
+        strip.final_to_s = to_s
+        self._marginalise(numbers, left)
+        if strip.ended and strip.is_gone(self._network.state):
+            self._block.gone(strip)
+            strip.release()
 
     def _is_settled(self, strip: WindowStrip, now_s: float) -> bool:
         """Whether a strip is over and nothing is waited for: late tie points, and smoothed poses under its rays."""
         late_s = now_s - strip.end_s - self.options.settle_s
         if not strip.ended or late_s < 0.0:
             return False
-        smoothed_s = self._trajectory.smoothed_to_s
+        smoothed_s = self._network.trajectory.smoothed_to_s
         if np.isinf(smoothed_s) or late_s >= SMOOTHED_LATE_S:
             return True
-        index = list(self._strips).index(strip.id)
-        return smoothed_s >= strip.end_s and not any(b.provisional and index in b.strips for b in self._batches)
+        return smoothed_s >= strip.end_s and not any(b.provisional for b in self._network.of_strip(strip))
 
     def _bearable_s(self, limit_s: float, passed_s: float) -> float:
         """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
             return limit_s
-        old = sorted((b for b in self._batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
+        old = sorted((b for b in self._network.batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
         most = max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S)
         rays = 0
         for batch in old:
@@ -168,62 +185,113 @@ class Leaver:
 
     def _settled_to(self, strip: WindowStrip) -> float:
         """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
-        index = list(self._strips).index(strip.id)
         rays = 0
-        for batch in sorted((b for b in self._batches if index in b.strips), key=lambda b: b.oldest_s):
+        for batch in sorted(self._network.of_strip(strip), key=lambda b: b.oldest_s):
             rays += len(batch.rays)
             if rays > MOST_LEAVING:
                 return batch.oldest_s
         return np.inf
 
-    def _step(
-        self,
-        numbers: IntArray,
-        final: RefinedOrientation | None = None,
-        design: Design | None = None,
-        noise: Array | None = None,
-    ) -> None:
-        """Marginalise unknowns, and keep what leads back to them."""
-        marginal = self._state.marginalise(numbers)
-        self._watch.marginalised(marginal)
-        self._steps.append(Step(marginal, final, design, noise, self._left))
+    def _marginalise(self, numbers: IntArray, final: LeftOrientation | None = None) -> None:
+        """Marginalise unknowns, with all that stands beside them, and keep what leads back to them."""
+        marginal = self._network.state.marginalise(numbers)
+        self._quality.integrity.marginalised(marginal)
+        self._control.marginalised(self._control.sources.marginalised(marginal))
+        self._steps.append(Step(marginal, final, self._left))
         self._left = []
-        self._orienter.forget()
+        self._orientation.forget()
 
     def _final(self, strip: WindowStrip, to_s: float) -> RefinedOrientation | None:
         """Orientation at the grid times that become final now."""
-        end = self._trajectory.end_s
+        end = self._network.trajectory.end_s
         if not np.isfinite(end):
             return None
         times = grid(self.options.grid_hz, strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
-        times = times[self._trajectory.covers(times)] if len(times) else times
+        times = times[self._network.trajectory.covers(times)] if len(times) else times
         if not len(times):
             return None
-        final = self._orienter.at(strip, times)
-        return _protected(final, self._watch.became_final(strip, final))
-
-    def protected(self, strip: WindowStrip, orientation: RefinedOrientation) -> RefinedOrientation:
-        """With protection levels as the middle of the times is exposed."""
-        return _protected(orientation, self._watch.exposure_at(strip, middle(orientation)))
+        return self._quality.protected(strip, self._orientation.at(strip, times), final=True)
 
     def _forget(self, limit_s: float, length_s: float) -> None:
         """Drop what nothing can need any more: names of points long final, old poses."""
         if not np.isfinite(limit_s) and limit_s < 0:
             return
-        self._intake.forget(limit_s - length_s)
-        used = min((b.oldest_s for b in self._batches), default=np.inf)
-        waiting = self._intake.oldest_waiting_s
-        finals = min((s.final_to_s for s in self._strips.values() if not s.is_gone(self._state)), default=np.inf)
-        self._trajectory.forget(min(limit_s - length_s, used, waiting, finals) - 1.0)
-
-
-def _protected(orientation: RefinedOrientation, exposure: Exposure | None) -> RefinedOrientation:
-    if exposure is None:
-        return orientation
-    sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
-    return replace(orientation, protection=exposure.protection(sigma))
+        self._network.intake.forget(limit_s - length_s)
+        used = min((b.oldest_s for b in self._network.batches), default=np.inf)
+        waiting = self._network.intake.oldest_waiting_s
+        finals = min(
+            (s.final_to_s for s in self._network.strips.values() if not s.is_gone(self._network.state)), default=np.inf
+        )
+        self._network.trajectory.forget(min(limit_s - length_s, used, waiting, finals) - 1.0)
 
 
 def grid(hz: float, from_s: float, to_s: float) -> Array:
     """Times of the published orientation in [from, to)."""
     return np.arange(np.ceil(from_s * hz - 1e-6), np.ceil(to_s * hz - 1e-6)) / hz
+
+
+#: Time between two looks for looks that wait in vain, s, unless unknowns leave.
+GIVE_UP_EVERY_S = 1.0
+#: Looks that are kept together.
+KEPT_TOGETHER = 12
+#: Batches whose points say about how far away the ground is.
+GROUND_BATCHES = 32
+
+
+class SingleLooks:
+    """Gives up waiting for partners of looks, and keeps what can be kept for the block.
+
+    Such looks say nothing of their strip, but a later strip may see their point again. Before the unknowns of their
+    time leave the window they are linearised.
+    """
+
+    def __init__(self, network: LiveNetwork, block: Block, sources: DriftMonitor) -> None:
+        self._network, self._block, self._sources = network, block, sources
+        self._maker = BatchMaker(network)
+        self._looked_s = -np.inf
+
+    def leave(self, now_s: float, limits_s: Mapping[str, float], at_once: bool) -> list[Refusal]:
+        """Looks older than the limits of their strips leave, now and then; told as refused: their strip has no use for
+        them.
+
+        Parameters
+        ----------
+        limits_s : by strip
+        at_once : unknowns are about to leave
+        """
+        if not at_once and now_s < self._looked_s + GIVE_UP_EVERY_S:
+            return []
+        self._looked_s = now_s
+        names = self._network.intake.without_partner(limits_s)
+        by_strip: dict[str, list[str]] = {}
+        for name in names:
+            point = self._network.intake.points[name]
+            if len(point.looks) == 1 and not point.alone and self._network.trajectory.covers(point.time_s)[0]:
+                by_strip.setdefault(point.looks[0].strip, []).append(name)
+        for id, single in by_strip.items():
+            for begin in range(0, len(single), KEPT_TOGETHER):
+                self._keep(self._network.strips[id], single[begin : begin + KEPT_TOGETHER])
+        return self._network.intake.give_up(names)
+
+    def _keep(self, strip: WindowStrip, names: list[str]) -> None:
+        """Keep looks of a strip, if its unknowns are there and ground is known near it."""
+        ground = self._network.of_strip(strip)
+        points = [self._network.intake.points[name] for name in names]
+        times = [p.time_s[0] for p in points]
+        if (
+            not ground
+            or strip.is_gone(self._network.state)
+            or (self._network.state.places(strip.design(times).unknowns()) < 0).any()
+        ):
+            return
+        ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
+        near = _placed(ground[:GROUND_BATCHES])
+        batch = self._maker.make_single(names, points, near) if len(near) else None
+        if batch is not None:
+            looks = [p.looks[0] for p in points]
+            self._block.keep_single(batch, looks, self._sources.cell_of_single(batch))
+
+
+def _placed(batches: Iterable[Batch]) -> Array:
+    """The points (m, 3) of batches that have a place."""
+    return np.concatenate([b.points_l[b.normals.rank == 3] for b in batches])

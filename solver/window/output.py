@@ -3,50 +3,93 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..measured_trajectory import MeasuredTrajectory
+from ..camera.self_calibration import unit_of
+from ..geometry.rotation import corrected_angles
 from ..models.base import COMPONENTS
-from ..rotation import corrected_angles
-from ..selfcalibration import SelfCalibration, unit_of
-from .batch import Batch
-from .compensation import Compensation
-from .determinability import ESTIMATED, NOT_YET, Standing
-from .points import ControlPoint, PointLooks
-from .pose_noise import PoseNoise
-from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation
-from .state import WindowState
-from .strip import WindowStrip
+from .datum.drift_monitor import DriftMonitor
+from .datum.drifts import Compensation
+from .quality.determinability import ESTIMATED, NOT_YET, Standing
+from .quality.light import QualityFindings
+from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, Refusal, WholeStrips, checks
+from .state.batch import Batch
+from .state.network import LiveNetwork
+from .state.strip import WindowStrip
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 #: Times worked on at once.
 CHUNK = 64
+#: After sigmas have changed sigma0 is told again when this share of the window's length has passed. Tuned.
+LEAST_SHARE = 0.5
 #: Sigma of a strip's parameter, in units of the a-priori one, from which the observations know it better.
 BETTER = 0.7
 
 
-class Orienter:
+@dataclass(frozen=True)
+class WindowReport:
+    """Figures of one update; sigma0 is 1 a priori.
+
+    Attributes
+    ----------
+    sigma0, redundancy : over about the length of the window; NaN without redundancy
+    sigma0_total, redundancy_total : since the start
+    observations, unknowns : in the window, what was marginalised counting as one observation an unknown
+    start_s, end_s : orientation before the start is final; newest ray
+    quality : light, protection levels and sources that drift
+    """
+
+    sigma0: float
+    redundancy: int
+    sigma0_total: float
+    redundancy_total: int
+    observations: int
+    unknowns: int
+    iterations: int
+    start_s: float
+    end_s: float
+    rays: int
+    points: int
+    control: int
+    strip: str
+    parameters: tuple[Parameter, ...]
+    quality: QualityFindings
+
+
+@dataclass
+class WindowUpdate:
+    """What one update gave; ``whole`` when strips have ended; ``events`` and ``warnings`` are for the operator."""
+
+    report: WindowReport | None = None
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    whole: WholeStrips | None = None
+
+    def tell_alone(self, names: list[str]) -> None:
+        """Points were found that do not agree with what earlier strips say of them."""
+        if names:
+            self.events.append(f"do not agree with earlier strips: {', '.join(names)}")
+
+
+class OrientationOutput:
     """Refined orientation at any time; keeps the cofactors of the unknowns asked for last.
 
     Parameters
     ----------
-    compensation : what tie points that drift do to the solution
+    sources : says what tie points that drift do to the solution
     """
 
-    def __init__(
-        self,
-        state: WindowState,
-        trajectory: MeasuredTrajectory,
-        pose_noise: PoseNoise,
-        compensation: Callable[[], Compensation | None],
-    ):
-        self._state, self._trajectory, self._pose_noise = state, trajectory, pose_noise
-        self._compensation = compensation
+    def __init__(self, network: LiveNetwork, sources: DriftMonitor) -> None:
+        self._network, self._sources = network, sources
         self._drift: Compensation | None = None
         self._drift_is_known = False
         self._columns: IntArray = np.empty(0, dtype=np.int64)
@@ -60,61 +103,51 @@ class Orienter:
     def drift(self) -> Compensation | None:
         """What tie points that drift do to the solution."""
         if not self._drift_is_known:
-            self._drift, self._drift_is_known = self._compensation(), True
+            self._drift, self._drift_is_known = self._sources.compensation(), True
         return self._drift
 
     def at(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
         """Orientation at times (n,) that have a measured one."""
         parts = [self._chunk(strip, times[i : i + CHUNK]) for i in range(0, len(times), CHUNK)]
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
-        measured = self._trajectory.at(times)
+        measured = self._network.trajectory.at(times)
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = covariance + self._pose_noise.at(measured, strip.followed)
+        covariance = covariance + self._network.pose_noise.at(measured, strip.followed) + self._network.sigmas.doubt
+        covariance += measured.open_end[:, :, None] * np.eye(6)
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
         )
 
     def noise(self, strip: WindowStrip, times: Array) -> Array:
         """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
-        noise = self._pose_noise.at(self._trajectory.at(times), strip.followed)
+        noise = self._network.pose_noise.at(self._network.trajectory.at(times), strip.followed)
         return noise + strip.left_out_variance(times)[:, :, None] * np.eye(6)
 
     def _chunk(self, strip: WindowStrip, times: Array) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""
-        design = strip.design(times)
-        columns = np.unique(design.columns)
-        columns = columns[columns >= 0].astype(np.int64)
+        columns, A = strip.design(times).functions()
         if self._cofactors is None or not np.array_equal(columns, self._columns):
-            self._cofactors, self._columns = self._state.covariance(columns), columns
-        local = np.where(design.columns >= 0, np.searchsorted(columns, design.columns), len(columns))
-        A = np.zeros((len(times), 6, len(columns) + 1))
-        row = np.arange(len(times))[:, None, None]
-        A[row, np.arange(6), local] += design.coefficients[:, :, None]
-        A = A[:, :, :-1]
+            self._cofactors, self._columns = self._network.state.covariance(columns), columns
         through = (A.reshape(-1, len(columns)) @ self._cofactors).reshape(A.shape)
         covariance = through @ np.swapaxes(A, 1, 2)
         covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
-        correction = A @ self._state.values(columns)
+        correction = A @ self._network.state.values(columns)
         if self.drift is not None:
-            change, of_drift = self.drift.change(A, self._state.places(columns))
+            change, of_drift = self.drift.change(A, self._network.state.places(columns))
             correction, covariance = correction + change, covariance + of_drift
         return correction, covariance
 
 
 def adjusted_points(
-    batch: Batch,
-    state: WindowState,
-    points: Mapping[str, PointLooks],
-    control: Mapping[str, ControlPoint],
-    final: bool,
-    drift: tuple[Array, Array] | None,
+    batch: Batch, network: LiveNetwork, final: bool, drift: tuple[Array, Array] | None
 ) -> list[AdjustedPoint]:
     """The points of a batch that are determined, with covariance and residuals.
 
     ``drift``: what to add to coordinates (p, 3) and covariance (p, 3, 3) for tie points that drift.
     """
-    cofactors, statistics = batch.judge(state)
+    points, control = network.intake.points, network.intake.control
+    cofactors, statistics = batch.judge(network.state)
     xyz_l, covariance = batch.points_l, cofactors.points
     if drift is not None:
         xyz_l, covariance = xyz_l + drift[0], covariance + drift[1]
@@ -141,18 +174,17 @@ def adjusted_points(
     return out
 
 
-def checks(rays: int, looks: int, known: bool) -> str:
-    """See `AdjustedPoint`."""
-    if 2 * rays <= looks and looks > 2:
-        return "doubtful"
-    return "all" if rays > 2 or known else "across"
-
-
 class CostHistory:
     """Weighted squares and redundancy so far, over time: what has been gained over the last while."""
 
     def __init__(self) -> None:
         self._past: deque[tuple[float, float, int]] = deque()
+        self._restarted = False
+
+    def restart(self) -> None:
+        """Sigmas have changed: costs before and after cannot be compared."""
+        self._past.clear()
+        self._restarted = True
 
     def over(self, now_s: float, length_s: float, cost: float, redundancy: int) -> tuple[float, int]:
         """sigma0 (NaN without redundancy) and redundancy of what came in the last ``length_s``."""
@@ -160,31 +192,29 @@ class CostHistory:
         while len(self._past) > 2 and self._past[1][0] <= now_s - length_s:
             self._past.popleft()
         then, old_cost, old_redundancy = self._past[0]
-        if now_s - then < length_s:
+        if now_s - then < length_s and not self._restarted:
             old_cost, old_redundancy = 0.0, 0
-        gained = redundancy - old_redundancy
-        if gained <= 0:
+        elif now_s - then < LEAST_SHARE * length_s:
             return float("nan"), 0
-        return float(np.sqrt(max(cost - old_cost, 0.0) / gained)), gained
+        gained = redundancy - old_redundancy
+        if gained <= 0 or cost < old_cost:  # less than before where sigmas have become larger in between
+            return float("nan"), 0
+        return float(np.sqrt((cost - old_cost) / gained)), gained
 
 
-def parameters(
-    state: WindowState,
-    strip_globals: ArrayLike,
-    apriori: Array,
-    self_calibration: SelfCalibration | None,
-    camera_columns: IntArray,
-    standing: Sequence[Standing] = (),
-) -> tuple[Parameter, ...]:
-    """Offset, shift and drift of a strip (numbers (9,), or none; a-priori sigmas (9,)) and the additional parameters.
+def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Standing] = ()) -> tuple[Parameter, ...]:
+    """Offset, shift and drift of a strip where its model has them, and the additional parameters.
 
     Those of the strip are in the state from the start, with what is known of them beforehand: "estimated" says that the
     observations know them better.
     """
+    state, self_calibration, camera_columns = network.state, network.self_calibration, network.camera_columns
+    slow, strip_globals = strip.slow, strip.numbers[:9]
+    apriori = np.concatenate([slow.offset_m, slow.shift, slow.drift])
     names: list[tuple[str, str, int]] = []
-    if len(np.asarray(strip_globals)):
+    if len(strip_globals):
         kinds = [f"d{c}" for c in COMPONENTS] + [f"{c} drift" for c in COMPONENTS[3:]]
-        names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, np.asarray(strip_globals).tolist(), strict=True))
+        names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, strip_globals.tolist(), strict=True))
     if self_calibration is not None:
         for name, number in zip(self_calibration.unknown_names, camera_columns.tolist(), strict=True):
             names.append((name, unit_of(name), number))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from ..adjustment.reliability import CRITICAL_W
 from ..models import MODELS
 
-if TYPE_CHECKING:
-    from .watch import Watched
-
 Array = NDArray[np.floating]
+
+
+#: Whose datum can be published.
+DATUMS = ("control", "gnss")
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class WindowOptions:
     snoop : whether observations are tested at all
     determine : whether it is tested which additional parameters the network can see by now; else all are estimated
     retest : batches tested again per update, besides new ones
+    datum : whose datum is published where control that agrees with itself and GNSS differ: "control" or "gnss"
     alert_limit_m : what an error on the ground must stay below for the operator's light to be good; 0 = so many ground
         sample distances (see `ground`)
     """
@@ -48,6 +50,7 @@ class WindowOptions:
     snoop: bool = True
     determine: bool = True
     retest: int = 4
+    datum: str = "control"
     alert_limit_m: float = 0.0
 
     @property
@@ -58,6 +61,8 @@ class WindowOptions:
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise ValueError(f"unknown trajectory model {self.model!r}; known: {', '.join(MODELS)}")
+        if self.datum not in DATUMS:
+            raise ValueError(f"datum: {self.datum!r} is not known, wanted one of {', '.join(DATUMS)}")
         for name in ("segment_s", "window_s", "settle_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: wanted seconds not below 0, got {getattr(self, name)}")
@@ -118,7 +123,7 @@ class RefinedOrientation:
     position_l, angles : (n, 3) m; omega, phi, kappa in rad
     covariance : (n, 6, 6) of correction and measurement noise together
     correction : (n, 6) added to the measured orientation
-    protection : (n, 6) protection levels, see `integrity`; None where they are not known
+    protection : (n, 6) protection levels, see `quality.exposure`; None where they are not known
     """
 
     strip: str
@@ -189,36 +194,6 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class WindowReport:
-    """Figures of one update; sigma0 is 1 a priori.
-
-    Attributes
-    ----------
-    sigma0, redundancy : over about the length of the window; NaN without redundancy
-    sigma0_total, redundancy_total : since the start
-    observations, unknowns : in the window, what was marginalised counting as one observation an unknown
-    start_s, end_s : orientation before the start is final; newest ray
-    watched : light, protection levels and sources that drift
-    """
-
-    sigma0: float
-    redundancy: int
-    sigma0_total: float
-    redundancy_total: int
-    observations: int
-    unknowns: int
-    iterations: int
-    start_s: float
-    end_s: float
-    rays: int
-    points: int
-    control: int
-    strip: str
-    parameters: tuple[Parameter, ...]
-    watched: Watched
-
-
-@dataclass(frozen=True)
 class WholeStrips:
     """Orientation and points with the information of whole strips, from the backward pass after their end."""
 
@@ -226,14 +201,8 @@ class WholeStrips:
     points: list[AdjustedPoint]
 
 
-@dataclass
-class WindowUpdate:
-    """What one update gave; ``whole`` when strips have ended; ``events`` and ``warnings`` are for the operator."""
-
-    report: WindowReport | None = None
-    final: list[RefinedOrientation] = field(default_factory=list)
-    points: list[AdjustedPoint] = field(default_factory=list)
-    refused: list[Refusal] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    whole: WholeStrips | None = None
+def checks(rays: int, looks: int, known: bool) -> str:
+    """What `AdjustedPoint.checked` is for a point of so many looks of which so many take part."""
+    if 2 * rays <= looks and looks > 2:
+        return "doubtful"
+    return "all" if rays > 2 or known else "across"

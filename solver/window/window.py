@@ -7,42 +7,35 @@ What is known of the slow errors beforehand makes the problem regular without an
 says how uncertain it is.
 
 A point that is seen again in a later strip after it has become final ties both strips, on line by what the earlier ones
-know of it (`ties`), and after each strip by a solution of the block as a whole (`block`).
+know of it (`block.ties`), and after each strip by a solution of the block as a whole (`block.block`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..camera import LineCamera
-from ..measured_trajectory import MeasuredTrajectory
-from ..selfcalibration import SelfCalibration
-from ..slow_errors import SlowErrors
-from .arriving import Arrivals, look_time
-from .batch import Batch
-from .batches import Batches
-from .block import Block
-from .control import ControlDesk
-from .determinability import Standing
-from .duties import LOOK_AFTER, RETEST, WATCH, Duties
-from .following import Follower
-from .intake import Intake
-from .leaving import Leaver, grid
-from .output import CostHistory, Orienter, adjusted_points, parameters
-from .points import BatchMaker, ControlPoint
-from .pose_noise import PoseNoise
-from .results import Look, Parameter, RefinedOrientation, WindowOptions, WindowReport, WindowUpdate
-from .settle import Settler, settle
-from .single_looks import SingleLooks
-from .snooping import reweigh, snoop
-from .sources import SourceMonitor
-from .state import WindowState
-from .strip import WindowStrip, segment_length
-from .watch import Watch
+from ..adjustment.pose_noise import ray_information
+from ..camera.line_camera import LineCamera
+from ..camera.self_calibration import SelfCalibration
+from ..models.slow_errors import SlowErrors
+from .block.block import Block
+from .datum.control import ControlTests
+from .datum.drift_monitor import DriftMonitor
+from .leaving import Leaving, grid
+from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, adjusted_points, parameters
+from .quality.light import Fit
+from .quality.quality_control import QualityControl
+from .results import Look, RefinedOrientation, WindowOptions
+from .screening.arriving import Arrivals, look_time
+from .screening.consensus import ConsensusSchedule, consensus_weights
+from .screening.sigma_check import SigmaCheck
+from .screening.snooping import reweigh, snoop
+from .state.batch import Batch
+from .state.network import LiveNetwork
+from .state.points import ControlPoint
+from .state.relinearisation import Relinearisation
+from .state.strip import WindowStrip, segment_length
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -55,6 +48,44 @@ USUAL_DELAY_S = 2.0
 MOST_RETESTED = 100
 #: Time between two looks at what corrections leave of the noise of poses, s.
 LEARNT_S = 2.0
+#: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
+HURRIED_S = 0.1
+#: Parts of the work that can wait: linearise what has moved, test old batches again, judge the quality.
+LOOK_AFTER, RETEST, WATCH = "look after", "retest", "watch"
+#: Time between two turns of each part, s; it is done in the first update after that.
+TURN_S = {LOOK_AFTER: 0.1, RETEST: 0.1, WATCH: 0.3}
+#: An update that has other work to do leaves a part to the next one unless it is overdue by more than this share of the
+#: time between its turns.
+PUT_OFF = 1.0
+_SMALL_S = 1e-6
+
+
+class Duties:
+    """Shares out work that can wait among the updates, by platform time, so that results do not depend on how many
+    updates a second there are."""
+
+    def __init__(self) -> None:
+        self._now_s = float("-inf")
+        self._done_s = dict.fromkeys(TURN_S, float("-inf"))
+
+    def take(self, now_s: float, busy: bool = False) -> set[str]:
+        """The parts that an update does.
+
+        Parameters
+        ----------
+        now_s : platform time of the update
+        busy : it has other work that does not come with every update
+        """
+        hurried = now_s - self._now_s < HURRIED_S
+        self._now_s = max(self._now_s, now_s)
+        late = {part: (now_s - done_s) / TURN_S[part] - 1.0 for part, done_s in self._done_s.items()}
+        due = {part for part, share in late.items() if share >= -_SMALL_S}
+        if hurried and due:
+            most = max(TURN_S, key=lambda part: late[part])
+            due = set() if busy and late[most] < PUT_OFF else {most}
+        for part in due:
+            self._done_s[part] = now_s
+        return due
 
 
 class Window:
@@ -80,62 +111,24 @@ class Window:
         self_calibration: SelfCalibration | None = None,
     ):
         self.camera, self.slow, self.options = camera, slow, options
-        self.trajectory = MeasuredTrajectory()
-        self.state = WindowState()
-        self.strips: dict[str, WindowStrip] = {}
-        self._self_calibration = self_calibration
-        self._camera_columns = np.empty(0, dtype=np.int64)
-        if self_calibration is not None:
-            self._camera_columns = self.state.new_numbers(self_calibration.n_unknowns)
-            self.state.enter(self._camera_columns)
-            m = len(self._camera_columns)
-            columns = self._camera_columns[:, None].astype(np.int32)
-            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
-        sigma = self_calibration.apriori_sigma if self_calibration is not None else np.empty(0)
-        self._block = Block(self.state, self.strips, self._camera_columns, sigma)
-        self._intake = Intake(camera, self.strips, self.trajectory)
-        self._points, self._control = self._intake.points, self._intake.control
-        self._pose_noise = PoseNoise(self.trajectory)
-        self._maker = BatchMaker(
-            camera, self.trajectory, self.strips, self.state, self._control, self_calibration, self._camera_columns,
-            self._pose_noise,
-        )  # fmt: skip
-        self._batches = Batches(self.state)
+        network = self.network = LiveNetwork(camera, self_calibration)
+        self.trajectory, self.state, self.strips = network.trajectory, network.state, network.strips
+        self._block = Block(network)
+        step_s = segment_length(slow, options)
+        self._sigma_check = SigmaCheck(network, constants=options.datum == "control")
+        self._arrivals = Arrivals(network, self._block, self._sigma_check, step_s, options.snoop)
+        self._relinearisation = Relinearisation(network, step_s)
+        self._consensus = ConsensusSchedule()
+        self._sources = DriftMonitor(network, follows=options.follows_wander)
+        self._control = ControlTests(network, self._sources, options.critical, options.datum)
+        self._quality = QualityControl(network, self._control, options)
+        self._orientation = OrientationOutput(network, self._sources)
+        self._leaving = Leaving(options, network, self._block, self._control, self._quality, self._orientation)
         self._history = CostHistory()
-        self._settler = Settler()
-        self._now_s = -np.inf
-        self._serial = 0
-        self._newest_ray_s = self._learnt_s = -np.inf
         self._duties = Duties()
         self._length_s = options.window_s
-        sources = SourceMonitor(
-            self._intake.sources_of, lambda: self.trajectory.noise_time_s, follows=options.follows_wander
-        )
-        self._control_desk = ControlDesk(
-            self.state, self.strips, self._batches, self._intake, self._block, options.critical, sources
-        )
-        self._watch = Watch(
-            camera, options.critical, self_calibration, self._camera_columns, self.state, options.determine,
-            self._control_desk, sources, options.alert_limit_m,
-        )  # fmt: skip
-        self._orienter = Orienter(
-            self.state, self.trajectory, self._pose_noise, lambda: self._watch.compensation(self._batches)
-        )
-        self._block.drifts = sources.named
-        step_s = segment_length(slow, options)
-        self._arrivals = Arrivals(
-            self._batches, self.state, self._maker, self._intake, self._block, step_s, options.snoop, self._watch.drop
-        )
-        self._follower = Follower(
-            self._batches, self.state, self._maker, self.trajectory, self._intake, step_s, self._watch.drop
-        )
-        single = SingleLooks(
-            self.state, self.strips, self.trajectory, self._intake, self._maker, self._batches, self._block, self._watch
-        )
-        self._leaver = Leaver(
-            options, self.state, self.strips, self._batches, self._intake, self.trajectory, self._block, self._watch,
-            self._orienter, self._control_desk, self._arrivals.apart, single,
-        )  # fmt: skip
+        self._now_s = self._newest_ray_s = self._learnt_s = -np.inf
+        self._serial = 0
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -166,8 +159,9 @@ class Window:
         if id in self.strips:
             return
         self.strips[id] = WindowStrip(
-            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s
-        )
+            id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s,
+            self.network.sigmas.apriori,
+        )  # fmt: skip
         self._block.begin(self.strips[id])
 
     def end_strip(self, id: str, lines: int = 0) -> None:
@@ -182,13 +176,13 @@ class Window:
         pass, and as soon as the strips that saw it are over also for the strip that is flown.
         """
         point = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
-        if name not in self._points:
+        if name not in self.network.intake.points:
             self._block.add_control(name, point)
-        self._intake.add_control(name, point)
+        self.network.intake.add_control(name, point)
 
     def add_look(self, name: str, look: Look) -> str:
         """A look at a point; returns why it is refused, "" if it is taken."""
-        return self._intake.add_look(name, look)
+        return self.network.intake.add_look(name, look)
 
     # -- update --------------------------------------------------------------------------------------------------------
 
@@ -197,19 +191,20 @@ class Window:
         self._now_s = max(self._now_s, now_s)
         self._serial += 1
         result = WindowUpdate()
-        for strip in self.strips.values():
-            if not strip.is_over(self.state):
-                strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
-        fresh = self._take_arrived(result)
-        joined = self._follower.replace_filtered()
+        self._extend_strips()
+        fresh = self._arrive(result)
+        joined = self._follow_trajectory()
         duties = self._duties.take(self._now_s, busy=bool(joined))
         if LOOK_AFTER in duties:
-            self._follower.look_after(self._now_s)
-        iterations = self._solve(fresh, joined, RETEST in duties, result)
+            self._relinearisation.look_after(self._now_s)
+        iterations = self._solve(fresh)
+        if self.options.snoop:
+            iterations += self._question_sigmas(result)
+            due = joined or (self._due_for_test() if RETEST in duties else [])
+            iterations += self._screen(fresh, fresh + due, result) + self._weigh_control(fresh, result)
+        self._judge(joined)
         self._learn_noise()
-        for batch in fresh:
-            drift = self._watch.on_points(batch, self._orienter.drift)
-            result.points += adjusted_points(batch, self.state, self._points, self._control, False, drift)
+        self._publish(fresh, result)
         self._let_go(self._limit_s(), result)
         result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
         return result
@@ -217,55 +212,104 @@ class Window:
     def finish(self) -> WindowUpdate:
         """Everything that is left becomes final."""
         result = WindowUpdate()
-        fresh = self._take_arrived(result)
-        joined = self._follower.replace_filtered(all_at_once=True)
-        iterations = self._solve(fresh, joined, True, result)
+        fresh = self._arrive(result)
+        joined = self._follow_trajectory(all_at_once=True)
+        iterations = self._solve(fresh)
+        if self.options.snoop:
+            due = joined or self._due_for_test()
+            iterations += self._screen(fresh, fresh + due, result) + self._weigh_control(fresh, result)
+        self._judge(joined)
         for strip in self.strips.values():
             strip.end(0)
         self._let_go(np.inf, result, at_the_end=True)
         result.report = self._report(iterations, joined, True, result)
         return result
 
-    def _take_arrived(self, result: WindowUpdate) -> list[Batch]:
-        fresh = self._arrivals.take(self._now_s, result)
-        for batch in fresh:
+    # -- the phases of an update ---------------------------------------------------------------------------------------
+
+    def _extend_strips(self) -> None:
+        """Unknowns that the strips need by now become present."""
+        for strip in self.strips.values():
+            if not strip.is_over(self.state):
+                strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
+
+    def _arrive(self, result: WindowUpdate) -> list[Batch]:
+        """Points with new looks become batches."""
+        arrived = self._arrivals.take(self._now_s)
+        self._quality.integrity.drop(arrived.apart)
+        result.refused += arrived.refused
+        result.tell_alone(arrived.alone)
+        for batch in arrived.fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-        if not self._length_s and fresh:
-            self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
-        return fresh
+        if not self._length_s and arrived.fresh:
+            self._length_s = self.options.window_looks * look_time(self.camera, arrived.fresh[0])
+        return arrived.fresh
 
-    def _limit_s(self) -> float:
-        """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the
-        window waits for their partners, by its own length at most."""
-        if not self._length_s:
-            return -np.inf
-        late_s = self._now_s - self._newest_ray_s - USUAL_DELAY_S
-        return self._now_s - self._length_s - min(max(late_s, 0.0), self._length_s)
+    def _follow_trajectory(self, all_at_once: bool = False) -> list[Batch]:
+        """Smoothed orientation takes the place of the filtered one under rays; the batches that came about that way."""
+        replaced = self._relinearisation.replace_filtered(all_at_once)
+        self._quality.integrity.drop(replaced.apart)
+        return replaced.joined
 
-    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
-        self._leaver.let_go(self._now_s, limit_s, self._length_s, self._serial, result, at_the_end)
-        result.refused += self._intake.take_refused()
-
-    def _solve(self, fresh: list[Batch], joined: list[Batch], retest: bool, result: WindowUpdate) -> int:
-        """One or two Gauss-Newton steps from the warm state, then tests; number of solutions computed."""
-        iterations = 1
+    def _solve(self, fresh: list[Batch]) -> int:
+        """One or two Gauss-Newton steps from the warm state; number of solutions computed."""
         self.state.solve()
         for batch in fresh:
             batch.back_substitute(self.state.values(batch.columns))
-        if self._follower.follow(fresh):  # more than once has shown no gain, even where control turns the orientation
+        if not self._relinearisation.follow(fresh):
+            return 1
+        # a third solution has shown no gain, even where control turns the orientation
+        self.state.solve()
+        return 2
+
+    def _question_sigmas(self, result: WindowUpdate) -> int:
+        """Variance components, before any look is thrown out; number of solutions computed."""
+        of_slow, of_image = self._sigma_check.look(self._now_s)
+        result.events += self._sigma_check.take_events()
+        if of_image:
+            self._relinearisation.reweigh()
             self.state.solve()
-            iterations += 1
-        if self.options.snoop:
-            due = joined or (self._due_for_test() if retest else [])
-            iterations += self._snoop(fresh + due, result)
-            iterations += self._settle(fresh, result)
-            if self._control_desk.is_due(self._now_s, fresh) and self._control_desk.look(self._now_s, result.refused):
-                iterations += 1
-            result.warnings += self._control_desk.take_warnings()
+        if of_slow or of_image:
+            self._orientation.forget()
+            self._history.restart()
+        return int(of_slow) + int(of_image)
+
+    def _screen(self, fresh: list[Batch], due: list[Batch], result: WindowUpdate) -> int:
+        """Data snooping, and the robust start of a young strip; number of solutions computed."""
+        solutions = self._snoop(due, result)
+        young = self._consensus.due(list(self.network.batches), fresh)
+        weights = consensus_weights(young, self.state) if young else None
+        if weights is not None:
+            result.refused += reweigh(young, weights, self.network)
+            self._relinearisation.follow(young)
+            self.state.solve()
+            solutions += self._snoop(young, result) + 2
+        return solutions
+
+    def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
+        """Test batches; number of solutions computed."""
+        found = snoop(batches, self.network, self._control, self._now_s, self._serial)
+        self._block.reweigh_control(found.control)
+        result.refused += found.refused
+        result.tell_alone(found.alone)
+        return found.rounds
+
+    def _weigh_control(self, fresh: list[Batch], result: WindowUpdate) -> int:
+        """Weigh all control where there is news of it; number of solutions computed."""
+        changed = False
+        if self._control.is_due(self._now_s, fresh):
+            found = self._control.weigh(self._now_s)
+            self._block.reweigh_control(found.of_final)
+            result.refused += found.refused
+            changed = found.changed
+        result.warnings += self._control.take_warnings()
+        return int(changed)
+
+    def _judge(self, joined: list[Batch]) -> None:
+        """Residuals of batches that came about anew, at the solution that this update arrives at."""
         for batch in joined:
             batch.judge(self.state)
-        self._orienter.forget()
-        return iterations
+        self._orientation.forget()
 
     def _learn_noise(self) -> None:
         """What the corrections of the strip that is flown leave of the noise of poses, now and then."""
@@ -275,39 +319,45 @@ class Window:
         if strip is None:
             return
         self._learnt_s = self._now_s
-        for batch in self._batches:
+        pose_noise = self.network.pose_noise
+        for batch in self.network.batches:
             if not (batch.provisional or batch.counted):
-                self._pose_noise.count(batch)
+                information = ray_information(batch.lin, batch.normals, batch.rays.point, batch.weight)
+                pose_noise.count(batch.rays.time_s, information)
                 batch.counted = True
-        if self._pose_noise.learn(strip.followed, self._now_s):
-            self._follower.reweigh()
+        if pose_noise.learn(strip.followed, self._now_s):
+            self._relinearisation.reweigh()
             self.state.solve()
-            self._orienter.forget()
+            self._orientation.forget()
 
-    def _settle(self, fresh: list[Batch], result: WindowUpdate) -> int:
-        """Ask a young strip again which of its points agree; number of solutions computed."""
-        due = self._settler.due(list(self._batches), fresh)
-        weights = settle(due, self.state) if due else None
-        if weights is None:
-            return 0
-        result.refused += reweigh(due, weights, self.state, self._points)
-        self._follower.follow(due)
-        self.state.solve()
-        return self._snoop(due, result) + 2
+    def _publish(self, fresh: list[Batch], result: WindowUpdate) -> None:
+        """The points of new batches, as they come out at once."""
+        for batch in fresh:
+            drift = self._sources.on_points(batch, self._orientation.drift)
+            result.points += adjusted_points(batch, self.network, False, drift)
 
-    def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
-        """Test batches; number of solutions computed."""
-        refused, rounds = snoop(
-            batches, self.state, self._points, self.options.critical, self._serial,
-            partial(self._control_desk.look, self._now_s), lambda names: self._arrivals.apart(names, result),
-        )  # fmt: skip
-        result.refused += refused
-        return rounds
+    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
+        """What is older than the window becomes final."""
+        left = self._leaving.let_go(self._now_s, limit_s, self._length_s, self._serial, at_the_end)
+        result.final += left.final
+        result.points += left.points
+        result.whole = left.whole
+        result.refused += left.refused + self.network.intake.take_refused()
+        result.tell_alone(left.alone)
+        result.events += left.events
+
+    def _limit_s(self) -> float:
+        """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the
+        window waits for their partners, by its own length at most."""
+        if not self._length_s:
+            return -np.inf
+        late_s = self._now_s - self._newest_ray_s - USUAL_DELAY_S
+        return self._now_s - self._length_s - min(max(late_s, 0.0), self._length_s)
 
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""
-        first = self._watch.most_exposed
-        waiting = sorted((b for b in self._batches if b.tested >= 0), key=lambda b: (b is not first, b.tested))
+        first = self._quality.integrity.most_exposed
+        waiting = sorted((b for b in self.network.batches if b.tested >= 0), key=lambda b: (b is not first, b.tested))
         waiting = waiting[: self.options.retest]
         due, rays = [], 0
         for batch in waiting:
@@ -326,12 +376,10 @@ class Window:
             return None
         if strip.activate(time_s, self.state):
             self.state.solve()
-            self._orienter.forget()
-        orientation = self._orienter.at(strip, np.array([time_s]))
-        if self._watch.exposure is None:
-            return orientation
-        sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance))
-        return replace(orientation, protection=self._watch.exposure.protection(sigma))
+            self._orientation.forget()
+        orientation = self._orientation.at(strip, np.array([time_s]))
+        exposure = self._quality.last.exposure if self._quality.last is not None else None
+        return orientation if exposure is None else exposure.protected(orientation)
 
     def live_between(self, from_s: float, to_s: float) -> list[RefinedOrientation]:
         """Live orientation at the grid times from one (or where it is not final yet) to another, by strip."""
@@ -346,8 +394,8 @@ class Window:
             if len(times):
                 if strip.activate(float(times[-1]), self.state):
                     self.state.solve()
-                    self._orienter.forget()
-                found.append(self._leaver.protected(strip, self._orienter.at(strip, times)))
+                    self._orientation.forget()
+                found.append(self._quality.protected(strip, self._orientation.at(strip, times)))
         return found
 
     def grid(self, from_s: float, to_s: float) -> Array:
@@ -356,7 +404,7 @@ class Window:
 
     def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
         """Orientation at times of a strip, none of them final, that have a measured one."""
-        return self._orienter.at(self.strips[strip], np.asarray(times, dtype=float))
+        return self._orientation.at(self.strips[strip], np.asarray(times, dtype=float))
 
     def strip_at(self, time_s: float) -> WindowStrip | None:
         """The strip a time belongs to, if its orientation there is not final."""
@@ -367,64 +415,48 @@ class Window:
         return None
 
     def _report(self, iterations: int, changed: list[Batch], look: bool, result: WindowUpdate) -> WindowReport:
+        """Judge the window as it is now, and count what is in it."""
+        state, batches, quality = self.state, self.network.batches, self._quality
+        fit = self._fit()
+        flown = self.network.flown
+        newest = flown[-1] if flown else None
+        quality.integrity.note([b for b in changed if b in batches])  # what left at once is no more exposed
+        findings = quality.last
+        if look or findings is None or findings.strip != (newest.id if newest else ""):
+            solution = state.solution
+            noise = self._noise(newest) if newest else np.zeros((6, 6))
+            findings = quality.look(self._now_s, self._length_s, fit, noise)
+            self._block.drifts = self._sources.named()
+            if state.solution != solution:
+                self._orientation.forget()
+        result.events += findings.events
+        unknowns = len(state) + sum(b.determined for b in batches)
+        return WindowReport(
+            **vars(fit),
+            observations=unknowns + sum(b.information.rows for b in batches),
+            unknowns=unknowns,
+            iterations=iterations,
+            start_s=min((s.final_to_s for s in flown), default=self._now_s),
+            end_s=self._newest_ray_s,
+            rays=sum(b.active_rays for b in batches),
+            points=sum(b.n_points for b in batches),
+            control=sum(b.active_control for b in batches),
+            strip=newest.id if newest else "",
+            parameters=parameters(self.network, newest, findings.standing) if newest else (),
+            quality=findings,
+        )
+
+    def _fit(self) -> Fit:
+        """How well observations and sigmas agree over the length of the window, and since the start."""
         state, length = self.state, max(self._length_s, 1.0)
         cost = state.cost()
         sigma0, gained = self._history.over(self._now_s, length, cost, state.redundancy)
         total = float(np.sqrt(cost / state.redundancy)) if state.redundancy > 0 else float("nan")
-        active = [s for s in self.strips.values() if not s.is_gone(state)]
-        self._watch.note([b for b in changed if b in self._batches])  # what left at once is no more exposed
-        watched = self._watch.last
-        if look or watched is None or self._watch.strip != (active[-1].id if active else ""):
-            solution = state.solution
-            watched = self._watch.look(
-                self._now_s, self._length_s, active[-1] if active else None, list(self._batches), sigma0, gained,
-                (total, state.redundancy), active[-1].slow.position_sigma if active else np.ones(3),
-                self._noise(active[-1]) if active else np.zeros((6, 6)),
-            )  # fmt: skip
-            if state.solution != solution:
-                self._orienter.forget()
-        result.events += watched.events
-        determined = rows = rays = points = control = 0
-        for batch in self._batches:
-            determined += batch.determined
-            rows += batch.information.rows
-            rays += batch.active_rays
-            points += len(batch.names)
-            control += batch.active_control
-        unknowns = len(state) + determined
-        return WindowReport(
-            sigma0=sigma0,
-            redundancy=gained,
-            sigma0_total=total,
-            redundancy_total=state.redundancy,
-            observations=unknowns + rows,
-            unknowns=unknowns,
-            iterations=iterations,
-            start_s=min((s.final_to_s for s in active), default=self._now_s),
-            end_s=self._newest_ray_s,
-            rays=rays,
-            points=points,
-            control=control,
-            strip=active[-1].id if active else "",
-            parameters=self.parameters(active[-1], watched.standing) if active else (),
-            watched=watched,
-        )
+        return Fit(sigma0, gained, total, state.redundancy)
 
     def _noise(self, strip: WindowStrip) -> Array:
         """Covariance (6, 6) of the noise of its newest orientation; 0 where there is none."""
         times = np.array([min(self._now_s, strip.end_s, self.trajectory.end_s)])
         if not np.isfinite(times[0]) or not self.trajectory.covers(times)[0]:
             return np.zeros((6, 6))
-        return self._orienter.noise(strip, times)[0]
-
-    def parameters(self, strip: WindowStrip, standing: tuple[Standing, ...] = ()) -> tuple[Parameter, ...]:
-        """Offset, shift and drift of a strip where its model has them, and the additional parameters."""
-        slow = strip.slow
-        return parameters(
-            self.state,
-            strip.numbers[:9],
-            np.concatenate([slow.offset_m, slow.shift, slow.drift]),
-            self._self_calibration,
-            self._camera_columns,
-            standing,
-        )
+        return self._orientation.noise(strip, times)[0]

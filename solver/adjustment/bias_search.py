@@ -1,0 +1,130 @@
+"""Which of several known coordinates are wrong, judged together: sets of biases against each other.
+
+The coordinates' discrepancies ``b`` have the covariance ``C^-1``, which allows for the errors of the GNSS and the slow
+errors of the measured trajectory. A hypothesis is a set S of biases: any single coordinates, and a shift that all have
+in common in an axis (the height system). It explains ``v_S' C_SS^-1 v_S`` of the weighted squares. Each bias has the
+square of the critical value as its price, so that one alone is Baarda's test; the score of a set is the price of its
+biases less what they explain. Where another set has nearly as low a score, it cannot be told which one is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+
+#: A set is told from another if its score is lower by so much: a little less than the price of one bias. Tuned.
+TOLD = 9.0
+#: By how much the score of another hypothesis has to be lower to replace what was decided before; a doubt lasts until
+#: `TOLD` is exceeded by so much. Tuned.
+BIAS_STEADY = 3.0
+#: Sets that are followed at a time, and the biases of one at most. Bounds the time of the search.
+BEAM, MOST = 24, 12
+AXES = 3
+#: Eigenvalues of information scaled to unit diagonal that are below this are rounding.
+UNTOLD = 1e-9
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong with c coordinates.
+
+    Attributes
+    ----------
+    chosen : the best hypothesis: places of coordinates, and c + axis for a shift of all in an axis
+    out : (c,) coordinates not to be used: those of the best hypothesis, and of all others that are nearly as good;
+        without those of a shift that all have in common where that is one of the trajectory
+    rivals : (k, c) the coordinates of the hypotheses between which it cannot be told, the best one first; k is 1 where
+        there is no other
+    score : of the best hypothesis, 0 if nothing is wrong; the lower, the better
+    """
+
+    chosen: frozenset[int]
+    out: Bools
+    rivals: tuple[Bools, ...]
+    score: float
+
+
+def judge(
+    C: Array, v: Array, axis: NDArray[np.int64], price: float, before: Bools, shifted: Collection[int] | None = None
+) -> Verdict:
+    """Find the biases that explain the discrepancies.
+
+    Parameters
+    ----------
+    C, v : (c, c), (c,) information about the biases, the unknowns of the adjustment eliminated
+    axis : (c,) 0..2
+    price : of a bias
+    before : (c,) what is refused now
+    shifted : axes in which the trajectory is known to be off, so that one coordinate says no more against it; a shift
+        that all have in common is then one of the trajectory. None: such a shift is one of the coordinates, all are out
+    """
+    n = len(v)
+    common = axis == np.arange(AXES)[:, None]
+    covers = np.vstack([np.eye(n, dtype=bool), common])  # the coordinates that each bias concerns
+    U = covers.T.astype(float)
+    M, m = U.T @ C @ U, U.T @ v
+    least = [1 if a in (shifted or ()) else 2 for a in range(AXES)]
+    usable = np.flatnonzero(np.append(np.full(n, True), common.sum(axis=1) >= least))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M), 1e-30))
+    scores = _search(M * scale[:, None] * scale, m * scale, usable, price)
+    ranked = sorted(scores, key=scores.__getitem__)
+    counted = covers if shifted is None else np.where(np.arange(len(covers))[:, None] < n, covers, False)
+    refused: dict[frozenset[int], Bools] = {s: np.asarray(counted[list(s)].any(axis=0)) for s in scores}
+    lowest = scores[ranked[0]]
+    as_before = (s for s in ranked if scores[s] <= lowest + BIAS_STEADY and (refused[s] == before).all())
+    best = next(as_before, ranked[0])
+    if shifted is not None:  # a trajectory that is off is nothing unusual: coordinates have to be clearly worse
+        steady = BIAS_STEADY if before.any() else 0.0
+        kept = (s for s in ranked if scores[s] <= lowest + TOLD - steady and not refused[s].any())
+        best = next(kept, best)
+    mine = refused[best]
+    rivals, out = [mine], mine.copy()
+    for s in ranked:
+        other = refused[s]
+        if scores[s] > scores[best] + TOLD + (BIAS_STEADY if before[other].all() else 0.0):
+            continue
+        if (other & ~mine).any() and (mine & ~other).any() and not any((other | r == other).all() for r in rivals[1:]):
+            rivals.append(other)  # and not one of them with more to it
+            out |= other
+    return Verdict(best, out, tuple(rivals), scores[best])
+
+
+def _search(M: Array, m: Array, usable: NDArray[np.int64], price: float) -> dict[frozenset[int], float]:
+    """Scores of the hypotheses worth a look, the lower the better; that of none is 0."""
+    scores: dict[frozenset[int], float] = {frozenset(): 0.0}
+    beam = [frozenset[int]()]
+    best, idle = 0.0, 0
+    for size in range(1, min(MOST, len(usable)) + 1):
+        sets = sorted({s | {int(i)} for s in beam for i in usable if i not in s}, key=sorted)
+        places = np.array([sorted(s) for s in sets])
+        blocks = M[places[:, :, None], places[:, None]] + UNTOLD * np.eye(size)
+        right = m[places]
+        drop = np.einsum("ki,ki->k", right, np.linalg.solve(blocks, right[:, :, None])[:, :, 0])
+        score = price * size - drop
+        order = np.argsort(score, kind="stable")[:BEAM]
+        beam = [sets[i] for i in order]
+        scores.update((sets[i], float(score[i])) for i in order)
+        lowest = float(score[order[0]])
+        best, idle = (lowest, 0) if lowest < best - 1e-9 else (best, idle + 1)
+        if idle == 2:
+            break
+    return scores
+
+
+def biases(C: Array, v: Array, out: Bools) -> tuple[Array, Array]:
+    """Biases (k,) of the coordinates that are out and their sigmas, the others taken for right.
+
+    Of what nothing else tells, as of a point of one look, biases are the smallest that explain it, with large sigmas.
+    """
+    own = C[np.ix_(out, out)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(own), 1e-30))
+    values, vectors = np.linalg.eigh(own * scale[:, None] * scale)
+    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, UNTOLD))
+    covariance = root @ root.T
+    return covariance @ v[out], np.sqrt(np.diagonal(covariance))

@@ -1,0 +1,380 @@
+"""The batch job: adjust, find outliers, weigh, remove what cannot be determined, and say how good the result is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.self_calibration import SelfCalibration
+from ..models.base import ModelOptions
+from .adjustment import AdjustmentOptions, Iteration, Problem, Solution, continue_problem, pose_problem, solve
+from .covariance import Cofactors, cofactors
+from .determinability import Limits, Removal
+from .direct_georeferencing import Georeferenced, georeference
+from .network import Control, Network
+from .network_weakness import Combination, undetermined
+from .normal_equations import reduce_normals
+from .normal_matrix import DenseMatrix
+from .parameter_elimination import eliminate, own_information
+from .point_consensus import Doubt, doubts
+from .pose_noise import with_noise_left
+from .ray_statistics import RayStatistics, ray_statistics
+from .reliability import CRITICAL_W
+from .robust import WeightFunction, huber
+from .snooping import Rejected, Round, Snooping, image_scale, joint_limit, snoop
+from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
+from .variance_components import LEAST_REDUNDANCY, Component, Scales, estimate_components, group_sums, scaled
+
+Array = NDArray[np.floating]
+
+#: Reduced unknowns up to which a network is searched for undetermined combinations (an eigenproblem of this size).
+MOST_UNKNOWNS = 1000
+
+#: Robust weight from which on a ray counts as left out.
+ROBUST_OUT = 0.02
+
+#: Share of the cost below which an adjustment that is followed by others is not worth another step.
+WARM_TOLERANCE = 1e-9
+
+#: Times that what is left of the noise of poses is looked at.
+NOISE_ROUNDS = 3
+
+#: Re-estimations of the image sigma, each followed by a new search for outliers.
+REWEIGHTINGS = 3
+
+
+class NotAdjustableError(ValueError):
+    """A network from which nothing can be computed: one line that says why."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What begins now, for progress lines."""
+
+    name: str
+
+
+Event = Phase | Iteration | Round | Removal
+Progress = Callable[[Event], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do.
+
+    Attributes
+    ----------
+    model : trajectory model
+    then : model that runs after it on the orientation it refined; None for one model alone
+    self_calibration : additional parameters
+    eliminate, limits : whether parameters that are not determinable go, and by which critical values
+    snoop, critical : data snooping and its critical value
+    robust : weight function; with `snoop` it gives the start of the search only
+    reweight : re-estimate the image sigma
+    components : estimate the sigmas of image, control, position and attitude
+    weights, max_iterations : see `AdjustmentOptions`
+    """
+
+    model: ModelOptions
+    then: ModelOptions | None = None
+    self_calibration: SelfCalibration | None = None
+    eliminate: bool = True
+    limits: Limits = field(default_factory=Limits)
+    snoop: bool = False
+    critical: float = CRITICAL_W
+    robust: WeightFunction | None = None
+    reweight: bool = False
+    components: bool = False
+    weights: str = "motion"
+    max_iterations: int = 30
+
+    @property
+    def options(self) -> AdjustmentOptions:
+        return AdjustmentOptions(self.weights, self.max_iterations)
+
+    @property
+    def on_the_way(self) -> AdjustmentOptions:
+        """For adjustments that are followed by others."""
+        return replace(self.options, tolerance=WARM_TOLERANCE)
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What the job found.
+
+    Attributes
+    ----------
+    stages : one solution per model; the last one is the result
+    cofactors, rays : of the last solution; for sigma0 = 1
+    test : sigma0 with its chi-square limits
+    rejected : observations left out
+    given_up : share of the image points that data snooping would have left out, where that is too many; else 0
+    removed, kept : additional parameters that are gone, and those that stay in spite of a failed criterion
+    components : variance components; () if they were not asked for
+    image_factor : what the a-priori image sigma was multiplied by
+    weak : combinations of unknowns that rest on a-priori weights alone; None where the network was too large to search
+    georeferenced : object points without adjustment
+    groups : number, ``v^T P v`` and redundancy of image, control, position and attitude
+    iterations : steps of all adjustments
+    doubtful : object points that the rays they kept do not confirm; comparisons leave them out
+    """
+
+    stages: tuple[Solution, ...]
+    cofactors: Cofactors
+    rays: RayStatistics
+    test: GlobalTest
+    rejected: tuple[Rejected, ...]
+    given_up: float
+    removed: tuple[Removal, ...]
+    kept: dict[str, str]
+    components: tuple[Component, ...]
+    image_factor: float
+    weak: tuple[Combination, ...] | None
+    georeferenced: Georeferenced
+    groups: dict[str, tuple[int, float, float]]
+    iterations: int
+    doubtful: tuple[Doubt, ...] = ()
+
+    @property
+    def solution(self) -> Solution:
+        return self.stages[-1]
+
+    @property
+    def network(self) -> Network:
+        return self.solution.network
+
+    @property
+    def measured_redundancy(self) -> float:
+        """Share of image points and control in the redundancy."""
+        return self.groups["image"][2] + self.groups["control"][2]
+
+    @property
+    def image_test(self) -> GlobalTest:
+        """sigma0 of the image points alone. A-priori equations that say what nothing contradicts, as the continuity of
+        a smooth trajectory, lower the common sigma0; this one they leave alone."""
+        _, squares, redundancy = self.groups["image"]
+        return global_test(squares, max(round(redundancy), 0))
+
+    @property
+    def sigma0(self) -> float:
+        """What sigmas are scaled with: sigma0 a posteriori, or 1 where image points and control have too little
+        redundancy to estimate it."""
+        return self.test.sigma0 if self.measured_redundancy >= LEAST_REDUNDANCY else 1.0
+
+    @property
+    def point_covariance(self) -> Array:
+        """(p, 3, 3) m^2, a posteriori; NaN for points that the network does not determine."""
+        C = self.sigma0**2 * self.cofactors.points
+        C[self.solution.points.rank < 3] = np.nan
+        return C
+
+    @property
+    def point_sigma_m(self) -> Array:
+        """(p, 3) metres, a posteriori."""
+        return np.sqrt(np.maximum(np.einsum("pii->pi", self.point_covariance), 0.0))
+
+    def compare(self, with_: Control, points_l: Array, sigma_m: Array) -> PointAccuracy:
+        """Accuracy of points (p, 3) with sigmas (p, 3) against given coordinates, without points that are doubtful."""
+        sure = ~np.isin(with_.point, [d.point for d in self.doubtful])
+        given = np.isfinite(with_.sigma_m) & sure[:, None]
+        difference = np.where(given, points_l[with_.point] - with_.xyz_l, np.nan)
+        return point_accuracy(difference, np.where(given, sigma_m[with_.point], np.nan))
+
+    def adjusted_points(self) -> Array:
+        """(p, 3) metres; NaN for points that the network does not determine."""
+        return np.where((self.solution.points.rank == 3)[:, None], self.solution.state.points_l, np.nan)
+
+
+def run(network: Network, job: Job, progress: Progress | None = None) -> BatchResult:
+    """Do the job.
+
+    Raises
+    ------
+    NotAdjustableError : no point is seen twice and nothing is known of any; values beyond all bounds
+    """
+    tell = progress or (lambda event: None)
+    _refuse_hopeless(network)
+    stages: list[Solution] = []
+    outcome: _Stage | None = None
+    for model in (job.model, job.then):
+        if model is not None:
+            last = model is (job.then or job.model)
+            outcome = _Stage(network, model, job, tell, outcome)
+            outcome.work(last)
+            stages.append(outcome.solution)
+    assert outcome is not None
+    solution = outcome.solution
+    tell(Phase("statistics"))
+    found = outcome.snooping
+    rejected = found.rejected if found else _robust_rejected(solution)
+    lost = np.array([r.ray for r in rejected if r.ray >= 0 and r.reason != "lone"], dtype=np.int64)
+    Q = cofactors(solution)
+    return BatchResult(
+        tuple(stages),
+        Q,
+        ray_statistics(solution, Q),
+        global_test(solution.cost, max(solution.redundancy, 0)),
+        rejected,
+        found.given_up if found else 0.0,
+        outcome.removed,
+        outcome.kept,
+        outcome.components,
+        outcome.scales.factor["image"],
+        weaknesses(solution),
+        georeference(stages[0].network, job.model, _taking_part(solution)),
+        group_sums(solution, Q),
+        outcome.steps,
+        doubts(solution, lost, joint_limit(job.critical)),
+    )
+
+
+class _Stage:
+    """One model's adjustment, as it goes through its steps."""
+
+    def __init__(self, network: Network, model: ModelOptions, job: Job, tell: Progress, before: _Stage | None):
+        self.job, self.tell = job, tell
+        self.scales = Scales(dict(before.scales.factor)) if before else Scales()
+        self.snooping: Snooping | None = None
+        self.removed: tuple[Removal, ...] = ()
+        self.kept: dict[str, str] = {}
+        self.components: tuple[Component, ...] = ()
+        self.steps = before.steps if before else 0
+        tell(Phase(f"adjustment, {model.name}"))
+        weight, points = None, None
+        if before:
+            weight, points = before.solution.ray_weight, before.solution.state.points_l
+            self.snooping = before.snooping
+            problem = continue_problem(before.solution, model)
+            problem = replace(self._adapt(problem), control=before.solution.problem.control)
+        else:
+            problem = pose_problem(network, model, job.self_calibration)
+        start = points
+        if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
+            start = solve(problem, points, weight, replace(job.options, robust=huber()), tell)
+        self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
+        if not before:
+            self._state_noise(network, model)
+        if self.scales.factor["image"] != 1.0:
+            self._keep(scaled(self.solution, {"image": self.scales.factor["image"]}, job.options))
+
+    def _state_noise(self, network: Network, model: ModelOptions) -> None:
+        """Weigh rays with what the corrections leave of the noise of poses: with less of it they follow more."""
+        for _ in range(NOISE_ROUNDS):
+            left = with_noise_left(network, self.solution)
+            if left is None:
+                return
+            problem = pose_problem(left, model, self.job.self_calibration)
+            options = replace(self.job.options, robust=self.job.robust)
+            self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
+
+    def work(self, last: bool) -> None:
+        """All steps after the first adjustment; elimination and variance components in the last stage only."""
+        job = self.job
+        if job.snoop:
+            self._snoop_with_start()
+        if job.reweight:
+            self._reweigh()
+        if last and job.self_calibration is not None and job.eliminate and self.solution.layout.n_camera:
+            self.tell(Phase("determinability of the additional parameters"))
+            outcome = eliminate(self.solution, job.limits, job.on_the_way, self._adapt, self.tell)
+            self.removed, self.kept = outcome.removed, outcome.kept
+            self._keep(outcome.solution)
+            if job.snoop:
+                self._snoop()
+        if last and job.components:
+            self.tell(Phase("variance components"))
+            found = estimate_components(self.solution, options=job.on_the_way, start=self.scales)
+            self.components = found.components
+            self.scales = Scales({c.group: c.factor for c in found.components})
+            self._keep(found.solution)
+            if job.snoop:
+                self._snoop()
+        self._keep(solve(self.solution.problem, self.solution, self.solution.ray_weight, job.options))
+
+    def _keep(self, solution: Solution) -> None:
+        if not (np.isfinite(solution.cost) and np.isfinite(solution.state.theta).all()):
+            raise NotAdjustableError("the adjustment leaves all bounds: image points and trajectory do not fit")
+        self.solution = solution
+        self.steps += solution.iterations
+
+    def _adapt(self, problem: Problem) -> Problem:
+        return self.scales.apply(problem)
+
+    def _snoop_with_start(self) -> None:
+        """Search from a robust start where one was asked for: what it left out may return."""
+        if self.job.robust is not None:
+            out = np.flatnonzero(self.solution.ray_weight < ROBUST_OUT)
+            weight = np.ones(len(self.solution.ray_weight))
+            weight[out] = 0.0
+            self._keep(solve(self.solution.problem, self.solution, weight, self.job.options))
+            Q = cofactors(self.solution)
+            first = tuple(Rejected(int(i), -1, -1, 0.0, "snooping") for i in out)
+            self.snooping = Snooping(self.solution, Q, ray_statistics(self.solution, Q), first, 0)
+        if self.job.reweight:  # a wrong a-priori sigma would make the test reject good rays or pass bad ones
+            self._scale_image(_robust_scale(self.solution))
+        self._snoop()
+
+    def _snoop(self) -> None:
+        self.tell(Phase("data snooping"))
+        self.snooping = snoop(self.solution, self.job.critical, self.job.on_the_way, self.tell, self.snooping)
+        self._keep(self.snooping.solution)
+
+    def _reweigh(self) -> None:
+        for _ in range(REWEIGHTINGS):
+            self.tell(Phase("image sigma"))
+            found = estimate_components(self.solution, ("image",), self.job.on_the_way, start=self.scales)
+            change = found.components[0].factor / self.scales.factor["image"]
+            self.scales = self.scales.times({"image": change})
+            self._keep(found.solution)
+            if not self.job.snoop or abs(change - 1.0) < 0.01:
+                return
+            self._snoop()
+
+    def _scale_image(self, factor: float) -> None:
+        self.scales = self.scales.times({"image": factor})
+        self._keep(scaled(self.solution, {"image": factor}, self.job.options))
+
+
+def weaknesses(solution: Solution) -> tuple[Combination, ...] | None:
+    """Combinations of unknowns that the observations do not determine; None where there are too many to search."""
+    problem, layout = solution.problem, solution.layout
+    if layout.n_unknowns > MOST_UNKNOWNS:
+        return None
+    lin = solution.linearisation.reweighted(solution.ray_weight)
+    state = solution.state
+    plan = replace(problem.elimination, structure=None)
+    normal = reduce_normals(lin, layout, plan, problem.prior, problem.control, state.theta, state.points_l).matrix
+    assert isinstance(normal, DenseMatrix)
+    prior = problem.prior.normal.toarray()
+    alone = own_information(solution)
+    return tuple(undetermined(normal.values - prior, prior, alone, layout.names, len(layout.sets)))
+
+
+def _refuse_hopeless(network: Network) -> None:
+    known = network.control.n_observations
+    if network.rays_per_point.max(initial=0) < 2 and not known:
+        raise NotAdjustableError("no object point is seen by two rays and there is no control: nothing to adjust")
+
+
+def _robust_scale(solution: Solution) -> float:
+    """Image sigma in units of the a-priori one: from the median of |w|, which outliers hardly move."""
+    of = ray_statistics(solution, cofactors(solution))
+    if of.redundancy[solution.ray_weight > 0].sum() < LEAST_REDUNDANCY:
+        return 1.0
+    return float(np.clip(image_scale(of, solution.ray_weight), 1e-2, 1e2))
+
+
+def _taking_part(solution: Solution) -> Array:
+    return (solution.ray_weight > ROBUST_OUT).astype(float)
+
+
+def _robust_rejected(solution: Solution) -> tuple[Rejected, ...]:
+    """Rays that robust estimation left without weight; their w is against the adjustment with what they have left."""
+    out = np.flatnonzero(solution.ray_weight < ROBUST_OUT)
+    if not len(out):
+        return ()
+    w = ray_statistics(solution, cofactors(solution)).largest_w
+    return tuple(sorted((Rejected(int(i), -1, -1, float(w[i]), "robust") for i in out), key=lambda r: -r.w))

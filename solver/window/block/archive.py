@@ -1,0 +1,316 @@
+"""The normal equations of the strips flown so far, kept after they have left the window.
+
+The window lets go of unknowns by marginalisation, one strip at a time. So that a later strip can still tell an earlier
+one something, the information of every batch that became final is kept here a second time, before marginalisation: the
+normal equations of all strips, dense, and for every object point its coordinates as a function of the unknowns that its
+rays touched (`LeftPoints`). A point that is seen again in a later strip thus ties both, and its earlier looks are never
+counted twice. Drifts of tie points are unknowns as well, held at zero until they are named (`datum.drifts`). A solution
+of the whole gives every line and every point the information of the block: it is the backward pass for several strips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.dense_in_parts import Cost, Parts
+from ...adjustment.drift_hypotheses import EACH
+from ...adjustment.eliminated_points import eliminated
+from ...adjustment.growing_normals import BlockNormals
+from ...adjustment.normal_equations import whiten_prior
+from ...models.base import PseudoObservations
+from ..datum.drifts import MOST_GROUPS, Cell, Named, of_block
+from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, WholeStrips, checks
+from ..state.batch import Batch
+from ..state.points import ControlPoint
+from ..state.strip import WindowStrip
+from .backward import BlockSolution, LeftOrientation, LeftPoints
+from .points import KeptPoint, SingleLook, rows_of
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
+#: two seconds of one core; with the equations it takes 210 MB, which are kept.
+BLOCK_UNKNOWNS = 4200
+#: Unknowns of one strip, at most, for it to be part of a block, which thus has room for two of them. Tuned.
+MOST_OF_STRIP = 1500
+#: Cost of refining a second or so of orientation, and the points of a batch, in floating point operations, about.
+REFINED_ORIENTATION, REFINED_POINTS = 4e7, 8e6
+#: Object points kept, beyond which the oldest strip is refined no more, and single looks kept beside them, beyond which
+#: the oldest are forgotten. They bound the memory. Tuned.
+MOST_POINTS, MOST_SINGLE = 30000, 1500
+#: Condition number of its normal matrix up to which a point counts as placed; rounding spoils what is beyond.
+PLACED = 1e12
+
+
+@dataclass
+class KeptStrip:
+    """A strip of the block.
+
+    Attributes
+    ----------
+    index : its place among the strips of the flight
+    numbers : of all its unknowns, consecutive
+    entered : numbers of those that were ever needed; none until nothing of the strip is left in the window
+    orientation : what became final of it
+    """
+
+    index: int
+    numbers: IntArray
+    entered: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    orientation: list[LeftOrientation] = field(default_factory=list)
+
+
+class Archive:
+    """The strips of a block that are over or being flown; see the module.
+
+    Parameters
+    ----------
+    camera_columns : (m,) numbers of the additional parameters, which all strips share
+    camera_sigma : (m,) a priori
+
+    Attributes
+    ----------
+    strips, points : by name, oldest first
+    changed : whether information was added since the last solution
+    """
+
+    def __init__(self, camera_columns: IntArray, camera_sigma: Array):
+        self.strips: dict[str, KeptStrip] = {}
+        self.points: dict[str, KeptPoint] = {}
+        self._camera = camera_columns
+        self._normals = BlockNormals()
+        self.add(camera_columns, np.diag(camera_sigma**-2.0), np.zeros(len(camera_columns)))
+        self.changed = False
+
+    def holds(self, columns: IntArray) -> bool:
+        """Whether all these unknowns are kept; drifts (negative numbers) are."""
+        kept = np.concatenate([self._camera, *(strip.numbers for strip in self.strips.values())])
+        return bool((np.isin(columns, kept) | (columns < 0)).all())
+
+    @property
+    def over(self) -> list[str]:
+        """Strips of which nothing is left in the window."""
+        return [id for id, strip in self.strips.items() if len(strip.entered)]
+
+    # -- what becomes final --------------------------------------------------------------------------------------------
+
+    def add(self, columns: IntArray, matrix: Array, rhs: Array) -> None:
+        """Add information (u, u), (u,) about unknowns (u,); without effect if some are kept no more."""
+        if self.holds(columns):
+            self.changed = True
+            self._normals.add(columns, matrix, rhs)
+
+    def end_strip(self, strip: WindowStrip) -> None:
+        """Nothing of a strip is left in the window: its unknowns, with their a-priori equations, are all known."""
+        kept = self.strips.get(strip.id)
+        if kept is not None:
+            kept.entered = strip.entered
+            columns, coefficients, value, sigma = strip.apriori()
+            places = np.where(columns >= 0, np.searchsorted(kept.entered, columns), -1).astype(np.int32)
+            prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(kept.entered))
+            self.add(kept.entered, prior.normal.toarray(), prior.matrix.T @ prior.value)
+
+    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> list[Refusal]:
+        """A batch became final; returns the single looks of earlier strips that count now.
+
+        Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
+        and of the earlier strip's coordinates, with all unknowns of that strip instead of the modes that stood for it.
+
+        Parameters
+        ----------
+        published : its points, those of full rank
+        cell : equations of the drifts of its strip, None if there are none
+        """
+        if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
+            return []
+        placed = np.flatnonzero(batch.normals.rank == 3)
+        if batch.ties is not None:
+            returned = [self._tie(batch, i, point, cell) for i, point in zip(placed.tolist(), published, strict=True)]
+            return [refusal for refusal in returned if refusal is not None]
+        left = LeftPoints.of(batch, published)
+        columns, matrix, rhs = batch.columns, batch.information.matrix, batch.information.rhs
+        if cell is not None:
+            b = cell.border
+            matrix, rhs = np.block([[matrix, b.G], [b.G.T, b.H]]), np.concatenate([rhs, b.r])
+            columns = np.concatenate([columns, cell.of_block])
+            coupling = np.concatenate([left.functions.coupling, cell.coupling[placed]], axis=2)
+            left = LeftPoints(replace(left.functions, columns=columns, coupling=coupling), left.points)
+        self.add(columns, matrix, rhs)
+        time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
+        for i, (at, point) in enumerate(zip(placed.tolist(), published, strict=True)):
+            seen = frozenset(r.look.strip for r in point.residuals)
+            self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), batch.control.weight[at]))
+        return []
+
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
+        """Keep looks that found no partner in their strip: a batch of points with one each."""
+        for i, look in enumerate(looks if self.holds(batch.columns) else ()):
+            name = batch.names[i]
+            if name in self.points and self.points[name].single is None:
+                continue
+            single = SingleLook(batch, i, look, cell)
+            seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
+            self._keep(name, KeptPoint(single.left(), 0, seen, time_s, np.zeros(3), single))
+
+    def linearise_single(self, solution: BlockSolution) -> Parts:
+        """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
+
+        Of too many the oldest are forgotten.
+        """
+        names = [name for name, kept in self.points.items() if kept.single is not None]
+        for name in names[: max(len(names) - MOST_SINGLE, 0)]:
+            del self.points[name]
+        done: set[int] = set()
+        for kept in self.points.values():
+            if kept.single is not None:
+                batch = kept.single.batch
+                if id(batch) not in done:
+                    theta, _ = solution.of(batch.columns)
+                    batch.back_substitute(theta)
+                    batch.linearise(theta, reweigh=True)
+                    done.add(id(batch))
+                    yield REFINED_POINTS
+                kept.left = kept.single.left()
+
+    def _keep(self, name: str, kept: KeptPoint) -> None:
+        """Put a point in place of what is known of it, as the newest."""
+        self.points.pop(name, None)
+        self.points[name] = kept
+
+    def _tie(self, batch: Batch, i: int, published: AdjustedPoint, cell: Cell | None) -> Refusal | None:
+        """A point of a batch that ties strips became final; returns its single look of an earlier strip if it counts
+        now."""
+        assert batch.ties is not None
+        rays, origin = rows_of(batch, i, cell)
+        old = self.points.get(published.name)
+        if old is not None and not (batch.ties.active[i] and self.holds(old.functions.columns)):
+            old = None
+        single = None if old is None else old.single
+        if old is not None and single is not None:
+            old = replace(old, left=single.left(batch.points_l[i]))
+        before = np.zeros(3) if old is None else old.control
+        control = np.where(before > 0, 0.0, batch.ties.control[i])
+        rows = [rays] if old is None else [rays, old.functions.rows(old.place, origin)]
+        point, matrix, rhs, _ = eliminated(rows, np.diag(control), batch.control.xyz_l[i], origin)
+        if np.linalg.cond(point.factor[0]) ** 2 > PLACED:
+            return None
+        self.add(point.columns, matrix, rhs)
+        seen = frozenset(r.look.strip for r in published.residuals)
+        if old is not None:
+            seen |= old.strips
+            n, looks = published.rays + old.point.rays, old.point.residuals + published.residuals
+            published = replace(published, rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
+        time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
+        self._keep(published.name, KeptPoint(LeftPoints(point, (published,)), 0, seen, time_s, before + control))
+        return None if single is None else Refusal(published.name, single.look, TAKEN_BACK)
+
+    def add_control(self, name: str, control: ControlPoint) -> bool:
+        """Known coordinates of a point that is final; whether they count."""
+        kept, weight = self.points.get(name), control.weight
+        if kept is None or kept.control.any() or not weight.any() or not self.holds(kept.functions.columns):
+            return False
+        if kept.single is not None:
+            place_l = kept.single.place_at(control)
+            if place_l is None:
+                return False
+            kept = replace(kept, left=kept.single.left(place_l))
+        self._weigh(name, kept, weight, np.nan_to_num(control.xyz_l), control.role)
+        return True
+
+    def weigh_control(self, name: str, axis: int, weight: float, value: float) -> None:
+        """Give a known coordinate (m) of a point that is final another weight, 0 to refuse it."""
+        kept = self.points.get(name)
+        if kept is None or not self.holds(kept.functions.columns) or (weight > 0) == (kept.control[axis] > 0):
+            return
+        change = (weight - kept.control[axis]) * (np.arange(3) == axis)
+        self._weigh(name, kept, change, np.full(3, value), kept.point.role)
+
+    def _weigh(self, name: str, kept: KeptPoint, change: Array, xyz_l: Array, role: str) -> None:
+        """Change the weights (3,) of known coordinates (3,) of a point; its looks are in the equations already."""
+        origin = kept.functions.origin_l[kept.place]
+        rows = kept.functions.rows(kept.place, origin)
+        point, matrix, rhs, _ = eliminated([rows], np.diag(change), xyz_l, origin)
+        self.add(point.columns, matrix, rhs)
+        left = LeftPoints(point, (replace(kept.point, role=role),))
+        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, kept.control + change)
+
+    # -- solution ------------------------------------------------------------------------------------------------------
+
+    def solving(self, named: Iterable[Named] = ()) -> Generator[Cost, None, BlockSolution]:
+        """Values and cofactors of all unknowns from all that is kept. The next solution takes its place in memory.
+
+        In parts, each with what it costs; nothing may become final meanwhile.
+
+        Parameters
+        ----------
+        named : drifts of tie points that are unknowns too, so that the others are free of them
+        """
+        self.changed = False
+        numbers, weight = self._unknowns(self.strips.values(), named, self._camera)
+        values, cofactors = yield from self._normals.solving(numbers, weight)
+        return BlockSolution(numbers, values, cofactors)
+
+    def _unknowns(
+        self, strips: Collection[KeptStrip], named: Iterable[Named], others: IntArray | tuple[()] = ()
+    ) -> tuple[IntArray, Array]:
+        """Numbers (n,), ascending, of the unknowns of strips, of the drifts named in them, and others; their weights
+        (n,) beforehand, beyond what the equations hold."""
+        drifts = [drift for drift in named if drift.strip in {strip.index for strip in strips}]
+        own = np.concatenate([others, *(strip.entered for strip in strips)]).astype(np.int64)
+        numbers = np.concatenate([own, *(of_block(drift.strip, drift.rows) for drift in drifts)])
+        weight = np.concatenate([np.zeros(len(own)), *(drift.sigma**-2.0 for drift in drifts)])
+        order = np.argsort(numbers)
+        return numbers[order], weight[order]
+
+    def refining(self, solution: BlockSolution, strips: Iterable[str]) -> Generator[Cost, None, WholeStrips]:
+        """Orientation and points of strips with the information of the block; a point goes with its last strip.
+
+        In parts, each with what it costs.
+        """
+        refined, wanted = WholeStrips([], []), set(strips)
+        for name, strip in self.strips.items():
+            for orientation in strip.orientation if name in wanted else ():
+                refined.orientation.append(orientation.refined(solution))
+                yield REFINED_ORIENTATION
+        mine = {name: k.left for name, k in self.points.items() if k.strips & wanted and k.single is None}
+        for left in {id(left): left for left in mine.values()}.values():
+            refined.points.extend(p for p in left.refined(solution) if mine.get(p.name) is left)
+            yield REFINED_POINTS
+        return refined
+
+    # -- bounds --------------------------------------------------------------------------------------------------------
+
+    def beyond(self) -> list[str]:
+        """The strips that must be closed so that the block keeps its bounds, oldest first."""
+        left, found = list(self.strips), []
+        while len(left) > 1:
+            unknowns = len(self._camera) + sum(len(self.strips[id].entered) for id in left)
+            points = sum(p.single is None and p.strips.isdisjoint(found) for p in self.points.values())
+            if unknowns <= BLOCK_UNKNOWNS and points <= MOST_POINTS:
+                break
+            found.append(left.pop(0))
+        return found
+
+    def drop(self, id: str) -> None:
+        """Forget a strip as if it had never been tied to others."""
+        self._normals.drop(self._forget(id).numbers)
+
+    def closing(self, id: str, named: Iterable[Named] = ()) -> Parts:
+        """Eliminate a strip's unknowns, also the drifts in it that are named: the others keep their solution.
+
+        In parts, each with what it costs. The memory of the last solution is used.
+        """
+        yield from self._normals.close(*self._unknowns([self.strips[id]], named))
+        self._forget(id)
+
+    def _forget(self, id: str) -> KeptStrip:
+        """A strip, its points and its drifts are kept no more; returns it."""
+        self.points = {name: p for name, p in self.points.items() if id not in p.strips}
+        strip = self.strips.pop(id)
+        self._normals.drop(of_block(strip.index, np.arange(MOST_GROUPS * EACH)))
+        return strip

@@ -1,0 +1,152 @@
+"""The backward pass: what is learnt late in a strip reaches the orientation and points that became final early.
+
+Each time unknowns left the window, `Marginal` kept their equations with those that stayed. From the last step to the
+first, ``x1 = R11^-1 (d1 - R12 x2)`` gives them the information of the whole strip, and covariances follow the same way.
+It is the smoother that belongs to the window's filter, and agrees with a batch adjustment of the strip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from ...adjustment.eliminated_points import EliminatedPoints
+from ...adjustment.reliability import CRITICAL_W
+from ...geometry.rotation import corrected_angles
+from ...models.base import Design
+from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
+from ..state.batch import Batch, inverse_factors
+from ..state.unknowns import Marginal, WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
+LARGER = 1.01
+
+
+@dataclass(frozen=True)
+class BlockSolution:
+    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), which ascend.
+
+    Drifts of tie points (`datum.drifts.of_block`) have negative numbers; those that are not among the unknowns are zero
+    and certain.
+    """
+
+    numbers: IntArray
+    values: Array
+    cofactors: Array
+
+    def places(self, numbers: IntArray) -> IntArray:
+        """Places of unknowns that are in the solution."""
+        return np.searchsorted(self.numbers, numbers)
+
+    def of(self, numbers: IntArray) -> tuple[Array, Array]:
+        """Values (m,) and cofactors (m, m) of some unknowns, drifts among them."""
+        known = (numbers >= 0) | np.isin(numbers, self.numbers)
+        at = self.places(numbers[known])
+        values, Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
+        values[known], Q[np.ix_(known, known)] = self.values[at], self.cofactors[np.ix_(at, at)]
+        return values, Q
+
+
+@dataclass(frozen=True)
+class LeftPoints:
+    """Points that became final: as functions of the unknowns that their rays touch, and as they were published."""
+
+    functions: EliminatedPoints
+    points: tuple[AdjustedPoint, ...]
+
+    @classmethod
+    def of(cls, batch: Batch, published: Iterable[AdjustedPoint]) -> LeftPoints:
+        """Those of a batch that were published, which are the ones of full rank, in its order."""
+        full, normals = batch.normals.rank == 3, batch.normals
+        factor, y = inverse_factors(normals)[full], normals.y.T[full]
+        functions = EliminatedPoints(batch.columns, batch.origin_l[full], factor, y, batch.coupling[full])
+        return cls(functions, tuple(published))
+
+    def refined(self, solution: BlockSolution) -> list[AdjustedPoint]:
+        """The points as a solution of whole strips gives them."""
+        xyz_l, covariance = self.functions.at(*solution.of(self.functions.columns))
+        return [replace(p, xyz_l=xyz_l[i], covariance=covariance[i], whole=True) for i, p in enumerate(self.points)]
+
+
+@dataclass(frozen=True)
+class LeftOrientation:
+    """Orientation that became final.
+
+    Attributes
+    ----------
+    published : at n times
+    design : how its corrections depend on the unknowns
+    noise : (n, 6, 6) covariance that comes from none of them
+    """
+
+    published: RefinedOrientation
+    design: Design
+    noise: Array
+
+    def refined(self, solution: BlockSolution) -> RefinedOrientation:
+        """The orientation as a solution of whole strips gives it."""
+        old = self.published
+        columns, A = self.design.functions()
+        theta, Q = solution.of(columns)
+        change = A @ theta - old.correction
+        angles = corrected_angles(old.angles, change[:, 3:])
+        angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        covariance = A @ Q @ np.swapaxes(A, 1, 2) + self.noise
+        protection = old.protection
+        if protection is not None:  # where control was taken out since, less is known than then
+            now, then = np.einsum("nii->ni", covariance), np.einsum("nii->ni", old.covariance)
+            protection = np.where(now > LARGER * then, np.hypot(protection, CRITICAL_W * np.sqrt(now)), protection)
+        return replace(
+            old, position_l=old.position_l + change[:, :3], angles=angles, covariance=covariance,
+            correction=old.correction + change, protection=protection,
+        )  # fmt: skip
+
+
+@dataclass
+class Step:
+    """What left the window at one time.
+
+    Attributes
+    ----------
+    marginal : the unknowns
+    orientation : what became final with them, None if nothing did
+    left : points that left since the step before
+    """
+
+    marginal: Marginal
+    orientation: LeftOrientation | None
+    left: list[LeftPoints] = field(default_factory=list)
+
+
+def backward(steps: list[Step], state: WindowState) -> WholeStrips:
+    """Go back through the steps from the present state of the window."""
+    orientation: list[RefinedOrientation] = []
+    points: list[AdjustedPoint] = []
+    if not steps:
+        return WholeStrips(orientation, points)
+    stayed = np.sort(steps[-1].marginal.stayed)
+    cofactors = state.covariance(stayed) if len(stayed) else np.empty((0, 0))
+    solution = BlockSolution(stayed, state.values(stayed), cofactors)
+    for step in reversed(steps):
+        m = step.marginal
+        x2, Q22 = solution.of(m.stayed)
+        x1 = solve_triangular(m.R11, m.d1 - m.R12 @ x2, check_finite=False)
+        T = solve_triangular(m.R11, m.R12, check_finite=False)
+        own = solve_triangular(m.R11, np.eye(len(x1)), check_finite=False)
+        Q12 = -T @ Q22
+        Q = np.block([[own @ own.T - Q12 @ T.T, Q12], [Q12.T, Q22]])
+        numbers, values = np.concatenate([m.gone, m.stayed]), np.concatenate([x1, x2])
+        order = np.argsort(numbers)
+        solution = BlockSolution(numbers[order], values[order], Q[np.ix_(order, order)])
+        if step.orientation is not None:
+            orientation.append(step.orientation.refined(solution))
+        for left in reversed(step.left):
+            points += left.refined(solution)
+    return WholeStrips(orientation[::-1], points[::-1])

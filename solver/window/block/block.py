@@ -1,0 +1,207 @@
+"""The block of strips that have left the window: what they hand over, when it is solved, what a later strip gets.
+
+When nothing of the strips flown so far is in the window any more, the block is solved with all that was kept
+(`archive`). The strips that are over get the information of the block so far, and the next one meets them in short form
+(`ties`). That is work of seconds, while the aircraft turns for about a minute, so it is done in portions: one with each
+update, as large as the platform time since the update before. What is left when the next strip brings points is done
+before they are looked up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.dense_in_parts import Parts
+from ..datum.biases import Coordinate
+from ..datum.drifts import Cell, Named
+from ..results import AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
+from ..state.batch import Batch
+from ..state.network import LiveNetwork
+from ..state.points import ControlPoint
+from ..state.strip import WindowStrip
+from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
+from .backward import LeftOrientation, Step, backward
+from .ties import EarlierStrips
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Floating point operations of the work on the block for each second of platform time: about a tenth of a core. Tuned.
+RATE = 4e9
+#: Platform time that the first portion stands for, s: that of a usual update. Tuned.
+FIRST_PORTION_S = 0.2
+#: What has been refined is published in portions too: stretches of orientation, each of which is a message, and points
+#: in one update. Tuned.
+MOST_TOLD, MOST_POINTS_TOLD = 8, 320
+
+
+class Block:
+    """See the module.
+
+    Attributes
+    ----------
+    earlier : what the strip that is flown knows of those before it
+    events : lines for the operator since they were taken last
+    drifts : drifts of tie points that have been named so far, by strip
+    """
+
+    def __init__(self, network: LiveNetwork) -> None:
+        set_ = network.self_calibration
+        sigma = set_.apriori_sigma if set_ is not None else np.empty(0)
+        self._network = network
+        self.earlier = EarlierStrips(network.state, network.camera_columns)
+        self.events: list[str] = []
+        self.drifts: Sequence[Named] = ()
+        self._archive = Archive(network.camera_columns, sigma)
+        self._touched: set[str] = set()
+        self._new: list[str] = []
+        self._full = 0
+        self._work: Parts | None = None
+        self._worked_s = -np.inf
+        self._orientation: dict[tuple[str, float], RefinedOrientation] = {}
+        self._points: dict[str, AdjustedPoint] = {}
+
+    # -- what becomes known --------------------------------------------------------------------------------------------
+
+    def begin(self, strip: WindowStrip) -> None:
+        """A strip begins."""
+        self._archive.strips[strip.id] = KeptStrip(self._network.index(strip), strip.numbers)
+
+    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> list[Refusal]:
+        """A batch became final; see `Archive.leave`."""
+        self.conclude()
+        names = list(self._network.strips)
+        self._touched.update(names[i] for i in batch.strips)
+        return self._archive.leave(batch, points, cell)
+
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
+        """Keep looks that found no partner in their strip, a batch of one each."""
+        self.conclude()
+        self._touched.update(look.strip for look in looks)
+        self._archive.keep_single(batch, looks, cell)
+
+    def orientation(self, strip: WindowStrip, final: LeftOrientation) -> None:
+        """Orientation that became final."""
+        kept = self._archive.strips.get(strip.id)
+        if kept is None:
+            return
+        kept.orientation.append(final)
+        if len(strip.entered) > MOST_OF_STRIP:
+            self._archive.drop(strip.id)
+            self.events.append(
+                f"strip {strip.id} has more than {MOST_OF_STRIP} unknowns: it is refined alone, and ties no others"
+            )
+
+    def gone(self, strip: WindowStrip) -> None:
+        """Nothing of a strip is left in the window."""
+        self.conclude()
+        self._touched.discard(strip.id)
+        self._archive.end_strip(strip)
+        self._new.append(strip.id)
+
+    def add_control(self, name: str, control: ControlPoint) -> None:
+        """Known coordinates, perhaps of a point that is final already."""
+        self.conclude()
+        if not self._archive.add_control(name, control):
+            return
+        if self.earlier.add_control(name, control):
+            self.events.append(f"control {name} came after its point was final: it counts from now on")
+        elif self._new or self._archive.over:
+            self.events.append(f"control {name} came after its point was final: it counts when the strip is over")
+
+    def reweigh_control(self, changes: Iterable[Coordinate]) -> None:
+        """Give known coordinates of points that are final other weights."""
+        for c in changes:
+            self.conclude()
+            self._archive.weigh_control(c.point, c.axis, c.weight, c.value)
+
+    def take_events(self) -> list[str]:
+        """Lines for the operator since the last call."""
+        events, self.events = self.events, []
+        return events
+
+    # -- when strips are over ------------------------------------------------------------------------------------------
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the window holds nothing of the block."""
+        return not self._touched and not self.earlier.present
+
+    def refined(self, now_s: float, steps: list[Step], at_the_end: bool) -> WholeStrips | None:
+        """Strips that are over with the information of the block so far: those that are new, at the end all of them.
+
+        Parameters
+        ----------
+        now_s : platform time, by which the portion of the work is measured
+        steps : what left the window, from which strips are refined that are no part of a block; emptied when work
+            begins
+        """
+        if at_the_end:
+            self.conclude()
+        if self._work is None and self.quiet and (self._new or self._archive.changed or at_the_end):
+            self._begin_work(steps, at_the_end)
+            self._worked_s = now_s - FIRST_PORTION_S
+        if self._work is not None:
+            self._advance(np.inf if at_the_end else RATE * (now_s - self._worked_s))
+            self._worked_s = now_s
+        return self._told(*(None, None) if at_the_end else (MOST_TOLD, MOST_POINTS_TOLD))
+
+    def _told(self, most: int | None, most_points: int | None) -> WholeStrips | None:
+        """So many stretches and points of what has been refined; the rest is published with the next updates."""
+        if not self._orientation and not self._points:
+            return None
+        stretches, names = list(self._orientation)[:most], list(self._points)[:most_points]
+        return WholeStrips([self._orientation.pop(s) for s in stretches], [self._points.pop(name) for name in names])
+
+    def conclude(self) -> None:
+        """Do what is left of the work: what comes now builds on it, or changes the equations that it reads."""
+        self._advance(np.inf)
+
+    def _advance(self, portion: float) -> None:
+        for cost in self._work or ():
+            portion -= cost
+            if portion <= 0.0:
+                return
+        self._work = None
+
+    def _begin_work(self, steps: list[Step], at_the_end: bool) -> None:
+        archive, over = self._archive, self._archive.over
+        new, self._new = self._new, []
+        alone = [id for id in new if id not in archive.strips]
+        if alone and steps:
+            self._network.state.solve()
+            chain = backward(steps, self._network.state)
+            told = {name for name, kept in archive.points.items() if kept.single is None}
+            points = [p for p in chain.points if p.name not in told]
+            self._tell(WholeStrips([o for o in chain.orientation if o.strip in alone], points))
+        steps.clear()
+        if over and (archive.changed or at_the_end):
+            wanted = over if at_the_end or not new else [id for id in new if id in over]
+            self._work = self._refining(wanted, at_the_end)
+        if self.earlier.full > self._full:
+            self._full = self.earlier.full
+            self.events.append(f"{self._full} points were seen in too many earlier strips at a time to tie all of them")
+
+    def _refining(self, wanted: Sequence[str], at_the_end: bool) -> Parts:
+        """Solve the block, refine strips, close the oldest if there are too many, prepare ties to them; in parts."""
+        named = self.drifts
+        solution = yield from self._archive.solving(named)
+        closing = self._archive.beyond()
+        for ids in (wanted, *([id] for id in closing)):
+            self._tell((yield from self._archive.refining(solution, ids)))
+        if not at_the_end:
+            yield from self._archive.linearise_single(solution)
+            yield from self.earlier.learning(self._archive, solution, closing)
+        for id in closing:
+            yield from self._archive.closing(id, named)
+            self.events.append(
+                f"strip {id} is refined no more: the block has over {BLOCK_UNKNOWNS} unknowns or {MOST_POINTS} points"
+            )
+
+    def _tell(self, refined: WholeStrips) -> None:
+        """Have something published: once, as it was refined last."""
+        self._orientation |= {(o.strip, float(o.time_s[0])): o for o in refined.orientation}
+        self._points |= {p.name: p for p in refined.points}

@@ -1,0 +1,258 @@
+"""What the strips flown so far say of points that a later strip sees again.
+
+To solve the block anew with every tie point is no on-line computation, so a later strip meets the earlier ones in short
+form. The points of some seconds of an earlier strip, a *patch*, share the errors of its orientation. The main
+directions of these joint errors, with the variance they have after the solution of the block, become a few unknowns of
+the window (their *modes*), ``p_i = p^_i + B_i s + e_i``; they enter when a point of the patch is seen again, with their
+correlation with the modes and additional parameters that are present, and are marginalised when the window has passed.
+What is left, ``e_i``, counts as independent from point to point. That costs about 1 % in RMSE of what becomes final
+against an adjustment with all the equations, and nothing after the backward pass (``bench/efficiency.py block``).
+
+Nothing is counted twice: what the later strip learns about a patch goes back to it not here, but when the block is
+solved again with all the equations (`archive`); a patch that has left is closed for the rest of the strip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.dense_in_parts import Parts
+from ...adjustment.eliminated_points import EliminatedPoints, eliminated, spread
+from ..state.batch import PointTies
+from ..state.points import ControlPoint
+from ..state.unknowns import Information, WindowState
+from .archive import PLACED, Archive
+from .backward import BlockSolution
+from .points import KeptPoint
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Length of a patch along the strip, s. Tuned: the errors of the orientation hardly change within it.
+PATCH_S = 10.0
+#: Points of a patch, at most, from which its modes are computed. Tuned.
+SAMPLED = 60
+#: Least variance of a mode, in units of what one point of the patch tells about it divided by their number: one that
+#: all points together would hardly notice is left out. Tuned.
+NEGLIGIBLE = 0.05
+#: Modes of a patch, and modes in the window, at most; with so many, points of further patches do not tie. They bound
+#: the time of an update. Tuned.
+MOST_MODES, MOST_PRESENT = 32, 240
+#: Cost of finding the modes of a patch, for each of its points, in floating point operations, about.
+PATCH_COST = 4e6
+#: Least variance of a mode given those present, as a share of its own: some modes all but follow from others.
+FLOOR = 1e-6
+
+
+@dataclass
+class Patch:
+    """Points of some seconds of a strip.
+
+    Attributes
+    ----------
+    place : its place among the patches
+    numbers : of its modes in the window, empty while they are not present
+    used_s : time of the newest ray that touched it
+    closed : whether its modes have left the window
+    """
+
+    place: int
+    numbers: IntArray
+    used_s: float = -np.inf
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class EarlierPoint:
+    """``p = xyz_l + modes @ s + e``, and ``root`` (3, 3) with ``root^T root`` the weight of e.
+
+    ``single``: of one look, which says where the point is but along its ray; the last row of its root is zero.
+    """
+
+    patch: int
+    xyz_l: Array
+    modes: Array
+    root: Array
+    with_control: bool
+    single: bool
+
+
+class EarlierStrips:
+    """Points of the block as it was solved last, and which of their modes are in the window.
+
+    Attributes
+    ----------
+    points : by name
+    full : how often a point could not tie because there were too many modes in the window
+    """
+
+    def __init__(self, state: WindowState, camera_columns: IntArray) -> None:
+        self.points: dict[str, EarlierPoint] = {}
+        self.full = 0
+        self._state, self._camera = state, camera_columns
+        self._patches: list[Patch] = []
+        self._covariance: list[Array] = []  # of the modes of each patch with those up to it, then of the parameters
+        self._camera_values = np.zeros(len(camera_columns))
+
+    @property
+    def present(self) -> bool:
+        """Whether modes are in the window."""
+        return any(len(p.numbers) for p in self._patches)
+
+    def learning(self, archive: Archive, solution: BlockSolution, without: Collection[str] = ()) -> Parts:
+        """Take the points of a solution of the block in place of those known so far, which are forgotten at once.
+
+        In parts, each with what it costs; before the last one nothing is known.
+
+        Parameters
+        ----------
+        without : strips whose points are left out
+        """
+        self.points, self._patches, self._covariance = {}, [], []
+        members: dict[tuple[str, int], list[str]] = {}
+        order = {id: i for i, id in enumerate(archive.strips)}
+        for name, kept in archive.points.items():
+            if kept.strips.isdisjoint(without):
+                strip = max(kept.strips, key=order.__getitem__)
+                part = int(kept.time_s // PATCH_S) if len(archive.strips[strip].entered) > 4 * MOST_MODES else 0
+                members.setdefault((strip, part), []).append(name)
+        points: dict[str, EarlierPoint] = {}
+        functions: list[tuple[IntArray, Array]] = []
+        for names in members.values():
+            found, modes = _patch([archive.points[name] for name in names], len(functions), solution)
+            points |= zip(names, found, strict=True)
+            functions.append(modes)
+            yield PATCH_COST * len(names)
+        functions.append((solution.places(self._camera), np.eye(len(self._camera))))
+        rows: list[Array] = []
+        for i, (places, M) in enumerate(functions):
+            half = M @ solution.cofactors[places]
+            rows.append(np.concatenate([half[:, at] @ other.T for at, other in functions[: i + 1]], axis=1))
+            yield 2.0 * rows[-1].size * len(solution.numbers)
+        self.points, self._covariance = points, rows
+        self._patches = [Patch(i, np.empty(0, dtype=np.int64)) for i in range(len(members))]
+        self._camera_values = solution.of(self._camera)[0]
+
+    # -- in the window -------------------------------------------------------------------------------------------------
+
+    def enter(self, name: str, time_s: float) -> bool:
+        """Make the modes of a point's patch present; False where it cannot tie.
+
+        Parameters
+        ----------
+        time_s : newest ray that will touch it
+        """
+        point = self.points.get(name)
+        if point is None or self._patches[point.patch].closed:
+            return False
+        patch = self._patches[point.patch]
+        if not len(patch.numbers):
+            here = [p for p in self._patches if len(p.numbers)]
+            m = len(self._covariance[patch.place])
+            if sum(len(p.numbers) for p in here) + m > MOST_PRESENT:
+                self.full += 1
+                return False
+            patch.numbers = self._state.new_numbers(m)
+            self._state.enter(patch.numbers)
+            self._observe(patch, here)
+        patch.used_s = max(patch.used_s, time_s)
+        return True
+
+    def _observe(self, patch: Patch, here: Sequence[Patch]) -> None:
+        """What is known of modes that enter, given those present and the additional parameters."""
+        S = self._joint([*(p.place for p in here), len(self._patches), patch.place])
+        m = len(patch.numbers)
+        given, own = np.arange(len(S) - m), np.arange(len(S) - m, len(S))
+        scale = np.sqrt(np.maximum(S[given, given], 1e-300))
+        known = S[np.ix_(given, given)] / scale[:, None] / scale + FLOOR * np.eye(len(given))
+        K = np.linalg.solve(known, S[np.ix_(given, own)] / scale[:, None]).T / scale
+        V = S[np.ix_(own, own)] - K @ S[np.ix_(given, own)]
+        root = np.linalg.inv(np.linalg.cholesky(V + FLOOR * np.eye(m)))
+        rows = np.concatenate([root, -root @ K], axis=1)
+        value = -root @ K[:, len(given) - len(self._camera) :] @ self._camera_values
+        columns = np.concatenate([patch.numbers, *(p.numbers for p in here), self._camera])
+        self._state.observe(np.tile(columns, (m, 1)).astype(np.int32), rows, value, np.ones(m))
+
+    def _joint(self, groups: Sequence[int]) -> Array:
+        """Covariance of the modes of some patches; the additional parameters come after the last patch."""
+        S = self._covariance
+        ends = np.cumsum([len(row) for row in S])
+        parts = [slice(end - len(row), end) for row, end in zip(S, ends, strict=True)]
+        return np.block([[S[a][:, parts[b]] if b <= a else S[b][:, parts[a]].T for b in groups] for a in groups])
+
+    def ties(self, names: Sequence[str], control: Array) -> PointTies:
+        """Of points whose patches are present; ``control`` (p, 3) are the weights of their known coordinates."""
+        points = [self.points[name] for name in names]
+        columns = {patch: self._patches[patch].numbers for patch in sorted({p.patch for p in points})}
+        numbers = np.concatenate(list(columns.values()))
+        modes = np.zeros((len(points), 3, len(numbers)))
+        for i, p in enumerate(points):
+            modes[i][:, np.isin(numbers, columns[p.patch])] = p.modes
+        return PointTies(
+            numbers, np.array([p.xyz_l for p in points]), modes, np.array([p.root for p in points]), control,
+            np.ones(len(points), dtype=bool), np.array([p.single for p in points]),
+            np.array([p.with_control for p in points]),
+        )  # fmt: skip
+
+    def add_control(self, name: str, control: ControlPoint) -> bool:
+        """Known coordinates of a point of an earlier strip that came late; whether they count in the window now."""
+        point, weight = self.points.get(name), np.diag(control.weight)
+        if point is None or point.with_control or not weight.any():
+            return False
+        # a single look, straight down, does not say where the point is
+        if np.linalg.cond(point.root.T @ point.root + weight) > PLACED or not self.enter(name, -np.inf):
+            return False
+        numbers, root = self._patches[point.patch].numbers, point.root[: 2 if point.single else 3]
+        rows = numbers, -root @ point.modes, root, np.zeros(len(root))
+        placed, matrix, rhs, square = eliminated([rows], weight, np.nan_to_num(control.xyz_l), point.xyz_l)
+        told = Information(matrix, rhs, square, len(root) + int(np.count_nonzero(weight)) - 3)
+        self._state.add(numbers, told)
+        self._state.fix(numbers, told)
+        (factor,), (y,), (D,) = placed.factor, placed.y, placed.coupling
+        xyz_l, root = point.xyz_l + factor.T @ y, np.linalg.inv(factor).T
+        self.points[name] = EarlierPoint(point.patch, xyz_l, -factor.T @ D, root, with_control=True, single=False)
+        return True
+
+    def leaving(self, limit_s: float, used: Iterable[IntArray]) -> IntArray:
+        """Modes that no batch in the window (columns of each) touches and none will; their patches are closed."""
+        if not self.present:
+            return np.empty(0, dtype=np.int64)
+        busy = {int(c) for columns in used for c in columns}
+        gone = [np.empty(0, dtype=np.int64)]
+        for patch in self._patches:
+            if len(patch.numbers) and patch.used_s <= limit_s and int(patch.numbers[0]) not in busy:
+                gone.append(patch.numbers)
+                patch.numbers, patch.closed = gone[0], True
+        return np.concatenate(gone)
+
+
+def _patch(
+    kept: Sequence[KeptPoint], number: int, solution: BlockSolution
+) -> tuple[list[EarlierPoint], tuple[IntArray, Array]]:
+    """Points of a patch, and its modes as functions (r, u) of the unknowns at places (u,) of the solution."""
+    columns = np.unique(np.concatenate([k.functions.columns for k in kept]))
+    theta, Q = solution.of(columns)
+    own = [(k.functions, k.place) for k in kept]
+    D = np.array([spread(f.coupling[i], f.columns, columns) for f, i in own])
+    origin, factor, y = (np.array(v) for v in zip(*((f.origin_l[i], f.factor[i], f.y[i]) for f, i in own), strict=True))
+    xyz_l, covariance = EliminatedPoints(columns, origin, factor, y, D).at(theta, Q)
+    chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), SAMPLED)).astype(int))
+    sample = -D[chosen].reshape(-1, len(columns))
+    values, vectors = np.linalg.eigh(sample @ Q @ sample.T)
+    r = max(min(int((values * len(kept) / len(chosen) > NEGLIGIBLE).sum()), MOST_MODES), 1)
+    M = (vectors[:, -r:] / np.sqrt(np.maximum(values[-r:], 1e-300))).T @ sample
+    B = -np.swapaxes(factor, 1, 2) @ D @ (Q @ M.T)
+    root = np.linalg.inv(np.linalg.cholesky(covariance - B @ np.swapaxes(B, 1, 2)))
+    for i in np.flatnonzero([k.single is not None for k in kept]):  # nothing is known along the ray
+        weight, axes = np.linalg.eigh(root[i].T @ root[i])
+        root[i] = np.sqrt(np.append(weight[1:], 0.0))[:, None] * np.column_stack([axes[:, 1:], axes[:, 0]]).T
+    found = [
+        EarlierPoint(number, xyz_l[i], B[i], root[i], bool(k.control.any()), k.single is not None)
+        for i, k in enumerate(kept)
+    ]
+    shared = columns >= 0  # drifts are of one strip alone
+    return found, (solution.places(columns[shared]), M[:, shared])

@@ -1,0 +1,144 @@
+"""What is judged besides data snooping: integrity, sources that drift, determinability of parameters, and the light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..datum.control import ControlTests
+from ..results import RefinedOrientation, WindowOptions
+from ..state.network import LiveNetwork
+from ..state.strip import WindowStrip
+from .determinability import Determinability
+from .exposure import Exposure, Integrity
+from .ground import GroundBelow
+from .light import Fit, LightDisplay, QualityFindings
+
+Array = NDArray[np.floating]
+
+
+class QualityControl:
+    """Judges the window after its updates; what costs much is spread over updates.
+
+    Parameters
+    ----------
+    control : judges control, and knows of tie points that drift
+
+    Attributes
+    ----------
+    integrity : what could be wrong unseen
+    last : what the last look found, without its events
+    """
+
+    def __init__(self, network: LiveNetwork, control: ControlTests, options: WindowOptions) -> None:
+        self._network, self._control, self._sources = network, control, control.sources
+        self._limit_m, self._below, self._display = options.alert_limit_m, GroundBelow(network.camera), LightDisplay()
+        self._parameters: Determinability | None = None
+        if network.self_calibration is not None and options.determine:
+            self._parameters = Determinability(network.self_calibration, network.camera_columns, network.camera)
+        self.integrity = Integrity(options.critical)
+        self.last: QualityFindings | None = None
+
+    def protected(self, strip: WindowStrip, orientation: RefinedOrientation, final: bool = False) -> RefinedOrientation:
+        """Orientation with protection levels, as that at the middle of its times is exposed; whether it is final."""
+        exposure = self.exposure_at(strip, float(orientation.time_s[len(orientation.time_s) // 2]))
+        if final:
+            levels, ground = np.empty(0), self._below.ground
+            if exposure is not None and ground is not None:
+                levels = exposure.factor[6:] * ground.sigma_m(orientation.covariance)
+            self._display.records[strip.id].became_final(len(orientation.time_s), levels, self._alert_limit_m)
+        return orientation if exposure is None else exposure.protected(orientation)
+
+    def exposure_at(self, strip: WindowStrip, time_s: float, renew: bool = False) -> Exposure | None:
+        """Exposure of the orientation at a time of a strip, and on the ground; None if its unknowns are not there."""
+        numbers, A = strip.design([time_s]).functions()
+        if not len(numbers) or (self._network.state.places(numbers) < 0).any():
+            return None
+        functions, ground = A[0], self._below.ground
+        if ground is not None:
+            functions = np.concatenate([A[0], ground.functions @ A[0]])
+        return self.integrity.at(numbers, functions, self._network.state, renew)
+
+    def look(self, now_s: float, length_s: float, fit: Fit, noise: Array) -> QualityFindings:
+        """Findings of an update.
+
+        Parameters
+        ----------
+        fit : how well observations and a-priori sigmas agree
+        noise : (6, 6) covariance of the noise that is on the newest orientation
+        """
+        network, batches, flown = self._network, list(self._network.batches), self._network.flown
+        strip = flown[-1] if flown else None
+        ground = self._below.look(batches)
+        time_s, exposure = -np.inf, None
+        sigma = protection = np.zeros(6)
+        if strip is not None and batches:
+            time_s = min(now_s, strip.end_s)
+            exposure = self.exposure_at(strip, time_s, renew=True)
+            if exposure is not None:
+                sigma = self._sigma(strip, time_s, exposure, noise)
+                protection = exposure.factor * sigma
+        if self._sources.begin():
+            self._control.strip_began()
+        self._sources.update(now_s)
+        events: list[str] = []
+        if self._parameters is not None:
+            gsd_m = 1.0 if ground is None else ground.gsd_m
+            events = self._parameters.step(now_s, network.state, batches, fit.sigma0_total, fit.redundancy_total, gsd_m)
+        rays = np.concatenate([np.empty(0, np.int64), *(b.points_left for b in batches)])
+        known = np.concatenate([np.empty((0, 3)), *(b.control.weight for b in batches)]) > 0
+        found = QualityFindings(
+            strip="" if strip is None else strip.id,
+            length_s=length_s,
+            since_s=0.0 if strip is None else now_s - strip.model.extent.start_s,
+            fit=fit,
+            points=len(rays),
+            refused=int((rays == 0).sum()),
+            tied=int((rays >= 2).sum()),
+            free=sum(
+                name not in network.intake.control
+                for batch in batches
+                for name, left in zip(batch.names, batch.points_left.tolist(), strict=True)
+                if left >= 2
+            ),
+            control=known[rays > 0].sum(axis=0),
+            control_refused=sum(b.control_refused for b in batches),
+            control_doubt=self._control.doubt,
+            control_failed=self._control.fails(self._alert_limit_m),
+            apriori_m=np.ones(3) if strip is None else strip.slow.position_sigma,
+            sources=self._sources.biased,
+            time_s=time_s,
+            exposure=exposure,
+            sigma=sigma[:6],
+            protection=protection[:6],
+            ground_sigma_m=sigma[6:],
+            ground_protection_m=protection[6:],
+            alert_limit_m=self._alert_limit_m,
+            standing=() if self._parameters is None else self._parameters.standing,
+            disagreement=float(network.sigmas.disagreement),
+            constants=(float(network.sigmas.apriori[0]), float(network.sigmas.apriori[1])),
+        )
+        light, reason = self._display.look(now_s, found)
+        self.last = replace(found, light=light, reason=reason)
+        return replace(self.last, events=tuple(events))
+
+    @property
+    def _alert_limit_m(self) -> float:
+        ground = self._below.ground
+        return self._limit_m or (np.inf if ground is None else ground.limit_m)
+
+    def _sigma(self, strip: WindowStrip, time_s: float, exposure: Exposure, noise: Array) -> Array:
+        """Sigmas of the orientation and, where it is known, on the ground (6 + g,).
+
+        To those from the unknowns come tie points that drift and, on the ground alone, the noise (6, 6) of the measured
+        orientation.
+        """
+        drifts, C = self._sources.compensation(), np.zeros((6, 6))
+        if drifts is not None:
+            numbers, A = strip.design([time_s]).functions()
+            C = drifts.change(A[0], self._network.state.places(numbers))[1]
+        ground = self._below.ground
+        on_ground = np.empty(0) if ground is None else ground.sigma_m(noise + C) ** 2
+        return np.sqrt(exposure.sigma**2 + np.concatenate([np.diagonal(C), on_ground]))

@@ -1,0 +1,121 @@
+"""What has arrived becomes batches: points all of whose looks have an orientation, tested before they enter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...camera.line_camera import LineCamera
+from ..block.block import Block
+from ..results import Refusal
+from ..state.batch import Batch
+from ..state.maker import BatchMaker, Draft
+from ..state.network import LiveNetwork
+from .entry import EntryEquations, disagreement
+from .sigma_check import SigmaCheck
+from .snooping import admit
+from .ties import ON_ENTRY, contradicting, drop_ties, drop_weak
+
+Array = NDArray[np.floating]
+
+
+@dataclass
+class Arrived:
+    """What has come.
+
+    Attributes
+    ----------
+    fresh : new batches
+    apart : batches that were taken apart, because one of their points got another look
+    refused : looks left out
+    alone : points that do not agree with what earlier strips say of them
+    """
+
+    fresh: list[Batch] = field(default_factory=list)
+    apart: list[Batch] = field(default_factory=list)
+    refused: list[Refusal] = field(default_factory=list)
+    alone: list[str] = field(default_factory=list)
+
+
+class Arrivals:
+    """Makes batches of the points that have news.
+
+    Parameters
+    ----------
+    step_s : points whose first looks lie within so much time go into a batch together
+    snoop : whether looks are tested before they enter
+    """
+
+    def __init__(self, network: LiveNetwork, block: Block, check: SigmaCheck, step_s: float, snoop: bool) -> None:
+        self._network, self._block, self._check, self._maker = network, block, check, BatchMaker(network)
+        self._step_s, self._snoop = step_s, snoop
+
+    def take(self, now_s: float) -> Arrived:
+        """Batches of the points that have new looks with a measured orientation; others wait."""
+        found, network, intake = Arrived(), self._network, self._network.intake
+        news = {name: intake.points[name] for name in intake.ready(now_s)}
+        if not news:
+            return found
+        self._block.conclude()  # points are about to be looked up among those of earlier strips
+        names = [name for name, point in news.items() if point.batch is None and point.looks]
+        found.apart = list({id(p.batch): p.batch for p in news.values() if p.batch is not None}.values())
+        known: dict[str, Array] = {}
+        for batch in found.apart:
+            known |= dict(zip(batch.names, batch.points_l, strict=True))
+            network.batches.remove(batch)
+            for name in batch.names:
+                intake.place(name, None)
+            names += batch.names
+        if not names:
+            return found
+        shares: dict[tuple[int, bool], list[str]] = {}
+        for name in names:
+            shares.setdefault(self._share(name), []).append(name)
+        network.state.solve()  # what is known of the orientation says where points are, and judges them
+        drafts = [self._draft(names, tied) for (_, tied), names in shares.items()]
+        made = self._maker.make_each([d for d in drafts if d.names], known)
+        found.fresh = [batch for batch, _ in made if batch is not None]
+        for batch in found.fresh:
+            for name in batch.names:
+                intake.place(name, batch)
+            drop_weak(batch)
+        if self._snoop:
+            network.state.expect(sum(len(batch.columns) for batch in found.fresh))
+            equations = [EntryEquations.of(batch, network.state) for batch in found.fresh]
+            for of_batch in equations:
+                self._check.entered(disagreement(of_batch))
+            for batch, of_batch in zip(found.fresh, equations, strict=True):
+                found.refused += admit(batch, of_batch, network)
+                found.alone += drop_ties(batch, contradicting(batch, network.state, ON_ENTRY))
+        intake.set_apart(found.alone)
+        for batch in found.fresh:
+            network.batches.enter(batch)
+        return found
+
+    def _draft(self, names: list[str], tied: bool) -> Draft:
+        """Of the points of a share, those that two looks, known coordinates or an earlier strip place."""
+        intake, points = self._network.intake, self._network.intake.points
+        ties = None
+        if tied:
+            weight = intake.known_coordinates(names, np.zeros(len(names), dtype=bool)).weight
+            ties = self._block.earlier.ties(names, weight)
+        else:
+            names = [n for n in names if len(points[n].looks) > 1 or (n in intake.control and not points[n].spent)]
+        return Draft(names, [points[n] for n in names], ties)
+
+    def _share(self, name: str) -> tuple[int, bool]:
+        """Which points go into a batch together: those of a time, and those that tie strips apart."""
+        point, earlier = self._network.intake.points[name], self._block.earlier.points.get(name)
+        point.spent = earlier is not None and earlier.with_control and not point.alone
+        tied = not point.alone and self._block.earlier.enter(name, max(point.time_s))
+        return int(min(point.time_s) // self._step_s), tied
+
+
+def look_time(camera: LineCamera, batch: Batch) -> float:
+    """Time between the first and the last look at a point, s, from view angles, height and speed."""
+    tangent = camera.principal_point_mm[:, 0] - np.array([line.centre_mm[0] for line in camera.lines])
+    height = float(np.median(batch.rays.position_l[:, 2] - batch.points_l[batch.rays.point, 2]))
+    speed = float(np.median(np.linalg.norm(batch.rays.velocity_l, axis=1)))
+    return float(np.ptp(tangent / camera.focal_length_mm)) * height / max(speed, 1.0)

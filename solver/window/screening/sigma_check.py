@@ -1,0 +1,314 @@
+"""Whether the a-priori sigmas are right: asked before any look is thrown out.
+
+A trajectory that is worse than stated makes good looks contradict each other. Data snooping would then throw out one
+after the other and keep a model that is wrong. Two quantities prevent that:
+
+*Disagreement.* Each point that comes is compared with the orientation as it is known without it, and without the look
+that disagrees most. Its weighted squares over their median under the chi-square distribution have a median of about 0.3
+over many points if all sigmas are right, also where every fifth look is a gross error. Where that of the newest points
+is clearly larger, tests of single looks are made wider by that much.
+
+*Variance components.* For each group of slow errors (`models.base.ERROR_GROUPS`) the squared residuals of its a-priori
+equations are compared with their redundancy over about the last `MEMORY_S`. Where they are significantly more, pairs of
+factors on the sigmas of positions and attitudes are weighed by their restricted likelihood (`_likely`); the sigmas of
+the unknowns present are stated anew, and those of all that come later. A factor falls again where the data no longer
+ask for it, and never below 1: a trajectory that is stated too good costs much, one that is stated too bad next to
+nothing. The image has a factor, too: from the median of squared normalised residuals, which gross errors do not move
+much. What looks at different points, taken at nearly the same time, have in common of these residuals is no noise of
+the image: the attitude vibrates. That part is stated as noise of the attitude, so that the orientation says it, too.
+
+Source: W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, AVN 86, 1979; restricted
+likelihood: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin geodesique 60, 1986.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT
+from ..state.network import LiveNetwork
+from ..state.strip import WindowStrip
+from ..state.unknowns import WindowState
+
+Array = NDArray[np.floating]
+
+#: Residuals of a-priori equations are compared with their redundancy over so long, s.
+MEMORY_S = 30.0
+#: Time between two looks, s; where looks disagree more than expected there is one in every update.
+CHECK_S = 1.0
+#: Probability that a right sigma is questioned, by one look at one group.
+QUESTIONED = 1e-4
+#: Redundancy of a group below which nothing is said about it.
+LEAST_REDUNDANCY = 0.2
+#: A factor is applied if it differs by so much from the one in force, and changes by so much at most in one look.
+CHANGED, MOST_UP, MOST_DOWN = 1.15, 3.0, 0.7
+#: Redundancy number from which the residual of a look says something, and normalised residuals wanted; how far the
+#: median of their squares may be off, in units of ``sqrt(2 / n)``: its standard deviation is 1.7 of these, and looks at
+#: one time have noise in common. Tuned.
+LEAST_CONTROLLED, LEAST_LOOKS, IMAGE_QUESTIONED = 0.1, 40, 8.0
+#: Looks are at one time if they are so far apart at most, s; pairs wanted, and share of the variance in common, in
+#: units of its standard deviation, to say that the attitude vibrates, and that it still does; normalised residuals
+#: count up to so much; less vibration than this share of the image sigma is none. Tuned.
+TOGETHER_S, LEAST_PAIRS, SIGNIFICANT, STILL_SIGNIFICANT, OUTLYING, LEAST_VIBRATION = 0.05, 40, 4.0, 1.5, 4.0, 0.3
+#: Of the share that was vibration so much is kept at least from one look to the next. Tuned.
+SHARE_KEPT = 0.7
+#: Batches that are looked at then, the newest ones.
+MOST_JUDGED = 120
+#: Looks are questioned when so many looks at the slow errors have changed nothing. Tuned.
+STEADY = 3
+#: Looks so far apart, s, that have this share of their variance in common show a wander; each time both wanders are
+#: stated so many times as large. Tuned.
+APART_S, LASTING, RAISED = (0.4, 0.8), 0.15, 1.5
+#: A factor is told again when it differs by so much from what was told last.
+TOLD_AGAIN = 1.5
+#: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
+BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: No factor becomes larger.
+LARGEST = 1000.0
+#: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
+#: median of chi-square values of one degree of freedom that are the least of three), that from which it counts, and
+#: from which a wander is questioned. Tuned.
+REMEMBERED, ENOUGH, RIGHT, CLEARLY, SUSPECT = 60, 15, 0.3, 1.5, 0.8
+
+
+class SigmaCheck:
+    """See the module.
+
+    Parameters
+    ----------
+    constants : whether offset, shift and drift are questioned; not where GNSS is the datum, which control gives way to
+    """
+
+    def __init__(self, network: LiveNetwork, constants: bool = True) -> None:
+        self._network = network
+        self._pairs = ((POSITION_WANDER, ATTITUDE_WANDER), (OFFSET, SHIFT))[: 1 + constants]
+        self._ratios: deque[float] = deque(maxlen=REMEMBERED)
+        self._looked_s = -np.inf
+        self._told = np.ones(len(ERROR_GROUPS) + 1)
+        self._vibration = 0.0
+        self._steady = 0
+        self._suspect = False
+        self.events: list[str] = []
+
+    def entered(self, squares: Iterable[tuple[float, int]]) -> None:
+        """Points have come: weighted squares of each against what was known without it, and their redundancy."""
+        self._ratios.extend(square / chi2.median(n) for square, n in squares if n > 0)
+        ratio = float(np.median(self._ratios)) if len(self._ratios) >= ENOUGH else 1.0
+        self._suspect = ratio > SUSPECT
+        self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
+
+    def look(self, now_s: float) -> tuple[bool, bool]:
+        """Compare residuals with sigmas where that is due; whether those of slow errors and of looks were changed."""
+        network = self._network
+        sigmas = network.sigmas
+        if now_s < self._looked_s + CHECK_S and sigmas.disagreement == 1.0:
+            return False, False
+        strip = next((s for s in reversed(network.flown) if s.first_line_time_s <= now_s), None)
+        if strip is None or not len(network.batches):
+            return False, False
+        self._looked_s = now_s
+        network.state.solve()
+        factor = self._slow_errors(strip, now_s)
+        of_slow = bool((factor != sigmas.apriori).any())
+        # what the trajectory explains is no noise of looks
+        self._steady = 0 if of_slow else self._steady + 1
+        of_image = False
+        if self._steady >= STEADY:
+            judged = self._judged()
+            if judged is not None and judged.last():
+                factor[[POSITION_WANDER, ATTITUDE_WANDER]] *= RAISED
+                of_slow, self._steady = True, 0
+            elif judged is not None:
+                of_image = self._restate_looks(judged)
+        if of_slow:
+            sigmas.apriori = np.clip(factor, 1.0, LARGEST)
+            for flown in network.flown:
+                flown.restate_sigmas(sigmas.apriori, network.state)
+            network.state.solve()
+        self._tell()
+        return of_slow, of_image
+
+    def _slow_errors(self, strip: WindowStrip, now_s: float) -> Array:
+        """Factors (4,) that the residuals of a-priori equations ask for."""
+        before, state = self._network.sigmas.apriori, self._network.state
+        group, square, redundancy = strip.apriori_fit(state, now_s - MEMORY_S)
+        n = len(ERROR_GROUPS)
+        squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
+        factor = before.copy()
+        asked = (redundancies >= LEAST_REDUNDANCY) & ((factor > 1.0) | (squares > chi2.isf(QUESTIONED, redundancies)))
+        if not self._suspect:  # gross errors that have not been found yet bend the wander as well
+            asked[[POSITION_WANDER, ATTITUDE_WANDER]] &= factor[[POSITION_WANDER, ATTITUDE_WANDER]] > 1.0
+        for pair in self._pairs:
+            if not asked[list(pair)].any():
+                continue
+            for g, wanted in zip(pair, _likely(strip, state, pair), strict=True):
+                factor[g] = _changed(float(factor[g]), wanted / float(factor[g]))
+            if (factor != before).any():
+                break  # what wanders is looked at first; the rest when that is settled
+        return factor
+
+    def _judged(self) -> _Residuals | None:
+        """Residuals of the looks in the window, where they ask for another noise than is stated; None where not."""
+        sigmas, noise, state = self._network.sigmas, self._network.pose_noise, self._network.state
+        known = [b.judged[2] for b in self._network.batches if b.judged is not None]
+        if not known:
+            return None
+        w = np.concatenate([s.w[s.redundancy > LEAST_CONTROLLED] for s in known])
+        if len(w) < LEAST_LOOKS:
+            return None
+        stated = sigmas.image == 1.0 and noise.vibration == 0.0
+        if stated and np.median(w**2) / chi2.median(1) < 1.0 + IMAGE_QUESTIONED * np.sqrt(2.0 / len(w)):
+            return None
+        judged = [(b, b.judge(state)[1]) for b in list(self._network.batches)[-MOST_JUDGED:]]
+        rays = [b.rays for b, _ in judged]
+        time_s = np.concatenate([r.time_s for r in rays])
+        order = np.argsort(time_s, kind="stable")
+        point = np.concatenate([r.point + 1000 * REMEMBERED * i for i, r in enumerate(rays)])
+        w = np.clip(np.concatenate([s.w for _, s in judged]), -OUTLYING, OUTLYING)
+        redundancy = np.concatenate([s.redundancy for _, s in judged])
+        pixel = np.concatenate([np.linalg.norm(r.pitch_mm, axis=1) / r.focal_length_mm for r in rays])
+        sigma = np.concatenate([r.sigma_sample_px for r in rays]) / sigmas.image
+        return _Residuals(
+            time_s[order], point[order], w[order], redundancy[order], float(np.median(pixel)), float(np.median(sigma))
+        )
+
+    def _restate_looks(self, found: _Residuals) -> bool:
+        """State the noise of lines, samples and the attitude under them as residuals ask for; whether it changed."""
+        sigmas, noise, pixel, sigma = self._network.sigmas, self._network.pose_noise, found.pixel, found.sigma_px
+        shared = found.shared(0.0, TOGETHER_S, STILL_SIGNIFICANT if noise.vibration else SIGNIFICANT)
+        total = (sigma * sigmas.image) ** 2 + (noise.vibration / pixel) ** 2
+        shared = max(shared, SHARE_KEPT * (noise.vibration / pixel) ** 2 / total)
+        wanted = total * min(max(found.ratio, MOST_DOWN**2), MOST_UP**2)
+        vibration = pixel * np.sqrt(shared * wanted)
+        image = float(np.sqrt(max((1.0 - shared) * wanted, sigma**2)) / sigma)
+        if vibration < LEAST_VIBRATION * pixel * sigma:
+            vibration = 0.0
+        before = np.array([sigmas.image, noise.vibration / pixel / sigma])
+        now = np.array([image, vibration / pixel / sigma])
+        little = np.abs(now - before).max() < (CHANGED - 1.0) * np.hypot(*before)
+        if (now == before).all() or (little and image > 1.0):
+            return False
+        sigmas.image, noise.vibration = image, vibration
+        sigmas.version += 1
+        return True
+
+    def _tell(self) -> None:
+        """Say what has become clearly larger or smaller since it was told last."""
+        vibration = self._network.pose_noise.vibration
+        if abs(vibration - self._vibration) > (TOLD_AGAIN - 1.0) * max(vibration, self._vibration):
+            self._vibration = vibration
+            self.events.append(
+                f"sigmas: the attitude vibrates by {1e3 * np.degrees(vibration):.1f} mdeg, which nobody stated"
+                if vibration
+                else "sigmas: the attitude does not vibrate any more"
+            )
+        now = np.append(self._network.sigmas.apriori, self._network.sigmas.image)
+        for i, name in enumerate((*ERROR_GROUPS, "image")):
+            if max(now[i] / self._told[i], self._told[i] / now[i]) < TOLD_AGAIN:
+                continue
+            self._told[i] = now[i]
+            self.events.append(
+                f"sigmas: {name} is {now[i]:.1f} times as large as stated"
+                if now[i] > 1.0
+                else f"sigmas: {name} is as stated"
+            )
+
+    def take_events(self) -> list[str]:
+        """Lines for the operator since the last call."""
+        lines, self.events = self.events, []
+        return lines
+
+
+def _likely(strip: WindowStrip, state: WindowState, pair: tuple[int, int]) -> tuple[float, float]:
+    """Factors of errors of position and attitude of one kind, by the likelihood of the data under a bank of them.
+
+    Whether a position is off or an attitude shows in the images by little. So each pair of factors is weighed by its
+    restricted likelihood, and variances are averaged: where the data cannot tell, both are larger, and no sigma is too
+    small. Minus twice the logarithm of the likelihood is ``log det N + sum 2 m log f - n' N^-1 n``, with m equations of
+    a group.
+
+    Parameters
+    ----------
+    pair : groups of position and attitude
+    """
+    (A, a, now_a), (B, b, now_b) = (strip.apriori_information(g, state) for g in pair)
+    N, rhs = state.normal()
+    rest = N - A / now_a**2 - B / now_b**2
+    cost = np.full((len(BANK), len(BANK)), np.inf)
+    for i, f in enumerate(BANK):
+        for j, g in enumerate(BANK):
+            try:
+                root = np.linalg.cholesky(rest + A / f**2 + B / g**2)
+            except np.linalg.LinAlgError:
+                continue
+            y = solve_triangular(root, rhs, lower=True, check_finite=False)
+            far = (np.log(f) ** 2 + np.log(g) ** 2) / USUAL_LOG**2
+            logarithms = 2.0 * np.log(np.diagonal(root)).sum() + 2.0 * (a * np.log(f) + b * np.log(g))
+            cost[i, j] = logarithms - y @ y + far
+    weight = np.exp(-0.5 * (cost - cost.min()))
+    weight /= weight.sum()
+    square = np.square(BANK)
+    return float(np.sqrt(weight.sum(axis=1) @ square)), float(np.sqrt(weight.sum(axis=0) @ square))
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Residuals of n looks in the order of their times.
+
+    Attributes
+    ----------
+    time_s, point : (n,)
+    w, redundancy : (n, 2) normalised residuals of line and sample, and their redundancy numbers
+    pixel, sigma_px : angle that a pixel subtends, rad, and the stated sigma of a sample
+    """
+
+    time_s: Array
+    point: NDArray[np.int64]
+    w: Array
+    redundancy: Array
+    pixel: float
+    sigma_px: float
+
+    @property
+    def ratio(self) -> float:
+        """Median of the squares over that of right sigmas."""
+        return float(np.median(self.w[self.redundancy > LEAST_CONTROLLED] ** 2) / chi2.median(1))
+
+    def last(self) -> bool:
+        """Whether what looks have in common lasts longer than a vibration: then it is a wander of the trajectory."""
+        return self.shared(*APART_S, SIGNIFICANT) > LASTING
+
+    def shared(self, least_s: float, most_s: float, significant: float) -> float:
+        """Share of the variance that looks at different points have in common which are so far apart in time.
+
+        Of two residuals with redundancy numbers r1, r2 and a noise of variance A in common, the product has the
+        expectation ``r1 r2 A``: the rest of the noise is taken by the points.
+
+        Parameters
+        ----------
+        significant : in units of its standard deviation, where nothing is in common; 0 is returned below
+        """
+        a = np.arange(len(self.time_s))
+        b = np.maximum(np.searchsorted(self.time_s, self.time_s + least_s), a + 1)
+        a, b = a[b < len(a)], b[b < len(a)]
+        near = (self.time_s[b] - self.time_s[a] < most_s) & (self.point[a] != self.point[b])
+        a, b = a[near], b[near]
+        if len(a) < LEAST_PAIRS:
+            return 0.0
+        w, r = self.w, self.redundancy[a] * self.redundancy[b]
+        found, noise = float(np.sum(w[a] * w[b] * r**1.5)), float(np.sqrt(np.sum(r**3)))
+        total = float(np.sum(w**2 * self.redundancy) / np.sum(self.redundancy))
+        return min(found / float(np.sum(r**2)) / total, 1.0) if found > significant * noise * total else 0.0
+
+
+def _changed(factor: float, ratio: float) -> float:
+    """A factor that residuals ask to be multiplied by a ratio: itself where that makes little difference."""
+    new = min(max(factor * min(max(ratio, MOST_DOWN), MOST_UP), 1.0), LARGEST)
+    return factor if max(new / factor, factor / new) < CHANGED and new > 1.0 else new

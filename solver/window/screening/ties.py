@@ -1,0 +1,116 @@
+"""Whether a point seen again agrees with what earlier strips say of it; ties that fail are dropped, the looks stay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ...adjustment.normal_equations import ControlWeights, without_point
+from ...adjustment.snooping import TOGETHER
+from ..state.batch import Batch, PointTies, inverse_factors
+from ..state.network import LiveNetwork
+from ..state.unknowns import WindowState
+
+Array = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+
+#: Probability that a good tie fails the test on entry, and the one in the window.
+ON_ENTRY, INSIDE = 1e-5, 1e-3
+#: Two rays place a point well if its sigma along them is below this share of the distance. Tuned.
+WELL = 0.02
+
+
+def drop_weak(batch: Batch) -> None:
+    """Drop the ties of points that lie on one ray and on a single look of an earlier strip which is nearly parallel.
+
+    Such points are placed badly; linearised far off, the tie would say more than it knows.
+    """
+    if batch.ties is None:
+        return
+    rows = batch.ties.rows(batch.origin_l, len(batch.columns))
+    weak = np.zeros(batch.n_points, dtype=bool)
+    for i in np.flatnonzero(batch.ties.active & batch.ties.single & (np.diff(batch.first_ray) == 1)):
+        _, J, _, origin = batch.equations(int(i))
+        least = np.linalg.eigvalsh(J.T @ J + rows.point[i].T @ rows.point[i])[0]
+        away = np.linalg.norm(origin - batch.rays.position_l[batch.first_ray[i]])
+        weak[i] = least < (WELL * away) ** -2
+    drop_ties(batch, weak)
+
+
+def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE, which: Bools | None = None) -> Bools:
+    """Which points (p,) have ties that their rays contradict, where neither of both are in the state.
+
+    The place where the rays meet, with the orientation as known, is compared with what the earlier strips say of it.
+    Where they do not meet, as a single one, the rays and what these strips say must agree on some place.
+
+    Parameters
+    ----------
+    alpha : probability that a good tie fails
+    which : points (p,) to be tested; by default all
+    """
+    ties = batch.ties
+    fails = np.zeros(batch.n_points, dtype=bool)
+    if ties is None or not ties.active.any():
+        return fails
+    theta, Q = state.values(batch.columns), state.covariance(batch.columns)
+    tied = ties.rows(batch.origin_l, len(batch.columns))
+    for i in np.flatnonzero(ties.active if which is None else ties.active & which):
+        A, J, residual, _ = batch.equations(int(i))
+        used = (J != 0).any(axis=1)
+        A, J, residual = A[used], J[used], residual[used]
+        m = ties.observations[i]
+        D, P, off = tied.design[i, :m], tied.point[i, :m], tied.residual[i, :m]
+        N = J.T @ J
+        if len(J) < 3 or np.linalg.cond(N) > 1e12:
+            D, off = without_point(np.concatenate([A, D]), np.concatenate([J, P]), np.concatenate([residual, off]))
+            C = np.eye(len(off))
+        else:
+            through = P @ np.linalg.inv(N) @ J.T
+            D, off = D - through @ A, off - through @ residual
+            C = np.eye(m) + through @ through.T
+        off = off - D @ theta
+        C = C + D @ Q @ D.T
+        fails[i] = len(off) > 0 and off @ np.linalg.solve(C, off) > chi2.isf(alpha, len(off))
+    return fails
+
+
+def snoop_ties(batches: Sequence[Batch], network: LiveNetwork) -> list[str]:
+    """Drop ties of batches in the state that fail; names of their points. The state has to be solved again if any."""
+    tests = [(b, b.ties, _joint(b, b.ties, network.state)) for b in batches if b.ties is not None]
+    worst = max((float(value.max(initial=0.0)) for *_, value in tests), default=0.0)
+    names = []
+    for batch, ties, value in tests:
+        before = batch.information
+        limit = chi2.isf(INSIDE, ties.observations)
+        if failed := drop_ties(batch, value > np.maximum(limit, TOGETHER * worst)):
+            network.state.exchange(batch.columns, before, batch.information)
+            names += failed
+    return names
+
+
+def _joint(batch: Batch, ties: PointTies, state: WindowState) -> Array:
+    """By how much the weighted squares fall without each tie (p,); 0 for points without."""
+    theta = state.values(batch.columns)
+    batch.back_substitute(theta)
+    rows = ties.rows(batch.origin_l, len(batch.columns))
+    through = rows.point @ np.swapaxes(inverse_factors(batch.normals), 1, 2)
+    design = rows.design - through @ batch.coupling
+    C = design @ state.covariance(batch.columns) @ np.swapaxes(design, 1, 2) + through @ np.swapaxes(through, 1, 2)
+    v = rows.residual - rows.design @ theta - np.einsum("pij,pj->pi", rows.point, batch.points_l - batch.origin_l)
+    value = np.einsum("pi,pij,pj->p", v, np.linalg.pinv(np.eye(3) - C, rcond=1e-6, hermitian=True), v)
+    return np.where(rows.active & (batch.normals.rank == 3), value, 0.0)
+
+
+def drop_ties(batch: Batch, fails: Bools) -> list[str]:
+    """Take the weight from ties; known coordinates that they stood for count themselves. Names of their points."""
+    if batch.ties is None or not fails.any():
+        return []
+    batch.ties = replace(batch.ties, active=batch.ties.active & ~fails)
+    weight = np.where(fails[:, None], batch.ties.control, batch.control.weight)
+    batch.control = ControlWeights(weight, batch.control.xyz_l, int((weight > 0).sum()))
+    batch.eliminate()
+    return [batch.names[i] for i in np.flatnonzero(fails)]

@@ -1,0 +1,339 @@
+"""Object points that became known together: their rays, linearised, with the points eliminated; a block of its own.
+
+A batch gives the window one dense block of information about the unknowns its rays touch, and can take it back.
+Residuals, weights, models and statistics are those of the batch adjustment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.covariance import Cofactors
+from ...adjustment.layout import Layout
+from ...adjustment.linearisation import Linearisation, Whitening, linearise, linearise_and_weigh
+from ...adjustment.network import Rays
+from ...adjustment.normal_equations import ControlWeights, PointNormals, inverse_factors, point_normals
+from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
+from .unknowns import Information, WindowState
+
+Array = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TieRows:
+    """Whitened equations of p points: ``design @ theta + point @ (xyz - origin) = residual``; three a point."""
+
+    design: Array
+    point: Array
+    residual: Array
+    active: Bools
+
+    def joined(self, lin: Linearisation, point: IntArray) -> tuple[Linearisation, IntArray]:
+        """With the observations of rays, as two more rays a point."""
+        p = len(self.point)
+        first, second = self.point[:, :2].transpose(1, 2, 0), np.zeros((2, 3, p))
+        second[0] = self.point[:, 2].T
+        rest = np.stack([self.residual[:, 2], np.zeros(p)])
+        both = replace(
+            lin,
+            residual=np.concatenate([lin.residual, self.residual[:, :2].T, rest], axis=1),
+            point=np.concatenate([lin.point, first, second], axis=2),
+        )
+        return both, np.concatenate([point, np.tile(np.arange(p), 2)])
+
+
+@dataclass
+class PointTies:
+    """What earlier strips say of the p points of a batch.
+
+    Attributes
+    ----------
+    columns : (m,) unknowns of the window that stand for earlier strips, the last ones of the batch
+    xyz_l, modes, root : (p, 3), (p, 3, m), (p, 3, 3) see `EarlierPoint`
+    control : (p, 3) weights of known coordinates, whether or not an earlier strip has used them
+    active : (p,) False where the tie failed its test
+    single : (p,) of one look
+    used : (p,) whether an earlier strip has used known coordinates of the point
+    """
+
+    columns: IntArray
+    xyz_l: Array
+    modes: Array
+    root: Array
+    control: Array
+    active: Bools
+    single: Bools
+    used: Bools
+
+    def part(self, which: IntArray) -> PointTies:
+        """Of some of the points."""
+        return replace(
+            self, xyz_l=self.xyz_l[which], modes=self.modes[which], root=self.root[which], control=self.control[which],
+            active=self.active[which], single=self.single[which], used=self.used[which],
+        )  # fmt: skip
+
+    @property
+    def placed(self) -> Bools:
+        """Which points (p,) have a place from earlier strips."""
+        return self.active & ~self.single
+
+    @property
+    def observations(self) -> IntArray:
+        """How many each tie stands for (p,), active or not: that of a single look two."""
+        return np.where(self.single, 2, 3)
+
+    def rows(self, origin_l: Array, n_unknowns: int) -> TieRows:
+        """Equations of all points, zero where they are not active."""
+        root = np.where(self.active[:, None, None], self.root, 0.0)
+        design = np.zeros((len(root), 3, n_unknowns))
+        design[:, :, n_unknowns - len(self.columns) :] = -root @ self.modes
+        return TieRows(design, root, np.einsum("pij,pj->pi", root, self.xyz_l - origin_l), self.active)
+
+
+@dataclass
+class Batch:
+    """A mini network of p points with n rays (sorted by point).
+
+    Attributes
+    ----------
+    names : (p,) points
+    rays : image measurements with the measured orientation
+    pose_covariance : (n, 6, 6) white noise of the measured orientation, with what the model leaves out
+    columns : (u,) unknowns of the window that the rays touch, by their number; then those of the camera, and at the
+        end those that stand for earlier strips
+    layout : the same, counted from 0
+    control : weighted coordinates of the points
+    weight : (n,) factor on each ray's weight; 0 = left out
+    points_l : (p, 3)
+    provisional : whether a ray leans on a filtered pose that a smoothed one will replace
+    ties : what earlier strips say of the points
+    noise_version : of the noise of poses and images that the weights are for, see `LiveNetwork.noise_version`
+    image_factor : what the sigmas of its lines and samples have been multiplied by
+    counted : whether its rays are counted there
+    tested : number of the update that tested it last
+    active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
+    judged : cofactors and statistics of the last test, and the solution of the window they are for
+    """
+
+    names: list[str]
+    rays: Rays
+    pose_covariance: Array
+    columns: IntArray
+    layout: Layout
+    control: ControlWeights
+    weight: Array
+    points_l: Array
+    provisional: bool
+    ties: PointTies | None = None
+    noise_version: int = 0
+    image_factor: float = 1.0
+    counted: bool = False
+    tested: int = -1
+    active_rays: int = field(init=False, default=0)
+    active_control: int = field(init=False, default=0)
+    determined: int = field(init=False, default=0)
+    judged: tuple[int, Cofactors, RayStatistics] | None = field(init=False, repr=False, default=None)
+    origin_l: Array = field(init=False, repr=False)
+    theta: Array = field(init=False)
+    lin: Linearisation = field(init=False)
+    whitening: Whitening = field(init=False)
+    normals: PointNormals = field(init=False)
+    information: Information = field(init=False)
+    _rows: Array = field(init=False, repr=False)
+    _places: tuple[IntArray, IntArray] = field(init=False, repr=False)
+    _coefficients: Array = field(init=False, repr=False)
+    _incomplete: bool = field(init=False, repr=False)
+    coupling: Array = field(init=False, repr=False)
+
+    @property
+    def n_points(self) -> int:
+        return len(self.names)
+
+    def __post_init__(self) -> None:
+        self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
+        self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
+        self.height_m = abs(float(np.median(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])))
+        self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
+        self._template()
+
+    def linearise(self, theta: Array, reweigh: bool) -> None:
+        """Linearise at values (u,) of the unknowns and the present points; ``reweigh`` renews the rays' weights."""
+        self.theta, self.origin_l = theta, self.points_l
+        if reweigh:
+            rays = replace(self.rays, orientation_noise=self.pose_covariance)
+            self.whitening, self.lin, self.layout = linearise_and_weigh(rays, self.layout, theta, self.points_l)
+        else:
+            self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+        self.eliminate()
+
+    def eliminate(self) -> None:
+        """Information about the orientation, with the points eliminated, at the present linearisation and weights."""
+        n, u, p = len(self.rays), len(self.columns), self.n_points
+        lin = self.lin if (self.weight == 1.0).all() else self.lin.reweighted(self.weight)
+        A = self._design_rows(lin)
+        flat = A.reshape(2 * n, u)
+        # the right-hand side for theta counted from zero, the points from where they are
+        lin = replace(lin, residual=lin.residual + (flat @ self.theta).reshape(n, 2).T)
+        tied = self.ties.rows(self.origin_l, u) if self.ties is not None else None
+        all_rows, plan = (lin, self.rays.point) if tied is None else tied.joined(lin, self.rays.point)
+        normals = point_normals(all_rows, plan, p, self.control, self.origin_l)
+        a, b, c, d, e, f = normals.inverse_factor[:, self.rays.point]
+        j = lin.point
+        w = np.empty((n, 3, 2))
+        w[:, 0] = (a * j[:, 0]).T
+        w[:, 1] = (b * j[:, 0] + c * j[:, 1]).T
+        w[:, 2] = (d * j[:, 0] + e * j[:, 1] + f * j[:, 2]).T
+        D = np.add.reduceat(w @ A, self.first_ray[:-1], axis=0)  # (p, 3, u)
+        if tied is not None:
+            D += inverse_factors(normals) @ np.swapaxes(tied.point, 1, 2) @ tied.design
+        of_points = D.reshape(3 * p, u)
+        y = normals.y.T.ravel()
+        matrix = flat.T @ flat - of_points.T @ of_points
+        rhs = lin.residual.T.ravel() @ flat - y @ of_points
+        off = self.control.residual(self.origin_l)
+        square = float(np.vdot(lin.residual, lin.residual) + np.vdot(off, off) - y @ y)
+        self.active_rays = int((self.weight > 0).sum())
+        self.active_control = int(self.control.weight.any(axis=1).sum())
+        self.determined = int(normals.rank.sum())
+        rows = 2 * self.active_rays + self.control.n_observations - self.determined
+        if tied is not None and self.ties is not None:
+            matrix += np.einsum("pku,pkv->uv", tied.design, tied.design)
+            rhs += np.einsum("pku,pk->u", tied.design, tied.residual)
+            square += float(np.vdot(tied.residual, tied.residual))
+            rows += int(self.ties.observations[tied.active].sum())
+        self.normals, self.information = normals, Information(matrix, rhs, square, rows)
+        self.judged = None
+        self._rows, self.coupling = A, D
+
+    @property
+    def n_tied(self) -> int:
+        """Number of unknowns that stand for earlier strips."""
+        return 0 if self.ties is None else len(self.ties.columns)
+
+    def equations(self, point: int) -> tuple[Array, Array, Array, Array]:
+        """Rows (2 m, u) and (2 m, 3) of a point's rays, by unknowns and point; the right-hand side (2 m,) for unknowns
+        counted from zero and the point from an origin; the origin (3,)."""
+        mine = slice(self.first_ray[point], self.first_ray[point + 1])
+        root = np.sqrt(self.weight[mine])
+        A = self._rows[mine]
+        residual = self.lin.residual[:, mine].T * root[:, None] + A @ self.theta
+        J = self.lin.point[:, :, mine].transpose(2, 0, 1) * root[:, None, None]
+        return A.reshape(-1, A.shape[2]), J.reshape(-1, 3), residual.ravel(), self.origin_l[point]
+
+    def back_substitute(self, theta: Array) -> None:
+        """Put the points where they belong for values (u,) of the unknowns."""
+        rest = self.normals.y.T - self.coupling @ theta
+        self.points_l = self.origin_l + self.normals.back(rest.T).T
+
+    def has_moved(self, theta: Array, far: float) -> bool:
+        """Whether a correction of a ray has changed by more since the linearisation, rad or flying heights."""
+        change = np.abs(self.layout.corrections(theta - self.theta))
+        return bool(change[:3].max() > far * self.height_m or change[3:].max() > far)
+
+    def points_moved(self) -> float:
+        """How far a point has moved at most since the linearisation, m."""
+        return float(np.abs(self.points_l - self.origin_l).max(initial=0.0))
+
+    @property
+    def points_left(self) -> IntArray:
+        """(p,) rays with weight of each point."""
+        return np.bincount(self.rays.point, self.weight > 0, self.n_points).astype(np.int64)
+
+    @property
+    def control_refused(self) -> int:
+        """Control points of which no ray is left."""
+        return int((self.control.weight.any(axis=1) & (self.points_left == 0)).sum()) if self.active_control else 0
+
+    def weigh_control(self, point: int, axis: int, weight: float) -> None:
+        """Give a control coordinate another weight; `eliminate` makes it count."""
+        weights = self.control.weight.copy()
+        weights[point, axis] = weight
+        if self.ties is not None:
+            self.ties.control[point, axis] = weight
+        self.control = ControlWeights(weights, self.control.xyz_l, int((weights > 0).sum()))
+
+    def cofactors(self, Q: Array) -> Cofactors:
+        """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
+        L = inverse_factors(self.normals)
+        n, p = len(self.rays), self.n_points
+        D, u = self.coupling, len(self.columns)
+        inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
+        points = np.swapaxes(L, 1, 2) @ inner @ L
+        j = self.lin.point.transpose(2, 0, 1)  # (n, 2, 3), of full weight
+        W = j @ np.swapaxes(L, 1, 2)[self.rays.point]
+        own = self._rows if (self.weight == 1.0).all() else self._design_rows(self.lin)
+        rows = own - W @ D[self.rays.point]
+        through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
+        observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
+        return Cofactors(np.diagonal(Q).copy(), points, observed)
+
+    def full_rows(self, which: IntArray) -> Array:
+        """Rows (m, 2, u) of rays at full weight."""
+        if len(which) == len(self.rays) and (self.weight == 1.0).all():
+            return self._rows
+        return self._design_rows(self.lin)[which]
+
+    def _design_rows(self, lin: Linearisation) -> Array:
+        """Derivatives (n, 2, u) of all rays to the unknowns, with the weights of a linearisation."""
+        n, u = len(self.rays), len(self.columns)
+        place, of_camera = self._places
+        rows = np.zeros(2 * n * u + 1)  # the last one takes what a ray does not have
+        for axis in range(2):
+            step = np.where(place < 2 * n * u, place + axis * u, place) if self._incomplete else place + axis * u
+            rows[step] = self._coefficients * lin.orientation[axis].take(self.layout.component, axis=0)
+            if self.layout.camera is not None:
+                end = of_camera >= 2 * n * u
+                rows[np.where(end, of_camera, of_camera + axis * u)] = lin.camera[axis]
+        return rows[:-1].reshape(n, 2, u)
+
+    def _template(self) -> None:
+        """Where the terms of the design stand in the rows of all rays, one row after the other."""
+        layout, n, u = self.layout, len(self.rays), len(self.columns)
+        first = 2 * u * np.arange(n)
+        nowhere = 2 * n * u
+        self._incomplete = bool((layout.columns < 0).any())
+        place = np.where(layout.columns >= 0, first + layout.columns, nowhere)
+        of_camera = np.empty((0, n), dtype=np.int64)
+        if layout.camera is not None:
+            column = layout.camera.columns[layout.camera.pattern].T
+            of_camera = np.where(column >= 0, first + column + layout.n_model, nowhere)
+        self._places = place, of_camera
+        self._coefficients = layout.coefficients.take(layout.node, axis=0)
+
+    def judge(self, state: WindowState) -> tuple[Cofactors, RayStatistics]:
+        """Points, cofactors and statistics at the present solution; computed once for each solution."""
+        if self.judged is None or self.judged[0] != state.solution:
+            theta = state.values(self.columns)
+            self.back_substitute(theta)
+            cofactors = self.cofactors(state.covariance(self.columns))
+            self.judged = state.solution, cofactors, self.statistics(theta, cofactors)
+        return self.judged[1], self.judged[2]
+
+    def residuals_px(self, state: WindowState) -> Array:
+        """Residuals (n, 2) of the rays in lines and samples at the present solution, as `judge` gives them."""
+        if self.judged is not None and self.judged[0] == state.solution:
+            return self.judged[2].v_px
+        theta = state.values(self.columns)
+        self.back_substitute(theta)
+        return residuals_px(self.rays, self._at(theta), self.whitening)
+
+    def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
+        """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
+        return statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
+
+    def _at(self, theta: Array) -> Linearisation:
+        """The linear equations with their residuals at values (u,) of the unknowns and the present points.
+
+        They are as good as the linearisation, which follows the unknowns (`relinearisation`).
+        """
+        n = len(self.rays)
+        rows = self.full_rows(np.arange(n)).reshape(2 * n, -1)
+        shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
+        moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
+        return replace(self.lin, residual=self.lin.residual - moved)

@@ -1,0 +1,130 @@
+"""The network in the window: strips, points with their looks, batches of points, and the unknowns they share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.pose_noise import PoseNoise
+from ...camera.line_camera import LineCamera
+from ...camera.self_calibration import SelfCalibration
+from ...geometry.measured_trajectory import MeasuredTrajectory
+from .batch import Batch
+from .points import Intake
+from .sigma_factors import SigmaFactors
+from .strip import WindowStrip
+from .unknowns import WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+
+class Batches:
+    """The batches whose information is in the live part of the state, in the order in which they came.
+
+    All that changes what the state holds of a batch goes through here.
+    """
+
+    def __init__(self, state: WindowState) -> None:
+        self._state = state
+        self._by_id: dict[int, Batch] = {}
+
+    def __iter__(self) -> Iterator[Batch]:
+        return iter(self._by_id.values())
+
+    def __len__(self) -> int:
+        return len(self._by_id)
+
+    def __contains__(self, batch: Batch) -> bool:
+        return id(batch) in self._by_id
+
+    def enter(self, batch: Batch) -> None:
+        """A batch comes."""
+        self._by_id[id(batch)] = batch
+        self._state.add(batch.columns, batch.information)
+
+    def remove(self, batch: Batch) -> None:
+        """A batch is taken apart."""
+        del self._by_id[id(batch)]
+        self._state.add(batch.columns, batch.information, -1)
+
+    def leave(self, batch: Batch) -> None:
+        """A batch becomes final: what it knows stays."""
+        del self._by_id[id(batch)]
+        self._state.fix(batch.columns, batch.information)
+
+    def linearise(self, batch: Batch, theta: Array, reweigh: bool) -> None:
+        """Linearise a batch again, see `Batch.linearise`."""
+        before = batch.information
+        batch.linearise(theta, reweigh)
+        self._state.exchange(batch.columns, before, batch.information)
+
+    def reweigh(self, batch: Batch, weight: Array) -> None:
+        """Give the rays of a batch other weights (n,)."""
+        batch.weight = weight
+        self.eliminate(batch)
+
+    def eliminate(self, batch: Batch) -> None:
+        """Let count what was changed in a batch: weights of its rays and of its control, its ties."""
+        before = batch.information
+        batch.eliminate()
+        self._state.exchange(batch.columns, before, batch.information)
+
+
+class LiveNetwork:
+    """What the window holds; every phase of an update works on it.
+
+    Parameters
+    ----------
+    camera : line camera
+    self_calibration : additional parameters that are estimated all along
+
+    Attributes
+    ----------
+    trajectory : the measured trajectory; its covariance is that of the white noise alone
+    state : the unknowns
+    strips : by name, in the order in which they began
+    intake : points that are not final, with their looks, and known coordinates
+    batches : points with their equations
+    pose_noise : what the corrections leave of the noise of poses
+    sigmas : what a-priori sigmas are multiplied by
+    camera_columns : (m,) numbers of the additional parameters
+    """
+
+    def __init__(self, camera: LineCamera, self_calibration: SelfCalibration | None = None) -> None:
+        self.camera, self.self_calibration = camera, self_calibration
+        self.trajectory = MeasuredTrajectory()
+        self.state = WindowState()
+        self.strips: dict[str, WindowStrip] = {}
+        self.intake = Intake(camera, self.strips, self.trajectory)
+        self.batches = Batches(self.state)
+        self.pose_noise = PoseNoise(self.trajectory)
+        self.sigmas = SigmaFactors()
+        self.camera_columns: IntArray = np.empty(0, dtype=np.int64)
+        if self_calibration is not None:
+            m = self_calibration.n_unknowns
+            self.camera_columns = self.state.new_numbers(m)
+            columns = self.camera_columns[:, None].astype(np.int32)
+            self.state.enter(self.camera_columns)
+            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+
+    @property
+    def noise_version(self) -> int:
+        """How often what is known of the noise of poses and images has changed."""
+        return self.pose_noise.version + self.sigmas.version
+
+    @property
+    def flown(self) -> list[WindowStrip]:
+        """Strips of which something is left in the window, oldest first."""
+        return [s for s in self.strips.values() if not s.is_gone(self.state)]
+
+    def index(self, strip: WindowStrip) -> int:
+        """Place of a strip, as rays name it."""
+        return list(self.strips).index(strip.id)
+
+    def of_strip(self, strip: WindowStrip) -> list[Batch]:
+        """Batches with rays of a strip."""
+        index = self.index(strip)
+        return [b for b in self.batches if index in b.strips]

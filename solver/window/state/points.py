@@ -1,0 +1,267 @@
+"""The points of the window: looks and control as they arrive, judged, and held until they can be used."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...adjustment.drift_hypotheses import Group
+from ...adjustment.normal_equations import ControlWeights
+from ...camera.line_camera import LineCamera
+from ...geometry.measured_trajectory import SMOOTHED_LATE_S, MeasuredTrajectory
+from ..results import Look, Refusal
+from .batch import Batch
+from .strip import WindowStrip
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+
+@dataclass
+class ControlPoint:
+    """Known coordinates: (3,) m with sigma (3,), infinite where not given; role as in the messages."""
+
+    xyz_l: Array
+    sigma_m: Array
+    role: str
+
+    @property
+    def weight(self) -> Array:
+        if self.role == "check":
+            return np.zeros(3)
+        return np.where(
+            np.isfinite(self.sigma_m), 1.0 / np.where(np.isfinite(self.sigma_m), self.sigma_m, 1.0) ** 2, 0.0
+        )
+
+
+@dataclass
+class PointLooks:
+    """All looks at one point that the window knows; m of them.
+
+    Attributes
+    ----------
+    looks : as they came
+    time_s : (m,)
+    weight : (m,) 0 for rejected ones
+    returned, reported : looks that were taken back once; looks whose rejection was reported
+    batch : where the point is, None while it waits for a second look
+    out : control coordinates that were rejected
+    alone : does not agree with what earlier strips say of it
+    spent : known coordinates have been used by an earlier strip, whether or not the point ties that strip
+    """
+
+    looks: list[Look] = field(default_factory=list)
+    time_s: list[float] = field(default_factory=list)
+    weight: list[float] = field(default_factory=list)
+    returned: set[int] = field(default_factory=set)
+    reported: set[int] = field(default_factory=set)
+    batch: Batch | None = None
+    out: set[int] = field(default_factory=set)
+    alone: bool = False
+    spent: bool = False
+
+
+#: Time after which a look whose orientation has not come is given up, s.
+PATIENCE_S = 2.0
+
+
+class Intake:
+    """The points of the window by name, and which of them have news or wait.
+
+    Attributes
+    ----------
+    points : all points that are not final
+    control : known coordinates by point
+    """
+
+    def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
+        self.points: dict[str, PointLooks] = {}
+        self.control: dict[str, ControlPoint] = {}
+        self._ccds = [line.id for line in camera.lines]
+        self._camera, self._strips, self._trajectory = camera, strips, trajectory
+        self._arrived: dict[str, None] = {}
+        self._waiting: dict[str, None] = {}
+        self._done: deque[tuple[float, str, str]] = deque()
+        self._is_done: set[tuple[str, str]] = set()
+        self._refused: list[Refusal] = []
+        self._missing_s = -np.inf  # when poses were missing last
+        self._out_before: dict[str, set[int]] = {}
+
+    def add_control(self, name: str, point: ControlPoint) -> None:
+        self.control[name] = point
+        self._out_before.pop(name, None)
+        if name in self.points:
+            self.points[name].out.clear()  # it is judged anew
+            self._arrived[name] = None
+
+    def add_look(self, name: str, look: Look) -> str:
+        """Take a look, or say why not."""
+        time_s = self._time_of(look)
+        reason = self._judge(look) or self._judge_time(name, look, time_s)
+        if reason:
+            self._refused.append(Refusal(name, look, reason))
+            return reason
+        point = self.points.get(name)
+        if point is None:  # what was refused of it in an earlier strip is in doubt
+            point = self.points[name] = PointLooks(out=set(self._out_before.get(name, ())))
+        point.looks.append(look)
+        point.time_s.append(time_s)
+        point.weight.append(1.0)
+        self._arrived[name] = None
+        if point.batch is None:
+            self._waiting[name] = None
+        return ""
+
+    def known_coordinates(self, names: Sequence[str], used: NDArray[np.bool_]) -> ControlWeights:
+        """Known coordinates of points; those that are refused, and those ``used`` (p,) by earlier strips, take no
+        weight."""
+        weight, xyz = np.zeros((len(names), 3)), np.zeros((len(names), 3))
+        for i, name in enumerate(names):
+            if name in self.control:
+                weight[i], xyz[i] = self.control[name].weight, np.nan_to_num(self.control[name].xyz_l)
+                weight[i, list(self.points[name].out)] = 0.0
+        weight[used] = 0.0
+        return ControlWeights(weight, xyz, int((weight > 0).sum()))
+
+    def set_apart(self, names: Iterable[str]) -> None:
+        """Points that do not agree with earlier strips are points of their own."""
+        for name in names:
+            self.points[name].alone, self.points[name].spent = True, False
+
+    def sources_of(self, batch: Batch) -> list[Group]:
+        """Source and CCD line of each ray."""
+        rays = batch.rays
+        looks = [self.points[name].looks for name in batch.names]
+        return [
+            (looks[p][s].source, self._ccds[c])
+            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
+        ]
+
+    def _time_of(self, look: Look) -> float:
+        """NaN for a strip that is not known."""
+        strip = self._strips.get(look.strip)
+        return float("nan") if strip is None else strip.time_of_line(look.line)
+
+    def _judge(self, look: Look) -> str:
+        if not (isfinite(look.line) and isfinite(look.sample)):
+            return "value is not finite"
+        if not (isfinite(look.sigma_line_px) and isfinite(look.sigma_sample_px)):
+            return "value is not finite"
+        if not (look.sigma_line_px > 0 and look.sigma_sample_px > 0):
+            return "sigma is not positive"
+        if look.ccd not in self._camera.line_index:
+            return "unknown ccd"
+        if look.strip not in self._strips:
+            return "unknown strip"
+        if not -0.5 <= look.sample <= self._camera.lines[self._camera.line_index[look.ccd]].pixels - 0.5:
+            return "beyond the ccd line"
+        if not self._strips[look.strip].contains(look.line):
+            return "outside strip"
+        return ""
+
+    def _judge_time(self, name: str, look: Look, time_s: float) -> str:
+        if time_s < self._strips[look.strip].final_to_s:
+            return "too late"
+        if (name, look.strip) in self._is_done:
+            return "point is final"
+        if name in self.points and look in self.points[name].looks:
+            return "duplicate"
+        return ""
+
+    def ready(self, now_s: float) -> list[str]:
+        """Points with news all of whose looks have a measured orientation; they have no news any more.
+
+        Looks for which no orientation will come are refused, and those that waited for a partner too long.
+        """
+        names = list(self._arrived)
+        points = [self.points[name] for name in names]
+        time_s = np.array([t for point in points for t in point.time_s])
+        final_s = np.array([self._strips[look.strip].final_to_s for point in points for look in point.looks])
+        alone = np.repeat([point.batch is None for point in points], [len(point.looks) for point in points])
+        past = alone.astype(bool) & (time_s < final_s)
+        covered = self._trajectory.covers(time_s) & ~past
+        if self._trajectory.end_s < now_s - PATIENCE_S:
+            self._missing_s = now_s
+        late_s = -np.inf
+        if now_s >= self._missing_s + SMOOTHED_LATE_S:
+            late_s = min(now_s - PATIENCE_S, self._trajectory.end_s)
+        over, good, lost = past.tolist(), covered.tolist(), (past | (~covered & (time_s < late_s))).tolist()
+        ready = []
+        end = 0
+        for name, point in zip(names, points, strict=True):
+            first, end = end, end + len(point.looks)
+            gone = [i for i in range(end - first) if lost[first + i]] if not all(good[first:end]) else []
+            if len(gone) + sum(good[first:end]) == end - first:
+                ready.append(name)
+                del self._arrived[name]
+            for i in gone[::-1]:
+                reason = "too few looks" if over[first + i] else "no orientation"
+                self._refused.append(Refusal(name, point.looks[i], reason))
+                del point.looks[i], point.time_s[i], point.weight[i]
+        return ready
+
+    def place(self, name: str, batch: Batch | None) -> None:
+        """A point is in a batch now, or in none."""
+        self.points[name].batch = batch
+        if batch is None:
+            self._waiting[name] = None
+        else:
+            self._waiting.pop(name, None)
+
+    def finish(self, batch: Batch) -> None:
+        """The points of a batch are final."""
+        for name in batch.names:
+            strips = {look.strip for look in self.points[name].looks}
+            if name in self.control:
+                self._out_before[name] = self.points[name].out
+            del self.points[name]
+            self._arrived.pop(name, None)
+            for strip in strips:
+                self._done.append((batch.newest_s, name, strip))
+                self._is_done.add((name, strip))
+
+    def without_partner(self, limits_s: Mapping[str, float]) -> list[str]:
+        """Points that wait for another look in vain: theirs are older than the limits of their strips."""
+        points = ((name, self.points[name]) for name in self._waiting)
+        return [
+            name
+            for name, point in points
+            if all(t <= limits_s[look.strip] for look, t in zip(point.looks, point.time_s, strict=True))
+        ]
+
+    def give_up(self, names: Iterable[str]) -> list[Refusal]:
+        """Wait no longer for other looks at points."""
+        refused = []
+        for name in names:
+            refused += [Refusal(name, look, "too few looks") for look in self.points[name].looks]
+            del self.points[name], self._waiting[name]
+            self._arrived.pop(name, None)
+        return refused
+
+    def without_place(self, batch: Batch, placed: Collection[str]) -> list[Refusal]:
+        """Looks of a batch that leaves which nothing has placed: single ones that were to tie strips and did not."""
+        points = ((name, self.points[name]) for name in batch.names if name not in placed)
+        return [
+            Refusal(name, p.looks[0], "too few looks") for name, p in points if len(p.looks) == 1 and p.weight[0] > 0
+        ]
+
+    def forget(self, before_s: float) -> None:
+        """Forget which points became final before a time."""
+        while self._done and self._done[0][0] < before_s:
+            _, name, strip = self._done.popleft()
+            self._is_done.discard((name, strip))
+
+    @property
+    def oldest_waiting_s(self) -> float:
+        """Time of the oldest look that waits."""
+        return min((min(self.points[n].time_s, default=np.inf) for n in self._waiting), default=np.inf)
+
+    def take_refused(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        refused, self._refused = self._refused, []
+        return refused

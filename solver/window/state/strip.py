@@ -1,0 +1,282 @@
+"""A strip in the window: its time scale and its trajectory model, whose unknowns come and go with time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...models import MODELS
+from ...models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
+from ...models.dgr import DgrOptions
+from ...models.lim import LimOptions
+from ...models.ppm import PpmOptions
+from ...models.slow_errors import LEARNING_TIME_S, SlowErrors
+from ...models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
+from ..results import WindowOptions
+from .unknowns import WindowState
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
+UNKNOWN_LENGTH_S = 600.0
+#: Sampling of the times at which an unknown is in use, share of a segment.
+_SAMPLING = 0.05
+#: Of a wander that is fast because the filter learns, so much may be left out between borders, m and rad: small against
+#: the noise of an image coordinate on the ground and in the air. There are half as many unknowns and less, and over
+#: seeds errors are no larger (bench/apriori.py).
+LEFT_OUT_M, LEFT_OUT = 0.035, 1.5e-5
+
+
+def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
+    """Longest segment, s."""
+    return options.segment_s or SEGMENT_SHARE * float(slow.wander_times_s.min())
+
+
+def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> ModelOptions:
+    """Settings of the model that `options` names, with a-priori sigmas from the slow errors.
+
+    All but "dgr", which has no place for it, state the wander as the process it is.
+
+    Raises
+    ------
+    ValueError : an unknown model
+    """
+    step = segment_length(slow, options)
+    pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
+    if options.model == "wander":
+        if slow.wander_times_s.min() > LEARNING_TIME_S or options.segment_s:
+            return WanderOptions(slow, step)
+        return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
+    if options.model == "dgr":
+        offset, shift, drift = (_triple(v) for v in (slow.offset_m, np.degrees(slow.shift), np.degrees(slow.drift)))
+        degrees = np.degrees(slow.wander)
+        return DgrOptions(offset, shift, drift, slow.wander_m, (degrees[0], degrees[1], degrees[2]))
+    if options.model == "lim":
+        return LimOptions(max(pieces + 1, 4), False, slow=slow.alike)
+    if options.model == "ppm":
+        return PpmOptions(segments=pieces, slow=slow.alike)
+    raise ValueError(f"unknown trajectory model {options.model!r}; known: {', '.join(MODELS)}")
+
+
+def _triple(values: ArrayLike) -> tuple[float, float, float]:
+    a, b, c = np.maximum(values, NOTHING).tolist()
+    return (a, b, c)
+
+
+class WindowStrip:
+    """A strip whose model grows with time.
+
+    The model is built for the planned length; unknowns become present in the window's state when a time needs them,
+    with those a-priori observations that speak of present unknowns only, and leave it when no later time needs them.
+
+    Attributes
+    ----------
+    id : name
+    first_line_time_s, line_rate_hz : image line u is taken at first_line_time_s + u / line_rate_hz
+    lines : number of lines, 0 = not known
+    model : its correction functions
+    slow : its slow errors, as known beforehand
+    followed : (6,) spectral density of the wander that its model follows, see `SlowErrors`
+    ended : whether the last line has been taken
+    final_to_s : orientation up to here is final, or not refined at all where the flight was joined later
+    factor : (4,) what the a-priori sigmas are multiplied by from now on, by `ERROR_GROUPS`
+    """
+
+    def __init__(
+        self,
+        id: str,
+        first_line_time_s: float,
+        line_rate_hz: float,
+        lines: int,
+        slow: SlowErrors,
+        options: WindowOptions,
+        state: WindowState,
+        joined_s: float = -np.inf,
+        factor: Array | None = None,
+    ):
+        self.id = id
+        self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
+        self.lines = lines
+        self.slow = slow
+        self.followed = slow.wander_density if options.follows_wander else np.zeros(6)
+        self.ended = False
+        self.end_s = first_line_time_s + lines / line_rate_hz if lines else np.inf
+        length = lines / line_rate_hz if lines else UNKNOWN_LENGTH_S
+        start_s = max(first_line_time_s, min(joined_s, first_line_time_s + length - 1.0))
+        self.final_to_s = start_s
+        self.model: CorrectionModel = model_options(slow, options, length).build(
+            Extent(f"strip {id}", start_s, first_line_time_s + length)
+        )
+        self.numbers = state.new_numbers(self.model.n_unknowns)
+        self._prior = self.model.pseudo_observations()
+        self._row_done = np.zeros(len(self._prior), dtype=bool)
+        self.factor = np.ones(4) if factor is None else factor.copy()
+        self._group = error_groups(self._prior.labels)
+        self._scale = np.ones(len(self._prior))  # of the sigmas of rows that are done
+        self._entered = np.zeros(self.model.n_unknowns, dtype=bool)
+        self._step_s = segment_length(slow, options)
+        self._over = False
+        self._look_up_uses()
+
+    def restate(self, from_s: float, slow: SlowErrors, another: bool = False) -> float:
+        """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""
+        assert isinstance(self.model, Wander)
+        border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_times_s, another)
+        if np.isfinite(border_s):
+            self._look_up_uses()
+        return border_s
+
+    def _look_up_uses(self) -> None:
+        self._first_use, self._last_use = self._uses(self._step_s)
+        self._need = self._first_use[self._prior.columns].max(axis=1, initial=-np.inf, where=self._prior.columns >= 0)
+
+    def _uses(self, step_s: float) -> tuple[Array, Array]:
+        """Times (n_unknowns,) before and after which an unknown takes no part; up to one sample on the safe side."""
+        extent = self.model.extent
+        t = np.linspace(extent.start_s, extent.end_s, int((extent.end_s - extent.start_s) / (_SAMPLING * step_s)) + 2)
+        columns = self.model.design(t).columns.reshape(len(t), -1)
+        first = np.full(self.model.n_unknowns + 1, np.inf)
+        last = np.full(self.model.n_unknowns + 1, -np.inf)
+        np.minimum.at(first, columns, t[:, None])
+        np.maximum.at(last, columns, t[:, None])
+        sample = t[1] - t[0]
+        return first[:-1] - sample, np.minimum(last[:-1] + sample, extent.end_s)
+
+    def time_of(self, line: ArrayLike) -> Array:
+        return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz
+
+    def time_of_line(self, line: float) -> float:
+        """`time_of` of one line."""
+        return self.first_line_time_s + line / self.line_rate_hz
+
+    def contains(self, line: float) -> bool:
+        return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
+
+    def end(self, lines: int) -> None:
+        """The strip is over."""
+        self.ended = True
+        if lines:
+            self.lines = lines
+            self.end_s = float(self.time_of(lines))
+
+    def design(self, time_s: ArrayLike) -> Design:
+        """Design with the unknowns' numbers in the window."""
+        d = self.model.design(time_s)
+        return Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
+
+    def left_out_variance(self, time_s: Array) -> Array:
+        """(n, 6) what the model cannot follow; 0 for models that do not say."""
+        return self.model.left_out_variance(time_s)
+
+    @property
+    def entered(self) -> IntArray:
+        """Numbers of the unknowns that a time has needed so far."""
+        return self.numbers[self._entered]
+
+    def apriori(self) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        """A-priori equations of these: columns (m, t) by number, -1 for none, coefficients, values, sigmas."""
+        rows = np.flatnonzero(self._row_done & np.isfinite(self._prior.sigma))
+        return self._rows(rows)
+
+    def _rows(self, rows: IntArray) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        p: PseudoObservations = self._prior
+        columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
+        return columns, p.coefficients[rows], p.value[rows], p.sigma[rows] * self._scale[rows]
+
+    def apriori_fit(self, state: WindowState, since_s: float) -> tuple[IntArray, Array, Array]:
+        """How well the solution agrees with what was known beforehand of the unknowns that are present.
+
+        Parameters
+        ----------
+        state : solved
+        since_s : only what speaks of unknowns that are in use after this time, and of those of the whole strip
+
+        Returns
+        -------
+        group, square, redundancy : (m,) place in `ERROR_GROUPS`, squared residual and redundancy number of each
+            a-priori equation, with the sigmas that it has now
+        """
+        rows = self._rows_present(state)
+        rows = rows[(self._need[rows] > since_s) | (self._group[rows] < 2)]
+        columns, coefficients, value, sigma = self._rows(rows)
+        place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), -1)
+        b = np.where(place >= 0, coefficients, 0.0) / sigma[:, None]
+        theta, Q = np.append(state.theta, 0.0), state.covariance(state.numbers)
+        residual = np.einsum("mt,mt->m", b, theta[place]) - value / sigma
+        known = np.einsum("mt,mtu,mu->m", b, Q[place[:, :, None], place[:, None, :]], b)
+        return self._group[rows], residual**2, np.clip(1.0 - known, 0.0, 1.0)
+
+    def apriori_information(self, group: int, state: WindowState) -> tuple[Array, int, float]:
+        """Information (n, n) about all unknowns of the state from the a-priori equations of a group that are present,
+        as if their sigmas were as stated; the number of these equations, and the factor that they have now."""
+        rows = self._rows_present(state)
+        rows = rows[self._group[rows] == group]
+        columns, coefficients, _, sigma = self._rows(rows)
+        place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), len(state))
+        b = np.zeros((len(rows), len(state) + 1))
+        np.add.at(b, (np.arange(len(rows))[:, None], place), coefficients * (self._scale[rows] / sigma)[:, None])
+        return b[:, :-1].T @ b[:, :-1], len(rows), float(self.factor[group])
+
+    def _rows_present(self, state: WindowState) -> IntArray:
+        """A-priori equations whose unknowns are all in the state."""
+        rows = np.flatnonzero(self._row_done & np.isfinite(self._prior.sigma))
+        columns = self._prior.columns[rows]
+        present = (columns < 0) | (state.places(self.numbers[np.maximum(columns, 0)]) >= 0)
+        return rows[present.all(axis=1)]
+
+    def restate_sigmas(self, factor: Array, state: WindowState) -> None:
+        """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come."""
+        self.factor = factor.copy()
+        rows = self._rows_present(state)
+        rows = rows[self._scale[rows] != factor[self._group[rows]]]
+        if len(rows):
+            columns, coefficients, value, before = self._rows(rows)
+            self._scale[rows] = factor[self._group[rows]]
+            state.reweigh(columns, coefficients, value, before, self._prior.sigma[rows] * self._scale[rows])
+
+    def activate(self, to_s: float, state: WindowState) -> bool:
+        """Make unknowns present that times up to this one need; whether there were any."""
+        new = np.flatnonzero(~self._entered & (self._first_use <= to_s))
+        if not len(new):
+            return False
+        self._entered[new] = True
+        rows = np.flatnonzero(~self._row_done & (self._need <= to_s))
+        self._row_done[rows] = True
+        self._scale[rows] = self.factor[self._group[rows]]
+        state.extend(self.numbers[new], *self._rows(rows))
+        return True
+
+    def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:
+        """Unknowns that no time after the limit needs, and the time up to which the orientation becomes final.
+
+        Unknowns in use to the end of the strip leave when it has ended and is settled (limit infinite).
+        """
+        if self._over:
+            return self.numbers, self.final_to_s
+        present = state.places(self.numbers) >= 0
+        gone = present & (self._last_use <= limit_s)
+        if not np.isinf(limit_s):
+            gone &= self._last_use < self.model.extent.end_s - 1e-6
+        if not gone.any():
+            return np.empty(0, dtype=np.int64), self.final_to_s
+        to_s = self.end_s if np.isinf(limit_s) else float(self._last_use[gone].max())
+        return self.numbers[gone], to_s
+
+    def release(self) -> None:
+        """It is over and will not come back: give up what was only needed to fly it, for flights go on for hours."""
+        self._over = True
+        none = np.empty(0)
+        self.model = DgrOptions().build(self.model.extent)  # a small one: that of the strip names all its unknowns
+        self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
+        self._need = self._first_use = self._last_use = self._scale = none
+        self._row_done = self._entered = np.empty(0, dtype=bool)
+        self.numbers = np.empty(0, dtype=np.int64)
+
+    def is_gone(self, state: WindowState) -> bool:
+        """Whether nothing of it is left in the state."""
+        return self._over or not (state.places(self.numbers) >= 0).any()
+
+    def is_over(self, state: WindowState) -> bool:
+        """Whether it has been in the state and will not be again."""
+        return self._over or (self.ended and bool(self._entered.any()) and self.is_gone(state))

@@ -1,0 +1,421 @@
+"""The unknowns of the window and what is known of them: information that is added, taken back and marginalised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from ...adjustment.reduced_system import DenseFactor
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+#: Weight of what is held, which makes its cofactors nothing.
+HELD_WEIGHT = 1e30
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=float)
+
+
+@dataclass(frozen=True)
+class Information:
+    """What a batch knows of the unknowns ``theta`` of its columns: cost ``square - 2 rhs theta + theta matrix theta``.
+
+    Attributes
+    ----------
+    matrix, rhs : (u, u), (u,) reduced normal equations
+    square : sum of squares at theta = 0
+    rows : observations less object coordinates
+    """
+
+    matrix: Array
+    rhs: Array
+    square: float
+    rows: int
+
+    def __sub__(self, other: Information) -> Information:
+        """What this says beyond another one about the same unknowns."""
+        return Information(
+            self.matrix - other.matrix, self.rhs - other.rhs, self.square - other.square, self.rows - other.rows
+        )
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """What was known of unknowns when they left: ``R11 x1 + R12 x2 = d1 + noise(1)`` with those that stayed, x2.
+
+    Attributes
+    ----------
+    gone, stayed : numbers of the unknowns
+    R11, R12, d1 : upper triangular (m, m), (m, k), (m,)
+    """
+
+    gone: IntArray
+    stayed: IntArray
+    R11: Array
+    R12: Array
+    d1: Array
+
+
+@dataclass
+class Border:
+    """Quantities beside the unknowns that are held at zero, as columns of the normal equations.
+
+    With c quantities ``b`` beside the unknowns ``x`` the normal equations are
+
+        [N  G] [x]   [n]
+        [G' H] [b] = [r]
+
+    and keep that form when unknowns leave. So a drift of tie points, a bias of control or a gross error can be tested,
+    estimated or named exactly, long after the observations it stands in have left the window.
+
+    Attributes
+    ----------
+    numbers : (n,) unknowns
+    G, H, r : (n, c), (c, c), (c,)
+    """
+
+    numbers: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    G: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    H: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    r: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+    @classmethod
+    def of(cls, columns: int, numbers: ArrayLike = ()) -> Border:
+        """So many quantities, of which nothing is known yet, beside unknowns (n,)."""
+        numbers = np.array(numbers, dtype=np.int64)
+        return cls(numbers, np.zeros((len(numbers), columns)), np.zeros((columns, columns)), np.zeros(columns))
+
+    def add(
+        self, places: IntArray, numbers: IntArray, G: Array, H: Array | float = 0.0, r: Array | float = 0.0
+    ) -> None:
+        """Add equations (u, k), (k, k), (k,) of quantities at places (k,), those beyond the last one being new."""
+        more = max(int(places.max(initial=-1)) + 1 - len(self), 0)
+        at = places_of(self.numbers, numbers)
+        new = np.flatnonzero(at < 0)
+        at[new] = len(self.numbers) + np.arange(len(new))
+        if more or len(new):
+            self.numbers = np.concatenate([self.numbers, numbers[new]])
+            self.G = np.pad(self.G, ((0, len(new)), (0, more)))
+            self.H, self.r = np.pad(self.H, ((0, more), (0, more))), np.pad(self.r, (0, more))
+        self.G[at[:, None], places] += G
+        self.H[places[:, None], places] += H
+        self.r[places] += r
+
+    def join(self, places: IntArray, other: Border) -> None:
+        """Add equations of quantities that stand in another border, here at places (k,)."""
+        self.add(places, other.numbers, other.G, other.H, other.r)
+
+    def rows(self, numbers: IntArray) -> Array:
+        """Rows (m, c) of G, zero for unknowns it does not have."""
+        at = places_of(self.numbers, numbers)
+        found = np.zeros((len(numbers), self.G.shape[1]))
+        found[at >= 0] = self.G[at[at >= 0]]
+        return found
+
+    def marginalise(self, m: Marginal) -> Array:
+        """Unknowns have left; returns what is left of their rows, ``R11^-T G1`` (m, c)."""
+        if (places_of(self.numbers, m.gone) < 0).all():
+            return np.zeros((len(m.gone), len(self)))
+        q = solve_triangular(m.R11, self.rows(m.gone), trans=1, check_finite=False)
+        self.G = self.rows(m.stayed) - m.R12.T @ q
+        self.H, self.r, self.numbers = self.H - q.T @ q, self.r - q.T @ m.d1, m.stayed.copy()
+        return q
+
+    def freed(self, which: IntArray | NDArray[np.bool_], weight: Array | float = 0.0) -> Information:
+        """Information that the unknowns lose when k of the quantities are estimated instead of held at zero.
+
+        Parameters
+        ----------
+        which : places (k,) of the quantities, or a mask
+        weight : (k,) what is known of them beforehand, which counts as one observation each; 0 for nothing
+        """
+        G, r = self.G[:, which], self.r[which]
+        K = np.linalg.inv(self.H[np.ix_(which, which)] + np.eye(len(r)) * weight)
+        return Information(G @ K @ G.T, G @ (K @ r), float(r @ K @ r), 0 if np.any(weight) else len(r))
+
+    def keep(self, which: IntArray | NDArray[np.bool_]) -> None:
+        """Forget all other quantities: they stay at zero."""
+        self.G, self.H, self.r = self.G[:, which], self.H[which][:, which], self.r[which]
+
+
+class WindowState:
+    """Unknowns, each with a number for life, and their normal equations in two parts.
+
+    The *live* part is the sum of the batches that can still be linearised again or lose a ray. The *fixed* part holds
+    a-priori knowledge and what was marginalised; it never changes its linearisation. When unknowns leave, the fixed
+    part is brought to square-root form (Cholesky, those that leave first): the lower right block of the factor is what
+    stays. It is positive definite by construction.
+
+    Attributes
+    ----------
+    numbers : (n,) unknowns present, in the order of the matrices
+    theta : (n,) values
+    square : cost of everything so far at theta = 0 of the present unknowns
+    redundancy : observations so far less unknowns so far
+    solution : number of solutions computed so far
+    """
+
+    def __init__(self) -> None:
+        self.numbers: IntArray = np.empty(0, dtype=np.int64)
+        self.theta: Array = np.empty(0)
+        self._next = 0
+        self._place = np.full(256, -1, dtype=np.int64)
+        self._fixed, self._live = np.zeros((0, 0)), np.zeros((0, 0))
+        self._fixed_rhs, self._live_rhs = np.empty(0), np.empty(0)
+        self.square = 0.0
+        self.redundancy = 0
+        self._factor: DenseFactor | None = None
+        self._cofactors: Array | None = None
+        self._asked = 0
+        self._solved = True
+        self.solution = 0
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def new_numbers(self, n: int) -> IntArray:
+        """Numbers for n unknowns that may become present later."""
+        numbers = np.arange(self._next, self._next + n)
+        self._next += n
+        if self._next > len(self._place):
+            self._place = np.concatenate([self._place, np.full(self._next, -1, dtype=np.int64)])
+        return numbers
+
+    def _present(self, numbers: IntArray) -> IntArray:
+        """Places of unknowns that must be present.
+
+        Raises
+        ------
+        ValueError : one that is not, because it has left or has not been entered yet
+        """
+        place = self._place[numbers]
+        if len(place) and place.min() < 0:
+            raise ValueError(f"unknown {int(numbers[int(np.argmin(place))])} is not in the window")
+        return place
+
+    def places(self, numbers: ArrayLike) -> IntArray:
+        """Places in the matrices; -1 for unknowns that are not present."""
+        return self._place[np.asarray(numbers, dtype=np.int64)]
+
+    def values(self, numbers: ArrayLike) -> Array:
+        """Values of unknowns; 0 for those that are not present."""
+        place = self.places(numbers)
+        return np.where(place >= 0, np.append(self.theta, 0.0)[place], 0.0)
+
+    def enter(self, numbers: IntArray) -> None:
+        """Make unknowns present; until observed they have no information."""
+        n = len(self.numbers)
+        self._place[numbers] = n + np.arange(len(numbers))
+        self.numbers = np.concatenate([self.numbers, numbers])
+        m = len(numbers)
+        self.theta = np.concatenate([self.theta, np.zeros(m)])
+        self._fixed, self._live = (np.pad(a, ((0, m), (0, m))) for a in (self._fixed, self._live))
+        self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m)) for a in (self._fixed_rhs, self._live_rhs))
+        self.redundancy -= m
+        self._changed()
+
+    def observe(self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array) -> None:
+        """Add a-priori observations (m, t) of present unknowns; column -1 is none, infinite sigma no weight."""
+        self._observe(*self._rows(columns, coefficients, value, sigma))
+
+    def reweigh(self, columns: NDArray[np.int32], coefficients: Array, value: Array, before: Array, now: Array) -> None:
+        """Give a-priori observations (m, t) of present unknowns other sigmas (m,) than those they were added with."""
+        places, rows, rhs = self._rows(columns, coefficients, value, np.ones(len(value)))
+        change = now**-2.0 - before**-2.0
+        weighted = rows * change[:, None]
+        self._fixed[np.ix_(places, places)] += rows.T @ weighted
+        self._fixed_rhs[places] += weighted.T @ rhs
+        self.square += float(rhs @ (change * rhs))
+        self._changed()
+
+    def extend(
+        self, numbers: IntArray, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array
+    ) -> None:
+        """Make unknowns present about which these a-priori observations say all that is known.
+
+        Where there are as many as unknowns, these follow from what is known of the others: values and cofactors of
+        those stay what they are, and there is nothing to solve.
+        """
+        solved, cofactors, n = self._solved, self._cofactors, len(self)
+        self.enter(numbers)
+        places, rows, rhs = self._rows(columns, coefficients, value, sigma)
+        self._observe(places, rows, rhs)
+        old, new = np.flatnonzero(places < n), np.flatnonzero(places >= n)
+        if not solved or not len(rows) == len(new) == len(numbers):
+            return
+        own = np.empty((len(new), len(new)))
+        own[:, places[new] - n] = rows[:, new]
+        try:
+            given = np.linalg.solve(own, np.column_stack([-rows[:, old], rhs, np.eye(len(own))]))
+        except np.linalg.LinAlgError:
+            return
+        m, places = len(old), places[old]
+        self.theta[n:] = given[:, :m] @ self.theta[places] + given[:, m]
+        self._solved = True
+        if cofactors is not None:
+            through = cofactors[:, places] @ given[:, :m].T
+            noise = given[:, m + 1 :]
+            self._cofactors = np.empty((len(self), len(self)))
+            self._cofactors[:n, :n] = cofactors
+            self._cofactors[:n, n:], self._cofactors[n:, :n] = through, through.T
+            self._cofactors[n:, n:] = given[:, :m] @ through[places] + noise @ noise.T
+
+    def _rows(
+        self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array
+    ) -> tuple[IntArray, Array, Array]:
+        """Places (u,) of the unknowns that a-priori observations speak of, whitened rows (m, u), right-hand side."""
+        keep = np.isfinite(sigma)
+        columns, weight = columns[keep], 1.0 / sigma[keep]
+        touched = np.unique(columns)
+        touched = touched[touched >= 0].astype(np.int64)
+        rows = np.zeros((len(columns), len(touched) + 1))
+        local = np.where(columns >= 0, np.searchsorted(touched, columns), len(touched))
+        np.add.at(rows, (np.arange(len(rows))[:, None], local), coefficients[keep] * weight[:, None])
+        return self._present(touched), rows[:, :-1], value[keep] * weight
+
+    def _observe(self, places: IntArray, rows: Array, rhs: Array) -> None:
+        self._fixed[np.ix_(places, places)] += rows.T @ rows
+        self._fixed_rhs[places] += rows.T @ rhs
+        self.square += float(rhs @ rhs)
+        self.redundancy += len(rows)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Something else is known."""
+        self._factor = self._cofactors = None
+        self._solved, self._asked = False, 0
+
+    def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
+        """Add a batch's information to the live part, or take it back (``sign = -1``)."""
+        place = self._present(columns)
+        self._live[np.ix_(place, place)] += sign * information.matrix
+        self._live_rhs[place] += sign * information.rhs
+        self.square += sign * information.square
+        self.redundancy += sign * information.rows
+        self._changed()
+
+    def exchange(self, columns: IntArray, old: Information, new: Information) -> None:
+        """Put a batch's new information in the live part in place of what it said before."""
+        self.add(columns, new - old)
+
+    def fix(self, columns: IntArray, information: Information) -> None:
+        """Move a batch's information from the live to the fixed part."""
+        place = self._present(columns)
+        block = np.ix_(place, place)
+        self._live[block] -= information.matrix
+        self._fixed[block] += information.matrix
+        self._live_rhs[place] -= information.rhs
+        self._fixed_rhs[place] += information.rhs
+
+    def normal(self, less: Iterable[tuple[IntArray, Information]] = ()) -> tuple[Array, Array]:
+        """Normal equations (n, n), (n,) of all information, less some about unknowns with these numbers."""
+        matrix, rhs = self._fixed + self._live, self._fixed_rhs + self._live_rhs
+        for columns, information in less:
+            place = self.places(columns)
+            matrix[np.ix_(place, place)] -= information.matrix
+            rhs[place] -= information.rhs
+        return matrix, rhs
+
+    def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
+        """Factor and values (n,) with other unknowns held at zero."""
+        matrix, rhs = self.normal()
+        _hold(matrix, self.places(held))
+        factor = DenseFactor(matrix)
+        rhs[self.places(held)] = 0.0
+        return factor, factor.solve(rhs)
+
+    @property
+    def factor(self) -> DenseFactor:
+        if self._factor is None:
+            self._factor = DenseFactor(self._fixed + self._live)
+        return self._factor
+
+    def solve(self) -> None:
+        """Values from all information, if they are not."""
+        if self._solved:
+            return
+        self.theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        self._solved = True
+        self.solution += 1
+
+    def cost(self) -> float:
+        """Weighted squares of everything so far, at the present solution."""
+        return max(self.square - float((self._fixed_rhs + self._live_rhs) @ self.theta), 0.0)
+
+    def expect(self, numbers: int) -> None:
+        """Cofactors of so many unknowns, not all of them different, will be asked for."""
+        self._asked += numbers
+
+    def covariance(self, numbers: IntArray) -> Array:
+        """Cofactors (m, m) of present unknowns."""
+        place = self.places(numbers)
+        if self._cofactors is None:
+            factor = self.factor
+            # the whole inverse costs as much as the columns of a third of it
+            self._asked += len(place)
+            if 3 * self._asked <= len(self):
+                return factor.few_cofactors(place)
+            self._cofactors = factor.inverse()
+        return self._cofactors[np.ix_(place, place)]
+
+    def propagated(self, functions: Array) -> Array:
+        """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
+        return self.factor.solve(functions) if self._cofactors is None else self._cofactors @ functions
+
+    def marginalise(self, numbers: IntArray) -> Marginal:
+        """Take unknowns out; batches that touch them must have been fixed before.
+
+        Raises
+        ------
+        ValueError : an unknown about which nothing is known, not even beforehand
+        """
+        gone = self.places(numbers)
+        stay = np.setdiff1d(np.arange(len(self)), gone)
+        own = self._fixed[np.ix_(gone, gone)]
+        diagonal = np.diagonal(own)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        R11, failed = _potrf(own * scale[:, None] * scale, lower=0, clean=1)
+        if failed:
+            raise ValueError(f"unknown {int(self.numbers[gone[failed - 1]])} is undetermined and cannot leave")
+        R11 /= scale
+        R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
+        d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
+        marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
+        self._fixed = _block(self._fixed, stay) - R12.T @ R12
+        self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
+        self._live, self._live_rhs = _block(self._live, stay), self._live_rhs[stay]
+        self.square -= float(d @ d)
+        self._place[self.numbers[gone]] = -1
+        self.numbers, self.theta = self.numbers[stay], self.theta[stay]
+        self._place[self.numbers] = np.arange(len(stay))
+        # of what stays, the cofactors are what they were
+        self._factor, self._asked = None, 0
+        self._cofactors = None if self._cofactors is None else _block(self._cofactors, stay)
+        return marginal
+
+
+def places_of(numbers: IntArray, wanted: IntArray) -> IntArray:
+    """Places of numbers among others, all different; -1 for those that are not there."""
+    if not len(numbers):
+        return np.full(len(wanted), -1)
+    order = np.argsort(numbers)
+    at = order.take(np.searchsorted(numbers, wanted, sorter=order), mode="clip")
+    return np.where(numbers[at] == wanted, at, -1)
+
+
+def _block(matrix: Array, places: IntArray) -> Array:
+    """Rows and columns of a large symmetric matrix; one after the other is several times faster than both at once."""
+    return matrix.take(places, axis=0).take(places, axis=1)
+
+
+def _hold(matrix: Array, places: IntArray) -> None:
+    """Cut unknowns off from the others, so that they are zero and certain."""
+    matrix[places, :] = 0.0
+    matrix[:, places] = 0.0
+    matrix[places, places] = HELD_WEIGHT
