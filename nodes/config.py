@@ -20,7 +20,7 @@ Tables = dict[str, dict[str, Any]]
 
 
 def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
-    """The tables of a configuration file, none without a file.
+    """The tables of a configuration file, none without a file; of a ``flight.toml`` those in ``[nodes]``.
 
     Parameters
     ----------
@@ -38,6 +38,12 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
             tables = tomllib.load(file)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not a TOML file: {error}") from None
+    except RecursionError:
+        raise UserError(f"{path}: not a TOML file: nested too deep") from None
+    except ValueError as error:  # numbers of thousands of digits
+        raise UserError(f"{path}: not a TOML file: {error}") from None
+    if isinstance(tables.get("flight"), dict):  # the settings of nodes in a flight.toml
+        tables = tables.get("nodes", {})
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise UserError(f"{path}: {name} stands outside a table, wanted [node] tables")

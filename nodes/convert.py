@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas import messages as m
-from ..solver.camera import CcdLine, Lens, LineCamera
-from ..solver.frames import LocalFrame
-from ..solver.rotation import (
+from ..solver.camera.line_camera import CcdLine, Lens, LineCamera
+from ..solver.geometry.frames import LocalFrame
+from ..solver.geometry.rotation import (
     R_BC_NOMINAL,
     angles_from_matrix,
     matrix_from_angles,
@@ -21,7 +21,7 @@ from ..solver.rotation import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
-from ..solver.slow_errors import SlowErrors
+from ..solver.models.slow_errors import SlowErrors
 
 Array = NDArray[np.floating]
 
@@ -247,20 +247,25 @@ def gnss_message(
     message = m.LocationFix(frame_id="gnss_antenna", position_covariance_type=2)
     set_time(message.timestamp, time_ns)
     message.latitude, message.longitude, message.altitude = (float(v) for v in np.asarray(geodetic_deg_m))
-    message.position_covariance.extend(np.diag(np.square(sigma_enu_m)).ravel().tolist())
+    message.position_covariance.extend(_diagonal(sigma_enu_m))
     if velocity_enu is not None:
         v = message.velocity_enu
         v.x, v.y, v.z = (float(c) for c in np.asarray(velocity_enu))
         if velocity_sigma_enu is not None:
-            message.velocity_covariance.extend(np.diag(np.square(velocity_sigma_enu)).ravel().tolist())
+            message.velocity_covariance.extend(_diagonal(velocity_sigma_enu))
     return message
 
 
 def attitude_message(time_ns: int, rpy: ArrayLike, sigma: ArrayLike) -> Any:
     """An Attitude message; roll, pitch, heading and their sigmas in radians."""
-    roll, pitch, heading = (float(v) for v in np.asarray(rpy))
-    covariance = np.diag(np.square(sigma)).ravel().tolist()
-    return m.Attitude(time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=covariance)
+    roll, pitch, heading = np.asarray(rpy, dtype=float).tolist()
+    return m.Attitude(time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=_diagonal(sigma))
+
+
+def _diagonal(sigma: ArrayLike) -> list[float]:
+    """The nine values of a covariance from three sigmas; a list, because arrays of three cost ten times as much."""
+    x, y, z = np.asarray(sigma, dtype=float).tolist()
+    return [x * x, 0.0, 0.0, 0.0, y * y, 0.0, 0.0, 0.0, z * z]
 
 
 def ground_point_message(

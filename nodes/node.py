@@ -23,6 +23,7 @@ class Message:
     source : id of the publisher
     sequence : number given by the publisher, per topic, from 0; -1 before a runner has given it
     body : the decoded protobuf message
+    start : tells one run of the publisher from the next; 0 = not known
     """
 
     topic: str
@@ -30,6 +31,7 @@ class Message:
     body: Any
     source: str = ""
     sequence: int = -1
+    start: int = 0
 
 
 class Node:
@@ -49,6 +51,7 @@ class Node:
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         self.last_problem = ""
+        self.alarms: dict[str, str] = {}  # what an operator has to look at now, by kind; runners set some of them
 
     def step(self, message: Message) -> Iterable[Message]:
         """What follows from one message."""
@@ -69,6 +72,11 @@ class Node:
     def light(self) -> tuple[str, str]:
         """The operator's light, "good", "weak" or "failed", and the reason; empty for nodes without one."""
         return "", ""
+
+    @property
+    def alarm(self) -> str:
+        """All alarms as one line; empty if there are none."""
+        return "; ".join(dict.fromkeys(filter(None, self.alarms.values())))
 
     def problem(self, kind: str, text: str) -> None:
         """Count bad data of a kind (a short counter name) and keep one line about the newest case."""

@@ -31,6 +31,8 @@ MAX_JUMP_NS = 60_000_000_000
 REBASE_AFTER = 5
 #: Missing sequence numbers that are remembered, to tell a message out of order from a duplicate.
 _REMEMBERED = 10_000
+#: A number that jumps ahead by more is believed when `REBASE_AFTER` messages in a row go on from it.
+MAX_SEQUENCE_JUMP = _REMEMBERED
 
 
 def order_key(topic: str, envelope: Envelope) -> Key:
@@ -62,12 +64,15 @@ class _Stream(Generic[T]):
     base_stamp: int = 0  # newest stamp of a possible earlier time base ...
     base_count: int = 0  # ... and how many messages support it
     held: tuple[int, T] | None = None  # stamp and message after a jump ahead, waiting to be confirmed
+    # messages whose numbers jumped far ahead, waiting for others that go on from them
+    ahead: list[tuple[Envelope, T]] = field(default_factory=list)
 
 
 def is_orderly(topic: str, sequence: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> bool:
     """Whether `StreamCheck` would let all messages of a stream pass, each at once."""
     row = topics.find(topic)
-    if (np.diff(sequence) < 1).any():
+    numbers = np.diff(sequence)
+    if (numbers < 1).any() or (numbers > MAX_SEQUENCE_JUMP).any():
         return False
     if row.latched or row.family is Family.STATUS:
         return True
@@ -101,8 +106,17 @@ class StreamCheck(Generic[T]):
             self._streams[key] = _Stream(envelope.sequence, envelope.sequence, envelope.stamp_ns)
             return [item]
         sequence = envelope.sequence
+        if sequence - stream.last > MAX_SEQUENCE_JUMP:
+            return self._numbers_jump(stream, envelope, item, counts, topic)
+        if stream.ahead:  # the numbers go on as before: those ahead were not of this stream
+            self._drop_ahead(stream, counts, topic, envelope.source)
         if sequence <= stream.last:
             return [item] if self._is_new(stream, sequence, counts, topic, envelope) else []
+        return self._next(stream, envelope, item, counts, topic)
+
+    def _next(self, stream: _Stream[T], envelope: Envelope, item: T, counts: TopicCounts, topic: str) -> list[T]:
+        """A message with a number beyond the newest."""
+        sequence = envelope.sequence
         self._note_gap(stream, sequence, counts)
         stream.last = sequence
         row = topics.find(topic)
@@ -115,6 +129,24 @@ class StreamCheck(Generic[T]):
             return self._check_jump(stream, envelope, item, counts, topic)
         stream.last_stamp = envelope.stamp_ns
         return [item]
+
+    def _numbers_jump(
+        self, stream: _Stream[T], envelope: Envelope, item: T, counts: TopicCounts, topic: str
+    ) -> list[T]:
+        """A number far ahead is held until others go on from it: a long loss, and not somebody in another's name."""
+        if stream.ahead and not 0 < envelope.sequence - stream.ahead[-1][0].sequence <= MAX_SEQUENCE_JUMP:
+            self._drop_ahead(stream, counts, topic, envelope.source)
+        stream.ahead.append((envelope, item))
+        if len(stream.ahead) < REBASE_AFTER:
+            return []
+        ahead, stream.ahead = stream.ahead, []
+        return [out for e, held in ahead for out in self._next(stream, e, held, counts, topic)]
+
+    def _drop_ahead(self, stream: _Stream[T], counts: TopicCounts, topic: str, source: str) -> None:
+        jump = stream.ahead[0][0].sequence - stream.last
+        counts.malformed += len(stream.ahead)
+        stream.ahead.clear()
+        self._problem("malformed", f"{topic} of {source!r}: numbers jump ahead by {jump}, and others go on before it")
 
     def _is_new(self, stream: _Stream[T], sequence: int, counts: TopicCounts, topic: str, envelope: Envelope) -> bool:
         """Whether a number below the newest is a message out of order and not a duplicate."""
@@ -205,11 +237,15 @@ class Sequencer(Generic[T]):
     ----------
     inputs : topics of the table that are listened to
     grace_s : waiting time granted to steady streams, s
+    problem : called with (kind, text) for every message that is left out, because its stream has a clock of its own
     """
 
     STEADY_HZ = 100.0
 
-    def __init__(self, inputs: Iterable[str], *, grace_s: float = 0.5) -> None:
+    def __init__(
+        self, inputs: Iterable[str], *, grace_s: float = 0.5, problem: Callable[[str, str], None] | None = None
+    ) -> None:
+        self._problem = problem or (lambda kind, text: None)
         self._heap: list[tuple[Key, int, T]] = []
         self._grace_s = grace_s
         self.ready = False
@@ -217,6 +253,8 @@ class Sequencer(Generic[T]):
         self._newest_ns: int | None = None
         self._time_ns: int | None = None  # the same without observations
         self._released: Key | None = None
+        self._ahead: dict[tuple[str, str], int] = {}  # messages in a row that were far ahead, by topic and source
+        self._leapt_ns: int | None = None  # a stamp far ahead of all others that the next message has to confirm
         self._streams: dict[tuple[str, str], _Watermark] = {}
         self._sources: dict[str, tuple[int, tuple[int, str, str]]] = {}  # newest stamp of each, and its place
         self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
@@ -235,6 +273,13 @@ class Sequencer(Generic[T]):
         stamp = envelope.stamp_ns
         if self._started_s is None:
             self._started_s = now_s
+        if self._leaps(stamp):  # it waits for its place, and tells nothing about how far time is
+            if self._has_own_clock(topic, envelope):
+                return None
+            self._arrivals += 1
+            heapq.heappush(self._heap, (order_key(topic, envelope), self._arrivals, item))
+            return None
+        self._ahead.pop((topic, envelope.source), None)
         if self._newest_ns is None or stamp > self._newest_ns:
             self._newest_ns = stamp
         row = topics.find(topic)
@@ -249,6 +294,34 @@ class Sequencer(Generic[T]):
         self._arrivals += 1
         heapq.heappush(self._heap, (key, self._arrivals, item))
         return None
+
+    def _leaps(self, stamp: int) -> bool:
+        """Whether a stamp is far ahead of all that has come, and the message before it was not there as well.
+
+        One clock that is an hour ahead is not the time of the platform; all of them are, after a pause.
+        """
+        newest_ns = self.newest_ns
+        if newest_ns is None or stamp - newest_ns <= MAX_JUMP_NS:
+            self._leapt_ns = None
+            return False
+        before, self._leapt_ns = self._leapt_ns, stamp
+        if before is None or abs(stamp - before) > MAX_JUMP_NS:
+            return True
+        self._leapt_ns = None
+        return False
+
+    def _has_own_clock(self, topic: str, envelope: Envelope) -> bool:
+        """Whether so many messages of a stream were far ahead of all others that it has another time than they."""
+        number = self._ahead[topic, envelope.source] = self._ahead.get((topic, envelope.source), 0) + 1
+        if number <= REBASE_AFTER:
+            return False
+        ahead_s = (envelope.stamp_ns - (self.newest_ns or 0)) / 1e9
+        self._problem(
+            "clock",
+            f"{topic} of {envelope.source!r} is stamped {ahead_s:.1f} s ahead of everything else and is left out: "
+            "its clock is wrong, or all others are",
+        )
+        return True
 
     def hear(self, topic: str, envelope: Envelope, now_s: float) -> None:
         """Note who speaks on a topic, and how far they are; all there is to it for what is worked off elsewhere."""

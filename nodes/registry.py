@@ -9,21 +9,27 @@ from .errors import UserError
 
 #: name -> (module, class): nodes that turn messages into messages.
 STEP_NODES: dict[str, tuple[str, str]] = {
-    "navigator": ("navigator", "Navigator"),
-    "matcher": ("matcher", "Matcher"),
-    "adjuster": ("adjuster", "Adjuster"),
-    "rectifier": ("rectifier", "Rectifier"),
+    "navigator": ("navigator.navigator", "Navigator"),
+    "matcher": ("matcher.matcher", "Matcher"),
+    "adjuster": ("adjuster.adjuster", "Adjuster"),
+    "rectifier": ("rectifier.rectifier", "Rectifier"),
 }
 #: name -> (module, function): programs on the bus with a life of their own, run as ``function(options)``.
 PROGRAMS: dict[str, tuple[str, str]] = {
-    "simulator": ("simulator", "run"),
-    "recorder": ("recorder", "run"),
-    "player": ("player", "run"),
-    "monitor": ("monitor", "run"),
+    "simulator": ("simulator.simulator", "run"),
+    "recorder": ("recorder.recorder", "run"),
+    "player": ("player.player", "run"),
+    "monitor": ("monitor.monitor", "run"),
+    "nmea": ("sensors.nmea", "run"),
+    "lines": ("sensors.line_camera", "run"),
+    "ros2": ("sensors.ros2", "run"),
+    "stream": ("sensors.stream", "run"),
 }
+#: Programs among them that bring data of real sensors onto the bus.
+SENSORS = ("nmea", "lines", "ros2", "stream")
 #: name -> (module, class): nodes that only look on.
 ONLOOKERS: dict[str, tuple[str, str]] = {
-    "viewer": ("viewer", "Viewer"),
+    "viewer": ("viewer.viewer", "Viewer"),
 }
 #: What `process` runs where nothing else is asked for.
 ESTIMATING = ("navigator", "adjuster")
@@ -31,7 +37,7 @@ ESTIMATING = ("navigator", "adjuster")
 
 def names() -> list[str]:
     """All names, in the order of the flow."""
-    return ["simulator", *STEP_NODES, "recorder", "player", *ONLOOKERS, "monitor"]
+    return ["simulator", *SENSORS, *STEP_NODES, "recorder", "player", *ONLOOKERS, "monitor"]
 
 
 def node_class(name: str) -> Any:
@@ -54,6 +60,6 @@ def _load(module: str, attribute: str, name: str) -> Any:
     try:
         return getattr(importlib.import_module(f".{module}", __package__), attribute)
     except ModuleNotFoundError as error:
-        if error.name != f"{__package__}.{module}":
+        if not f"{__package__}.{module}.".startswith(f"{error.name}."):  # neither the module nor its folder
             raise
         raise UserError(f"node {name!r} is not part of this installation") from None

@@ -1,7 +1,7 @@
 """The only caller of `Node.step`.
 
-Over the bus (`live`) and over a recording (`runner`) a node gets the same messages in the same order, so the same
-outputs follow, with the same stamps and numbers.
+Over the bus (`bus.live`) and over a recording (`recording.runner`) a node gets the same messages in the same order, so
+the same outputs follow, with the same stamps and numbers.
 """
 
 from __future__ import annotations
@@ -10,13 +10,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from ..schemas import messages as m
 from ..schemas import topics
 from .node import Message, Node
+from .voices import VERDICT, Voices, is_voiced
 
 
 class StepDriver:
     """Feeds one node and gives its outputs their envelopes.
 
+    Of configuration, sensors and control the node is given what the source says that spoke first (`Voices`).
     An output cannot be known before its cause: its stamp is raised to the newest stamp the node has been given, so that
     the outputs of a node never go back in time.
 
@@ -29,16 +32,43 @@ class StepDriver:
     def __init__(self, node: Node, clock: Callable[[], float] | None = None) -> None:
         self.node = node
         self.time_ns = 0
+        self.voices = Voices()
         self._clock = clock
         self._sequences: Counter[str] = Counter()
         self._allowed: dict[str, bool] = {}
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Topics the node has to be fed from: its own, and an operator's verdicts where topics have one voice."""
+        names = self.node.inputs
+        return names if VERDICT in names or not any(map(is_voiced, names)) else (*names, VERDICT)
 
     def step(self, message: Message) -> list[Message]:
         """The outputs that follow from one message; from one that is there for the order alone, nothing does."""
         if topics.find(message.topic).order_only:
             return []
-        self.time_ns = max(self.time_ns, message.stamp_ns)
-        return self._collect(self.node.step, message)
+        heard = self.voices.hear(message)
+        outputs: list[Message] = []
+        for used in heard.pass_on:
+            if used.topic == VERDICT and VERDICT not in self.node.inputs:
+                continue
+            self.time_ns = max(self.time_ns, used.stamp_ns)
+            outputs += self._collect(self.node.step, used)
+        if not heard.pass_on:
+            self.node.counters["not used"] += 1
+        if heard.alarms or heard.notes:
+            for text in heard.alarms:
+                self.node.problem("second voice", text)
+            outputs += self._collect(self._told, heard.alarms, "ERROR") + self._collect(self._told, heard.notes, "INFO")
+        self.node.alarms["voices"] = self.voices.alarm(self.time_ns)
+        return outputs
+
+    def _told(self, lines: Iterable[str], level: str) -> Iterable[Message]:
+        """Lines of the event log, of nodes that write into it."""
+        for text in lines if "event/log" in self.node.outputs else ():
+            body = m.Log(name=self.node.name, message=text, level=m.Log.Level.Value(level))
+            body.timestamp.FromNanoseconds(self.time_ns)
+            yield Message("event/log", self.time_ns, body)
 
     def behind(self, lag_s: float, now_s: float) -> list[Message]:
         """The decisions that follow from being behind; see `Node.behind`."""

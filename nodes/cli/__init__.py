@@ -9,23 +9,31 @@ import sys
 from typing import Any
 
 from ..errors import UserError
+from ..terminal import clean_streams, plain
+
+#: Longest reason that is printed, characters.
+LONGEST_LINE = 1000
 
 #: command -> (module, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args) -> exit code.
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the live on-line triangulation demo"),
+    "fly": ("fly", "the live system on real sensors, from a flight folder"),
     "simulate": ("simulate", "a flight recording with truth, from a seed"),
     "node": ("node", "one node alone, for running across machines"),
     "confirm": ("confirm", "confirm or reject a signalised point in a running system"),
+    "keys": ("keys", "certificates and access lists for encrypted platforms"),
     "replay": ("replay", "play a recording onto the bus with its timing"),
     "process": ("process", "the same nodes over a recording, as fast as it goes"),
     "adjust": ("adjust", "batch adjustment of a recording or a block folder"),
     "navigate": ("navigate", "GNSS/inertial filter and smoother over a recording or a sensor folder"),
     "analyze": ("analyze", "offline analysis: one self-contained HTML report"),
     "info": ("info", "what a recording holds"),
-    "check": ("check", "whether a recording is whole"),
+    "new": ("new", "a commented flight folder to fill in"),
+    "check": ("check", "whether a recording is whole, or what a flight folder lacks"),
     "recover": ("recover", "a valid recording from a broken one"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
-    "import": ("import_", "block folder, sensor folder, SBET and others to a recording"),
+    "import": ("import_", "flight folder, poses, sensors, image lines and others to a recording"),
+    "locate": ("locate", "pixels to the ground and back, by a satellite's rigorous model or RPC"),
     "rectify": ("rectify", "image lines to an orthoimage, a cloud-optimised GeoTIFF"),
     "study": ("study", "Monte Carlo and sensitivity studies"),
     "view": ("view", "open a recording in Rerun"),
@@ -33,7 +41,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    """What was asked for; an option nobody knows is told with the usage of its command."""
+    """Parse the arguments; an unknown option is reported with the usage of its command."""
     command = next((word for word in argv if not word.startswith("-")), None)
     parser, subparser = _parser(command if command in COMMANDS else None)
     args, unknown = parser.parse_known_args(argv)
@@ -89,19 +97,23 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
     # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    argv = sys.argv[1:] if argv is None else argv
+    with clean_streams():
+        return _run(sys.argv[1:] if argv is None else argv)
+
+
+def _run(argv: list[str]) -> int:
     args = _parse(argv)
     try:
         return args.run(args)
     except UserError as error:
-        print(f"triline {args.command}: {error}", file=sys.stderr)
+        print(f"triline {args.command}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
     except FileNotFoundError as error:
         print(f"triline {args.command}: {error.filename}: no such file or folder", file=sys.stderr)
     except (PermissionError, IsADirectoryError, NotADirectoryError) as error:
         print(f"triline {args.command}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
     except MemoryError as error:
         print(f"triline {args.command}: not enough memory: {str(error) or 'out of memory'}", file=sys.stderr)
-    except BrokenPipeError:  # the reader of our output has gone, as in `triline info F | head`
+    except BrokenPipeError:  # the program that reads our output has ended, as in `triline info F | head`
         sys.stderr.close()
     except KeyboardInterrupt:
         print(f"triline {args.command}: interrupted", file=sys.stderr)
@@ -112,5 +124,6 @@ def main(argv: list[str] | None = None) -> int:
         if getattr(args, "verbose", False):
             raise
         what = " ".join(f"{type(error).__name__}: {error}".split())
-        print(f"triline {args.command}: fault in triline, please report it (-v shows where): {what}", file=sys.stderr)
+        told = f"fault in triline, please report it (-v shows where): {plain(what, 300)}"
+        print(f"triline {args.command}: {told}", file=sys.stderr)
     return 1

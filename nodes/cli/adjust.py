@@ -14,37 +14,48 @@ from typing import Any
 import numpy as np
 
 from ...solver.adjustment.adjustment import Iteration
-from ...solver.adjustment.batch import Event, Job, NotAdjustableError, Phase
-from ...solver.adjustment.batch import run as run_job
-from ...solver.adjustment.block import Block, network_from_block
+from ...solver.adjustment.block_data import BlockData, network_from_block
 from ...solver.adjustment.determinability import Limits, Removal
+from ...solver.adjustment.job import Event, Job, NotAdjustableError, Phase
+from ...solver.adjustment.job import run as run_job
 from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
+from ...solver.adjustment.surface_control import run_with_surface
+from ...solver.camera.self_calibration import SELF_CALIBRATIONS, SelfCalibration
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
-from ...solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
-from ..adjustment_result import PLOTS, TABLES, Adjustment, result_of, worst_strip
-from ..adjustment_summary import summary_lines
-from ..adjustment_tables import write_tables
+from ...solver.orthoimage.surface import HeightField
+from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
+from ..batch.adjustment_summary import summary_lines
+from ..batch.adjustment_tables import oriented_lines, write_tables
+from ..batch.scene_adjustment import SETS
 from ..errors import UserError
-from ..formats.block_folder import read_block
+from ..formats.block_folder import is_block_folder, read_block
 from ..formats.block_recording import TOPICS, block_from_messages
+from ..formats.camera_json import write_camera
+from ..formats.dem import dem_in_frame
+from ..formats.importable import refuse_importable
+from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import refuse_unless_folder
-from ..recording import RecordingReader
-from ..recording_summary import damage_lines
+from ..formats.scene_block import is_scene_block
+from ..recording.reader import RecordingReader
+from ..recording.summary import damage_lines
+from ..terminal import drawing, plain
+from .adjust_scenes import run_scenes
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
-  triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result"""
+  triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result
+  triline adjust flight.mcap --dem ground.tif --dem-sigma 0.5 --dem-crs EPSG:5773 --per-line -o result"""
 
-#: Beyond this sigma0 an adjustment that has not converged is no result.
+#: An adjustment that has not converged is refused if its sigma0 is larger than this.
 HOPELESS = 100.0
 
-#: So many segments or fixes are never too many for a block.
+#: Up to so many segments or fixes a strip are not checked against the number of rays.
 FEW = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", metavar="INPUT", help="block folder, or recording (MCAP)")
+    parser.add_argument("input", metavar="INPUT", help="block folder, block of satellite scenes, or recording (MCAP)")
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
     group = parser.add_argument_group("model")
     group.add_argument(
@@ -52,9 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--then", choices=sorted(MODELS), help="a second model on the orientation the first one refined")
     group.add_argument("--segments", type=int, metavar="N", help="segments a strip, for ppm")
+    group.add_argument("--sets", choices=SETS, help="satellite scenes: corrections a lens, or a scene (lens)")
     group.add_argument("--fixes", type=int, metavar="N", help="orientation fixes a strip, for lim")
-    sets = ["none", *SELF_CALIBRATIONS]
-    group.add_argument("--selfcal", choices=sets, default="none", help="additional parameters of the camera (none)")
+    selfcal = ["none", *SELF_CALIBRATIONS]
+    group.add_argument("--selfcal", choices=selfcal, default="none", help="additional parameters of the camera (none)")
     group.add_argument("--free", action="store_true", help="additional parameters without a-priori weight")
     group.add_argument(
         "--keep",
@@ -71,24 +83,48 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--variance-components", action="store_true", help="estimate sigmas of image, control, position and attitude"
     )
+    group.add_argument("--dem", type=Path, metavar="FILE", help="heights of a raster as control of all tie points")
+    group.add_argument("--dem-sigma", type=float, metavar="M", help="of these heights, 1 sigma; wanted with --dem")
+    group.add_argument(
+        "--dem-crs", metavar="CRS",
+        help="of the raster: 'ellipsoid', a vertical CRS (EPSG:5773), or the whole, where it does not say",
+    )  # fmt: skip
     group.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
+    parser.add_argument(
+        "--per-line", action="store_true", help="refined orientation of every image line: orientation_lines.csv (-o)"
+    )
     parser.add_argument("--plots", action="store_true", help="pictures of residuals, check points and corrections (-o)")
 
 
 def run(args: argparse.Namespace) -> int:
     if args.plots and not args.output:
         raise UserError("--plots needs a folder for the pictures: -o DIR")
+    if args.per_line and not args.output:
+        raise UserError("--per-line needs a folder for the table: -o DIR")
+    if (args.dem is None) != (args.dem_sigma is None):
+        raise UserError("--dem and --dem-sigma: wanted both, the raster and the sigma of its heights")
+    if args.dem is None and args.dem_crs is not None:
+        raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
+    if args.dem_sigma is not None and not 0 < args.dem_sigma < float("inf"):
+        raise UserError(f"--dem-sigma {args.dem_sigma:g}, wanted more than 0")
     if not args.critical > 0:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
     if args.iterations < 1:
         raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
+    if is_scene_block(Path(args.input)):
+        return run_scenes(args)
+    if args.sets is not None:
+        raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
     block = read_input(Path(args.input))
-    adjustment = adjust_block(block, job_of(args, block), _Teller(args))
+    surface = None
+    if args.dem is not None:
+        surface = dem_in_frame(args.dem, block.frame, args.dem_crs), float(args.dem_sigma or 0.0)
+    adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface)
     content = result_of(adjustment)
     if args.output:
-        write_result(adjustment, content, Path(args.output), plots=args.plots)
+        write_result(adjustment, content, Path(args.output), plots=args.plots, per_line=args.per_line)
     if args.json:
         print(json.dumps(content, indent=2))
     else:
@@ -99,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def read_input(path: Path) -> Block:
+def read_input(path: Path) -> BlockData:
     """The block in a folder or a recording.
 
     Raises
@@ -107,15 +143,18 @@ def read_input(path: Path) -> Block:
     UserError : neither, or one that cannot be adjusted
     """
     if path.is_dir():
+        if not is_block_folder(path):
+            refuse_importable(path)
         return read_block(path)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
+    refuse_importable(path)
     reader = RecordingReader(path)
     block = block_from_messages(reader.messages(TOPICS), path.name)
     return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
 
 
-def job_of(args: argparse.Namespace, block: Block) -> Job:
+def job_of(args: argparse.Namespace, block: BlockData) -> Job:
     """The job that the options ask for."""
     settings: dict[str, object] = dict(block.apriori.trajectory)
     settings |= {key: value for key in ("segments", "fixes") if (value := getattr(args, key)) is not None}
@@ -143,12 +182,15 @@ def job_of(args: argparse.Namespace, block: Block) -> Job:
 
 
 def _wanders(settings: Mapping[str, object]) -> bool:
-    """Whether the project says that the errors of the trajectory wander."""
+    """Whether the project states a sigma for wandering errors of the trajectory."""
     return any(np.any(np.asarray(settings.get(key, 0.0), float)) for key in ("wander_sigma_m", "wander_sigma_deg"))
 
 
-def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str], block: Block) -> None:
-    """A segment has 18 unknowns and a ray two equations; fixes that too few rays carry are merged, up to a limit."""
+def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str], block: BlockData) -> None:
+    """Raise UserError for more segments or fixes than rays can determine: a segment has 18 unknowns, a ray 2 equations.
+
+    Fixes with too few rays are merged, up to a limit.
+    """
     rays = np.bincount(block.image.strip[block.image.strip >= 0], minlength=1)
     most, strip = int(rays.max()), block.strips[int(rays.argmax())].id
     for option, model, share in (("segments", "ppm", 9), ("fixes", "lim", 2)):
@@ -167,7 +209,7 @@ def _model(name: str, settings: Mapping[str, object]) -> ModelOptions:
         raise UserError(f"model {name}: {error}") from None
 
 
-def _self_calibration(args: argparse.Namespace, block: Block) -> SelfCalibration | None:
+def _self_calibration(args: argparse.Namespace, block: BlockData) -> SelfCalibration | None:
     if args.selfcal == "none":
         return None
     try:
@@ -177,8 +219,10 @@ def _self_calibration(args: argparse.Namespace, block: Block) -> SelfCalibration
     return parameters.free() if args.free else parameters
 
 
-def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
-    """Do a job on a block.
+def adjust_block(
+    block: BlockData, job: Job, tell: Any = None, surface: tuple[HeightField, float] | None = None
+) -> Adjustment:
+    """Adjust a block as a job asks; ``surface``: ground on which tie points lie, and the sigma of its heights, m.
 
     Raises
     ------
@@ -186,36 +230,48 @@ def adjust_block(block: Block, job: Job, tell: Any = None) -> Adjustment:
     """
     start = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):  # what is not finite is looked for where it matters
-            result = run_job(network_from_block(block), job, tell)
+        with np.errstate(all="ignore"):  # results that are not finite are refused below
+            network, fit = network_from_block(block), None
+            if surface is None:
+                result = run_job(network, job, tell)
+            else:
+                result, fit = run_with_surface(network, job, surface[0].height, surface[1], tell)
     except NotAdjustableError as error:
         raise UserError(f"{block.name}: {error}") from None
     except ValueError as error:
         raise UserError(f"{block.name}: cannot be adjusted: {error}") from None
     finally:
-        if isinstance(tell, _Teller):
+        if isinstance(tell, _ProgressLines):
             tell.close()
-    adjustment = Adjustment(block, job, result, time.perf_counter() - start)
+    adjustment = Adjustment(block, job, result, time.perf_counter() - start, fit)
     if not result.solution.converged and result.test.sigma0 > HOPELESS:
         raise UserError(f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {worst_strip(adjustment)}")
     return adjustment
 
 
-def write_result(adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False) -> None:
-    """Write ``result.json`` and the tables, and the pictures on request."""
+def write_result(
+    adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False, per_line: bool = False
+) -> None:
+    """Write ``result.json``, the tables and the calibrated camera; pictures and the table of lines on request."""
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("result.json", *TABLES, *PLOTS):  # of an earlier run: what stands side by side belongs together
+    # files of an earlier run, which do not belong to this result
+    for name in ("result.json", *TABLES, *PLOTS, CAMERA, PER_LINE):
         (folder / name).unlink(missing_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
+    camera = adjustment.camera()
+    if camera is not None:
+        write_camera(folder / CAMERA, camera)
+    if per_line:
+        write_oriented_lines(folder / PER_LINE, oriented_lines(adjustment), adjustment.block.frame)
     if plots:
         from ..report.adjustment_plots import write_plots
 
         write_plots(adjustment, folder)
 
 
-class _Teller:
+class _ProgressLines:
     """Progress on standard error: one line that is written over on a terminal, plain lines elsewhere."""
 
     def __init__(self, args: argparse.Namespace):
@@ -232,13 +288,13 @@ class _Teller:
                 return
         text = f"{self.phase}: {_words(event)}" if not isinstance(event, Phase) else f"{self.phase} ..."
         if self.terminal:
-            print(f"\r\x1b[K{text[:110]}", end="", file=sys.stderr, flush=True)
+            print(f"\r\x1b[K{plain(text)[:110]}", end="", file=drawing(sys.stderr), flush=True)
         else:
             print(text, file=sys.stderr)
 
     def close(self) -> None:
         if self.terminal and not self.silent:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            print("\r\x1b[K", end="", file=drawing(sys.stderr), flush=True)
 
 
 def _words(event: Iteration | Round | Removal | Phase) -> str:

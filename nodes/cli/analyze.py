@@ -10,14 +10,14 @@ from typing import Any
 
 from ..errors import UserError
 from ..formats.new_file import new_file
-from ..recording_summary import Holdings
+from ..recording.summary import Holdings
 from ..report.accuracy_table import accuracy_lines
 
 EXAMPLE = "triline analyze flight.mcap -o report.html"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="MCAP recording, best one that went through the adjuster")
+    parser.add_argument("recording", type=Path, help="MCAP recording, with results of the adjuster for a full report")
     parser.add_argument("-o", "--output", type=Path, default=Path("report.html"), help="HTML file (report.html)")
 
 
@@ -35,7 +35,7 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     if output.exists() and recording.exists() and output.samefile(recording):
         raise UserError(f"{output}: is the recording itself")
     try:
-        with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work that it costs
+        with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work begins
             flight, held = read(recording)
             if held.span_ns is None or not flight.counts:
                 raise UserError(f"{recording}: {_nothing(held)}")

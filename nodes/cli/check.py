@@ -1,4 +1,4 @@
-"""``triline check``: whether a recording is whole."""
+"""``triline check``: whether a recording is whole, and what a flight folder lacks."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ import json
 from pathlib import Path
 
 from ..errors import UserError
-from ..recording import RecordingReader
-from ..recording_summary import findings
+from ..formats.flight_folder import read_flight
+from ..recording.reader import RecordingReader
+from ..recording.summary import findings
+from ..sensors.settings import read_sensors
 
 EXAMPLE = "triline check flight.mcap"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+    parser.add_argument(
+        "recording", type=Path, metavar="RECORDING_OR_FOLDER", help="flight.mcap, or a folder with flight.toml"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.recording.is_dir():
+        return _check_folder(args)
     reader = RecordingReader(args.recording)
     found = findings(reader)
     if args.json:
@@ -30,4 +36,30 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"{args.recording}: {found[0]}{more}")
     if not args.quiet:
         print(f"{args.recording}: whole, {len(reader.index)} messages in {reader.n_chunks} chunks")
+    return 0
+
+
+def _check_folder(args: argparse.Namespace) -> int:
+    """Print what a flight folder lacks, a line each; 1 where something does."""
+    flight = read_flight(args.recording)
+    programs = read_sensors(flight)
+    problems, notes = flight.problems, [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
+    if args.json:
+        print(
+            json.dumps({"folder": str(args.recording), "complete": not problems, "problems": problems, "notes": notes})
+        )
+        return 1 if problems else 0
+    for problem in problems:
+        print(f"  missing or wrong: {problem}")
+    if not args.quiet:
+        for note in notes:
+            print(f"  note: {note}")
+    if problems:
+        raise UserError(f"{args.recording}: {len(problems)} to be mended before the flight can be imported")
+    if not args.quiet and programs:
+        names = ", ".join(f"{program.id} ({program.node})" for program in programs)
+        print(f"{args.recording}: `triline fly` starts the sensors {names}")
+    if not args.quiet:
+        strips = f"{len(flight.strips)} strips with images" if flight.strips else "no images"
+        print(f"{args.recording}: complete; {strips}, ground at {flight.ground_height_m:g} m above the ellipsoid")
     return 0

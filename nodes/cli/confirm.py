@@ -1,4 +1,4 @@
-"""``triline confirm``: a surveyor's verdict on a signalised point, sent to a running system."""
+"""``triline confirm``: an operator's verdict on a signalised point or on who speaks on a topic, in a running system."""
 
 from __future__ import annotations
 
@@ -15,30 +15,43 @@ from ...schemas.envelope import RawMessage
 from ...schemas.topics import Family, find
 from ..errors import UserError
 from ..node import Message
-from .bus_options import add_bus_arguments
+from ..voices import is_voiced
+from .bus_options import add_bus_arguments, bus_of
 
 EXAMPLE = """triline confirm GCP3 --port 17447
-  triline confirm GCP3 --reject"""
+  triline confirm GCP3 --reject
+  triline confirm configuration/camera              # another camera than the flight began with
+  triline confirm sensor/gnss --source receiver2    # its messages count from now on"""
 
-#: The verdict takes effect so long after the newest platform time that was heard: everybody has it by then.
+#: Time from the newest platform time until the verdict takes effect, ns: by then every node has received it.
 AHEAD_NS = 500_000_000
-#: Time to hear of ground points and of platform time, and to hear what came of the verdict, s.
+#: Longest wait for ground points and platform time, and for the answer to the verdict, s.
 LISTEN_S, NOBODY_S, ANSWER_S = 1.0, 4.0, 6.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("point", metavar="POINT", help="name of the ground point")
     parser.add_argument(
-        "--reject", action="store_true", help="neither its looks nor its coordinates are used (default: looks are used)"
+        "point", metavar="POINT", help="name of the ground point, or topic of configuration, sensors or control"
     )
-    parser.add_argument("--by", metavar="NAME", default=_user(), help="who says so (default: %(default)s)")
+    parser.add_argument("--source", default="", metavar="NAME", help="of the topic (default: what was refused last)")
+    parser.add_argument(
+        "--reject",
+        action="store_true",
+        help="of a point use neither its image points nor its coordinates; of a source, nothing",
+    )
+    parser.add_argument(
+        "--by", metavar="NAME", default=_user(), help="name of the person who decides (default: %(default)s)"
+    )
     add_bus_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    from ..bus import Bus
+    from ..bus.session import Bus
 
-    with Bus(args.platform, source="surveyor", port=args.port, file=args.bus) as bus:
+    topic = args.point if _is_topic(args.point) else ""
+    if args.source and not topic:
+        raise UserError(f"--source {args.source}: wanted a topic before it, as in sensor/gnss, not {args.point}")
+    with Bus(source="surveyor", file=args.bus, **bus_of(args)) as bus:
         heard = _Heard(args.point)
         for name in ("status/*", "trajectory/filtered", "observation/control", "observation/target", "event/log"):
             bus.subscribe(name, heard.take)
@@ -46,10 +59,12 @@ def run(args: argparse.Namespace) -> int:
         _wait(lambda: heard.stamp_ns > 0, NOBODY_S)
         time.sleep(LISTEN_S)
         if not heard.stamp_ns:
-            raise UserError(f"nobody speaks on the bus of platform {args.platform}")
-        if heard.points and args.point not in heard.points:
+            raise UserError(f"no node sends on the bus of platform {bus.platform}")
+        if not topic and heard.points and args.point not in heard.points:
             raise UserError(f"{args.point} is no ground point of this flight, there are {_few(heard.points)}")
         verdict = m.Verdict(point=args.point, accepted=not args.reject, by=args.by)
+        if topic:
+            verdict = m.Verdict(topic=topic, publisher=args.source, accepted=not args.reject, by=args.by)
         heard.sent.set()
         bus.publish(Message("observation/verdict", heard.stamp_ns + AHEAD_NS, verdict))
         answered = _wait(lambda: heard.answer != "", ANSWER_S)
@@ -59,12 +74,12 @@ def run(args: argparse.Namespace) -> int:
     elif answered:
         print(heard.answer + (f"; {heard.looks} looks that were held" if heard.looks else ""))
     if not answered:
-        raise UserError(f"{args.point}: the verdict was sent, but no adjuster answers")
+        raise UserError(f"{args.point}: the verdict was sent, but no {'node' if topic else 'adjuster'} answers")
     return 0
 
 
 class _Heard:
-    """What is heard of a point, and of time."""
+    """Messages about the point, and the newest platform time."""
 
     def __init__(self, point: str) -> None:
         self._point = point
@@ -87,10 +102,26 @@ class _Heard:
             self.points.add(body.point)
         elif not self.sent.is_set():
             return
-        elif raw.topic == "event/log" and body.message.startswith(f"{self._point} is "):
+        elif raw.topic == "event/log" and body.message.startswith((f"{self._point} is ", f"{self._point} of ")):
             self.answer = body.message
         elif raw.topic == "observation/target" and body.point == self._point:
             self.looks += body.state in (body.CONFIRMED, body.REJECTED)
+
+
+def _is_topic(name: str) -> bool:
+    """Whether a name is a topic that belongs to one source.
+
+    Raises
+    ------
+    UserError : another topic
+    """
+    try:
+        find(name)
+    except KeyError:
+        return False
+    if not is_voiced(name):
+        raise UserError(f"{name}: anybody may speak on it, wanted a topic of configuration, sensors or control")
+    return True
 
 
 def _wait(done: Any, seconds: float) -> bool:

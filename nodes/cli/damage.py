@@ -1,15 +1,15 @@
-"""What commands say of a damaged recording that they work on all the same."""
+"""The line with which a command reports a damaged recording that it can still work on."""
 
 from __future__ import annotations
 
 import sys
 
-from ..recording import RecordingReader
-from ..recording_summary import damage_lines
+from ..recording.reader import RecordingReader
+from ..recording.summary import damage_lines
 
 
 def tell_damage(command: str, reader: RecordingReader) -> None:
-    """One line on standard error if something is missing in the result, quiet or not."""
+    """Print one line on standard error if damage makes the result incomplete, also with --quiet."""
     lines = damage_lines(reader)
     if lines:
         print(f"triline {command}: {reader.path}: {'; '.join(lines)}", file=sys.stderr)

@@ -13,24 +13,31 @@ import numpy as np
 
 from ...schemas import messages as m
 from ...schemas import topics
-from ...solver.frames import LocalFrame, navigation_from_R_lc
-from ...solver.gps_time import gps_from_utc_ns
-from ...solver.rotation import matrix_from_quaternion
-from ...solver.trajectory import Trajectory
+from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
+from ...solver.geometry.rotation import matrix_from_quaternion
+from ...solver.geometry.trajectory import Trajectory
+from ..batch.point_table import write_points
+from ..batch.rectification import ORIENTATIONS, lines_of_recording, project_frame
 from ..convert import R_bc_of, local_frame, pose_sample
 from ..errors import UserError
 from ..formats.features import features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
+from ..formats.gps_time import gps_from_utc_ns
+from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import new_file
+from ..formats.projection import refuse_missing_grids
 from ..formats.rows import RowLayout, repeated_messages, spread_by_default
 from ..formats.sbet import write_sbet
 from ..node import Message
-from ..recording import RecordingReader
-from ..recording_summary import damage_lines
+from ..recording.access import Recording
+from ..recording.reader import RecordingReader
+from ..recording.summary import damage_lines
 from .damage import tell_damage
 
-EXAMPLE = "triline export flight.mcap --topic orientation/final --csv orientation.csv"
+EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientation.csv
+  triline export flight.mcap --points points.csv
+  triline export flight.mcap --per-line orientation_lines.csv"""
 
 #: Messages turned into rows at a time.
 BATCH = 20_000
@@ -38,7 +45,7 @@ BATCH = 20_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", metavar="RECORDING")
-    parser.add_argument("--topic", required=True, help="one of: " + ", ".join(row.name for row in topics.TOPICS))
+    parser.add_argument("--topic", help="one of: " + ", ".join(row.name for row in topics.TOPICS))
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument("--csv", metavar="FILE", help="one row a message, or one an element of a repeated sub-message")
     target.add_argument("--parquet", metavar="FILE", help="the same table as Parquet")
@@ -46,6 +53,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     target.add_argument("--gpkg", metavar="FILE", help="the same as GeoPackage")
     target.add_argument(
         "--sbet", metavar="FILE", help="poses of trajectory/*, orientation/* or truth/trajectory as SBET"
+    )
+    target.add_argument(
+        "--points",
+        metavar="FILE",
+        help="CSV of object points, one row a point by its best answer, in the project's CRS",
+    )
+    target.add_argument(
+        "--per-line", metavar="FILE", help="CSV of the refined orientation of every image line, in the project's CRS"
+    )
+    parser.add_argument("--covariance", action="store_true", help="of the points, with --points")
+    parser.add_argument(
+        "--orientation", choices=tuple(ORIENTATIONS), help="with --per-line (default: the best there is, in this order)"
     )
     parser.add_argument(
         "--rows", metavar="FIELD",
@@ -58,6 +77,13 @@ def run(args: argparse.Namespace) -> int:
     if args.every < 1:
         raise UserError(f"--every {args.every}, wanted at least 1")
     path = Path(args.recording)
+    if args.points or args.per_line:
+        return _run_table(path, args)
+    if args.topic is None:
+        raise UserError("--topic: wanted with --csv, --parquet, --geojson, --gpkg and --sbet")
+    for name in ("covariance", "orientation"):
+        if getattr(args, name):
+            raise UserError(f"--{name}: wanted with --{'points' if name == 'covariance' else 'per-line'} only")
     reader = RecordingReader(path)
     try:
         row = topics.find(args.topic)
@@ -85,6 +111,36 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         what = ", ".join(f"{number} {name}" for name, number in count.items())
         print(f"{args.topic} -> {target}: {what}")
+    tell_damage("export", reader)
+    return 0
+
+
+def _run_table(path: Path, args: argparse.Namespace) -> int:
+    """Points, or the orientation of all lines: tables that are no topic."""
+    if args.topic is not None:
+        raise UserError(f"--topic {args.topic}: does not go with --points and --per-line")
+    target = Path(args.points or args.per_line)
+    if path.exists() and target.exists() and target.samefile(path):
+        raise UserError(f"{target}: is the recording itself")
+    result: dict[str, Any] = {"recording": str(path), "file": str(target)}
+    with new_file(target) as part:
+        if args.points:
+            reader = RecordingReader(path)
+            project = reader.first("configuration/project")
+            refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
+            result["points"] = write_points(reader, part, covariance=args.covariance)
+        else:
+            recording = Recording(path)
+            reader = recording.reader
+            name, lines = lines_of_recording(recording, args.orientation)
+            frame, project = project_frame(recording), recording.project()
+            refuse_missing_grids(frame.crs, path)
+            result |= {"orientation": name, "lines": write_oriented_lines(part, lines, frame, R_bc_of(project))}
+    if args.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    if not args.quiet:
+        print(f"{path} -> {target}: " + ", ".join(f"{v} {k}" for k, v in list(result.items())[2:]))
     tell_damage("export", reader)
     return 0
 

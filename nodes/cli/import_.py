@@ -1,9 +1,10 @@
-"""``triline import``: block folder, sensor folder, AVIRIS, POS Export, SBET, CSV, ROS 2 to a recording."""
+"""``triline import``: block and sensor folders, AVIRIS, POS Export, SBET, CSV, ROS 2, ENVI images to a recording."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -11,18 +12,21 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from ...solver.camera import LineCamera
-from ...solver.sensors import PRESETS, preset
+from ...solver.camera.line_camera import LineCamera
+from ...solver.camera.sensors import PRESETS, preset
 from ..errors import UserError
 from ..formats.avirisc import LINE_RATE_HZ
 from ..formats.camera_json import read_camera, write_camera
-from ..formats.detect import KINDS, Options, kind_of_path, read_any
+from ..formats.detect import KINDS, Imported, Options, kind_of_path, read_any
+from ..formats.flight_folder import flight_messages
 from ..formats.geocal_xml import read_glas_camera, read_tie_points
+from ..formats.image_lines import LinesGiven, files_of
 from ..formats.new_file import new_file
 from ..formats.tie_points import statistics, write_tie_points
 from ..formats.track import Accuracy, Mounting
 from ..node import Message
-from ..recording import RecordingWriter
+from ..recording.writer import RecordingWriter
+from ..terminal import drawing
 
 EXAMPLE = "triline import block_folder -o flight.mcap"
 
@@ -53,9 +57,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help=f"accuracy of the poses, in place of what the file says: {what}",
         )  # fmt: skip
     parser.add_argument(
-        "--line-rate", type=float, default=LINE_RATE_HZ, metavar="HZ", help="of AVIRIS-C (default %(default)s)"
+        "--line-rate",
+        type=float,
+        metavar="HZ",
+        help=f"lines a second: of images, of AVIRIS-C (default {LINE_RATE_HZ:g})",
     )
     parser.add_argument("--seconds-of-day", action="store_true", default=None, help="SBET times count from midnight")
+    images = parser.add_argument_group("image lines")
+    images.add_argument(
+        "--lines", action="append", default=[], metavar="VIEW=FILE,..",
+        help="ENVI images of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for a band of it",
+    )  # fmt: skip
+    images.add_argument("--strip", default="", metavar="ID", help="of the images (default: name of the first file)")
+    images.add_argument(
+        "--line-times", type=Path, metavar="CSV", help="time of each line: line, and time, time_s or gps_s"
+    )
+    images.add_argument("--first-time", metavar="ISO", help="time of line 0 (UTC), with --line-rate")
+    images.add_argument("--band", metavar="BAND", help="number from 1, name, or weighted sum: 2:0.5,3:0.5")
+    images.add_argument(
+        "--grey-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="values that become black and white"
+    )
 
 
 def _day(text: str) -> date:
@@ -67,16 +88,22 @@ def _day(text: str) -> date:
 
 def run(args: argparse.Namespace) -> int:
     source, output = Path(args.input), Path(args.output)
-    if not args.line_rate > 0:
+    if args.line_rate is not None and not args.line_rate > 0:
         raise UserError(f"--line-rate {args.line_rate:g}, wanted more than 0 Hz")
     kind = args.format or kind_of_path(source)
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
     if args.camera and kind in ("block", "ties", "camera"):
         raise UserError(f"--camera does not go with {KINDS[kind]}")
+    if args.date is not None and kind == "camera":
+        raise UserError(f"--date does not go with {KINDS[kind]}")
     if output.exists() and source.exists() and output.samefile(source):
         raise UserError(f"{output}: is the input itself")
-    if kind == "camera":
+    if kind == "flight":
+        _refuse_options(args)
+        imported, platform = flight_messages(source)
+        result = _write(source, imported, output, platform, shown=not args.quiet and not args.json)
+    elif kind == "camera":
         result = _import_camera(source, output)
     elif kind == "ties" and output.suffix.lower() == ".csv":
         ties = read_tie_points(source)
@@ -86,18 +113,45 @@ def run(args: argparse.Namespace) -> int:
             args.date,
             args.crs,
             Mounting(tuple(args.lever_arm), tuple(args.boresight)),
-            args.line_rate,
+            args.line_rate or LINE_RATE_HZ,
             read_camera_of(args.camera) if args.camera else None,
             args.seconds_of_day,
             _accuracy(args),
+            _lines(args, kind),
         )
-        result = _import_messages(source, kind, options, output, shown=not args.quiet and not args.json)
+        imported = read_any(source, kind, options)
+        result = _write(source, imported, output, "demo", shown=not args.quiet and not args.json)
     result = {"input": str(source), "kind": kind, "output": str(output), **result}
     if args.json:
         print(json.dumps(result, indent=2))
     elif not args.quiet:
         _print_summary(result)
     return 0
+
+
+def _lines(args: argparse.Namespace, kind: str) -> LinesGiven | None:
+    """What the arguments say about images; None without any.
+
+    Raises
+    ------
+    UserError : arguments that do not go together
+    """
+    if not args.lines and kind != "lines":
+        for name in ("strip", "line_times", "first_time", "band", "grey_range"):
+            if getattr(args, name):
+                raise UserError(f"--{name.replace('_', '-')} is of images, wanted --lines VIEW=FILE with it")
+        return None
+    first = None
+    if args.first_time is not None:
+        if args.line_rate is None:
+            raise UserError("--first-time without --line-rate, wanted both")
+        first = (args.first_time, args.line_rate)
+    elif args.line_rate is not None and kind != "avirisc":
+        raise UserError("--line-rate without --first-time, wanted both")
+    span = None if args.grey_range is None else (args.grey_range[0], args.grey_range[1])
+    if span is not None and not -math.inf < span[0] < span[1] < math.inf:
+        raise UserError(f"--grey-range {span[0]:g} {span[1]:g}, wanted two numbers, the lower one first")
+    return LinesGiven(files_of(args.lines), args.strip, args.line_times, first, args.band, span, args.date)
 
 
 def _accuracy(args: argparse.Namespace) -> Accuracy:
@@ -135,14 +189,24 @@ def _import_camera(source: Path, output: Path) -> dict[str, Any]:
     return {"lines": {line.id: line.pixels for line in camera.lines}, "notes": notes}
 
 
-def _import_messages(source: Path, kind: str, options: Options, output: Path, *, shown: bool) -> dict[str, Any]:
-    imported = read_any(source, kind, options)
+def _refuse_options(args: argparse.Namespace) -> None:
+    """Raise UserError for an option that says what flight.toml says."""
+    names = ("date", "crs", "camera", "position_sigma", "attitude_sigma", "line_rate", "seconds_of_day", "lines")
+    given = [
+        name for name in (*names, "strip", "line_times", "first_time", "band", "grey_range") if getattr(args, name)
+    ]
+    given += [name for name in ("lever_arm", "boresight") if any(getattr(args, name))]
+    if given:
+        raise UserError(f"--{given[0].replace('_', '-')} does not go with a flight folder: it stands in flight.toml")
+
+
+def _write(source: Path, imported: Imported, output: Path, platform: str, *, shown: bool) -> dict[str, Any]:
     messages = iter(imported.messages)
-    first = next(messages, None)  # what is wrong with the input shows before a file is made
+    first = next(messages, None)  # errors of the input are found before a file is made
     if first is None:
         raise UserError(f"{source}: nothing in it to import")
     start = end = first.stamp_ns
-    with new_file(output) as part, RecordingWriter(part) as writer:
+    with new_file(output) as part, RecordingWriter(part, platform=platform) as writer:
         writer.write(first)
         for message in _with_progress(messages, shown):
             writer.write(message)
@@ -155,16 +219,19 @@ def _import_messages(source: Path, kind: str, options: Options, output: Path, *,
 
 
 def _with_progress(messages: Iterable[Message], shown: bool) -> Iterator[Message]:
-    """The messages; how many there were is told in one line on a terminal, in a plain line now and then elsewhere."""
+    """The messages; their number is shown in one line that is updated on a terminal, every 5 s elsewhere."""
     terminal = sys.stderr.isatty()
     told = time.monotonic()
     for i, message in enumerate(messages):
         if shown and i % 1000 == 0 and time.monotonic() - told > (0.2 if terminal else 5.0):
             told = time.monotonic()
-            print(f"\r{i} messages" if terminal else f"{i} messages", end="" if terminal else "\n", file=sys.stderr)
+            if terminal:
+                print(f"\r{i} messages", end="", file=drawing(sys.stderr))
+            else:
+                print(f"{i} messages", file=sys.stderr)
         yield message
     if shown and terminal:
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        print("\r\x1b[K", end="", file=drawing(sys.stderr), flush=True)
 
 
 def _print_summary(result: dict[str, Any]) -> None:

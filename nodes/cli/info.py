@@ -7,9 +7,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..access import Recording
-from ..player import iso
-from ..recording_summary import findings, holdings
+from ..formats.importable import refuse_importable
+from ..player.player import iso
+from ..recording.access import Recording
+from ..recording.summary import findings, holdings
+from ..terminal import plain
 
 EXAMPLE = "triline info flight.mcap"
 
@@ -19,8 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    refuse_importable(args.recording)
     summary = _summary(Recording(args.recording))
-    print(json.dumps(summary, indent=2) if args.json else "\n".join(_lines(summary)))
+    print(json.dumps(summary, indent=2) if args.json else "\n".join(map(plain, _lines(summary))))
     return 0
 
 
@@ -28,7 +31,7 @@ def _summary(recording: Recording) -> dict[str, Any]:
     reader = recording.reader
     held = holdings(reader)
     span, rows = held.span_ns, held.topics
-    present = {row.topic for row in rows if row.messages}  # a channel can be announced by a file whose chunks are gone
+    present = {row.topic for row in rows if row.messages}  # a damaged file can name a channel whose messages are lost
     summary: dict[str, Any] = {
         "file": str(reader.path),
         "bytes": reader.size,
@@ -61,6 +64,8 @@ def _summary(recording: Recording) -> dict[str, Any]:
              "lines": int(s.lines), "ended": bool(s.ended)}
             for name, s in recording.strips().iterrows()
         ]  # fmt: skip
+    if "truth/world" in present:
+        summary["world"] = recording.true_world()
     return summary
 
 
@@ -81,6 +86,8 @@ def _lines(s: dict[str, Any]) -> list[str]:
         ended = "" if strip["ended"] else ", not ended"
         rate = f"{strip['line_rate_hz']:.1f} Hz"
         lines.append(f"strip {strip['id']}: from {strip['start']}, {strip['lines']} lines at {rate}{ended}")
+    if "world" in s:
+        lines.append(f"true world, not stated: {s['world']}")
     lines.append(f"{'topic':<24} {'messages':>9} {'rate':>9}  {'gaps':>5}  source")
     for row in s["topics"]:
         rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] else "-"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...solver.simulation.flight import Flight
 from ...solver.simulation.matching_study import looks_under
-from ..matcher import Matcher
+from ..matcher.matcher import Matcher
 from ..node import Message
 
 Array = NDArray[np.floating]
@@ -27,7 +27,7 @@ def is_matched(message: Message) -> bool:
 
 
 def is_target(message: Message) -> bool:
-    """Whether a tie message tells a target that the matcher found."""
+    """Whether a tie message is about a target that the matcher found."""
     return message.topic == "observation/tie" and "-M" not in message.body.point and message.source == Matcher.name
 
 

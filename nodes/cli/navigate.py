@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.navigation.error_state import Observation
 from ...solver.navigation.inertial_data import GnssData, InertialData
-from ...solver.navigation.observations import Observation
 from ...solver.navigation.post_processing import (
     Navigated,
     NavigationError,
@@ -32,7 +32,8 @@ HELP = "GNSS/inertial filter and smoother over a recording or a sensor folder"
 EXAMPLE = "triline navigate flight_sensors/ -o navigation"
 
 _VALUES = ("lat_deg", "lon_deg", "height_m", "vn_m_s", "ve_m_s", "vd_m_s", "roll_deg", "pitch_deg", "heading_deg")
-COLUMNS = ("time_s", *_VALUES, *(f"{name}_sigma" for name in _VALUES))
+_SIGMAS = ("n_m", "e_m", "d_m", "vn_m_s", "ve_m_s", "vd_m_s", "roll_deg", "pitch_deg", "heading_deg")
+COLUMNS = ("time_s", *_VALUES, *(f"sigma_{name}" for name in _SIGMAS))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -220,7 +221,7 @@ def _stretch(stretch: Navigated, gnss: GnssData, held_out: NDArray[np.bool_], of
 
 
 def _by_kind(sigma: NDArray[Any]) -> dict[str, list[float]]:
-    """Standard deviations (9,) by what they are of."""
+    """Standard deviations (9,) by quantity."""
     return {
         "position_m": _rounded(sigma[:3]),
         "velocity_m_s": _rounded(sigma[3:6]),

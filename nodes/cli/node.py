@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from .. import registry
-from ..collection import RareCollections
+from ..bus.live import BusRunner
+from ..bus.program import ProgramOptions, stop_on_signals, stop_with_parent
 from ..config import Tables, build, load
 from ..errors import UserError
-from ..live import BusRunner
+from ..garbage_collection import RareCollections
 from ..node import Node
-from ..program import ProgramOptions, stop_on_signals, stop_with_parent
-from .bus_options import add_bus_arguments, reporter
+from .bus_options import add_bus_arguments, bus_of, reporter
 
 EXAMPLE = "triline node adjuster --config adjuster.toml --platform aircraft1"
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     tables = _tables(args)
-    options = ProgramOptions(args.name, args.platform, args.port, args.bus, tables, report=reporter(args.quiet))
+    options = ProgramOptions(args.name, bus_file=args.bus, tables=tables, report=reporter(args.quiet), **bus_of(args))
     stop_on_signals(options.stop)
     stop_with_parent(options.stop)
     if args.name in registry.PROGRAMS:
@@ -72,5 +72,5 @@ def _value(text: str) -> Any:
     """A TOML value, or the text as it is."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # no TOML, or more of it than can be read
         return text

@@ -10,20 +10,22 @@ import time
 from pathlib import Path
 
 from .. import registry
-from ..collection import RareCollections
 from ..config import Tables, build, load
 from ..errors import UserError
+from ..formats.importable import refuse_importable
 from ..formats.new_file import refuse_unless_file
+from ..garbage_collection import RareCollections
 from ..node import Node
-from ..recording import COMPRESSIONS, RecordingReader, RecordingWriter
-from ..runner import ProcessSummary, process
+from ..recording.reader import RecordingReader
+from ..recording.runner import ProcessSummary, process
+from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
 from .progress import progress
 
 EXAMPLE = "triline process flight.mcap -o out.mcap"
-#: Distance of filtered poses at the pace for throughput, s: they say how good the trajectory is, no more.
+#: Interval of filtered poses at the pace for throughput, s; there they only document the accuracy of the trajectory.
 FILTERED_S = 0.2
-#: At that pace smoothed poses come when the adjuster works them in, s.
+#: Interval at which smoothed poses are handed to the adjuster at that pace, s.
 SMOOTH_EVERY_S = 2.0
 
 
@@ -37,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--pace", choices=("load", "throughput"), default="load",
-        help="throughput: larger batches and filtered poses at 5 Hz, for long flights; results are as good, answers "
-        "are not early (default: as live, with the recorded changes under load)",
+        help="throughput: larger batches and filtered poses at 5 Hz, for long flights; as accurate, but results come "
+        "later (default: load, the pace of a live flight with its recorded changes under load)",
     )  # fmt: skip
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the output (default: none)")
     parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
@@ -46,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     tables = at_pace(load(args.config, registry.names()), args.pace)
+    refuse_importable(args.recording)
     reader = RecordingReader(args.recording)
     _check(reader, args)
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
@@ -85,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def at_pace(tables: Tables, pace: str) -> Tables:
-    """The configuration of the nodes with that of a pace; what the file says goes before it."""
+    """The configuration of the nodes with the settings of a pace; settings in the file take precedence."""
     if pace != "throughput":
         return tables
     rare = {"filtered_s": FILTERED_S, "smooth_every_s": SMOOTH_EVERY_S}
@@ -113,7 +116,7 @@ def _held(reader: RecordingReader) -> str:
 
 
 def _waiting(summary: ProcessSummary) -> str:
-    """What the nodes that ran say of themselves."""
+    """What the nodes wait for, from their status."""
     said = ((name, summary.states[name], summary.problems.get(name)) for name in summary.nodes)
     return "; ".join(f"{name} {state}" + (f" ({problem})" if problem else "") for name, state, problem in said)
 

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, plain lines elsewhere, nothing where quiet."""
+"""Progress of long work: a bar on a terminal, plain lines elsewhere, nothing with --quiet."""
 
 from __future__ import annotations
 
@@ -7,21 +7,24 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-#: Between two plain lines, s.
+from ..terminal import drawing, plain
+
+#: Time between two plain lines, s.
 _LINE_PERIOD_S = 5.0
 
 
 @contextmanager
 def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None] | None]:
-    """Gives a function that is told the fraction done."""
+    """Yield a function that takes the fraction done, 0 to 1."""
     if quiet:
         yield None
     elif sys.stderr.isatty():
         from rich.console import Console
+        from rich.markup import escape
         from rich.progress import Progress
 
-        with Progress(console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(text, total=1.0)
+        with Progress(console=Console(file=drawing(sys.stderr)), transient=True) as bar:
+            task = bar.add_task(escape(plain(text)), total=1.0)
             yield lambda fraction: bar.update(task, completed=fraction)
     else:
         last = time.monotonic()

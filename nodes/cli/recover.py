@@ -9,8 +9,9 @@ from pathlib import Path
 
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_file
-from ..recording import RecordingReader, RecordingWriter
-from ..recording_summary import topic_summaries
+from ..recording.reader import RecordingReader
+from ..recording.summary import topic_summaries
+from ..recording.writer import RecordingWriter
 
 EXAMPLE = "triline recover broken.mcap -o whole.mcap"
 

@@ -1,4 +1,4 @@
-"""``triline rectify``: image lines of a recording to an orthoimage, a cloud-optimised GeoTIFF."""
+"""``triline rectify``: image lines of a recording, or any image of a sensor, to an orthoimage, a GeoTIFF."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from ...solver.camera import LineCamera
-from ...solver.frames import LocalFrame
-from ...solver.orthoimage.ground_grid import GroundGrid, heights_in_frame, utm_of
+from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.frames import LocalFrame
+from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ...solver.orthoimage.resampling import TAPS
 from ...solver.orthoimage.surface import Ellipsoid, Surface
-from ..access import Recording
-from ..errors import UserError
-from ..formats.geotiff import read_heights, write_orthoimage
-from ..formats.new_file import refuse_unless_file
-from ..rectification import (
+from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
+from ..batch.rectification import (
     ORIENTATIONS,
+    REFINED,
     Rectification,
     Rectified,
+    estimated_camera,
     frame_for,
     ground_of_points,
     known_points,
@@ -30,22 +29,36 @@ from ..rectification import (
     orientation_of,
     pixel_on_ground,
     project_frame,
+    trajectory_orientation,
 )
+from ..errors import UserError
+from ..formats.dem import dem_in_frame
+from ..formats.geotiff import write_orthoimage
+from ..formats.new_file import refuse_unless_file
+from ..recording.access import Recording
+from . import rectify_image
 from .progress import progress
 
 EXAMPLE = """triline rectify flight.mcap -o ortho.tif
-  triline rectify flight.mcap -o before.tif --orientation measured --dem heights.tif --gsd 0.25"""
+  triline rectify flight.mcap -o before.tif --orientation measured --dem heights.tif --gsd 0.25
+  triline rectify scene.tif --sensor DIM_PHR1A.XML --dem N44E005.hgt --dem-datum EPSG:5773 -o ortho.tif"""
 
 #: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
 MOST_CELLS = 4e9
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", type=Path, metavar="INPUT", help="recording with image lines")
+    parser.add_argument(
+        "input", type=Path, metavar="INPUT", help="recording with image lines, or with --sensor an image"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="GeoTIFF to write")
     parser.add_argument(
         "--orientation", choices=tuple(ORIENTATIONS), help="of the lines (default: the best there is, in this order)"
     )
+    parser.add_argument(
+        "--trajectory", type=Path, metavar="FILE",
+        help="refined orientation from a table instead: trajectory_refined.csv of `triline adjust`",
+    )  # fmt: skip
     parser.add_argument("--ccd", metavar="ID", help="CCD line (default: the one that looks down most steeply)")
     parser.add_argument("--strip", action="append", metavar="ID", help="only this strip (may be given again)")
     parser.add_argument("--gsd", type=float, metavar="X", help="size of a cell, units of the CRS (default: of a pixel)")
@@ -53,23 +66,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--crs", help="projected CRS, e.g. EPSG:32632, or local (default: the project's, or the UTM zone)"
     )
     parser.add_argument(
-        "--dem", metavar="FILE",
-        help="raster of heights; above the ellipsoid where its CRS does not say otherwise; 'points': object points",
+        "--dem", metavar="FILE", action="append",
+        help="raster of heights; of a recording also 'points': object points; of an image: with --dem-datum, may be "
+        "given again, or a folder of tiles",
     )  # fmt: skip
     parser.add_argument(
-        "--height", type=float, metavar="M", help="height of the ground above the ellipsoid (default: of known points)"
+        "--height",
+        type=float,
+        metavar="M",
+        help="of the ground above the ellipsoid (default: of known points; RPC's middle; 0)",
     )
-    parser.add_argument("--resampling", choices=tuple(TAPS), default="bilinear", help="(default: %(default)s)")
+    parser.add_argument("--resampling", choices=tuple(IMAGE_TAPS), default="bilinear", help="(default: %(default)s)")
+    rectify_image.add_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.sensor is not None:
+        return rectify_image.run(args)
     begun = time.perf_counter()
     _check(args)
     recording = Recording(args.input)
     camera = recording.camera()
     ccd = _ccd(recording, camera, args.ccd)
     _check_strips(recording, args.strip)
-    name, orientation, reference_ns = orientation_of(recording, args.orientation)
+    if args.trajectory is not None:
+        name = args.trajectory.name
+        orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
+    else:
+        name, orientation, reference_ns = orientation_of(recording, args.orientation)
+    estimated = 0
+    if name in REFINED:
+        camera, estimated = estimated_camera(recording, camera)
     frame = project_frame(recording)
     target = frame_for(frame, args.crs or _crs(frame))
     surface, ground_m, ground = _ground(args, recording, frame)
@@ -101,7 +128,8 @@ def run(args: argparse.Namespace) -> int:
     result = {
         "output": str(args.output), "orientation": name, "ccd": camera.lines[ccd].id, "crs": target.crs,
         "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
-        "pixels_together": factor, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
+        "pixels_together": factor, "camera_parameters": estimated,
+        "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args)
@@ -122,8 +150,19 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"--{name} {value}: wanted a number")
     if args.gsd is not None and not args.gsd > 0:
         raise UserError(f"--gsd {args.gsd}: wanted more than 0")
+    if args.trajectory is not None and args.orientation is not None:
+        raise UserError("--orientation and --trajectory: wanted one of them")
+    if args.dem_crs is not None and args.dem in (None, ["points"]):
+        raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
     if args.dem is not None and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
+    if args.dem is not None and len(args.dem) > 1:
+        raise UserError("--dem: given more than once, which goes with --sensor only")
+    if args.resampling not in TAPS:
+        raise UserError(f"--resampling {args.resampling}: goes with --sensor, wanted one of {', '.join(TAPS)}")
+    for name in rectify_image.OPTIONS:
+        if name != "dem_crs" and getattr(args, name) not in (None, False):
+            raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
 
 
 def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
@@ -147,7 +186,7 @@ def _check_strips(recording: Recording, wanted: list[str] | None) -> None:
 
 
 def _crs(frame: LocalFrame) -> str:
-    """The horizontal CRS of the project, or the UTM zone; local where nobody knows where the project lies."""
+    """The horizontal CRS of the project, or its UTM zone; local where the place of the project is not known."""
     if frame.crs == "local":
         return "local" if frame.lat_deg == frame.lon_deg == frame.height_m == 0 else utm_of(frame)
     import pyproj
@@ -159,20 +198,14 @@ def _crs(frame: LocalFrame) -> str:
 
 def _ground(args: argparse.Namespace, recording: Recording, frame: LocalFrame) -> tuple[Surface, float, str]:
     """The ground, its mean height in the local frame, and its name."""
-    if args.dem == "points":
+    if args.dem == ["points"]:
         field = ground_of_points(recording)
         return field, float(np.median(known_points(recording)[:, 2])), "heights of object points"
     if args.dem is not None:
-        heights = read_heights(Path(args.dem))
-        try:
-            field = heights_in_frame(
-                frame, heights.crs, heights.z_m, heights.x0, heights.y0, heights.dx, heights.dy
-            )  # fmt: skip
-        except ValueError as error:
-            raise UserError(f"{args.dem}: {error}") from None
+        field = dem_in_frame(Path(args.dem[0]), frame, args.dem_crs)
         if not np.isfinite(field.z_m).any():
-            raise UserError(f"{args.dem}: lies far from the project")
-        return field, float(np.nanmedian(field.z_m)), f"heights of {Path(args.dem).name}"
+            raise UserError(f"{args.dem[0]}: lies far from the project")
+        return field, float(np.nanmedian(field.z_m)), f"heights of {Path(args.dem[0]).name}"
     if args.height is not None:
         h = args.height
     else:
@@ -200,6 +233,8 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> 
         f"{lines} lines of {result['ccd']}, {result['orientation']} orientation, {result['ground']}, "
         f"{result['seconds']:.1f} s"
     )
+    if result["camera_parameters"]:
+        print(f"  camera with {result['camera_parameters']} estimated parameters")
     if done.left_out:
         print("  left out: " + ", ".join(f"{n} lines {why}" for why, n in done.left_out.items()))
     if done.missed_rays:

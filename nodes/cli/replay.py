@@ -8,11 +8,12 @@ import threading
 import time
 from pathlib import Path
 
-from ..bus import Bus
-from ..player import first_stamp_ns, iso, play, time_argument
-from ..program import stop_on_signals
-from ..recording import RecordingReader
-from .bus_options import add_bus_arguments, reporter
+from ..bus.brake import Brake
+from ..bus.program import stop_on_signals
+from ..bus.session import Bus
+from ..player.player import first_stamp_ns, iso, play, time_argument
+from ..recording.reader import RecordingReader
+from .bus_options import add_bus_arguments, bus_of, reporter
 from .progress import progress
 
 EXAMPLE = "triline replay flight.mcap --rate 4 --from 20 --to 50"
@@ -29,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="again and again; later rounds have shifted times and new names of strips and points",
     )
     parser.add_argument("--all", action="store_true", help="also what nodes make anew: trajectories, orientations, ...")
+    parser.add_argument(
+        "--wait-for", default="", metavar="NODES", help="wait for nodes (navigator,adjuster) that are too far behind"
+    )
     add_bus_arguments(parser)
 
 
@@ -40,10 +44,11 @@ def run(args: argparse.Namespace) -> int:
     stop_on_signals(stop)
     if args.loop:
         report("looping: later rounds have shifted stamps and times, and new names of strips and points (S1~2)")
-    with Bus(args.platform, source="player", port=args.port, file=args.bus) as bus:
+    with Bus(source="player", file=args.bus, **bus_of(args)) as bus:
         nobody = bus.why_alone() or _nobody(bus)
         bus.announce("player")
         bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
+        brake = Brake(bus, args.wait_for, stop)
         report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
         if nobody:
             report(nobody)
@@ -59,13 +64,14 @@ def run(args: argparse.Namespace) -> int:
                 everything=args.all,
                 start=bus.start,
                 progress=told,
+                hold=brake.wait,
             )
-        stop.wait(0.5)  # what is still on its way
+        stop.wait(0.5)  # time for messages that are still on their way
     if args.json:
         print(json.dumps({
             "messages": dict(sorted(result.counts.items())), "left_out": dict(sorted(result.left_out.items())),
             "rounds": result.rounds, "worst_late_ms": round(1e3 * result.worst_late_s, 3),
-            "mean_late_ms": round(1e3 * result.mean_late_s, 4),
+            "mean_late_ms": round(1e3 * result.mean_late_s, 4), "waited_s": round(brake.held_s, 3),
         }, indent=2))  # fmt: skip
         return 0
     left_out = sum(result.left_out.values())
@@ -73,12 +79,13 @@ def run(args: argparse.Namespace) -> int:
         f"played {sum(result.counts.values())} messages"
         + (f", left out {left_out} that nodes make anew" if left_out else "")
         + f"; at most {1e3 * result.worst_late_s:.1f} ms late, {1e3 * result.mean_late_s:.2f} ms on average"
+        + (f"; waited {brake.held_s:.1f} s for nodes that were behind" if brake.held_s else "")
     )
     return 0
 
 
 def _nobody(bus: Bus, patience_s: float = 0.5) -> str:
-    """That no node is there, or ""; a node that has just been started is waited for a little."""
+    """A line which says that no node is there, or ""; waits a little for nodes that have just been started."""
     until = time.monotonic() + patience_s
     while not bus.alive():
         if time.monotonic() > until:

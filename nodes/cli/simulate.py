@@ -11,19 +11,25 @@ from typing import Any
 
 import numpy as np
 
+from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
 from .. import convert
+from ..batch.rectification import true_relief
+from ..batch.simulated_scenes import SceneSimulation, write_simulated_scenes
 from ..errors import UserError
-from ..flight_settings import GRADES, OPTIONS, Option, SimulatedFlight, shown_default, simulated_flight
 from ..formats.geotiff import write_heights
-from ..formats.new_file import new_file
-from ..recording import COMPRESSIONS, RecordingWriter
-from ..rectification import true_relief
-from ..simulator import Simulator
+from ..formats.new_file import new_file, refuse_unless_folder
+from ..recording.writer import COMPRESSIONS, RecordingWriter
+from ..simulator.flight_settings import GRADES, OPTIONS, Option, SimulatedFlight, shown_default, simulated_flight
+from ..simulator.simulator import Simulator
+from ..simulator.world_settings import HELP, world_terms
 from .progress import progress
 
 EXAMPLE = """triline simulate -o flight.mcap --sensor ads40 --strips 6 --cross 2 --seconds 60 --seed 1
   triline simulate -o flight.mcap --motion ang20170323t202244_eph_att --from 800 --seconds 300
-  triline simulate -o flight.mcap --sensor ads40-small --images --seconds 60"""
+  triline simulate -o flight.mcap --motion trajectory.csv --ground 310
+  triline simulate -o flight.mcap --sensor ads40-small --images --seconds 60
+  triline simulate -o flight.mcap --true sine=0.02@0.1 --true clock=5ms
+  triline simulate -o pair --satellite spot5-hrs --seed 1"""
 
 DEFAULT_EPOCH = "2026-05-01T10:00:00Z"
 _GROUPS = {
@@ -33,15 +39,25 @@ _GROUPS = {
     "imagery": "image lines",
     "observations": "observations",
     "errors": "errors of the trajectory, 1 sigma",
+    "world": "errors that are not stated",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="recording to write")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="recording to write, or folder")
     parser.add_argument("--epoch", metavar="UTC", help=f"when it begins (default {DEFAULT_EPOCH}, or as --motion says)")
     parser.add_argument("--compression", choices=sorted(COMPRESSIONS), default="none", help="of the recording")
     parser.add_argument("--dem", metavar="FILE", help="also write the true relief, a GeoTIFF in UTM, for `rectify`")
-    groups = {name: parser.add_argument_group(title) for name, title in _GROUPS.items()}
+    satellite = parser.add_argument_group(
+        "satellite scenes",
+        "a block of scenes for `adjust` in place of a flight; of the other options --seed, --control, --check, "
+        "--image-sigma, --control-sigma and --outliers go with it",
+    )
+    satellite.add_argument("--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a folder")
+    satellite.add_argument("--place", type=float, nargs=2, metavar=("LAT", "LON"), help="passed over (36 139.6)")
+    satellite.add_argument("--points", type=int, metavar="N", help="ground points in all (120)")
+    about = {"world": f"messages and sigmas stay as the other options say; the flight has these as well: {HELP}"}
+    groups = {name: parser.add_argument_group(title, about.get(name)) for name, title in _GROUPS.items()}
     for option in OPTIONS:
         _add(groups[option.group], option)
 
@@ -50,6 +66,9 @@ def _add(group: Any, option: Option) -> None:
     flag = "--" + option.name.replace("_", "-")
     if option.kind is bool:
         group.add_argument(flag, action="store_true", default=None, help=option.text)
+        return
+    if option.count == 0:
+        group.add_argument(flag, action="append", metavar="KEY=VALUE", help=option.text)
         return
     shown = shown_default(option)
     text = f"{option.text} (default {shown})" if shown else option.text
@@ -66,6 +85,10 @@ def _add(group: Any, option: Option) -> None:
 
 def run(args: argparse.Namespace) -> int:
     given = {option.name: getattr(args, option.name) for option in OPTIONS}
+    if args.satellite is not None:
+        return _simulate_scenes(args, given)
+    if args.place is not None or args.points is not None:
+        raise UserError("--place and --points go with --satellite")
     flight = simulated_flight({name: _single(value) for name, value in given.items() if value is not None})
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or _utc_ns(DEFAULT_EPOCH)
     simulator = Simulator(flight.simulation, flight.imager)
@@ -89,8 +112,33 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
+    """A block of satellite scenes, as a folder."""
+    goes = {"seed", "control", "check", "image_sigma", "control_sigma", "outliers"}
+    other = [name for name, value in given.items() if value is not None and name not in goes]
+    other += [name for name in ("epoch", "dem") if getattr(args, name) is not None]
+    if other:
+        raise UserError(f"--{other[0].replace('_', '-')} does not go with --satellite")
+    refuse_unless_folder(Path(args.output))
+    keys = {"seed": "seed", "control": "control", "check": "check", "image_sigma": "image_sigma_px",
+            "control_sigma": "control_sigma_m", "outliers": "outliers"}  # fmt: skip
+    stated = {keys[name]: _single(given[name]) for name in goes if given[name] is not None}
+    if isinstance(stated.get("control_sigma_m"), list):
+        raise UserError("--control-sigma: wanted one number with --satellite")
+    stated |= {} if args.place is None else {"lat_deg": args.place[0], "lon_deg": args.place[1]}
+    stated |= {} if args.points is None else {"points": args.points}
+    result = write_simulated_scenes(Path(args.output), SceneSimulation(args.satellite, **stated))
+    if args.json:
+        print(json.dumps(result, indent=2))
+    elif not args.quiet:
+        print(f"{result['folder']}: {result['satellite']}, images {', '.join(result['images'])}, seed {result['seed']}")
+        print(f"  {result['points']} points, {result['control']} control and {result['check']} check among them; "
+              f"{result['image_points']} image points, {result['outliers']} of them gross errors")  # fmt: skip
+    return 0
+
+
 def _single(value: Any) -> Any:
-    """One number for X, Y and Z may stand alone."""
+    """Accept one number for X, Y and Z."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value
 
 
@@ -125,6 +173,8 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
         "outliers": int(images.outlier.sum()),
         "messages": counts,
     }
+    if not simulation.world.as_stated:
+        result["true"] = world_terms(simulation.world)
     if motion is not None:
         result["motion"] = {"poses": len(motion.trajectory), "steps_taken_out": motion.jumps}
     return result
@@ -133,6 +183,8 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
 def _print_summary(result: dict[str, Any]) -> None:
     points = result["points"]
     print(f"{result['recording']}: {result['seconds']:.0f} s, camera {result['camera']}, seed {result['seed']}")
+    if "true" in result:
+        print(f"  true world, not stated: {' '.join(result['true'])}")
     if "motion" in result:
         motion = result["motion"]
         print(f"  {motion['poses']} poses; {motion['steps_taken_out']} steps of the recorded position taken out")

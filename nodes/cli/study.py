@@ -13,6 +13,11 @@ STUDIES: dict[str, tuple[str, str]] = {
     "matching": ("study_matching", "tie points from image lines alone, held against truth"),
     "ties": ("study_ties", "what an adjustment makes of matched tie points, beside simulated ones of the same noise"),
     "starts": ("study_starts", "flights whose orientation is wrong by 30 px, in one direction after another"),
+    "misspecified": ("study_misspecified", "flights whose true errors are not as stated, on line beside the batch"),
+    "sensitivity": ("study_sensitivity", "which parameter a located pixel owes its error to, by four methods"),
+    "scenes": ("study_scenes", "whether errors of adjusted satellite scenes are as large as their sigmas say"),
+    "rectification": ("study_rectification", "transforms of the plane, RPC and the differential method, compared"),
+    "regularisation": ("study_regularisation", "nine control pixels: condition and error, published table beside ours"),
     "consistency": ("study_consistency", "whether errors of adjusted blocks are as large as their sigmas say"),
 }
 
@@ -41,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    """The common options behind the name of the study; SUPPRESS keeps what was said before it."""
+    """Accept the common options after the name of the study, too; SUPPRESS keeps those given before it."""
     for flags, text in _COMMON:
         if flags[0] not in parser._option_string_actions:
             parser.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)

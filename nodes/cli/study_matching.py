@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 
 from ...solver.simulation.flight import Flight
-from ..adjuster import Adjuster
+from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
-from ..flight_settings import simulated_flight
-from ..matcher import Matcher
-from ..navigator import Navigator
-from ..recording import RecordingReader, RecordingWriter
-from ..runner import process
-from ..simulator import Simulator
+from ..matcher.matcher import Matcher
+from ..navigator.navigator import Navigator
+from ..recording.reader import RecordingReader
+from ..recording.runner import process
+from ..recording.writer import RecordingWriter
+from ..simulator.flight_settings import simulated_flight
+from ..simulator.simulator import Simulator
 from .matched_ties import EPOCH_NS, ROUGH, is_matched, tie_errors
 from .progress import progress
 
 EXAMPLE = "triline study matching --seeds 3"
-#: Good matches are nearer to the truth than this, wrong ones farther, px; and what is wanted of them.
+#: Errors below the first value are good matches, above the second wrong ones, px; then the limits to be met.
 GOOD_PX, WRONG_PX = 0.3, 2.0
 WANTED_GOOD, WANTED_WRONG, WANTED_SIGMA_PX, WANTED_NORMALISED = 0.95, 0.01, 0.15, (0.8, 1.25)
 KINDS: dict[str, dict[str, Any]] = {
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def fly(settings: dict[str, Any]) -> dict[str, Any]:
-    """A flight with image lines through the on-line nodes, and what its ties are worth."""
+    """Process a flight with image lines through the on-line nodes, and compare its ties with truth."""
     flown = simulated_flight(settings)
     simulator = Simulator(flown.simulation, flown.imager)
     with tempfile.TemporaryDirectory() as folder:

@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from ...solver.accuracy import nees_band, normalised_error_squared
-from ..adjuster import Adjuster
+from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
-from ..flight_settings import simulated_flight
-from ..navigator import Navigator
-from ..recording import RecordingReader, RecordingWriter
+from ..navigator.navigator import Navigator
+from ..recording.reader import RecordingReader
+from ..recording.runner import process
+from ..recording.writer import RecordingWriter
 from ..report.evaluation import evaluate_flight, orientation_errors
 from ..report.flight import collect
 from ..report.source import messages_of
-from ..runner import process
-from ..simulator import Simulator
+from ..simulator.flight_settings import simulated_flight
+from ..simulator.simulator import Simulator
 from .progress import progress
 
 EXAMPLE = "triline study online --seeds 20"

@@ -20,22 +20,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.intersection import intersect_rays
-from ...solver.rotation import matrix_from_angles
+from ...solver.geometry.ray_intersection import intersect_rays
+from ...solver.geometry.rotation import matrix_from_angles
 from ...solver.simulation.flight import Flight
 from ...solver.simulation.observations import find_looks
-from ..adjuster import Adjuster
+from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
-from ..flight_settings import simulated_flight
-from ..matcher import Matcher
-from ..navigator import Navigator
+from ..matcher.matcher import Matcher
+from ..navigator.navigator import Navigator
 from ..node import Message
-from ..recording import RecordingReader, RecordingWriter
+from ..recording.reader import RecordingReader
+from ..recording.runner import process
+from ..recording.writer import RecordingWriter
 from ..report.evaluation import orientation_errors
 from ..report.flight import collect
 from ..report.source import messages_of
-from ..runner import process
-from ..simulator import Simulator
+from ..simulator.flight_settings import simulated_flight
+from ..simulator.simulator import Simulator
 from .matched_ties import EPOCH_NS, ROUGH, is_matched, is_target, simulated_ties, tie_errors
 from .progress import progress
 

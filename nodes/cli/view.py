@@ -25,9 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from ..recording import RecordingReader
-    from ..rerun_scene import RerunCanvas, open_canvas
-    from ..scene import TOPICS, TRUTH_TOPICS
+    from ..recording.reader import RecordingReader
+    from ..viewer.rerun_canvas import RerunCanvas, open_canvas
+    from ..viewer.scene import TOPICS, TRUTH_TOPICS
 
     messages = RecordingReader(args.recording).sorted_messages((*TOPICS, *TRUTH_TOPICS))
     if args.rrd is not None and args.rrd.exists() and args.rrd.samefile(args.recording):
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
 def show(messages, canvas, truth: bool = True) -> Counter[str]:
     """Draw messages, in the order of their stamps, and close the canvas; returns how many of each topic were used."""
-    from .. import scene
+    from ..viewer import scene
 
     picture = scene.Scene(canvas)
     hidden = frozenset(() if truth else scene.TRUTH_TOPICS)
@@ -65,7 +65,7 @@ def show(messages, canvas, truth: bool = True) -> Counter[str]:
         try:
             picture.take(message)
         except ValueError:
-            continue  # what a node would drop is not shown either
+            continue  # messages that a node would drop are not shown
         counts[message.topic] += 1
         if message.stamp_ns >= next_ns:
             picture.draw()

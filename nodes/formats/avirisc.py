@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.frames import CrsError
+from ...solver.geometry.frames import CrsError
 from ..errors import UserError
 from .envi import read_records
 from .projection import Projection

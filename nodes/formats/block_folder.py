@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.adjustment.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from ...solver.adjustment.network import ROLES, Strip
-from ...solver.camera import LineCamera
-from ...solver.frames import CrsError, LocalFrame
-from ...solver.rotation import matrix_from_angles, quaternion_from_matrix
-from ...solver.trajectory import Trajectory
+from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.frames import CrsError, Frame, LocalFrame
+from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
+from ...solver.geometry.trajectory import Trajectory
 from ..errors import UserError
 from .camera_json import read_camera
 from .keys import read_toml
@@ -39,11 +39,12 @@ _TRAJECTORY = (
     *(Column(name) for name in _POSE),
     Column("lens", "text", optional=True, blank=True),
 )
-_GROUND = (
+GROUND = (
     Column("point", "text"),
     *(Column(name, blank=True) for name in ("X_m", "Y_m", "Z_m")),
     *(Column(name, blank=True, low=0.0) for name in ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")),
     Column("role", "text", choices=ROLES),
+    Column("target_radius_m", optional=True, blank=True, low=0.0),
 )
 _IMAGE = (
     Column("point", "text"),
@@ -62,7 +63,7 @@ def is_block_folder(path: Path) -> bool:
     return path.is_dir() and any((path / name).is_file() for name in ("camera.json", "image_points.csv", "strips.csv"))
 
 
-def read_block(folder: Path | str) -> Block:
+def read_block(folder: Path | str) -> BlockData:
     """Read a block folder into arrays in the local frame.
 
     Raises
@@ -81,7 +82,7 @@ def read_block(folder: Path | str) -> Block:
     camera = read_camera(folder / "camera.json", notes)
     strip_table = read_table(folder / "strips.csv", _STRIPS, notes)
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
-    ground_table = read_table(folder / "ground_points.csv", _GROUND, notes, may_be_empty=True)
+    ground_table = read_table(folder / "ground_points.csv", GROUND, notes, may_be_empty=True)
     frame = _frame(folder, crs, poses, ground_table)
     grids = missing_grids(crs) if crs != "local" else []
     if grids:
@@ -93,9 +94,38 @@ def read_block(folder: Path | str) -> Block:
     used = {id(strip.trajectory) for strip in strips}
     extra = [_name(*key) for key, trajectory in trajectories.items() if id(trajectory) not in used]
     notes.extend(f"trajectory.csv: strip {name!r} is not in strips.csv and was ignored" for name in extra)
-    ground = _ground_points(ground_table, frame, notes)
+    ground = known_points(ground_table, frame, notes)
     point_ids, image = _image_points(folder / "image_points.csv", camera, strips, ground, apriori, notes)
-    return Block(name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes))
+    return BlockData(name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes))
+
+
+def read_ground_points(
+    path: Path, crs: str, frame: LocalFrame | None, notes: list[str]
+) -> tuple[KnownPoints, LocalFrame]:
+    """Control and check points of a CSV as ``ground_points.csv`` in a block folder.
+
+    Parameters
+    ----------
+    path : file
+    crs : of the points, anything that PROJ understands
+    frame : that they get; None puts one at their middle, on the ellipsoid
+    notes : gets remarks
+
+    Returns
+    -------
+    points, and their frame
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``, a CRS that PROJ does not know
+    """
+    table = read_table(path, GROUND, notes)
+    try:
+        around = LocalFrame.around(table.stack("X_m", "Y_m", "Z_m"), crs)
+    except CrsError as error:
+        raise UserError(f"{path}: {error}") from None
+    frame = around if frame is None else LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
+    return known_points(table, frame, notes), frame
 
 
 def _name(strip: str, lens: str | None) -> str:
@@ -135,7 +165,7 @@ def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:
         raise UserError(f"{folder / 'project.toml'}: project.crs: {error}") from None
 
 
-def _to_local(table: Table, xyz: NDArray[np.float64], frame: LocalFrame) -> NDArray[np.float64]:
+def _to_local(table: Table, xyz: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
     """Coordinates in the local frame; a point that the CRS cannot carry is named by its line."""
     try:
         return np.asarray(frame.from_crs(xyz), dtype=float)
@@ -253,11 +283,17 @@ def _line_times(path: Path, refuse, notes: list[str]) -> NDArray[np.float64]:
     return time
 
 
-def _ground_points(table: Table, frame: LocalFrame, notes: list[str]) -> GroundPoints:
+def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
+    """Control and check points of a table with the columns `GROUND`, in a frame.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``
+    """
     n = len(table)
     if not n:
         notes.append("ground_points.csv: no points: the block stands on its trajectories alone")
-        return GroundPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
+        return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
     ids, role = table["point"], table["role"].astype(str)
     repeated = np.ones(n, dtype=bool)
     repeated[np.unique(ids.astype(str), return_index=True)[1]] = False
@@ -269,7 +305,7 @@ def _ground_points(table: Table, frame: LocalFrame, notes: list[str]) -> GroundP
     needs[role == "height", :2] = False
     for axis, letter in enumerate("XYZ"):
         column = f"{letter}_m"
-        must = needs[:, axis] if axis == 2 else np.ones(n, dtype=bool)  # height points need a place as well
+        must = needs[:, axis] if axis == 2 else np.ones(n, dtype=bool)  # height points: as approximate values
         table.refuse(must & np.isnan(xyz[:, axis]), column, lambda i: f"missing, wanted a number ({role[i]} point)")
         weighted = needs[:, axis] & (role != "check")
         s = sigma[:, axis]
@@ -279,9 +315,11 @@ def _ground_points(table: Table, frame: LocalFrame, notes: list[str]) -> GroundP
         height = float(np.mean(xyz[~no_height, 2])) if (~no_height).any() else 0.0
         notes.append(f"ground_points.csv: {no_height.sum()} points without height were put at {height:.1f} m")
         xyz[no_height, 2] = height
+    xyz_l = _to_local(table, xyz, frame)  # names a point outside the area
     R = frame.R_l_crs(xyz)
     covariance = R @ (np.square(np.nan_to_num(sigma))[:, :, None] * np.swapaxes(R, -1, -2))
-    return GroundPoints(tuple(ids), _to_local(table, xyz, frame), covariance, tuple(role.tolist()))
+    radius = np.nan_to_num(table["target_radius_m"]) if "target_radius_m" in table else np.zeros(n)
+    return KnownPoints(tuple(ids), xyz_l, covariance, tuple(role.tolist()), tuple(radius.tolist()))
 
 
 def _shown(value: float) -> str:
@@ -289,7 +327,7 @@ def _shown(value: float) -> str:
 
 
 def _image_points(
-    path: Path, camera: LineCamera, strips: tuple[Strip, ...], ground: GroundPoints, apriori: Apriori, notes: list[str]
+    path: Path, camera: LineCamera, strips: tuple[Strip, ...], ground: KnownPoints, apriori: Apriori, notes: list[str]
 ) -> tuple[tuple[str, ...], ImagePoints]:
     table = read_table(path, _IMAGE, notes)
     ids: dict[str, int] = {id: i for i, id in enumerate(ground.id)}
@@ -329,7 +367,7 @@ def _base(strip: Strip) -> Key:
 
 
 def _codes(words: NDArray[np.object_], code: Callable[[str], int]) -> NDArray[np.int64]:
-    """A number for every word; ``code`` is asked once per different word, in the order of appearance."""
+    """A number for every word; ``code`` is called once for each different word, in the order of appearance."""
     known: dict[str, int] = {}
     return np.fromiter((known[w] if w in known else known.setdefault(w, code(w)) for w in words), np.int64, len(words))
 

@@ -1,4 +1,4 @@
-"""A block as the messages of a flight, in the order an on-line system would have had them."""
+"""A block as the messages of a flight, in the order in which an on-line system would receive them."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas.topics import rank
-from ...solver.adjustment.block import Block
+from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
+from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
 from ...solver.models.dgr import DgrOptions
-from ...solver.rotation import angles_from_matrix, matrix_from_quaternion
 from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
 from ..node import Message
 
-#: Strips whose times overlap in the files are set apart by this much.
+#: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0
 #: A-priori sigmas of the trajectory that a project message carries.
 SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg")
 
 
-def block_messages(block: Block, source: str = "import") -> Iterator[Message]:
+def block_messages(block: BlockData, source: str = "import") -> Iterator[Message]:
     """All messages of a block, sorted by stamp and rank.
 
-    Time in the files counts from the Unix epoch. Strips whose times overlap are set one after the other by whole
-    seconds. Configuration and control come first; a pose has the time it is valid for; the looks at a point come strip
-    by strip, when the last one in the strip has been imaged.
+    Time in the files counts from the Unix epoch. Strips whose times overlap are shifted by whole seconds, so that one
+    follows the other. Configuration and control come first. A pose has the time it is valid for. The image points of an
+    object point come strip by strip, at the time when the last of them in the strip was imaged.
     """
     times = _Times(block)
     start = min((begin for begin, _ in times.extents), default=0)
@@ -46,8 +46,8 @@ def block_messages(block: Block, source: str = "import") -> Iterator[Message]:
     yield from merge(*streams, key=lambda message: (message.stamp_ns, rank(message.topic)))
 
 
-def not_carried(block: Block) -> list[str]:
-    """What of a block has no place in the messages, in words."""
+def not_carried(block: BlockData) -> list[str]:
+    """The parts of a block that messages cannot hold, a line each."""
     notes = []
     keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, "wander_time_s")]
     if keys:
@@ -61,7 +61,7 @@ def not_carried(block: Block) -> list[str]:
     return notes
 
 
-def strip_shifts(block: Block) -> NDArray[np.float64]:
+def strip_shifts(block: BlockData) -> NDArray[np.float64]:
     """Seconds (strips,) to add to the times of each strip so that no two overlap; lenses of a strip stay together."""
     names = [_file_name(strip) for strip in block.strips]
     spans: dict[str, tuple[float, float]] = {}
@@ -93,10 +93,10 @@ class _Times:
     Attributes
     ----------
     shift : (strips,) seconds added to the times of each strip
-    extents : begin and end of each strip, ns; it ends after its last pose and line, which looks may come with
+    extents : begin and end of each strip, ns; it ends after its last pose and line, at which image points may stand
     """
 
-    def __init__(self, block: Block):
+    def __init__(self, block: BlockData):
         self._reference_ns = block.time_reference_ns
         self.shift = strip_shifts(block)
         self.extents: list[tuple[int, int]] = []
@@ -111,8 +111,8 @@ class _Times:
         whole = np.floor(t)
         return self._reference_ns + whole.astype(np.int64) * SECOND_NS + np.rint((t - whole) * 1e9).astype(np.int64)
 
-    def of_looks(self, block: Block) -> NDArray[np.int64]:
-        """(n,) stamps of the image points: when they were imaged, within their strip; the last of all without strip."""
+    def of_looks(self, block: BlockData) -> NDArray[np.int64]:
+        """(n,) stamps of the image points: when they were imaged, within their strip; those without strip come last."""
         strip, time = block.image.strip, block.image.time_s
         stamps = np.full(len(strip), max(end for _, end in self.extents), dtype=np.int64)
         for i, (begin, end) in enumerate(self.extents):
@@ -123,7 +123,7 @@ class _Times:
         return stamps
 
 
-def _project(block: Block) -> Any:
+def _project(block: BlockData) -> Any:
     settings = block.apriori.trajectory
     frame, known = block.frame, _sigmas(block)
     project = m.Project(
@@ -141,7 +141,7 @@ def _project(block: Block) -> Any:
     return project
 
 
-def _sigmas(block: Block) -> dict[str, list[float]]:
+def _sigmas(block: BlockData) -> dict[str, list[float]]:
     """A-priori sigmas of the trajectory; shift, offset and drift by default where the project gives none."""
     settings = block.apriori.trajectory
     dgr = DgrOptions.from_settings(settings)
@@ -150,15 +150,15 @@ def _sigmas(block: Block) -> dict[str, list[float]]:
     return {key: np.broadcast_to(np.asarray(value, dtype=float), 3).tolist() for key, value in given.items()}
 
 
-def _pose_covariance(block: Block) -> NDArray[np.float64]:
-    """(6, 6) of each pose: all that is told to be wrong with the trajectory, taken together."""
+def _pose_covariance(block: BlockData) -> NDArray[np.float64]:
+    """(6, 6) of each pose: the sum of all a-priori variances that the project states for the trajectory."""
     known = {key: np.square(values) for key, values in _sigmas(block).items()}
     position = known["offset_sigma_m"] + known.get("wander_sigma_m", 0.0)
     attitude = known["shift_sigma_deg"] + known["drift_sigma_deg"] + known.get("wander_sigma_deg", 0.0)
     return np.diag(np.concatenate([position, attitude * np.radians(1.0) ** 2]))
 
 
-def _pass_messages(block: Block, times: _Times, i: int, source: str) -> Iterator[Message]:
+def _pass_messages(block: BlockData, times: _Times, i: int, source: str) -> Iterator[Message]:
     """Begin and end of a strip."""
     strip = block.strips[i]
     first_line = int(times.ns(strip.time_of(np.zeros(1)) + times.shift[i])[0])
@@ -173,7 +173,7 @@ def _pass_messages(block: Block, times: _Times, i: int, source: str) -> Iterator
         yield Message("configuration/strip", stamp, body, source)
 
 
-def _pose_messages(block: Block, times: _Times, i: int, source: str) -> Iterator[Message]:
+def _pose_messages(block: BlockData, times: _Times, i: int, source: str) -> Iterator[Message]:
     strip = block.strips[i]
     trajectory = strip.trajectory
     angles = angles_from_matrix(matrix_from_quaternion(trajectory.quaternion))
@@ -192,7 +192,7 @@ def _pose_messages(block: Block, times: _Times, i: int, source: str) -> Iterator
         yield Message("trajectory/smoothed", stamp, body, source)
 
 
-def _tie_messages(block: Block, times: _Times, source: str) -> Iterator[Message]:
+def _tie_messages(block: BlockData, times: _Times, source: str) -> Iterator[Message]:
     """One message a point and strip, in order of their stamps."""
     image = block.image
     if not len(image):

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
-from ...solver.adjustment.block import Apriori, Block, GroundPoints, ImagePoints
+from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from ...solver.adjustment.network import Strip
-from ...solver.slow_errors import SlowErrors
-from ...solver.trajectory import Trajectory
+from ...solver.geometry.trajectory import Trajectory
+from ...solver.models.slow_errors import SlowErrors
 from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of
 from ..errors import UserError
 from ..node import Message
@@ -25,7 +25,7 @@ TOPICS = (
     *("observation/control", "observation/tie", "trajectory/filtered", "trajectory/smoothed"),
 )
 
-#: Share of a variance that is rounding.
+#: Differences below this share of a variance are rounding.
 ROUNDING = 1e-9
 
 
@@ -57,7 +57,7 @@ class _Collected:
             self.poses.setdefault(message.topic, []).append((stamp, body.strip, body))
 
 
-def block_from_messages(messages: Iterable[Message], name: str) -> Block:
+def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     """The block in the messages of a recording (those of `TOPICS`): smoothed trajectory if there is one, else filtered.
 
     Parameters
@@ -91,7 +91,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
     project = found.project or m.Project(name=name)
     notes: list[str] = []
     poses.sort(key=lambda pose: pose[0])
-    # times near the start of the epoch are those of a project; others lose digits unless they count from their start
+    # times near the start of the epoch are a project's own; others count from their start, to keep all digits
     reference = 0 if poses[-1][0] < 10**8 * SECOND_NS else poses[0][0] // SECOND_NS * SECOND_NS
     stated = any(getattr(project, key) for key in SIGMAS)
     slow = slow_errors_of(project) if stated else None
@@ -105,9 +105,9 @@ def block_from_messages(messages: Iterable[Message], name: str) -> Block:
     ground = _ground_of(found, notes)
     point_ids, image = _image_of(found, camera, strips, ground, apriori)
     frame = local_frame(project)
-    return Block(
+    return BlockData(
         project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
-        heading=not any(pose[1] for pose in poses),  # poses of a strip of their own are those of a block folder
+        heading=not any(pose[1] for pose in poses),  # poses that name a strip come from a block folder
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def _strips_of(
 def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating] | None:
     """(n, 6, 6) white noise of poses: their covariance without the slow errors that the project states.
 
-    None where it states none, since then nobody knows what part of the covariance is white, or where nothing is left.
+    None where it states none, since then the white part of the covariance is not known, or where nothing is left.
     """
     if slow is None or not all(len(pose.covariance) == 36 for pose in poses):
         return None
@@ -176,7 +176,7 @@ def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating]
     return noise if np.isfinite(noise).all() and (variances[0] > ROUNDING * variances[1]).any() else None
 
 
-def _ground_of(found: _Collected, notes: list[str]) -> GroundPoints:
+def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
     ids, xyz, covariance, roles = [], [], [], []
     for id, body in found.ground.items():
         if len(body.covariance) != 9 or not np.isfinite([body.x, body.y, body.z, *body.covariance]).all():
@@ -186,11 +186,11 @@ def _ground_of(found: _Collected, notes: list[str]) -> GroundPoints:
         xyz.append((body.x, body.y, body.z))
         covariance.append(np.reshape(body.covariance, (3, 3)))
         roles.append(role_of(body))
-    return GroundPoints(tuple(ids), np.array(xyz).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3), tuple(roles))
+    return KnownPoints(tuple(ids), np.array(xyz).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3), tuple(roles))
 
 
 def _image_of(
-    found: _Collected, camera: Any, strips: tuple[Strip, ...], ground: GroundPoints, apriori: Apriori
+    found: _Collected, camera: Any, strips: tuple[Strip, ...], ground: KnownPoints, apriori: Apriori
 ) -> tuple[tuple[str, ...], ImagePoints]:
     ids = {id: i for i, id in enumerate(ground.id)}
     place = {strip.id: i for i, strip in enumerate(strips)}

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.adjustment.block import Block
+from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
-from ...solver.rotation import angles_from_matrix, matrix_from_quaternion
+from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
 from .camera_json import write_camera
 from .table import write_table
 
 
-def write_block(folder: Path | str, block: Block) -> None:
+def write_block(folder: Path | str, block: BlockData) -> None:
     """Write all files of a block folder, in the CRS of the block's frame.
 
     Coordinates have six decimals (eleven where the CRS counts in degrees), angles nine decimals of a degree.
@@ -30,7 +30,7 @@ def write_block(folder: Path | str, block: Block) -> None:
     _write_image_points(folder, block)
 
 
-def _project(block: Block) -> str:
+def _project(block: BlockData) -> str:
     lines = ["[project]", f"name = {json.dumps(block.name)}", f"crs = {json.dumps(block.frame.crs)}"]
     lines += ["[apriori]", f"image_sigma_px = {block.apriori.image_sigma_px!r}"]
     if block.apriori.trajectory:
@@ -51,7 +51,7 @@ def _name(strip: Strip) -> str:
     return strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}")
 
 
-def _write_strips(folder: Path, block: Block) -> None:
+def _write_strips(folder: Path, block: BlockData) -> None:
     strips = block.strips
     columns: dict[str, list[object]] = {
         "strip": [_name(strip) for strip in strips],
@@ -72,8 +72,8 @@ def _write_strips(folder: Path, block: Block) -> None:
     write_table(folder / "strips.csv", columns, {"first_line_time_s": ".9f", "line_rate_hz": ".12g"})
 
 
-def _write_trajectories(folder: Path, block: Block) -> None:
-    written: dict[int, Strip] = {}  # strips of one trajectory (lenses that share it) give it once
+def _write_trajectories(folder: Path, block: BlockData) -> None:
+    written: dict[int, Strip] = {}  # strips that share a trajectory (lenses) write it once
     for strip in block.strips:
         written.setdefault(id(strip.trajectory), strip)
     strips = list(written.values())
@@ -98,12 +98,12 @@ def _write_trajectories(folder: Path, block: Block) -> None:
     write_table(folder / "trajectory.csv", columns, formats)  # type: ignore[arg-type]
 
 
-def _place_formats(block: Block) -> dict[str, str]:
+def _place_formats(block: BlockData) -> dict[str, str]:
     flat = ".11f" if block.frame.is_geographic else ".6f"
     return {"X_m": flat, "Y_m": flat, "Z_m": ".6f"}
 
 
-def _write_ground_points(folder: Path, block: Block) -> None:
+def _write_ground_points(folder: Path, block: BlockData) -> None:
     ground = block.ground
     xyz = block.frame.to_crs(ground.xyz_l) if len(ground) else np.empty((0, 3))
     covariance = ground.covariance
@@ -119,7 +119,7 @@ def _write_ground_points(folder: Path, block: Block) -> None:
     write_table(folder / "ground_points.csv", columns, formats)  # type: ignore[arg-type]
 
 
-def _write_image_points(folder: Path, block: Block) -> None:
+def _write_image_points(folder: Path, block: BlockData) -> None:
     image = block.image
     points = np.array(block.point_ids, dtype=object)
     strips = np.array([*(_name(strip) for strip in block.strips), ""], dtype=object)

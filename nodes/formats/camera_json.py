@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.camera import CcdLine, Lens, LineCamera
-from ...solver.sensors import line_from_parameters
+from ...solver.camera.line_camera import CcdLine, Lens, LineCamera
+from ...solver.camera.sensors import line_from_parameters
 from ..errors import UserError
 from .keys import Keys, read_json
 from .table import Column, read_table, write_table

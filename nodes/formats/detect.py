@@ -1,33 +1,39 @@
-"""What a file or folder is, and its messages."""
+"""Finds out the kind of a file or folder, and reads its messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from datetime import date
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
-from ...solver.camera import LineCamera
+from ...solver.camera.line_camera import LineCamera
+from ...solver.navigation.inertial_data import InertialGrade
 from ..convert import camera_message
 from ..errors import UserError
 from ..node import Message
-from ..recording import RecordingReader
 from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
 from .avirisng import is_avirisng, read_avirisng
 from .block_folder import is_block_folder, read_block
 from .block_messages import block_messages, not_carried
+from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
+from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
 from .pos_export import is_pos_export, read_pos_export
-from .ros2 import is_ros2, ros2_messages
+from .ros2 import ros2_messages
 from .sbet import is_sbet, read_sbet
+from .scene_block import is_scene_block
 from .sensor_recording import sensor_messages
 from .tie_points import statistics, tie_point_messages
-from .track import Accuracy, Mounting, NavigationTrack, track_messages
+from .time_columns import same_day
+from .track import Accuracy, Mounting, NavigationTrack, frame_of, track_messages
 from .trajectory_csv import is_trajectory_csv, read_trajectory_csv
+from .vendor_poses import is_headwall, is_resonon, read_headwall, read_resonon
 
 #: What `triline import` understands: name -> words.
 KINDS = {
+    "flight": "flight folder (flight.toml)",
     "block": "block folder (camera.json, strips.csv, trajectory.csv, ground_points.csv, image_points.csv)",
     "sensors": "sensor folder (imu.csv, gnss.csv, attitude.csv)",
     "avirisng": "AVIRIS-NG line-by-line poses (angYYYYMMDDtHHMMSS_eph_att)",
@@ -35,7 +41,10 @@ KINDS = {
     "pos": "Applanix POS Export text",
     "sbet": "SBET",
     "csv": "trajectory as CSV",
-    "ros2": "ROS 2 recording (MCAP) with NavSatFix and Imu",
+    "headwall": "Headwall poses (imu_gps.txt)",
+    "resonon": "Resonon poses (.lcf)",
+    "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix and Imu",
+    "lines": "image lines, an ENVI image with .hdr",
     "ties": "AVIRIS-NG tie points (GeoCal XML)",
     "camera": "AVIRIS-NG camera (GLAS GFM XML)",
 }
@@ -43,7 +52,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Options:
-    """What a file may need to be told.
+    """Facts that a file may lack and the user gives.
 
     Attributes
     ----------
@@ -54,6 +63,10 @@ class Options:
     camera : put into the recording as ``configuration/camera``
     seconds_of_day : SBET times count from midnight
     accuracy : of poses
+    lines : images of a strip, beside poses or sensors, or (with the file itself as image) alone
+    ground_height_m : of the origin of the local frame, above the ellipsoid
+    poses_only : poses that belong to image lines make no strip
+    grade : of the inertial unit of a sensor folder, in place of its platform.toml
     """
 
     day: date | None = None
@@ -63,11 +76,15 @@ class Options:
     camera: LineCamera | None = None
     seconds_of_day: bool | None = None
     accuracy: Accuracy = field(default_factory=Accuracy)
+    lines: LinesGiven | None = None
+    ground_height_m: float = 0.0
+    poses_only: bool = False
+    grade: InertialGrade | None = None
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What came of a file: kind, messages sorted by stamp and rank, remarks (complete once all messages are read)."""
+    """Contents of a file: kind, messages sorted by stamp and rank, remarks (complete once all messages are read)."""
 
     kind: str
     messages: Iterable[Message]
@@ -83,18 +100,24 @@ def kind_of_path(path: Path) -> str:
     UserError : nothing there, an empty file, or one of no known kind
     """
     if path.is_dir():
+        if (path / "flight.toml").is_file():
+            return "flight"
+        if is_scene_block(path):
+            raise UserError(f"{path}: a block of satellite scenes, which `triline adjust` takes as it is")
         if is_block_folder(path):
             return "block"
         if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "attitude.csv")):
             return "sensors"
-        raise UserError(f"{path}: neither {KINDS['block']} nor {KINDS['sensors']}")
+        if (path / "metadata.yaml").is_file():
+            return "ros2"
+        raise UserError(f"{path}: none of {KINDS['block']}, {KINDS['sensors']} and {KINDS['ros2']}")
     if not path.is_file():
         raise UserError(f"{path}: no such file or folder")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: empty, wanted one of: {', '.join(KINDS)}")
     with open(path, "rb") as file:
         head = file.read(512)
-    if head.startswith(b"\x89MCAP0\r\n"):
+    if head.startswith(b"\x89MCAP0\r\n") or (head.startswith(b"SQLite format 3\0") and path.suffix == ".db3"):
         return "ros2"
     if is_avirisng(path):
         return "avirisng"
@@ -102,22 +125,33 @@ def kind_of_path(path: Path) -> str:
         return "avirisc"
     if head.lstrip().startswith(b"<?xml") or b"boost_serialization" in head:
         kind = kind_of(path)
+        if kind is None and b"dimap_document" in head.lower():
+            raise UserError(
+                f"{path}: metadata of a satellite scene, which `triline locate` reads; "
+                "`triline new scenes` makes a block of scenes for `triline adjust`"
+            )
         if kind is None:
             raise UserError(f"{path}: XML of another kind, wanted {KINDS['ties']} or {KINDS['camera']}")
         return kind
     if is_pos_export(path):
         return "pos"
+    if is_headwall(path):
+        return "headwall"
+    if is_resonon(path):
+        return "resonon"
     if b"\0" not in head and is_trajectory_csv(path):
         return "csv"
     if is_sbet(path):
         return "sbet"
-    if path.suffix.lower() == ".csv":  # let the reader say which columns it misses
+    if is_envi_image(path):
+        return "lines"
+    if path.suffix.lower() == ".csv":  # its reader names the columns that are missing
         return "csv"
     raise UserError(f"{path}: of no known kind, wanted one of: {', '.join(KINDS)}")
 
 
 def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
-    """The poses in a file of one of the kinds avirisng, avirisc, pos, sbet, csv.
+    """The poses in a file of one of the kinds avirisng, avirisc, pos, sbet, csv, headwall, resonon.
 
     Raises
     ------
@@ -131,11 +165,15 @@ def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
         return read_pos_export(path, options.day)
     if kind == "sbet":
         return read_sbet(path, options.day, seconds_of_day=options.seconds_of_day)
-    return read_trajectory_csv(path, options.crs)
+    if kind == "headwall":
+        return read_headwall(path, options.day)
+    if kind == "resonon":
+        return read_resonon(path, options.day)
+    return read_trajectory_csv(path, options.crs, options.day)
 
 
 def read_any(path: Path, kind: str | None = None, options: Options | None = None) -> Imported:
-    """The messages of a file or folder of any kind but ``camera``.
+    """The messages of a file or folder of any kind but ``camera`` and ``flight``.
 
     Raises
     ------
@@ -143,36 +181,105 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     """
     kind = kind_of_path(path) if kind is None else kind
     options = Options() if options is None else options
+    if options.day is not None and kind in ("block", "ties"):
+        raise UserError(f"{path}: --date does not go with a {KINDS[kind]}: its times stand for themselves")
+    if options.lines is not None and kind in ("block", "ties"):
+        raise UserError(f"{path}: --lines do not go with a {KINDS[kind]}, wanted poses or sensors of the flight")
     if kind == "block":
         block = read_block(path)
         return Imported(kind, block_messages(block), [*block.notes, *not_carried(block)])
-    if kind == "sensors":
-        notes: list[str] = []
-        return Imported(kind, _with_camera(sensor_messages(path, notes), options.camera), notes)
-    if kind == "ros2":
-        reader = RecordingReader(path)
-        if not is_ros2(reader):
-            if any(channel.known for channel in reader.channels.values()):
-                raise UserError(f"{path}: is a triline recording already")
-            raise UserError(f"{path}: an MCAP file without sensor_msgs/msg/NavSatFix or sensor_msgs/msg/Imu")
-        notes = [f"{path.name}: damaged, {damage}" for damage in reader.damage[:3]]
-        return Imported(kind, _with_camera(ros2_messages(reader, notes), options.camera), notes)
     if kind == "ties":
         ties = read_tie_points(path)
         return Imported(kind, tie_point_messages(ties, path.stem), statistics=statistics(ties))
-    track = read_track(path, kind, options)
-    messages = track_messages(track, "import", options.mounting, accuracy=options.accuracy)
-    notes = list(track.notes)
-    if track.sigma_ned_m is None and not options.accuracy.stated:
-        east, _, up = options.accuracy.position_m
-        omega, _, kappa = options.accuracy.attitude_deg
-        taken = f"{east:g} and {up:g} m, {omega:g} and {kappa:g} deg taken (--position-sigma, --attitude-sigma)"
-        notes.append(f"{path.name}: no accuracies of the poses: {taken}")
-    return Imported(kind, _with_camera(messages, options.camera), notes)
+    if kind == "lines":
+        return _image_alone(path, options)
+    notes: list[str] = []
+    if kind in ("sensors", "ros2"):
+        messages = (
+            sensor_messages(path, notes, grade=options.grade) if kind == "sensors" else ros2_messages(path, notes)
+        )
+        messages = _at_height(_on_day(path, messages, options.day), options.ground_height_m)
+        strip = None if options.lines is None else _strip_of(options, options.lines)
+    else:
+        track = read_track(path, kind, options)
+        notes.extend(track.notes)
+        if track.sigma_ned_m is None and not options.accuracy.stated:
+            east, _, up = options.accuracy.position_m
+            omega, _, kappa = options.accuracy.attitude_deg
+            taken = f"{east:g} and {up:g} m, {omega:g} and {kappa:g} deg taken (--position-sigma, --attitude-sigma)"
+            notes.append(f"{path.name}: no accuracies of the poses: {taken}")
+        strip = None
+        if options.lines is not None:  # the images are the strip, not the poses
+            strip = _strip_of(options, options.lines, track if track.line_rate_hz > 0 else None)
+            check_within(strip, track)
+        if strip is not None or options.poses_only:
+            track = replace(track, line_rate_hz=0.0)
+        frame = replace(frame_of(track), height_m=options.ground_height_m)
+        messages = track_messages(track, "import", options.mounting, frame, options.accuracy)
+    messages = _with_camera(messages, options.camera)
+    if strip is not None:
+        notes.extend(strip.notes)
+        messages = with_lines(messages, strip, notes)
+    return Imported(kind, messages, notes)
+
+
+def _strip_of(options: Options, lines: LinesGiven, track: NavigationTrack | None = None) -> ImageStrip:
+    return open_strip(lines, options.camera, None if track is None else track.time_ns)
+
+
+def _image_alone(path: Path, options: Options) -> Imported:
+    """A recording of image lines and nothing else."""
+    if options.lines is None:
+        raise UserError(
+            f"{path}: times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"
+        )
+    files = options.lines.files or (("", path, None),)
+    if not any(file.exists() and file.samefile(path) for _, file, _ in files):
+        raise UserError(
+            f"{path}: an image that --lines does not name; wanted poses or sensors as input, or it in --lines"
+        )
+    strip = open_strip(replace(options.lines, files=files), options.camera)
+    notes = [*strip.notes, f"{path.name}: image lines alone: no poses, and no configuration/project"]
+    start = int(strip.time_ns[0])
+    camera = options.camera
+    first = [] if camera is None else [Message("configuration/camera", start, camera_message(camera), "import")]
+    return Imported("lines", with_lines(first, strip, notes), notes)
+
+
+def check_within(strip: ImageStrip, track: NavigationTrack) -> None:
+    """Raise UserError where no line of a strip was imaged while there are poses."""
+    begin, end = int(strip.time_ns[0]), int(strip.time_ns[-1])
+    if end < track.time_ns[0] or begin > track.time_ns[-1]:
+        spans = [f"{_utc(a)} to {_utc(b)}" for a, b in ((begin, end), (int(track.time_ns[0]), int(track.time_ns[-1])))]
+        raise UserError(
+            f"strip {strip.id}: lines from {spans[0]}, but poses from {spans[1]}; wanted the same time scale"
+        )
+
+
+def _utc(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _on_day(path: Path, messages: Iterable[Message], day: date | None) -> Iterator[Message]:
+    """The messages; raises UserError where they do not begin on the day that the user gives."""
+    messages = iter(messages)
+    for message in messages:
+        same_day(path, message.stamp_ns, day)
+        yield message
+        break
+    yield from messages
+
+
+def _at_height(messages: Iterable[Message], height_m: float) -> Iterator[Message]:
+    """The messages, with the origin of the local frame at a height (of sensors: they are not in the local frame)."""
+    for message in messages:
+        if message.topic == "configuration/project":
+            message.body.origin_height = height_m
+        yield message
 
 
 def _with_camera(messages: Iterable[Message], camera: LineCamera | None) -> Iterator[Message]:
-    """The messages with the camera behind the project."""
+    """The messages with the camera inserted after the project."""
     for message in messages:
         yield message
         if camera is not None and message.topic == "configuration/project":

@@ -1,4 +1,4 @@
-"""Binary tables with an ENVI header: float64 values, one record a line of the image."""
+"""ENVI headers, and binary tables that have one: float64 values, one record a line of the image."""
 
 from __future__ import annotations
 
@@ -39,6 +39,27 @@ def header_of(path: Path) -> Path | None:
     """The header beside a binary file, if there is one."""
     found = [p for p in (path.with_name(path.name + ".hdr"), path.with_suffix(".hdr")) if p.is_file()]
     return found[0] if found else None
+
+
+def header_integer(path: Path, header: dict[str, str], key: str, default: int | None = None, low: int = 0) -> int:
+    """An integer of a header; ``default`` where the key is absent.
+
+    Raises
+    ------
+    UserError : absent without a default, not an integer, or less than ``low``
+    """
+    if key not in header and default is not None:
+        return default
+    wanted = f"wanted an integer of at least {low}"
+    if key not in header:
+        raise UserError(f"{path}: {key}: missing, {wanted}")
+    try:
+        value = int(header[key])
+    except ValueError:
+        raise UserError(f"{path}: {key}: {header[key]!r}, {wanted}") from None
+    if value < low:
+        raise UserError(f"{path}: {key}: {value}, {wanted}")
+    return value
 
 
 def read_records(path: Path, bands: tuple[str, ...], notes: list[str]) -> tuple[tuple[str, ...], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import topics
-from ...solver.frames import LocalFrame
+from ...solver.geometry.frames import LocalFrame
 from ..convert import SECOND_NS
 from ..errors import UserError
 from ..node import Message

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.camera import CcdLine, Lens, LineCamera
+from ...solver.camera.line_camera import CcdLine, Lens, LineCamera
 from ..errors import UserError
 
 _CAMERA, _TIES = "GeoCal::GlasGfmCamera", "GeoCal::TiePointCollection"

@@ -6,8 +6,11 @@ Rasterio is imported where it is used: it takes half a second, and most commands
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,8 @@ Array = NDArray[np.floating]
 BLOCK = 512
 #: A raster of heights has no more cells than this.
 MOST_HEIGHTS = 100_000_000
+#: Tag by which a file of ours says what its heights count from.
+_DATUM = "VERTICAL_DATUM"
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class Heights:
     z_m : (rows, columns), NaN where not known
     x0, y0 : CRS coordinates of the first value
     dx, dy : from column to column, from row to row
+    above_ellipsoid : the file says that they count from the ellipsoid
     """
 
     crs: str
@@ -43,6 +49,7 @@ class Heights:
     y0: float
     dx: float
     dy: float
+    above_ellipsoid: bool = False
 
 
 def read_heights(path: Path) -> Heights:
@@ -71,12 +78,13 @@ def read_heights(path: Path) -> Heights:
                     raise UserError(f"{path}: {size} heights are too many, wanted at most {MOST_HEIGHTS:.0e}")
                 band = source.read(1, masked=True)
                 crs = source.crs.to_wkt()
+                ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
     except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
     z = np.ma.filled(band.astype(float), np.nan)
     if not np.isfinite(z).any():
         raise UserError(f"{path}: holds no height")
-    return Heights(crs, z, t.c + 0.5 * t.a, t.f + 0.5 * t.e, t.a, t.e)
+    return Heights(crs, z, t.c + 0.5 * t.a, t.f + 0.5 * t.e, t.a, t.e, ellipsoidal)
 
 
 def write_heights(path: Path, heights: Heights) -> None:
@@ -99,6 +107,8 @@ def write_heights(path: Path, heights: Heights) -> None:
         ) as target,
     ):  # fmt: skip
         target.write(heights.z_m.astype(np.float32), 1)
+        if heights.above_ellipsoid:
+            target.update_tags(**{_DATUM: "ellipsoid"})
 
 
 def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[str, str]) -> tuple[int, int]:
@@ -150,3 +160,112 @@ def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[st
         finally:
             draft.unlink(missing_ok=True)
     return shape
+
+
+@dataclass(frozen=True)
+class Raster:
+    """What a raster of a map is, before there is anything in it.
+
+    Attributes
+    ----------
+    crs : what rasterio understands
+    left, top, gsd : CRS coordinates of the upper left corner, and size of a cell
+    rows, columns, bands, dtype, nodata : no data where nothing is written
+    tags, descriptions : of the file, of its bands
+    """
+
+    crs: str
+    left: float
+    top: float
+    gsd: float
+    rows: int
+    columns: int
+    bands: int
+    dtype: str
+    nodata: float | None
+    tags: dict[str, str] = field(default_factory=dict)
+    descriptions: tuple[str, ...] = ()
+
+
+class Draft:
+    """A raster that is written piece by piece, in any order; made by `tiled_orthoimage`.
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+
+    def __init__(self, path: Path, target: Any):
+        self._path, self._target = path, target
+
+    def write(self, row: int, column: int, values: NDArray[Any]) -> None:
+        """Values (bands, rows, columns) at a place."""
+        from rasterio.windows import Window
+
+        window = Window(column, row, values.shape[2], values.shape[1])  # type: ignore[call-arg]
+        with _told(self._path):
+            self._target.write(values, window=window)
+
+    def read(self, row: int, column: int, rows: int, columns: int) -> NDArray[Any]:
+        """What stands at a place so far, (bands, rows, columns)."""
+        from rasterio.windows import Window
+
+        with _told(self._path):
+            return self._target.read(window=Window(column, row, columns, rows))  # type: ignore[call-arg]
+
+
+@contextmanager
+def tiled_orthoimage(
+    path: Path, raster: Raster, compress: str = "deflate", overview_resampling: str = "average"
+) -> Iterator[Draft]:
+    """A cloud-optimised GeoTIFF with overviews, which gets its name when it is whole.
+
+    Parameters
+    ----------
+    compress : deflate, zstd, lzw or none; "plain" for a tiled file without overviews, which is written but once
+    overview_resampling : how overviews are made; ``nearest`` for classes
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    import rasterio
+    import rasterio.shutil
+    from rasterio.crs import CRS
+
+    predictor = {} if compress == "none" else {"predictor": "yes"}
+    with new_file(path) as part:
+        draft = part.with_suffix(".draft")
+        try:
+            with _told(path):
+                target = rasterio.open(
+                    draft, "w+", driver="GTiff", tiled=True, blockxsize=BLOCK, blockysize=BLOCK, bigtiff="if_safer",
+                    sparse_ok=True, interleave="band", width=raster.columns, height=raster.rows, count=raster.bands,
+                    dtype=raster.dtype, nodata=raster.nodata, crs=CRS.from_user_input(raster.crs),
+                    transform=rasterio.Affine(raster.gsd, 0.0, raster.left, 0.0, -raster.gsd, raster.top),
+                )  # fmt: skip
+            with target:
+                target.update_tags(**raster.tags)
+                for k, text in enumerate(raster.descriptions):
+                    target.set_band_description(k + 1, text)
+                yield Draft(path, target)
+            if compress == "plain":
+                draft.replace(part)
+                return
+            with _told(path):
+                rasterio.shutil.copy(
+                    draft, part, driver="COG", compress=compress, blocksize=BLOCK, bigtiff="if_safer",
+                    overview_resampling=overview_resampling, num_threads="all_cpus", **predictor,
+                )  # fmt: skip
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except RasterioError as error:
+        raise UserError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None

@@ -12,6 +12,9 @@ import numpy as np
 
 from ..errors import UserError
 
+#: Largest integer of a file: larger ones are no double.
+LARGEST = 1 << 53
+
 
 class Keys:
     """One table (object) of a file, read key by key.
@@ -55,8 +58,9 @@ class Keys:
 
     def integer(self, key: str, default: int | None = None, *, low: int = 0) -> int:
         value = self._get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise self.refuse(key, f"an integer of at least {low}")
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= LARGEST:
+            most = f" and at most {LARGEST}" if isinstance(value, int) and value > LARGEST else ""
+            raise self.refuse(key, f"an integer of at least {low}{most}")
         return value
 
     def numbers(
@@ -83,7 +87,7 @@ class Keys:
         return self._get(key, default)
 
     def unread(self) -> list[str]:
-        """Keys that nobody asked for."""
+        """Keys that were not read."""
         return [self.name(key) for key in self.values if key not in self._read]
 
     def _get(self, key: str, default: Any) -> Any:
@@ -104,6 +108,10 @@ def read_toml(path: Path) -> Keys:
         raise UserError(f"{path}: not valid TOML: {error}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file, wanted TOML") from None
+    except RecursionError:
+        raise UserError(f"{path}: not valid TOML: nested too deep") from None
+    except ValueError as error:  # numbers of thousands of digits
+        raise UserError(f"{path}: not valid TOML: {error}") from None
 
 
 def read_json(path: Path) -> Keys:
@@ -119,12 +127,24 @@ def read_json(path: Path) -> Keys:
         raise UserError(f"{path}:{error.lineno}: not valid JSON: {error.msg} (column {error.colno})") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file, wanted JSON") from None
+    except RecursionError:
+        raise UserError(f"{path}: not valid JSON: nested too deep") from None
+    except ValueError as error:  # numbers of thousands of digits
+        raise UserError(f"{path}: not valid JSON: {error}") from None
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return bool(np.isfinite(float(value)))
+    except OverflowError:  # an integer of hundreds of digits
+        return False
 
 
 def _shown(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # nested deep, or an integer of thousands of digits
+        return f"a {type(value).__name__} that is too large to show"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,4 @@
-"""Files that appear when they are whole."""
+"""New files that get their name only when they are complete."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..errors import UserError
 
 
 def refuse_unless_file(target: Path) -> None:
-    """Raise UserError for what a new file must not take the place of: a folder, a device such as /dev/null."""
+    """Raise UserError where a folder or a device such as /dev/null has the name of a new file."""
     if target.is_dir():
         raise UserError(f"{target}: is a folder, wanted a file")
     if target.exists() and not target.is_file():
@@ -19,7 +19,7 @@ def refuse_unless_file(target: Path) -> None:
 
 
 def refuse_unless_folder(target: Path) -> None:
-    """Raise UserError where no folder of results can be, before the work that they cost; makes nothing."""
+    """Raise UserError where a folder of results cannot be made; called before the work begins, and makes nothing."""
     place = target
     while not (place.exists() or place.is_symlink()) and place != place.parent:
         place = place.parent
@@ -32,7 +32,7 @@ def refuse_unless_folder(target: Path) -> None:
 
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
-    """A path to write to that takes the place of ``target`` at the end, and goes away if something fails before.
+    """A path to write to, which is renamed to ``target`` at the end, or deleted if something fails before.
 
     Raises
     ------

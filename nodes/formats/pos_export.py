@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.frames import CrsError
+from ...solver.geometry.frames import CrsError
 from ..errors import UserError
 from .projection import Projection
 from .table import MOST_PROBLEMS, one_line

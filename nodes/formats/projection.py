@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...solver.frames import CrsError
+from ...solver.geometry.frames import CrsError
+from ..errors import UserError
 
 
 class Projection:
@@ -52,7 +53,7 @@ class Projection:
 
 
 def missing_grids(crs: str) -> list[str]:
-    """Names of the grids (geoids, datum shifts) that PROJ's best way from a CRS to WGS 84 needs and has not here."""
+    """Names of the grids (geoids, datum shifts) that PROJ's best path from a CRS to WGS 84 needs and cannot find."""
     import pyproj
     from pyproj.transformer import TransformerGroup
 
@@ -63,3 +64,16 @@ def missing_grids(crs: str) -> list[str]:
     if group.best_available:
         return []
     return sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available})
+
+
+def refuse_missing_grids(crs: str, where: object) -> None:
+    """Raise UserError where PROJ would take heights in a CRS for ellipsoidal ones, because it lacks the geoid."""
+    grids = [] if crs == "local" else missing_grids(crs)
+    if grids:
+        import pyproj
+
+        name = pyproj.CRS.from_user_input(crs).name
+        raise UserError(
+            f"{where}: PROJ lacks the grid {', '.join(grids[:3])} for {name!r}: heights would be off by the geoid "
+            f"(`projsync --file {grids[0]}` fetches it)"
+        )

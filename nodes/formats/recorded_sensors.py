@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.inertial_cleaning import Finding
 from ...solver.navigation.inertial_data import TACTICAL, GnssData, InertialGrade
-from ...solver.rotation import R_ENU_NED
 from .. import convert
 from ..errors import UserError
-from ..recording import RecordingReader
+from ..recording.reader import RecordingReader
 from .sensor_folder import Platform, SensorFolder, read_platform
 
 _FIELDS = {
@@ -81,12 +81,12 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
 
 
 def _grade(imu: list[Any], notes: list[str]) -> InertialGrade:
-    """Noise as the samples say; biases, which they do not say, as units of such noise have them."""
+    """Noise from the sigmas of the samples; biases, which they do not have, as usual for units of such noise."""
     root = np.sqrt(np.median([b.interval_ns for b in imu]) * 1e-9)
     gyro, accel = (float(np.median([getattr(b, n) for b in imu]) * root) for n in ("rate_sigma", "force_sigma"))
     grade = InertialGrade.of_noise(gyro, accel)
     name = "tactical" if grade.gyro_bias == TACTICAL.gyro_bias else "MEMS"
-    notes.append(f"sensor/imu: biases are not in a recording: those of a {name} unit taken (--platform gives others)")
+    notes.append(f"sensor/imu: a recording holds no biases; a {name} unit is assumed (--platform gives others)")
     return grade
 
 

@@ -1,188 +1,254 @@
-"""ROS 2 recordings (MCAP): ``sensor_msgs/msg/NavSatFix`` and ``sensor_msgs/msg/Imu``, decoded from CDR.
+"""ROS 2 bags: ``sensor_msgs/msg/NavSatFix`` and ``sensor_msgs/msg/Imu``, decoded by rosbags.
 
 ROS bodies are forward-left-up against east-north-up (REP 103); ours are forward-right-down against north-east-down.
+
+Bag folders and ``.db3`` files are read by rosbags. An MCAP file is read by `RecordingReader`, because rosbags refuses a
+file that was cut off, or one of another profile, and stops at the first damaged chunk.
 """
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from heapq import merge
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas.topics import rank
-from ...solver.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
+from ...solver.geometry.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
 from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..node import Message
-from ..recording import RecordingReader
+from ..recording.reader import RecordingReader
+
+Array = NDArray[np.floating]
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 #: Taken where a message says that its covariance is not known.
 FIX_SIGMA_M = (5.0, 5.0, 10.0)
 ATTITUDE_SIGMA_RAD = (0.01, 0.01, 0.03)
-_FLU_FRD = np.diag([1.0, -1.0, -1.0])
+_FLU_FRD = np.array([1.0, -1.0, -1.0])
+_DIAGONAL = [0, 4, 8]
+#: Inertial samples that are converted at once.
+_BATCH = 4096
 
 
-@dataclass(frozen=True)
-class _Header:
-    time_ns: int
-    frame_id: str
+class _McapBag:
+    """An MCAP file, whole or damaged."""
+
+    def __init__(self, path: Path, notes: list[str]) -> None:
+        self._reader = RecordingReader(path)
+        self._channels = list(self._reader.channels.values())
+        if any(channel.known for channel in self._channels):
+            raise UserError(f"{path}: is a triline recording already")
+        notes += [f"{path.name}: damaged, {damage}" for damage in self._reader.damage[:3]]
+        self.topics: Counter[tuple[str, str]] = Counter()
+        for channel in self._channels:
+            self.topics[channel.topic, channel.type_name] += int((self._reader.index.channel == channel.id).sum())
+
+    def payloads(self, topic: str, kind: str) -> Iterator[bytes | memoryview]:
+        ids = [channel.id for channel in self._channels if (channel.topic, channel.type_name) == (topic, kind)]
+        for number in np.flatnonzero(np.isin(self._reader.index.channel, ids)):
+            yield self._reader.raw(int(number)).data
 
 
-class _Cdr:
-    """Reads one CDR message: numbers stand at multiples of their size behind the four bytes of encapsulation."""
+class _RosbagsBag:
+    """A bag folder or a ``.db3`` file."""
 
-    def __init__(self, data: bytes | memoryview):
-        self.data = memoryview(data)
-        if len(self.data) < 4 or self.data[0] != 0 or self.data[1] > 1:
-            raise ValueError("not plain CDR")
-        self.order = "<" if self.data[1] == 1 else ">"
-        self.place = 4
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.topics: Counter[tuple[str, str]] = Counter()
+        with self._opened() as bag:
+            for connection in bag.connections:
+                self.topics[connection.topic, connection.msgtype] += connection.msgcount
 
-    def take(self, kind: str, count: int = 1) -> tuple[Any, ...]:
-        size = struct.calcsize(kind)
-        self.place += -(self.place - 4) % size
-        values = struct.unpack_from(f"{self.order}{count}{kind}", self.data, self.place)
-        self.place += size * count
-        return values
+    def payloads(self, topic: str, kind: str) -> Iterator[bytes]:
+        with self._opened() as bag:
+            chosen = [c for c in bag.connections if (c.topic, c.msgtype) == (topic, kind)]
+            yield from (data for _, _, data in bag.messages(chosen))
 
-    def header(self) -> _Header:
-        (sec,), (nanosec,) = self.take("i"), self.take("I")
-        (length,) = self.take("I")
-        text = bytes(self.data[self.place : self.place + length])
-        self.place += length
-        return _Header(sec * SECOND_NS + nanosec, text.rstrip(b"\0").decode(errors="replace"))
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        from rosbags.rosbag2 import Reader
 
-
-def is_ros2(reader: RecordingReader) -> bool:
-    """Whether a recording has topics of the two ROS 2 types."""
-    return any(channel.type_name in (FIX, IMU) for channel in reader.channels.values())
+        try:
+            with Reader(self._path) as bag:
+                yield bag
+        except Exception as error:  # errors of SQLite, YAML and compression come through rosbags as they are
+            raise UserError(f"{self._path}: not a whole ROS 2 bag: {error}") from None
 
 
-def ros2_messages(reader: RecordingReader, notes: list[str], source: str = "import") -> Iterator[Message]:
+def ros2_messages(path: Path, notes: list[str], source: str = "import") -> Iterator[Message]:
     """``configuration/project``, ``sensor/gnss``, ``sensor/imu`` and ``sensor/attitude``, sorted by stamp and rank.
 
-    Where several topics have the same type, the one with most messages is taken. Messages that cannot be decoded, fixes
-    without a fix and times that do not come after the one before are left out and counted in ``notes``.
+    Parameters
+    ----------
+    path : bag folder, ``.db3`` file or MCAP file
+    notes : gets what is not imported. Where several topics have the same type, the one with most messages is taken.
+        Messages that cannot be decoded, fixes without a fix and times that do not come after the one before are left
+        out and counted.
 
     Raises
     ------
-    UserError : no NavSatFix and no Imu that can be used
+    UserError : not a bag that can be read, or no NavSatFix and no Imu in it that can be used
     """
-    path = Path(reader.path)
-    messages: list[Message] = []
-    for kind, decode in ((FIX, _fix_messages), (IMU, _imu_messages)):
-        channels = [channel for channel in reader.channels.values() if channel.type_name == kind]
-        if not channels:
-            continue
-        by_topic: dict[str, int] = {}
-        for channel in channels:
-            count = int((reader.index.channel == channel.id).sum())
-            by_topic[channel.topic] = by_topic.get(channel.topic, 0) + count
-        topic = max(by_topic, key=lambda t: by_topic[t])
-        others = sorted(set(by_topic) - {topic})
-        if others:
-            notes.append(f"{path.name}: {kind} taken from {topic}, not from {', '.join(others)}")
-        ids = [channel.id for channel in channels if channel.topic == topic]
-        numbers = np.flatnonzero(np.isin(reader.index.channel, ids))
-        messages.extend(decode((reader.raw(int(i)).data for i in numbers), source, topic, notes))
-    if not messages:
-        raise UserError(f"{path}: no usable {FIX} or {IMU}")
-    messages.sort(key=lambda message: (message.stamp_ns, rank(message.topic)))
-    fixes = [message.body for message in messages if message.topic == "sensor/gnss"]
+    bag = _RosbagsBag(path) if path.is_dir() or path.suffix == ".db3" else _McapBag(path, notes)
+    chosen = {}
+    for (topic, kind), count in bag.topics.most_common():
+        if kind in (FIX, IMU) and count:
+            chosen.setdefault(kind, topic)
+    others = [
+        f"{count} {kind} of {topic}"
+        for (topic, kind), count in sorted(bag.topics.items())
+        if count and chosen.get(kind) != topic
+    ]
+    if others:
+        notes.append(f"{path.name}: not imported: {', '.join(others)}")
+    fixes = fix_messages(bag.payloads(chosen[FIX], FIX), chosen[FIX], notes, source) if FIX in chosen else iter(())
+    inertial: Iterator[Message] = iter(())
+    if IMU in chosen:
+        inertial = inertial_messages(bag.payloads(chosen[IMU], IMU), chosen[IMU], notes, source)
+    fix = next(fixes, None)
+    messages = merge(
+        chain([] if fix is None else [fix], fixes),
+        inertial,
+        key=lambda message: (message.stamp_ns, rank(message.topic)),
+    )
+    first = next(messages, None)
+    if first is None:
+        raise UserError("; ".join([f"{path}: no usable {FIX} or {IMU}", *notes]))
     project = m.Project(name=path.stem, crs="local")
-    if fixes:
-        project.origin_latitude, project.origin_longitude = (
-            round(v, 6) for v in (fixes[0].latitude, fixes[0].longitude)
-        )
+    if fix is not None:
+        project.origin_latitude, project.origin_longitude = round(fix.body.latitude, 6), round(fix.body.longitude, 6)
     else:
-        notes.append(f"{path.name}: no GNSS fix, the local frame has no place on Earth")
-    yield Message("configuration/project", messages[0].stamp_ns, project, source)
+        notes.append(f"{path.name}: no GNSS fix, so the origin of the local frame is not known")
+    yield Message("configuration/project", first.stamp_ns, project, source)
+    yield first
     yield from messages
 
 
-def _fix_messages(
-    payloads: Iterator[bytes | memoryview], source: str, topic: str, notes: list[str]
-) -> Iterator[Message]:
-    last, broken, late, without, nominal = -1, 0, 0, 0, 0
+@cache
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.LATEST)
+
+
+def decoded(payloads: Iterable[bytes | memoryview], kind: str, left_out: Counter[str]) -> Iterator[tuple[int, Any]]:
+    """Header time in ns and message of each that can be used, each later than the one before."""
+    from rosbags.serde import SerdeError
+
+    types, last = _types(), -1
     for payload in payloads:
         try:
-            cdr = _Cdr(payload)
-            header = cdr.header()
-            (status,), _ = cdr.take("b"), cdr.take("H")
-            place = cdr.take("d", 3)
-            covariance = np.reshape(cdr.take("d", 9), (3, 3))
-            (covariance_type,) = cdr.take("B")
-        except (ValueError, struct.error):
-            broken += 1
+            message = types.deserialize_cdr(payload, kind)
+        except SerdeError:
+            left_out["not decodable"] += 1
             continue
-        if status < 0 or not np.isfinite(place).all():
-            without += 1
-            continue
-        if header.time_ns <= last:
-            late += 1
-            continue
-        last = header.time_ns
-        variance = np.diagonal(covariance)
-        known = covariance_type != 0 and np.isfinite(variance).all() and (variance > 0).all()
+        time_ns = message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
+        if kind == FIX and not (message.status.status >= 0 and np.isfinite(message.latitude + message.longitude)):
+            left_out["without a fix"] += 1
+        elif time_ns <= last:
+            left_out["not later than the one before"] += 1
+        else:
+            last = time_ns
+            yield time_ns, message
+
+
+def fix_messages(
+    payloads: Iterable[bytes | memoryview],
+    topic: str,
+    notes: list[str],
+    source: str,
+    left_out: Counter[str] | None = None,
+) -> Iterator[Message]:
+    """``sensor/gnss`` of each NavSatFix in CDR; ``left_out`` counts, as they come, those that cannot be used."""
+    left_out = Counter() if left_out is None else left_out
+    nominal = 0
+    for time_ns, fix in decoded(payloads, FIX, left_out):
+        variance = fix.position_covariance[_DIAGONAL]
+        known = fix.position_covariance_type != 0 and np.isfinite(variance).all() and (variance > 0).all()
         nominal += not known
-        sigma = np.sqrt(variance) if known else np.array(FIX_SIGMA_M)
-        yield Message("sensor/gnss", header.time_ns, gnss_message(header.time_ns, place, sigma), source)
-    _count(notes, topic, {"not CDR": broken, "without a fix": without, "not after the one before": late})
+        place, sigma = (fix.latitude, fix.longitude, fix.altitude), np.sqrt(variance) if known else FIX_SIGMA_M
+        yield Message("sensor/gnss", time_ns, gnss_message(time_ns, place, sigma), source)
+    _note(notes, topic, left_out)
     if nominal:
-        notes.append(
-            f"{topic}: {nominal} fixes without covariance, taken as {FIX_SIGMA_M[0]:g} m and {FIX_SIGMA_M[2]:g} m"
-        )
+        taken = f"{FIX_SIGMA_M[0]:g} m and {FIX_SIGMA_M[2]:g} m in height"
+        notes.append(f"{topic}: fixes without covariance: {nominal}, taken with sigmas of {taken}")
 
 
-def _imu_messages(
-    payloads: Iterator[bytes | memoryview], source: str, topic: str, notes: list[str]
+def inertial_messages(
+    payloads: Iterable[bytes | memoryview],
+    topic: str,
+    notes: list[str],
+    source: str,
+    left_out: Counter[str] | None = None,
+    at_once: int = _BATCH,
 ) -> Iterator[Message]:
-    last, broken, late, nominal = -1, 0, 0, 0
-    for payload in payloads:
-        try:
-            cdr = _Cdr(payload)
-            header = cdr.header()
-            quaternion, cov_q = np.array(cdr.take("d", 4)), cdr.take("d", 9)
-            rate, cov_rate = np.array(cdr.take("d", 3)), cdr.take("d", 9)
-            force, cov_force = np.array(cdr.take("d", 3)), cdr.take("d", 9)
-        except (ValueError, struct.error):
-            broken += 1
-            continue
-        if header.time_ns <= last:
-            late += 1
-            continue
-        interval = header.time_ns - last if last >= 0 else 0
-        last = header.time_ns
-        if cov_rate[0] != -1 and cov_force[0] != -1:
-            f, w = _FLU_FRD @ force, _FLU_FRD @ rate
-            body = m.Imu(
-                time_ns=last, interval_ns=interval,
-                force_x=f[0], force_y=f[1], force_z=f[2], rate_x=w[0], rate_y=w[1], rate_z=w[2],
-                force_sigma=_sigma(cov_force), rate_sigma=_sigma(cov_rate),
-            )  # fmt: skip
-            yield Message("sensor/imu", last, body, source)
-        if cov_q[0] != -1 and abs(float(np.linalg.norm(quaternion)) - 1.0) < 1e-3:
-            R_nb = R_ENU_NED.T @ matrix_from_quaternion(quaternion / np.linalg.norm(quaternion)) @ _FLU_FRD
-            known = all(cov_q[i] > 0 for i in (0, 4, 8))
-            nominal += not known
-            sigma = np.sqrt([cov_q[0], cov_q[4], cov_q[8]]) if known else np.array(ATTITUDE_SIGMA_RAD)
-            yield Message("sensor/attitude", last, attitude_message(last, navigation_from_matrix(R_nb), sigma), source)
-    _count(notes, topic, {"not CDR": broken, "not after the one before": late})
+    """``sensor/imu`` and ``sensor/attitude`` of each Imu in CDR, so many ``at_once``.
+
+    A covariance that begins with -1 marks values that a message lacks. ``left_out`` counts, as they come, messages that
+    cannot be used.
+    """
+    left_out = Counter() if left_out is None else left_out
+    samples = decoded(payloads, IMU, left_out)
+    last, nominal = None, 0
+    while batch := list(islice(samples, at_once)):
+        time_ns = [time for time, _ in batch]
+        interval_ns = np.diff(time_ns, prepend=time_ns[0] if last is None else last).tolist()
+        last = time_ns[-1]
+        read = [sample for _, sample in batch]
+        force = _FLU_FRD * [(v.x, v.y, v.z) for v in (s.linear_acceleration for s in read)]
+        rate = _FLU_FRD * [(v.x, v.y, v.z) for v in (s.angular_velocity for s in read)]
+        force_variance = np.array([s.linear_acceleration_covariance for s in read])[:, _DIAGONAL]
+        rate_variance = np.array([s.angular_velocity_covariance for s in read])[:, _DIAGONAL]
+        measured = (force_variance[:, 0] != -1) & (rate_variance[:, 0] != -1)
+        angles, sigma, oriented, assumed = _attitudes(read)
+        nominal += int(assumed.sum())
+        columns = (force, rate, _sigma(force_variance), _sigma(rate_variance))
+        for k, (time, interval, f, w, force_sigma, rate_sigma) in enumerate(
+            zip(time_ns, interval_ns, *(column.tolist() for column in columns), strict=True)
+        ):
+            if measured[k]:
+                body = m.Imu(
+                    time_ns=time, interval_ns=interval, force_x=f[0], force_y=f[1], force_z=f[2],
+                    rate_x=w[0], rate_y=w[1], rate_z=w[2], force_sigma=force_sigma, rate_sigma=rate_sigma,
+                )  # fmt: skip
+                yield Message("sensor/imu", time, body, source)
+            if oriented[k]:
+                yield Message("sensor/attitude", time, attitude_message(time, angles[k], sigma[k]), source)
+    _note(notes, topic, left_out)
     if nominal:
-        notes.append(f"{topic}: {nominal} orientations without covariance, taken as 0.6 and 1.7 deg")
+        east, _, heading = np.degrees(ATTITUDE_SIGMA_RAD)
+        taken = f"{east:.1f} deg and {heading:.1f} deg in heading"
+        notes.append(f"{topic}: orientations without covariance: {nominal}, taken with sigmas of {taken}")
 
 
-def _sigma(covariance: tuple[float, ...]) -> float:
-    """One sigma of a 3 x 3 covariance, 0 if it is not given."""
-    mean = (covariance[0] + covariance[4] + covariance[8]) / 3
-    return float(np.sqrt(mean)) if np.isfinite(mean) and mean > 0 else 0.0
+def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Roll, pitch, heading (n, 3) and their sigmas (n, 3), rad; which samples have them; which sigmas are assumed."""
+    q = np.array([(v.x, v.y, v.z, v.w) for v in (s.orientation for s in samples)])
+    variance = np.array([s.orientation_covariance for s in samples])[:, _DIAGONAL]
+    oriented = (variance[:, 0] != -1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 1e-3)
+    q[~oriented] = 0.0, 0.0, 0.0, 1.0
+    R_nb = R_ENU_NED.T @ matrix_from_quaternion(q) * _FLU_FRD
+    known = np.all(variance > 0, axis=1)
+    sigma = np.where(known[:, None], np.sqrt(np.maximum(variance, 0.0)), ATTITUDE_SIGMA_RAD)
+    return navigation_from_matrix(R_nb), sigma, oriented, oriented & ~known
 
 
-def _count(notes: list[str], topic: str, left_out: dict[str, int]) -> None:
-    notes.extend(f"{topic}: {count} messages left out: {why}" for why, count in left_out.items() if count)
+def _sigma(variance: Array) -> Array:
+    """One sigma (n,) from the variances (n, 3) of three axes, 0 where they are not given."""
+    mean = variance.mean(axis=1)
+    return np.sqrt(np.where(np.isfinite(mean) & (mean > 0), mean, 0.0))
+
+
+def _note(notes: list[str], topic: str, left_out: Counter[str]) -> None:
+    if left_out:
+        notes.append(f"{topic}: messages left out: {', '.join(f'{n} {why}' for why, n in sorted(left_out.items()))}")

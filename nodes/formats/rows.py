@@ -19,7 +19,7 @@ from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ..node import Message
 
-#: Repeated sub-messages that are spread unless told otherwise; a type with only one is spread without being named.
+#: Repeated sub-messages whose elements become rows by default; a type with only one need not be named here.
 _SPREAD = {"triline.Camera": "lines"}
 _ENVELOPE = {"stamp_ns": "Int64", "sequence": "Int64", "source": "string"}
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...solver.gps_time import DAY_S
 from ..errors import UserError
+from .gps_time import DAY_S
 from .track import NavigationTrack, checked, times_from_gps
 
 #: Fields of a record: seconds; radians; metres; m/s and m/s^2 in the wander frame; rad/s in the body.
@@ -53,7 +53,7 @@ def read_sbet(path: Path, day: date | None = None, *, seconds_of_day: bool | Non
         if of_day:
             notes.append(f"{path.name}: times below one day, taken as seconds of {day}")
     time = times_from_gps(path, column["time"], day, notes, of_day=of_day)
-    with np.errstate(over="ignore"):  # of a damaged file; refused below
+    with np.errstate(over="ignore"):  # a damaged file overflows here and is refused below
         lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))
     heading = column["platform_heading"] - column["wander_angle"]
     track = NavigationTrack(

@@ -1,4 +1,4 @@
-"""Sensor folder: raw inertial and GNSS data as CSV, with what is known of the platform."""
+"""Sensor folder: raw inertial and GNSS data as CSV, and platform.toml with lever arms and noise."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.geometry.rotation import R_BC_NOMINAL, matrix_from_navigation
 from ...solver.navigation.alignment import AttitudePrior
 from ...solver.navigation.carried import CameraMount
 from ...solver.navigation.error_state import NavigationSettings
 from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
 from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, InertialGrade
-from ...solver.rotation import R_BC_NOMINAL, matrix_from_navigation
 from ..errors import UserError
 from .keys import Keys, read_toml
 from .table import Column, Table, read_table
@@ -89,19 +89,19 @@ class Platform:
 
 @dataclass(frozen=True)
 class SensorFolder:
-    """A sensor folder as it stands.
+    """The contents of a sensor folder, not yet checked or cleaned.
 
     Attributes
     ----------
     path : the folder
     time_s : (n,) stamps of the inertial samples, or None without imu.csv
     rotation, force : (n, 3) angular rates (rad/s) and specific forces (m/s^2), or increments (rad, m/s)
-    increments : which of both
+    increments : whether they are increments
     gnss : fixes, or None without gnss.csv
     attitude : or None without attitude.csv
     platform : of platform.toml, or defaults
     notes : remarks on reading
-    offset_s : what is added to the times where they are written
+    offset_s : added to the times in output files
     """
 
     path: Path
@@ -116,7 +116,7 @@ class SensorFolder:
     offset_s: float = 0.0
 
     def cleaned(self) -> tuple[InertialData, GnssData, list[Finding]]:
-        """Data for the navigator, and what was taken out of them.
+        """Data for the navigator, and findings about what was taken out of them.
 
         Raises
         ------
@@ -208,7 +208,7 @@ def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
     if not path.is_file():
         return None
     columns = [Column(name) for name in ("time_s", *POSITION)]
-    # as text, because what is no number (nan, empty) is the checks' business here, not the reader's
+    # as text, because the checks, and not the reader, deal with empty values and nan
     columns += [Column(name, kind="text", blank=True) for name in SIGMA]
     columns += [Column(name, kind="text", optional=True, blank=True) for name in (*VELOCITY, *SIGMA_VELOCITY)]
     table = read_table(path, columns, notes)
@@ -225,7 +225,7 @@ def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
 
 
 def _all_there(path: Path, table: Table, names: tuple[str, ...]) -> bool:
-    """Whether all of some optional columns are there; some but not all is an error."""
+    """Whether optional columns that belong together are there; an error where only some of them are."""
     there = [name for name in names if name in table]
     missing = [name for name in names if name not in table]
     if there and missing:
@@ -259,7 +259,7 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
     if _all_there(path, table, SIGMA_ANGLES):
         sigma = table.stack(*SIGMA_ANGLES)
     else:
-        notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg taken")
+        notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg are assumed")
     return AttitudeTable(table["time_s"], angles, np.radians(sigma))
 
 
@@ -272,9 +272,9 @@ def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:
 
 
 def read_platform(path: Path, notes: list[str]) -> Platform:
-    """Read platform.toml; what it does not say has a default, and a note where that matters."""
+    """Read platform.toml; keys that it lacks have defaults, with a note where the default matters."""
     if not path.is_file():
-        notes.append(f"{path.name}: absent: no lever arm, a MEMS unit taken")
+        notes.append(f"{path.name} is absent: a lever arm of zero and a MEMS unit are assumed")
         return Platform()
     keys = read_toml(path)
     zero = (0.0, 0.0, 0.0)
@@ -285,7 +285,7 @@ def read_platform(path: Path, notes: list[str]) -> Platform:
     wander_time_s = gnss.number("wander_time_s", 60.0, positive=True)
     if min(wander) < 0.0:
         raise gnss.refuse("wander_sigma_m", "3 numbers of at least 0: north, east, down")
-    grade = _grade(imu, notes, path.name)
+    grade = read_grade(imu, notes, path.name)
     prior = _prior(initial) if initial.values else None
     for table in (keys, imu, initial, gnss):
         notes.extend(f"{path.name}: key {name!r} is not known and was ignored" for name in table.unread())
@@ -293,20 +293,34 @@ def read_platform(path: Path, notes: list[str]) -> Platform:
     return Platform(a, b, c, sigma, grade, prior, w, wander_time_s)
 
 
-def _grade(imu: Keys, notes: list[str], file: str) -> InertialGrade:
+def read_grade(imu: Keys, notes: list[str], file: str, default_grade: InertialGrade | None = None) -> InertialGrade:
+    """Noise of an inertial unit by its data sheet (table [imu]); what is absent is that of a default unit.
+
+    Parameters
+    ----------
+    imu : table of the file
+    notes : gets what was assumed
+    file : name for notes
+    default_grade : without one, that of a MEMS unit, with a note
+
+    Raises
+    ------
+    UserError : a value that no unit has
+    """
+    unit = MEMS if default_grade is None else default_grade
     deg, names = (
         np.pi / 180.0,
         ("gyro_noise_deg_sqrt_h", "gyro_bias_deg_h", "accel_noise_m_s_sqrt_h", "accel_bias_mgal"),
     )
     default = (
-        MEMS.gyro_noise / deg * 60.0,
-        MEMS.gyro_bias / deg * 3600.0,
-        MEMS.accel_noise * 60.0,
-        MEMS.accel_bias * 1e5,
+        unit.gyro_noise / deg * 60.0,
+        unit.gyro_bias / deg * 3600.0,
+        unit.accel_noise * 60.0,
+        unit.accel_bias * 1e5,
     )
     missing = [name for name in names if not imu.has(name)]
-    if missing:
-        notes.append(f"{file}: [imu] {', '.join(missing)} absent: those of a MEMS unit taken")
+    if missing and default_grade is None:
+        notes.append(f"{file}: [imu] {', '.join(missing)} absent: those of a MEMS unit are assumed")
     values = [imu.number(name, round(d, 9), positive=True) for name, d in zip(names, default, strict=True)]
     # biases of MEMS units wander within minutes, those of better ones within hours
     time_s = imu.number("bias_time_s", 600.0 if values[1] > 2.0 else 7200.0, positive=True)

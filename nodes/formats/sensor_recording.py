@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,28 +11,33 @@ from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas.topics import rank
-from ...solver.adjustment.block import Apriori
+from ...solver.adjustment.block_data import Apriori
+from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
-from ...solver.navigation.inertial_data import InertialData
-from ...solver.rotation import R_ENU_NED
+from ...solver.navigation.inertial_data import InertialData, InertialGrade
 from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..node import Message
 from .sensor_folder import SensorFolder, read_sensor_folder
 
 
-def sensor_messages(path: Path, notes: list[str], source: str = "import") -> Iterator[Message]:
+def sensor_messages(
+    path: Path, notes: list[str], source: str = "import", grade: InertialGrade | None = None
+) -> Iterator[Message]:
     """``configuration/project``, ``sensor/imu``, ``sensor/gnss`` and ``sensor/attitude``, sorted by stamp and rank.
 
-    Times in the files count from the Unix epoch. Increments become the rates and forces they are the integral of. The
-    noise of the inertial unit travels as the sigma of each sample; its biases and the initial attitude do not travel.
+    Times in the files count from the Unix epoch. Increments are divided by their interval. Each sample carries
+    the noise of the inertial unit as its sigma; messages have no field for its biases and the initial attitude.
+    ``grade`` takes the place of the unit in platform.toml.
 
     Raises
     ------
     UserError : ``file:line: column: what is wrong``, or nothing usable in the folder
     """
     folder = read_sensor_folder(path)
-    notes.extend(folder.notes)
+    if grade is not None:
+        folder = replace(folder, platform=replace(folder.platform, grade=grade))
+    notes.extend(note for note in folder.notes if grade is None or not note.startswith("platform.toml"))
     messages = [*_imu(folder, notes, source), *_gnss(folder, notes, source), *_attitude(folder, source)]
     if not messages:
         raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import UserError
 
-#: Numbers are read to the last bit; pandas 3 does so by itself.
+#: Numbers are read to the last bit, which is the default only since pandas 3.
 _EXACT: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
-#: How many problems of one file are looked for before giving up.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+#: The search for problems of a file ends after so many.
 MOST_PROBLEMS = 10
 
 
@@ -107,7 +109,7 @@ class Table:
     def line_of(self, row: int) -> int:
         """Line number in the file (from 1) of a row (from 0)."""
         with _open(self.path) as file:
-            for place, (line, _) in enumerate(_rows(file)):
+            for place, (line, _) in enumerate(_rows(file, separator_of(self.path))):
                 if place == row + 1:
                     return line
         return row + 2
@@ -129,6 +131,8 @@ def one_line(problems: Sequence[str], others: int = 0) -> str:
 def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_be_empty: bool = False) -> Table:
     """Read a CSV file with a header; columns in any order, unknown ones ignored with a note.
 
+    Values stand between commas, or between semicolons (then with decimal commas or points).
+
     Parameters
     ----------
     path : file
@@ -141,6 +145,7 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     UserError : ``file:line: column: what is wrong``, and how many more problems there are
     """
     header = _header(path, columns, notes)
+    separator, decimal = separator_of(path)
     known = {column.name: column for column in columns if column.name in header}
     try:
         frame = pd.read_csv(
@@ -152,18 +157,21 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             skipinitialspace=True,
             encoding="utf-8-sig",
             index_col=False,
+            sep=separator,
+            decimal=decimal,
             **_EXACT,
         )
-    except (ValueError, pd.errors.ParserError):  # not said where: look line by line
+    except (ValueError, pd.errors.ParserError):  # pandas does not say where, so every line is checked
         raise UserError(one_line(_problems(path, known) or [f"{path}: cannot be read as CSV"])) from None
-    if path.read_bytes().count(b",") != (len(header) - 1) * (len(frame) + 1):  # pandas cuts rows that are too long
+    # pandas ignores surplus fields of a row
+    if path.read_bytes().count(separator.encode()) != (len(header) - 1) * (len(frame) + 1):
         problems = _problems(path, known)
         if problems:
             raise UserError(one_line(problems))
     values: dict[str, NDArray[Any]] = {}
     for name, column in known.items():
         if column.kind == "text":
-            # few different names, many rows: clean the names, not the rows
+            # few different names in many rows: each name is cleaned once
             codes, names = pd.factorize(frame[name], use_na_sentinel=False)
             clean = np.array([str(word).strip() if isinstance(word, str) else "" for word in names], dtype=object)
             values[name] = clean[codes] if len(clean) else np.empty(0, dtype=object)
@@ -192,20 +200,39 @@ def _open(path: Path):
     return open(path, newline="", encoding="utf-8-sig", errors="replace")
 
 
-def _rows(file: Any):
-    """(line number, fields) of all lines that are not blank."""
-    reader = csv.reader(file, skipinitialspace=True)
-    for fields in reader:
+def separator_of(path: Path) -> tuple[str, str]:
+    """What stands between the values, a comma or a semicolon, and the decimal sign, by the first two lines.
+
+    A semicolon separates where the header has one and no comma; then a comma between digits is a decimal sign.
+    """
+    with _open(path) as file:
+        lines = [line for line in (file.readline(65536) for _ in range(8)) if line.strip()]
+    if not lines or ";" not in lines[0] or "," in lines[0]:
+        return ",", "."
+    return ";", "," if len(lines) > 1 and re.search(r"\d,\d", lines[1]) else "."
+
+
+def _rows(file: Any, separator: tuple[str, str]):
+    """(line number, fields) of all lines that are not blank; numbers with a decimal point."""
+    delimiter, decimal = separator
+    reader = csv.reader(file, skipinitialspace=True, delimiter=delimiter)
+    while True:
+        try:
+            fields = next(reader)
+        except StopIteration:
+            return
+        except csv.Error as error:
+            raise UserError(f"{file.name}:{max(reader.line_num, 1)}: not a text table ({error})") from None
         if fields and any(text.strip() for text in fields):
-            yield reader.line_num, [text.strip() for text in fields]
+            texts = [text.strip() for text in fields]
+            if decimal == ",":
+                texts = [text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text for text in texts]
+            yield reader.line_num, texts
 
 
 def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str]:
     with _open(path) as file:
-        try:
-            _, header = next(_rows(file), (0, []))
-        except csv.Error as error:
-            raise UserError(f"{path}:1: not a text table ({error})") from None
+        _, header = next(_rows(file, separator_of(path)), (0, []))
     if not header:
         raise UserError(f"{path}: empty, wanted a header with {_names(columns)}")
     if any("\0" in name or "\ufffd" in name for name in header):
@@ -215,7 +242,7 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
         raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
     missing = [column.name for column in columns if not column.optional and column.name not in header]
     if missing:
-        hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in ";\t ") else ""
+        hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
         raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{hint}")
     known = {column.name for column in columns}
     notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in header if name not in known)
@@ -230,7 +257,7 @@ def _problems(path: Path, known: Mapping[str, Column]) -> list[str]:
     """Look at every value; used once something is known to be wrong."""
     found: list[str] = []
     with _open(path) as file:
-        rows = _rows(file)
+        rows = _rows(file, separator_of(path))
         _, header = next(rows)
         place = {name: header.index(name) for name in known}
         for line, fields in rows:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
-from ...solver.earth import geodetic_from_ecef
+from ...solver.geometry.earth import geodetic_from_ecef
 from ..node import Message
 from .geocal_xml import TiePoints
 from .table import write_table
@@ -24,7 +24,7 @@ def strip_names(ties: TiePoints) -> tuple[str, ...]:
 
 
 def write_tie_points(path: Path, ties: TiePoints) -> int:
-    """Write the looks as ``image_points.csv`` of a block folder, with the approximate ground point beside."""
+    """Write the image points as ``image_points.csv`` of a block folder, each with its approximate ground point."""
     point, image = np.nonzero(np.isfinite(ties.line) & np.isfinite(ties.sample))
     names = np.array(strip_names(ties))
     lat, lon, height = _geodetic(ties).T

@@ -1,4 +1,4 @@
-"""A navigation solution of a platform, as position and attitude files give it, and its messages."""
+"""The trajectory of a platform from files of position and attitude, and its messages."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
-from ...solver.adjustment.block import Apriori
-from ...solver.earth import ecef_from_geodetic
-from ...solver.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from ...solver.gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps
-from ...solver.models.dgr import DgrOptions
-from ...solver.rotation import (
+from ...solver.adjustment.block_data import Apriori
+from ...solver.geometry.earth import ecef_from_geodetic
+from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
+from ...solver.geometry.rotation import (
     R_BC_NOMINAL,
     angles_from_matrix,
     matrix_from_navigation,
     quaternion_from_matrix,
 )
-from ...solver.trajectory import Trajectory
+from ...solver.geometry.trajectory import Trajectory
+from ...solver.models.dgr import DgrOptions
 from ..convert import pose_message
 from ..errors import UserError
 from ..node import Message
+from .gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps
 
 Array = NDArray[np.floating]
 
@@ -85,7 +85,7 @@ class NavigationTrack:
     rpy : (n, 3) roll, pitch, heading against true north, radians
     sigma_ned_m, sigma_rpy : (n, 3) or None; metres, radians
     line_rate_hz : image lines a second where each pose belongs to an image line, 0 otherwise
-    notes : what the reader wants said
+    notes : remarks of the reader
     """
 
     name: str
@@ -137,7 +137,7 @@ def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
 
 
 def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:
-    """The track with a note about positions that no aircraft can take: a step off the velocity before it."""
+    """The track with a note about steps of the position that no aircraft can fly, given the velocity before them."""
     lat, lon, height = track.geodetic.T
     position = ecef_from_geodetic(np.radians(lat), np.radians(lon), height)
     step_s = np.diff(track.time_ns) * 1e-9
@@ -156,7 +156,7 @@ def times_from_gps(
 ) -> NDArray[np.int64]:
     """UTC nanoseconds of GPS seconds of the week (or of the day), given the day of the flight.
 
-    Without a day the times count from the start of GPS time, which is noted.
+    Without a day the times count from the start of GPS time, and a note says so.
 
     Raises
     ------
@@ -218,8 +218,8 @@ def track_messages(
 ) -> Iterator[Message]:
     """The track as ``configuration/project``, ``configuration/strip`` (of line-by-line poses), ``trajectory/smoothed``.
 
-    A pose is stamped with the time it is valid for. Errors of such trajectories are slow, so the accuracy of the poses
-    stands in the project too, as a-priori sigma of offset and shift, and, for the drift, once more.
+    A pose is stamped with the time it is valid for. Errors of such trajectories change slowly, so the project states
+    the accuracy of the poses, too: as a-priori sigma of offset and shift, and of the drift.
     """
     frame = frame_of(track) if frame is None else frame
     start = int(track.time_ns[0])

@@ -2,61 +2,153 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 
-from ...solver.frames import CrsError, LocalFrame, navigation_from_R_lc
-from ...solver.rotation import matrix_from_angles
+from ...solver.geometry.frames import CrsError, LocalFrame, navigation_from_R_lc
+from ...solver.geometry.rotation import matrix_from_angles
 from ..errors import UserError
-from .table import Column, Table, read_table
+from .plausible import check_units
+from .table import Column, Table, read_table, separator_of
+from .time_columns import WANTED, time_columns, times_of
 from .track import NavigationTrack, checked
 
+#: Quantity -> how files call it, without unit.
+_NAMES = {
+    "lat": ("lat", "latitude"),
+    "lon": ("lon", "lng", "long", "longitude"),
+    "height": ("height", "ellipsoidal_height", "h_ell", "alt", "altitude"),
+    "roll": ("roll",),
+    "pitch": ("pitch",),
+    "heading": ("heading", "true_heading", "yaw"),
+}
 _NAVIGATION = ("lat_deg", "lon_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
 _PHOTOGRAMMETRIC = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+_NED = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
+_RPY = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
+_UNITS = {"deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad", "m": "m"}
 
 
 def is_trajectory_csv(path: Path) -> bool:
     """Whether the header of a CSV file has the columns of a trajectory."""
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        names = {name.strip() for name in file.readline(4096).split(",")}
-    return "time_s" in names and (set(_NAVIGATION) <= names or set(_PHOTOGRAMMETRIC) <= names)
+    names = _header(path)
+    if not time_columns(names):
+        return False
+    return set(_PHOTOGRAMMETRIC) <= set(names) or {"lat", "lon", "roll"} <= {_quantity(name)[0] for name in names}
 
 
-def read_trajectory_csv(path: Path, crs: str | None = None) -> NavigationTrack:
-    """Poses with ``time_s`` in seconds since the Unix epoch (UTC), or since any other start, which then stands for it.
+def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = None) -> NavigationTrack:
+    """Poses with a time that `time_columns` knows; ``time_s`` from another start than 1970 is taken as it is.
 
-    Columns are ``time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg`` with optional sigmas as ``triline
-    navigate`` writes them (``lat_deg_sigma`` in metres ...), or ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in
-    the CRS given.
+    Columns are ``lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg`` (or ``lat_rad``, ``Roll [rad]``: names state
+    the unit) with optional sigmas as ``triline navigate`` writes them, or ``X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg``
+    in the CRS given.
+
+    Parameters
+    ----------
+    path : file
+    crs : of X_m, Y_m, Z_m
+    day : of the flight; needed for GPS seconds of the week without a week, compared with all others
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``, angles that cannot be in the unit that the header states
+    """
+    notes: list[str] = []
+    header = _header(path)
+    time = time_columns(header)
+    if not time:
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
+    photogrammetric = set(_PHOTOGRAMMETRIC) <= set(header)
+    names = {} if photogrammetric else _columns(path, header)
+    wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(names.values())
+    columns = [*time, *(Column(name) for name in wanted)]
+    sigmas = (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
+    columns += [Column(name, low=0.0) for name in sigmas if name in header]
+    table = read_table(path, columns, notes)
+    time_ns = times_of(table, time, day, notes)
+    late = np.concatenate([[False], np.diff(time_ns) <= 0])
+    seconds = time_ns * 1e-9
+    shown = (lambda i: table["time_s"][i]) if "time_s" in table else (lambda i: seconds[i])
+    table.refuse(late, time[0].name, lambda i: f"{shown(i):.6f} does not come after {shown(i - 1):.6f}")
+    if photogrammetric:
+        geodetic, rpy = _from_crs(path, table, crs)
+        sigma_m = sigma_rpy = None
+    else:
+        geodetic = np.column_stack([_in_degrees(table, names[q]) for q in ("lat", "lon", "height")])
+        rpy = np.radians(np.column_stack([_in_degrees(table, names[q]) for q in ("roll", "pitch", "heading")]))
+        given = all(name in table for name in sigmas)
+        sigma_m = table.stack(*sigmas[:3]) if given else None
+        sigma_rpy = np.radians(table.stack(*sigmas[3:])) if given else None
+    track = NavigationTrack(path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes))
+    return check_units(checked(track, path), path, names)
+
+
+def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Perspective centres (n, 3), rotations image to local (n, 3, 3) and UTC (n,) in ns, in time order.
+
+    Of a table ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in the local frame.
 
     Raises
     ------
     UserError : ``file:line: column: what is wrong``
     """
     notes: list[str] = []
+    time = time_columns(_header(path))
+    if not time:
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
+    table = read_table(path, [*time, *(Column(name) for name in _PHOTOGRAMMETRIC)], notes)
+    time_ns, first = np.unique(times_of(table, time, None, notes), return_index=True)
+    if len(time_ns) < 2:
+        raise UserError(f"{path}: {len(time_ns)} poses, wanted at least 2")
+    R = matrix_from_angles(*np.radians(table.stack(*_PHOTOGRAMMETRIC[3:])).T)
+    return table.stack(*_PHOTOGRAMMETRIC[:3])[first], R[first], time_ns
+
+
+def _header(path: Path) -> list[str]:
     with open(path, encoding="utf-8-sig", errors="replace") as file:
-        header = {name.strip() for name in file.readline(4096).split(",")}
-    photogrammetric = set(_PHOTOGRAMMETRIC) <= header
-    wanted = _PHOTOGRAMMETRIC if photogrammetric else _NAVIGATION
-    sigmas = tuple(f"{name}_sigma" for name in wanted)
-    columns = [Column("time_s"), *(Column(name) for name in wanted)]
-    columns += [Column(name, optional=True, low=0.0) for name in sigmas]
-    table = read_table(path, columns, notes)
-    time = table["time_s"]
-    late = np.concatenate([[False], np.diff(time) <= 0])
-    table.refuse(late, "time_s", lambda i: f"{time[i]:.6f} does not come after {time[i - 1]:.6f}")
-    time_ns = np.rint(time).astype(np.int64) * 1_000_000_000 + np.rint((time - np.rint(time)) * 1e9).astype(np.int64)
-    if photogrammetric:
-        geodetic, rpy = _from_crs(path, table, crs)
-        sigma_m = sigma_rpy = None
-    else:
-        geodetic = table.stack(*_NAVIGATION[:3])
-        rpy = np.radians(table.stack(*_NAVIGATION[3:]))
-        given = all(name in table for name in sigmas)
-        sigma_m = table.stack(*sigmas[:3]) if given else None
-        sigma_rpy = np.radians(table.stack(*sigmas[3:])) if given else None
-    return checked(NavigationTrack(path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes)), path)
+        return [name.strip() for name in file.readline(4096).split(separator_of(path)[0])]
+
+
+def _quantity(name: str) -> tuple[str, str]:
+    """Quantity and unit of a column name such as ``lat_deg``, ``Roll [rad]``, ``Altitude (m)``; "" if not known."""
+    plain = re.sub(r"[\s\[\]()]+", "_", name.strip().lower()).strip("_")
+    base, _, end = plain.rpartition("_")
+    unit = _UNITS.get(end, "")
+    base = base if unit else plain
+    return next((quantity for quantity, known in _NAMES.items() if base in known), ""), unit
+
+
+def _columns(path: Path, header: Sequence[str]) -> dict[str, str]:
+    """Quantity -> column; every one with its unit."""
+    found: dict[str, str] = {}
+    for name in header:
+        quantity, unit = _quantity(name)
+        if not quantity:
+            continue
+        if quantity in found:
+            raise UserError(f"{path}:1: {name}: {quantity} comes twice, also as {found[quantity]}")
+        right = ("m",) if quantity == "height" else ("deg", "rad")
+        if unit not in right:
+            stated = " or ".join(f"{quantity}_{u}" for u in right)
+            raise UserError(f"{path}:1: {name}: the unit is not stated, wanted {stated}")
+        found[quantity] = name
+    for quantity, wanted in zip(_NAMES, _NAVIGATION, strict=True):
+        if quantity not in found:
+            raise UserError(f"{path}:1: {wanted}: column missing, wanted {','.join(_NAVIGATION)}")
+    return found
+
+
+def _in_degrees(table: Table, name: str) -> np.ndarray:
+    if _quantity(name)[1] != "rad":
+        return table[name]
+    values = table[name]
+    table.refuse(np.abs(values) > 2 * np.pi + 1e-3, name, lambda i: f"{values[i]:g}, wanted radians; are they degrees?")
+    return np.degrees(values)
 
 
 def _from_crs(path: Path, table: Table, crs: str | None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The accuracy of a flight as a few lines of text, for the ends of commands."""
+"""The accuracy of a flight as a few lines of text, which commands print at their end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _ORIENTATIONS = {
     "final": "on-line, final",
     "whole": "after the strips",
 }
-#: Points as they were published; without any, those intersected with the final orientation.
+#: Rows of points as they were published; a recording without them shows those intersected with the final orientation.
 _POINTS = {
     "direct_georeferencing": "direct georeferencing",
     "adjusted_live": "adjusted on-line, at once",
@@ -27,8 +27,8 @@ _NOTE = "sigma: root mean of the stated variances; NEES: squared errors over sta
 def accuracy_lines(result: dict[str, Any]) -> list[str]:
     """RMSE against truth of an evaluation (`evaluation.evaluate_flight`), with n and stated sigmas.
 
-    The lines have 100 columns at most. Points are compared with check points where no truth is recorded; no lines where
-    there is neither, but of what is missing of the flight.
+    The lines have 100 columns at most. Points are compared with check points where no truth is recorded. Where there is
+    neither, only strips that were not flown to their end are named.
     """
     orientation, points = result["orientation"], result["points"] or result["check"]
     if not orientation and not points:
@@ -37,7 +37,7 @@ def accuracy_lines(result: dict[str, Any]) -> list[str]:
     lines = [f"{'RMSE against ' + against:<28}{_HEAD}   omega     phi   kappa        NEES"]
     if orientation:
         lines.append("exterior orientation")
-    # the smoothed trajectory says something of its own only where nothing else was measured
+    # the smoothed trajectory is shown only where there is no filtered one
     shown = [
         name for name in _ORIENTATIONS if name in orientation and (name != "smoothed" or "filtered" not in orientation)
     ]
@@ -73,7 +73,7 @@ def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
 
 
 def early_lines(result: dict[str, Any]) -> list[str]:
-    """What was planned and is not in the recording, a line each strip."""
+    """A line for each strip that was planned longer than it was recorded."""
     what = "the recording is cut off" if result.get("damage") else "flight ended early"
     return [
         f"{what}: strip {s['strip']} after {s['flown_s']:.1f} s of {s['planned_s']:.1f} s planned"

@@ -9,15 +9,15 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from ..adjustment_result import PLOTS, Adjustment, set_name
-from ..adjustment_tables import correction_functions
+from ..batch.adjustment_result import PLOTS, Adjustment, set_name
+from ..batch.adjustment_tables import correction_functions
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 Array = NDArray[np.floating]
 
-#: Image points drawn at most in a frame; more would be a carpet.
+#: Image points drawn at most in a frame; arrows of more would cover each other.
 MOST_ARROWS = 150
 
 _BLUE, _RED, _GREY, _GREEN = "#2b5d8a", "#c0392b", "#9aa5b1", "#3a7d44"
@@ -59,7 +59,7 @@ def draw_residuals(adjustment: Adjustment) -> Any:
             every = max(1, -(-len(used) // MOST_ARROWS))
             drawn = used[::every]
             pixels = network.camera.lines[k].pixels
-            # both residuals in the same scale on paper: one rms is 1/25 of the picture's width
+            # both components in the same scale: an arrow of one rms is 1/25 of the picture's width
             axis.quiver(
                 rays.line[drawn], rays.sample[drawn], s.v_px[drawn, 0], s.v_px[drawn, 1], color=_BLUE, width=0.003,
                 scale=25 * rms, scale_units="width", angles="uv",

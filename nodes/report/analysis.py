@@ -1,4 +1,4 @@
-"""The analysis of a recording: everything a report says, as numbers."""
+"""The analysis of a recording: all numbers that a report shows."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from statistics import median
 from typing import Any
 
 from ...schemas import topics
-from ...solver.window.determinability import ESTIMATED
+from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
-from ..recording_summary import Holdings, TopicSummary
+from ..recording.summary import Holdings, TopicSummary
 from .evaluation import evaluate_flight
 from .flight import Flight, updates_with_new_rays
 from .integrity import integrity
@@ -25,15 +25,15 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
 
     Parameters
     ----------
-    flight : what its messages say
-    held : what the recording holds, see `recording_summary.holdings`
+    flight : the contents of its messages
+    held : counts and times of what the recording holds, see `recording.summary.holdings`
 
     Returns
     -------
     the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
     ``damage`` (one line each), ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status),
     ``parameters`` (of the newest report that has any), ``rejected_observations`` (the largest first), ``latency_s``
-    (median, max), ``integrity`` (see `integrity.integrity`; absent where nothing is said of it), ``events``
+    (median, max), ``integrity`` (see `integrity.integrity`; absent where no report has a light), ``events``
     """
     result = {"recording": _recording(flight, held), "damage": held.damage, **evaluate_flight(flight)}
     result["topics"] = {
@@ -66,7 +66,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
 
 
 def _unusable(flight: Flight, row: TopicSummary) -> int | None:
-    """Messages of a topic that could not be decoded or hold no usable value; None where nobody looked."""
+    """Messages of a topic that could not be decoded or hold no usable value; None for topics that are not decoded."""
     try:
         looked_at = topics.find(row.topic).name in WANTED
     except KeyError:
@@ -109,8 +109,10 @@ def _parameter(p: Any, since_s: float | None) -> dict[str, Any]:
 
 
 def _estimated_since(flight: Flight) -> dict[str, float]:
-    """From which time of the flight on every parameter has been estimated until the end, s; those that are not are not
-    there."""
+    """Time in the flight, s, from which on each parameter was estimated until the end, by name.
+
+    Parameters that were not estimated at the end are absent.
+    """
     since: dict[str, float] = {}
     over: set[str] = set()
     for stamp, report in reversed(flight.reports):
@@ -132,7 +134,7 @@ def _level(log: Any) -> str:
 
 
 def finite(value: Any) -> Any:
-    """The same with None in place of numbers that JSON does not know."""
+    """The same with None in place of infinite numbers and NaN, which JSON does not have."""
     if isinstance(value, dict):
         return {key: finite(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.accuracy import Accuracy, accuracy, angle_difference
-from ...solver.frames import R_lc_from_navigation, opk_covariance_from_navigation
-from ...solver.rotation import matrix_from_navigation, quaternion_from_matrix
-from ...solver.space_intersection import ImageRays, Intersection, intersect
-from ...solver.trajectory import Trajectory
+from ...solver.geometry.frames import R_lc_from_navigation, opk_covariance_from_navigation
+from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_matrix
+from ...solver.geometry.space_intersection import ImageRays, Intersection, intersect
+from ...solver.geometry.trajectory import Trajectory
 from .. import convert
-from .flight import Flight, Poses, collect, rejected_key
+from .flight import Flight, PoseSeries, collect, in_gap, rejected_key
 
 Array = NDArray[np.floating]
 
@@ -22,10 +22,10 @@ Array = NDArray[np.floating]
 ORIENTATIONS = ("measured", "filtered", "smoothed", "live", "final", "whole")
 #: Points are intersected with these orientations; "" stands for the trajectory before triangulation.
 INTERSECTED = {"direct_georeferencing": "", "live": "live", "final": "final"}
-#: What a flight is judged by: the points as published; where none were, those intersected with the final orientation.
+#: Rows that the accuracy of a flight is taken from: points as published, else intersected with the final orientation.
 TRIANGULATED = ("adjusted", "final")
 _LARGEST_GAP_S = 1.0
-_EARLY_S = 1.0  # a strip that lacks less than this was flown to its end
+_EARLY_S = 1.0  # a strip that is shorter than planned by less than this was flown to its end
 _IMAGE_SIGMA_PX = 0.3  # where the project names none
 
 
@@ -76,7 +76,7 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     shared = _shared(rows)
     check, control = _given(flight, "check"), _given(flight, "control")
     given = {id for id, g in flight.ground.items() if convert.role_of(g) != "check"}
-    truth = {id: xyz for id, xyz in flight.truth_points.items() if id not in given}  # what was put in is no result
+    truth = {id: xyz for id, xyz in flight.truth_points.items() if id not in given}  # given coordinates are no result
     for target, known in (("points", truth), ("check", check), ("control", control)):
         known = {id: xyz for id, xyz in known.items() if shared is None or id in shared}
         for name, (ids, xyz, covariance) in rows.items():
@@ -90,21 +90,21 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
 
 
 def _shared(rows: dict[str, tuple[list[str], Array, Array]]) -> set[str] | None:
-    """Points by direct georeferencing and by triangulation, so that rows compare like with like; None without both."""
+    """Names of the points that both direct georeferencing and triangulation gave; None where one of them gave none."""
     if "direct_georeferencing" not in rows or "adjusted" not in rows:
         return None
     return set(rows["direct_georeferencing"][0]) & set(rows["adjusted"][0])
 
 
 def triangulated(rows: dict[str, Any]) -> str | None:
-    """The row of points that a flight is judged by, see TRIANGULATED; None where there is none."""
+    """The row of points that the accuracy of a flight is taken from, see TRIANGULATED; None where there is none."""
     return next((name for name in TRIANGULATED if name in rows), None)
 
 
 def ended_early(flight: Flight) -> list[dict[str, Any]]:
-    """Strips that were planned longer than the recording goes; a strip that ended says how long it became."""
+    """Strips whose planned end lies after that of the recording; for a strip that was ended its true length counts."""
     measured = [convert.time_ns(g.timestamp) for g in flight.gnss[-1:]] + [a.time_ns for a in flight.attitude[-1:]]
-    end_ns = max(measured, default=flight.end_ns)  # results come later
+    end_ns = max(measured, default=flight.end_ns)  # the end of the measurements, because results come after it
     found = []
     for id, strip in flight.strips.items():
         span = flight.strip_times(id)
@@ -136,7 +136,7 @@ def _totals(flight: Flight) -> dict[str, Any]:
 
 
 def missing(flight: Flight) -> list[str]:
-    """What a full evaluation needs and the recording does not hold."""
+    """Topics that a full evaluation needs and the recording does not hold, a line each."""
     wanted = [
         (flight.project is not None, "configuration/project"),
         (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
@@ -148,11 +148,17 @@ def missing(flight: Flight) -> list[str]:
         (bool(flight.points), "point/object"),
         (bool(_given(flight, "check")), "check points (observation/control with role check)"),
     ]
-    return [text for there, text in wanted if not there]
+    gaps = flight.poses["truth"].gaps() if "truth" in flight.poses else []
+    told = [
+        f"truth/trajectory from {(a - flight.start_ns) / convert.SECOND_NS:.1f} to "
+        f"{(b - flight.start_ns) / convert.SECOND_NS:.1f} s: nothing is compared there"
+        for a, b in gaps
+    ]
+    return [text for there, text in wanted if not there] + told
 
 
-def measured_poses(flight: Flight) -> Poses | None:
-    """Orientation straight from the sensors: INS attitude, GNSS positions interpolated and freed from the lever arm."""
+def measured_poses(flight: Flight) -> PoseSeries | None:
+    """Orientation from the sensors alone: INS attitude, GNSS positions interpolated and reduced by the lever arm."""
     if flight.project is None or len(flight.gnss) < 2 or not flight.attitude:
         return None
     frame = convert.local_frame(flight.project)
@@ -163,6 +169,7 @@ def measured_poses(flight: Flight) -> Poses | None:
     variance = np.array([_diagonal3(fixes[t].position_covariance) for t in fix_ns])
     attitude = {a.time_ns: a for a in flight.attitude if fix_ns[0] <= a.time_ns <= fix_ns[-1]}
     time = np.array(sorted(attitude), dtype=np.int64)
+    time = time[~in_gap(fix_ns, time)]
     if len(time) < 2:
         return None
     step = max(1, round(0.05 * convert.SECOND_NS / float(np.median(np.diff(time)))))
@@ -182,14 +189,14 @@ def measured_poses(flight: Flight) -> Poses | None:
     q = quaternion_from_matrix(R_lc)
     none6 = np.full((len(time), 6), np.nan)
     everywhere = np.ones(len(time), dtype=bool)
-    return Poses(time, position, q, convert.angles_of(q), covariance, none6, everywhere, np.full(len(time), ""))
+    return PoseSeries(time, position, q, convert.angles_of(q), covariance, none6, everywhere, np.full(len(time), ""))
 
 
 def _diagonal3(values: Any) -> Array:
     return np.array(values).reshape(3, 3).diagonal() if len(values) == 9 else np.full(3, np.nan)
 
 
-def _compared(flight: Flight) -> dict[str, Poses]:
+def _compared(flight: Flight) -> dict[str, PoseSeries]:
     """Samples on strips, in the time that the final orientation and the truth cover, by name; valid or not."""
     truth = flight.poses.get("truth")
     if truth is None or len(truth) < 2:
@@ -204,13 +211,14 @@ def _compared(flight: Flight) -> dict[str, Poses]:
     for name in (n for n in ORIENTATIONS if n in all_poses):
         t = all_poses[name].time_ns
         use = flight.during_strips(t) & (t >= span[0]) & (t <= span[-1]) & true_path.covers(flight.seconds(t))
+        use &= truth.known_at(t)  # a recorder that stood still leaves gaps, and nobody knows what was in them
         if use.any():
             result[name] = all_poses[name].take(use)
     return result
 
 
 def poses_left_out(flight: Flight) -> dict[str, int]:
-    """How many poses say of themselves that they are not valid, and so are not compared with truth; by name."""
+    """Number of poses that are marked as not valid and so are not compared with truth, by name."""
     counts = {name: int((~poses.valid).sum()) for name, poses in _compared(flight).items()}
     return {name: n for name, n in counts.items() if n}
 
@@ -218,7 +226,7 @@ def poses_left_out(flight: Flight) -> dict[str, int]:
 def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Array, Array]]:
     """Time (n,), error estimate minus truth (n, 6) in m and rad, and stated covariance (n, 6, 6), by name.
 
-    Valid samples on strips, in the time the final orientation covers, so that rows compare like with like.
+    Valid samples on strips, in the time the final orientation covers, so that all rows are of the same times.
     """
     result = {}
     compared = _compared(flight)
@@ -312,7 +320,7 @@ def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array
     nearest = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
     if poses is filtered:
         return np.zeros((len(time_s), 6)), filtered.covariance[nearest]
-    base = flight.poses.get("smoothed", filtered)  # the less noisy one: what is interpolated has to be smooth
+    base = flight.poses.get("smoothed", filtered)  # the less noisy trajectory, because it is interpolated
     values = _difference(poses, base, flight.start_ns)
     correction = np.stack([np.interp(time_s, t, values[:, i], np.nan, np.nan) for i in range(6)], axis=1)
     if base is not filtered:
@@ -327,7 +335,7 @@ def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array
     return correction, poses.covariance[nearest]
 
 
-def corrections_of(flight: Flight, poses: Poses) -> Array:
+def corrections_of(flight: Flight, poses: PoseSeries) -> Array:
     """Correction functions dX, dY, dZ, domega, dphi, dkappa (n, 6): as published, else orientation minus filtered."""
     filtered = flight.poses.get(flight.measured)
     bare = np.atleast_1d(~np.isfinite(poses.correction).all(axis=1))
@@ -336,7 +344,7 @@ def corrections_of(flight: Flight, poses: Poses) -> Array:
     return np.where(bare.reshape(-1, 1), _difference(poses, filtered, flight.start_ns), poses.correction)
 
 
-def _difference(poses: Poses, base: Poses, start_ns: int) -> Array:
+def _difference(poses: PoseSeries, base: PoseSeries, start_ns: int) -> Array:
     """Position and angles minus those of a base at the same times (n, 6); NaN where the base has none."""
     path: Trajectory = base.trajectory(start_ns)
     t = (poses.time_ns - start_ns) / convert.SECOND_NS

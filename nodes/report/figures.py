@@ -14,7 +14,7 @@ from scipy.stats import chi2, norm
 from ...solver.accuracy import angle_difference
 from .. import convert
 from .evaluation import corrections_of, orientation_errors
-from .flight import Flight, Key, Look, Poses, rejected_key, updates_with_new_rays
+from .flight import Flight, Key, Look, PoseSeries, rejected_key, updates_with_new_rays
 from .strip_time import StripTime
 from .style import CCDS, CHECK, CONTROL, FILTERED, FINAL, LIVE, REJECTED, TIE, TRUTH, figure, scale_note
 
@@ -25,12 +25,12 @@ SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 MDEG = 1000.0 * float(np.degrees(1.0))
 SCALE = np.array([1.0, 1.0, 1.0, MDEG, MDEG, MDEG])
 _TELLING = 30  # redundancy from which sigma0 is shown
-_MOST_ARROWS = 300  # residuals of a CCD line that are drawn; more would be a carpet
+_MOST_ARROWS = 300  # residuals of a CCD line that are drawn; arrows of more would cover each other
 _SIGMAS = 3.0
 
 
 def trajectory_map(flight: Flight) -> Figure | None:
-    """Strips, ground points by status, and what the adjustment left at control and check points."""
+    """Strips, ground points by status, and adjusted minus given coordinates of control and check points."""
     poses = flight.poses.get(flight.measured) or flight.poses.get("final") or flight.poses.get("truth")
     if poses is None:
         return None
@@ -40,7 +40,7 @@ def trajectory_map(flight: Flight) -> Figure | None:
         if len(drawn):
             low, high = np.minimum(low, drawn.min(axis=0)), np.maximum(high, drawn.max(axis=0))
     extent = np.maximum(high - low, 1.0)[:2]
-    turned = extent[1] > 1.15 * extent[0]  # a flight to the north lies on its side, so that it fills the page
+    turned = extent[1] > 1.15 * extent[0]  # north is drawn to the right, to fill the page
     fig = figure(float(np.clip(1.45 + 8.6 * min(extent) / max(extent), 2.3, 7.5)))
     ax = fig.add_subplot()
     ax.set_aspect("equal", anchor="N")
@@ -73,7 +73,7 @@ def trajectory_map(flight: Flight) -> Figure | None:
     return fig
 
 
-def _strips(ax: Axes, flight: Flight, poses: Poses, place: Any) -> None:
+def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
     for k, id in enumerate(flight.strips):
         span = flight.strip_times(id)
         if span is None:
@@ -149,7 +149,7 @@ def residuals_by_ccd(flight: Flight) -> dict[str, Array]:
 
 
 def _ray_key(point: str, residual: Any) -> Key:
-    """As `rejected_key`, of a residual of a point."""
+    """The key of `rejected_key` for a residual of a point."""
     r = residual
     return Look(point, r.strip, r.ccd, r.line, r.sample, 0.0, 0.0).key
 
@@ -272,7 +272,7 @@ def correction_functions(flight: Flight) -> Figure | None:
         curves.insert(0, ("live", flight.seconds(live.time_ns), corrections_of(flight, live) * SCALE, LIVE, 0.9))
     if truth is not None and len(truth) >= 2:
         path = truth.trajectory(flight.start_ns)
-        known = path.covers(t)
+        known = path.covers(t) & truth.known_at(final.time_ns)
         true = path.at(t[known])
         error = np.hstack(
             [final.position_l[known] - true.position_l, angle_difference(final.angles[known], true.angles)]

@@ -1,4 +1,4 @@
-"""A flight as arrays: what a recording says about orientation, points, residuals and the adjustment's progress."""
+"""A flight as arrays: orientation, points, residuals and the progress of the adjustment, from a recording."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
-from ...solver.camera import LineCamera
-from ...solver.trajectory import Trajectory
+from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.trajectory import Trajectory
 from .. import convert
 from ..node import Message
 
@@ -31,8 +31,29 @@ POSE_TOPICS = {
 }
 
 
+#: Between samples that are further apart nothing is interpolated: s, and times the usual step (both have to be passed).
+LARGEST_STEP_S, LARGEST_STEPS = 0.5, 5.0
+
+
+def largest_step_ns(time_ns: NDArray[np.int64]) -> float:
+    """From where on a step between samples is a gap."""
+    usual = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else 0.0
+    return max(LARGEST_STEP_S * SECOND_NS, LARGEST_STEPS * usual)
+
+
+def in_gap(known_ns: NDArray[np.int64], time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether times (n,) lie in a gap of ascending times (k,), or outside of them."""
+    if len(known_ns) < 2:
+        return np.ones(len(time_ns), dtype=bool)
+    after = np.searchsorted(known_ns, time_ns)
+    outside = (time_ns < known_ns[0]) | (time_ns > known_ns[-1])
+    after = np.clip(after, 1, len(known_ns) - 1)
+    far = known_ns[after] - known_ns[after - 1] > largest_step_ns(known_ns)
+    return outside | (far & (time_ns != known_ns[after]) & (time_ns != known_ns[after - 1]))
+
+
 @dataclass(frozen=True)
-class Poses:
+class PoseSeries:
     """Orientation over time, in order of time; n samples.
 
     Attributes
@@ -56,9 +77,18 @@ class Poses:
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def take(self, which: Any) -> Poses:
+    def take(self, which: Any) -> PoseSeries:
         """A selection by index or mask."""
-        return Poses(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return PoseSeries(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    def known_at(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether times (n,) lie between neighbours of this series and not in a gap of it."""
+        return ~in_gap(self.time_ns, time_ns)
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Gaps of the series, each from and to, ns."""
+        k = np.flatnonzero(np.diff(self.time_ns) > largest_step_ns(self.time_ns))
+        return [(int(self.time_ns[i]), int(self.time_ns[i + 1])) for i in k]
 
     def trajectory(self, start_ns: int) -> Trajectory:
         """Interpolator over seconds since ``start_ns``; raises ValueError for fewer than two samples."""
@@ -79,7 +109,7 @@ class Look:
 
     @property
     def key(self) -> Key:
-        """What names it in a list of rejected observations."""
+        """The key by which a list of rejected observations names it."""
         return _key(self)
 
 
@@ -96,7 +126,7 @@ class Flight:
         each object point
     ground : control and check points by id; truth_points : true coordinates by id
     reports : adjustment reports in order; rejected : the rejected observations they name, once each, without those
-        that were taken back
+        that were accepted again later
     counts : messages taken in, by topic; refused : messages that hold no usable value
     status : newest status of each node
     """
@@ -106,7 +136,7 @@ class Flight:
     project: Any = None
     camera: LineCamera | None = None
     strips: dict[str, Any] = field(default_factory=dict)
-    poses: dict[str, Poses] = field(default_factory=dict)
+    poses: dict[str, PoseSeries] = field(default_factory=dict)
     gnss: list[Any] = field(default_factory=list)
     attitude: list[Any] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
@@ -151,7 +181,7 @@ class Flight:
 
 
 def collect(messages: Iterable[Message]) -> Flight:
-    """Read the messages of a recording once; what cannot be used is counted, never raised."""
+    """Read the messages of a recording once; messages that cannot be used are counted and raise no error."""
     flight = Flight()
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
@@ -182,7 +212,7 @@ def collect(messages: Iterable[Message]) -> Flight:
 
 
 def updates_with_new_rays(reports: Iterable[Any]) -> list[bool]:
-    """Which adjustment reports answer rays that the one before had not seen; between strips there are none."""
+    """Which adjustment reports contain rays that the one before did not; between strips there are none."""
     newest, new = 0, []
     for r in reports:
         new.append(r.rays > 0 and r.window_end_ns > newest)
@@ -191,12 +221,12 @@ def updates_with_new_rays(reports: Iterable[Any]) -> list[bool]:
 
 
 def rejected_key(r: Any) -> Key:
-    """What names a rejected observation; the same as `Look.key` of the measurement."""
+    """The key of a rejected observation; the same as `Look.key` of the measurement."""
     return _key(r)
 
 
 def _key(r: Any) -> Key:
-    """Ids, and line and sample to a hundredth of a pixel, (0, 0) where they are not finite; a coordinate of control."""
+    """Ids; line and sample in hundredths of a pixel, (0, 0) where they are not finite; the coordinate of control."""
     line, sample = (round(100 * v) if np.isfinite(v) else 0 for v in (r.line, r.sample))
     return r.point, r.strip, r.ccd, line, sample, getattr(r, "coordinate", "")
 
@@ -255,7 +285,7 @@ def _finite(body: Any, *values: float) -> Any:
     return body
 
 
-def _poses(samples: list[convert.PoseSample], keep_first: bool) -> Poses:
+def _poses(samples: list[convert.PoseSample], keep_first: bool) -> PoseSeries:
     """Samples in order of time; of two at the same time the first or the last is kept."""
     time = np.array([s.time_ns for s in samples], dtype=np.int64)
     ordered = samples if keep_first else samples[::-1]
@@ -263,7 +293,7 @@ def _poses(samples: list[convert.PoseSample], keep_first: bool) -> Poses:
     kept = [ordered[i] for i in index]
     none6, none66 = np.full(6, np.nan), np.full((6, 6), np.nan)
     quaternion = np.array([s.quaternion for s in kept])
-    return Poses(
+    return PoseSeries(
         np.array([s.time_ns for s in kept], dtype=np.int64),
         np.array([s.position_l for s in kept]),
         quaternion,

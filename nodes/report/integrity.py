@@ -24,8 +24,8 @@ _COLORS = {"good": "#dff1e5", "weak": "#fdebc8", "failed": "#f9d2cd"}
 _SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 _MDEG = 1000.0 * float(np.degrees(1.0))
 _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
-_LONGEST_S = 6.0  # a report speaks for no longer than this
-_NEAR_S = 0.3  # an error is compared with the protection level of a report that is so near in time
+_LONGEST_S = 6.0  # a report counts for no longer than this
+_NEAR_S = 0.3  # largest distance in time between an error and the protection level it is compared with
 _NUMBER = re.compile(r"[+-]?\b\d+(\.\d+)?\b")
 
 
@@ -37,8 +37,8 @@ def integrity(flight: Flight) -> dict[str, Any] | None:
     dict with
 
     - ``seconds``: time on strips; ``share``: of "good", "weak" and "failed", 0 to 1;
-    - ``reasons``: ``light, reason, seconds, times`` (how often it came up), the longest first; reasons that differ in
-      their numbers only are one, told with the numbers of the first;
+    - ``reasons``: ``light, reason, seconds, times`` (how often it began), the longest first; reasons that differ in
+      their numbers only count as one, with the numbers of the first;
     - ``protection_m``, ``sigma_m`` (X, Y, Z), ``protection_deg``, ``sigma_deg`` (omega, phi, kappa): medians;
     - ``alert_limit_m`` and ``ground_m`` (worst protection level on the ground), medians, and ``below_limit``, the share
       of the reports in which it is below;
@@ -81,7 +81,7 @@ def _lit(flight: Flight) -> list[tuple[int, Any]]:
 
 
 def _lasting(all_ns: list[int], lit_ns: list[int]) -> list[float]:
-    """How long each report speaks: until the next one, s."""
+    """Time until the next report, s, for each report with a light."""
     following = dict(pairwise(all_ns))
     return [min((following.get(ns, ns) - ns) / convert.SECOND_NS, _LONGEST_S) for ns in lit_ns]
 
@@ -137,7 +137,7 @@ def _sources(flight: Flight, lit: list[tuple[int, Any]], lasting: list[float]) -
 
 
 def protection_figure(flight: Flight) -> Figure | None:
-    """Protection level and sigma of the newest orientation, its error where there is truth, and the light behind."""
+    """Protection level and sigma of the newest orientation, its error where there is truth; the light as background."""
     found = levels(flight)
     if found is None:
         return None
@@ -172,12 +172,12 @@ def _lights(flight: Flight) -> tuple[Array, Array]:
 
 
 def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array) -> None:
-    """The light as the colour of the ground."""
+    """The light as the colour of the background."""
     if not len(time_s):
         return
     x, values = axis.curve(time_s, code[:, None])
     for k, light in enumerate(LIGHTS):
-        burning = np.isfinite(x[1:] - x[:-1]) & (values[:-1, 0] == k)  # each holds until the next report
+        burning = np.isfinite(x[1:] - x[:-1]) & (values[:-1, 0] == k)  # a light holds until the next report
         edges = np.flatnonzero(np.diff(burning, prepend=False, append=False))
         spans = [(float(x[a]), float(x[b] - x[a])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         if spans:

@@ -1,4 +1,4 @@
-"""Plots of a navigation: trajectory, attitude, standard deviations, innovations, biases, what is missing."""
+"""Plots of a navigation: trajectory, attitude, standard deviations, innovations, biases, and times without data."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _COLOURS = ("#1f6fb4", "#d1602a", "#3c8d4f")
 _GAP, _OUTAGE = "#d33", "#777"
 #: Fixes farther apart than so many usual intervals have an outage between them.
 _OUTAGE_FACTOR = 4.5
-#: An axis of innovations shows so many median sigmas on either side, or more if this share of the values needs it; what
-#: lies beyond is drawn at its edge.
+#: An axis of innovations shows so many median sigmas on either side, or more so that this share of the values lies
+#: inside; the others are drawn at its edge.
 _SHOWN_SIGMAS, _SHOWN_SHARE = 5.0, 0.98
 
 
@@ -43,6 +43,10 @@ def trajectory(stretches: list[Navigated], gnss: GnssData) -> Figure:
         height.plot(t, g[:, 2], color=_COLOURS[0])
     plan.plot(east[:1], north[:1], "^", color="k", ms=6, label="first fix")
     plan.set(xlabel="east, m", ylabel="north, m")
+    for line, limits in ((north, plan.set_ylim), (east, plan.set_xlim)):  # a straight flight gets some room beside it
+        room = 0.1 * max(float(np.ptp(east)), float(np.ptp(north)), 10.0)
+        if np.ptp(line) < 2.0 * room:
+            limits(line.min() + 0.5 * np.ptp(line) - room, line.min() + 0.5 * np.ptp(line) + room)
     plan.set_aspect("equal", adjustable="box")
     plan.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.0, handletextpad=0.4)
     height.set_ylabel("height, m")
@@ -118,7 +122,7 @@ def innovations(stretches: list[Navigated], gnss: GnssData) -> Figure:
 
 
 def _innovation(axis: Any, rows: list[Innovation], k: int) -> None:
-    """Component ``k``; the marks in the legend say what became of the observations."""
+    """Component ``k``; the marks tell used, weighted, rejected and held-out observations apart."""
     t = np.array([i.time_s for i in rows])
     value, sigma = np.array([i.value[k] for i in rows]), np.array([i.sigma[k] for i in rows])
     status = np.array([i.status for i in rows])
@@ -195,7 +199,7 @@ def _ticks(axis: Any) -> tuple[float, ...]:
 
 
 def _time_axis(axes: Any, stretches: list[Navigated], gnss: GnssData) -> None:
-    """The same times on every plot, and what is missing shaded: inertial data red, GNSS grey."""
+    """The same times on every plot; times without inertial data are shaded red, those without GNSS grey."""
     begin, end = stretches[0].best.start_s, stretches[-1].best.end_s
     for axis in axes:
         for a, b in outages(gnss):

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from ...schemas.topics import TOPICS
 from ..node import Message
-from ..recording import RecordingReader
-from ..recording_summary import Holdings, holdings
+from ..recording.reader import RecordingReader
+from ..recording.summary import Holdings, holdings
 from .flight import Flight, collect
 
-#: Topics nothing is drawn or computed from here; they are most of the bytes.
+#: Topics that reports and views do not use; most bytes of a recording are theirs.
 LEFT_OUT = frozenset({"sensor/imu", "sensor/lines/*"})
 WANTED = tuple(row.name for row in TOPICS if row.name not in LEFT_OUT)
 

@@ -17,7 +17,7 @@ _SAMPLES = 1200  # of a curve; a page shows no more
 
 
 class StripTime:
-    """Seconds since the start of the flight to places on an axis where strips stand side by side.
+    """Maps seconds since the start of the flight to an axis on which strips stand side by side.
 
     With one strip, or none that is known, the axis is the time itself.
     """
@@ -34,7 +34,7 @@ class StripTime:
         self._gap = gap
 
     def curve(self, time_s: Array, values: Array) -> tuple[Array, Array]:
-        """Places and values of a curve, thinned out; NaN where it pauses, so that nothing is drawn across a pause."""
+        """Places and values of a thinned-out curve; NaN where its data pause, so that no line crosses a pause."""
         step = max(1, len(time_s) // _SAMPLES)
         t, v = np.asarray(time_s, dtype=float)[::step], np.asarray(values, dtype=float)[::step]
         if self.strips:
@@ -50,7 +50,7 @@ class StripTime:
         return np.insert(x, pauses, np.nan), np.insert(v, pauses, np.nan, axis=0)
 
     def dress(self, axes: Iterable[Axes], lowest: Iterable[Axes]) -> None:
-        """Borders and names of strips on all axes, ticks and label below the lowest ones."""
+        """Draw borders and names of strips on all axes, and ticks and a label below the lowest ones."""
         for ax in axes:
             for _, _, place, _ in self.strips[1:]:
                 ax.axvline(place - self._gap / 2, color="#999999", lw=0.7, ls=(0, (2, 2)))

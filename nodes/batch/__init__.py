@@ -1,0 +1,1 @@
+"""What is computed in one go from a block or a recording: adjustment results and orthoimages."""

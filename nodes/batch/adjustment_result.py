@@ -1,0 +1,429 @@
+"""A batch adjustment as its ``result.json``: plain numbers, degrees and metres, names as in the input."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.adjustment.adjustment import Solution
+from ...solver.adjustment.block_data import BlockData
+from ...solver.adjustment.job import BatchResult, Job
+from ...solver.adjustment.layout import CorrectionSet
+from ...solver.adjustment.network import Control
+from ...solver.adjustment.reliability import reliability
+from ...solver.adjustment.snooping import control_tests
+from ...solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest_correlations
+from ...solver.adjustment.surface_control import SurfaceFit
+from ...solver.camera.line_camera import LineCamera
+from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
+
+Array = NDArray[np.floating]
+
+#: Pairs of correlated unknowns and undetermined combinations that are listed at most.
+MOST_LISTED = 20
+
+#: Undetermined combinations that the notes name.
+MOST_NAMED = 4
+
+#: More undetermined combinations than a block with a defect has.
+MANY_WEAK = 30
+
+#: Files beside ``result.json``.
+TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
+CAMERA, PER_LINE = "camera.json", "orientation_lines.csv"
+PLOTS = ("residuals.png", "points.png", "corrections.png")
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A finished job with what it was made from.
+
+    Attributes
+    ----------
+    block : input
+    job, result : what was done, what came out
+    seconds : wall time of the job
+    surface : what came of the heights of a surface, where there was one
+    """
+
+    block: BlockData
+    job: Job
+    result: BatchResult
+    seconds: float
+    surface: SurfaceFit | None = None
+
+    @property
+    def surveyed(self) -> Control:
+        """Control that was given point by point, without heights of a surface."""
+        control = self.result.network.control
+        if self.surface is None:
+            return control
+        mine = ~np.isfinite(self.surface.difference_m[control.point])
+        return Control(control.point[mine], control.xyz_l[mine], control.sigma_m[mine])
+
+    def camera(self) -> LineCamera | None:
+        """The camera with the estimated additional parameters in its tables; None where none was estimated."""
+        full = self.job.self_calibration
+        if full is None:
+            return None
+        solution = self.result.solution
+        names = solution.layout.names[solution.layout.n_model :]
+        values = dict(zip(names, solution.camera_parameters.tolist(), strict=True))
+        return calibrated(self.result.network.camera, full, values) if values else None
+
+    @property
+    def image_sigma_px(self) -> float:
+        """Image sigma that sigma0 = 1 stands for; the median where measurements give their own."""
+        rays = self.result.network.rays
+        return float(np.median([rays.sigma_line_px, rays.sigma_sample_px])) * self.result.image_factor
+
+
+def set_name(adjustment: Adjustment, item: CorrectionSet) -> str:
+    """Strip of a correction set as the input names it, with the lens where lenses look separately."""
+    network = adjustment.result.network
+    strip = network.strips[item.strip].id
+    lens = None if item.lens is None else network.camera.lenses[item.lens].id
+    return strip if lens is None or strip.endswith(f"/{lens}") else f"{strip}/{lens}"
+
+
+def result_of(adjustment: Adjustment) -> dict[str, Any]:
+    """The content of ``result.json``; what cannot be computed is None."""
+    result, solution = adjustment.result, adjustment.result.solution
+    redundancy = solution.redundancy
+    content = {
+        "project": adjustment.block.name,
+        "crs": adjustment.block.frame.crs,
+        "model": adjustment.job.model.name,
+        "then": adjustment.job.then.name if adjustment.job.then else None,
+        "selfcal": adjustment.job.self_calibration.name if adjustment.job.self_calibration else "none",
+        "sigma0": result.test.sigma0,
+        "sigma0_px": result.test.sigma0 * adjustment.image_sigma_px,
+        "image_sigma_px": adjustment.image_sigma_px,
+        "chi_square_test": {"low": result.test.low, "high": result.test.high, "passed": result.test.passed},
+        "sigma0_groups": {
+            group: {"observations": n, "redundancy": r, "sigma0": float(np.sqrt(v / r)) if r > 1e-3 else None}
+            for group, (n, v, r) in result.groups.items()
+        },
+        "n_observations": solution.n_observations,
+        "n_unknowns": solution.n_unknowns,
+        "redundancy": redundancy,
+        "n_image_points": len(solution.network.rays),
+        "n_points": solution.network.n_points,
+        "iterations": result.iterations,
+        "converged": bool(solution.converged),
+        "seconds": adjustment.seconds,
+        "strips": strips_of(adjustment, solution),
+        "additional_parameters": parameters_of(result, adjustment.job.self_calibration),
+        **accuracies(result, adjustment.surveyed),
+        **({} if adjustment.surface is None else {"dem": _surface(adjustment.surface)}),
+        "rejected": rejected(adjustment),
+        "rejected_control": [
+            {"point": result.network.point_ids[r.point], "coordinate": "XYZ"[r.axis], "w": r.w}
+            for r in result.rejected
+            if r.ray < 0
+        ],
+        "doubtful_points": [
+            {"point": result.network.point_ids[d.point], "rays_left_out": d.lost, "rays": d.rays, "reason": d.reason}
+            for d in result.doubtful
+        ],
+        "variance_components": {
+            c.group: {
+                "observations": c.n,
+                "redundancy": c.redundancy,
+                "sigma_factor": c.factor,
+                "sigma_factor_sigma": c.factor * c.uncertainty,
+                "estimated": c.estimated,
+            }
+            for c in result.components
+        },
+        "reliability": _reliability(result),
+        "correlations": _correlations(solution),
+        "undetermined": [
+            {"words": c.words, "share": c.share, "unknowns": list(c.unknowns)}
+            for c in (result.weak or ())[:MOST_LISTED]
+        ],
+        "notes": notes_of(adjustment),
+    }
+    if len(result.stages) > 1:
+        content["before"] = [
+            {"model": s.problem.model.name, "sigma0": s.sigma0, "strips": strips_of(adjustment, s)}
+            for s in result.stages[:-1]
+        ]
+    return _plain(content)
+
+
+def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
+    """Correction functions of every strip, as their model describes them, with a-posteriori sigmas."""
+    sigma0 = adjustment.result.sigma0
+    sigma = sigma0 * np.sqrt(np.maximum(solution.factor.variances(), 0.0))
+    found = {}
+    for item in solution.layout.sets:
+        part = item.columns
+        found[set_name(adjustment, item)] = item.model.describe(solution.state.theta[part], sigma[part])
+    return found
+
+
+def parameters_of(result: BatchResult, full: SelfCalibration | None) -> dict[str, Any]:
+    """All additional parameters of the set; for those that are gone value 0, and sigma and t when they went."""
+    if full is None:
+        return {}
+    solution = result.solution
+    first = solution.layout.n_model
+    sigma = result.sigma0 * np.sqrt(np.maximum(solution.factor.variances()[first:], 0.0))
+    value = dict(zip(solution.layout.names[first:], solution.camera_parameters, strict=True))
+    spread = dict(zip(solution.layout.names[first:], sigma, strict=True))
+    gone = {r.name: r for r in result.removed}
+    found: dict[str, Any] = {}
+    for name in full.unknown_names:
+        if name in value:
+            s = spread[name]
+            t = value[name] / s if s > 0 else 0.0
+            entry = {"value": value[name], "sigma": s, "t": t, "status": "estimated"}
+            entry["reason"] = result.kept.get(name, "")
+        else:
+            r = gone[name]
+            t = r.value / r.sigma if r.sigma > 0 else 0.0
+            entry = {"value": 0.0, "sigma": r.sigma, "t": t, "status": "eliminated", "reason": r.reason}
+            entry |= {"criterion": str(r.criterion), "figure": r.figure, "limit": r.limit}
+        found[name] = entry | {"unit": unit_of(name)}
+    return found
+
+
+def _surface(fit: SurfaceFit) -> dict[str, Any]:
+    d = fit.difference_m[np.isfinite(fit.difference_m)]
+    counts = fit.weight[fit.weight > 0]
+    return {
+        "n": len(d),
+        "sigma_m": fit.sigma_m,
+        "rmse_m": float(np.sqrt(np.mean(d**2))),
+        "median_m": float(np.median(d)),
+        "half_weight_or_less": int((counts <= 0.5).sum()),
+        "rounds": fit.rounds,
+    }
+
+
+def accuracies(result: BatchResult, surveyed: Control) -> dict[str, Any]:
+    """Empirical and theoretical accuracy of check, control and tie points, and of direct georeferencing.
+
+    Direct georeferencing is compared with the check points, or with the control where there are none.
+    """
+    network, points, sigma = result.network, result.adjusted_points(), result.point_sigma_m
+    tie = np.ones(network.n_points, dtype=bool)
+    tie[network.check.point] = tie[surveyed.point] = False
+    reference = network.check if len(network.check) else surveyed
+    direct = result.georeferenced
+    return {
+        "check": _accuracy(result.compare(network.check, points, sigma))
+        | _expected(result, network.check, sigma, independent=True),
+        "control": _accuracy(result.compare(surveyed, points, sigma))
+        | _expected(result, surveyed, sigma, independent=False),
+        "tie": {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()},
+        "direct_georeferencing": _accuracy(result.compare(reference, direct.xyz_l, direct.sigma_m))
+        | _expected(result, reference, direct.sigma_m, independent=True)
+        | {"against": "check" if len(network.check) else "control"},
+    }
+
+
+def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent: bool) -> dict[str, Any]:
+    """RMSE to be expected of the differences to given coordinates, which have errors of their own.
+
+    Points that were adjusted without them differ by both errors; control took part, so that the variance of its
+    differences is that of the given coordinate less that of the adjusted one.
+    """
+    sure = ~np.isin(given.point, [d.point for d in result.doubtful])
+    used = np.isfinite(given.sigma_m) & sure[:, None] & np.isfinite(sigma_m[given.point])
+    sign, scale = (1.0, 1.0) if independent else (-1.0, result.sigma0)  # sigmas of control scale with the others
+    variance = np.where(used, (scale * given.sigma_m) ** 2 + sign * sigma_m[given.point] ** 2, 0.0)
+    n = used.sum(axis=0)
+    if not n.any():
+        return {}
+    mean = np.maximum(variance, 0.0).sum(axis=0) / np.maximum(n, 1)
+    return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
+
+
+def _accuracy(a: PointAccuracy) -> dict[str, Any]:
+    return {
+        "n": a.n,
+        "rmse_m": a.rmse_m.tolist(),
+        "mean_m": a.mean_m.tolist(),
+        "max_m": a.max_m.tolist(),
+        "sigma_m": a.sigma_m.tolist(),
+        "empirical_sigma_m": a.empirical_sigma_m.tolist(),
+        "rmse_xy_m": a.rmse_xy_m,
+        "sigma_xy_m": a.sigma_xy_m,
+    }
+
+
+def rejected(adjustment: Adjustment) -> list[dict[str, Any]]:
+    """Image points left out: by a test, with its w, and those that could not be used at all, with w = 0."""
+    block, result = adjustment.block, adjustment.result
+    rows = [(int(result.network.rays.source[r.ray]), r.w, r.reason) for r in result.rejected if r.ray >= 0]
+    rows += [(row, 0.0, reason) for row, reason in result.network.refused]
+    found = []
+    for row, w, reason in rows:
+        point, strip, ccd = block.image_name(row)
+        pixel = {"line": float(block.image.line[row]), "sample": float(block.image.sample[row])}
+        found.append({"point": point, "strip": strip, "ccd": ccd, **pixel, "w": w, "reason": reason})
+    return found
+
+
+def notes_of(adjustment: Adjustment) -> list[str]:
+    """What a reader of the result should know, one sentence each."""
+    result, solution = adjustment.result, adjustment.result.solution
+    network = result.network
+    notes = list(adjustment.block.notes)
+    notes += dict.fromkeys(note for item in solution.layout.sets for note in item.model.notes)
+    if not solution.converged:
+        notes.append("not converged: the figures are those of the last step")
+    if result.sigma0 != result.test.sigma0 or solution.redundancy <= 0:
+        notes.append(
+            f"redundancy of image points and control is {result.measured_redundancy:.1f}: too little for sigma0; "
+            "sigmas are those of the a-priori weights"
+        )
+    elif not result.test.passed:
+        notes.append(_sigma0_note(result))
+    notes += _test_notes(adjustment)
+    notes += _control_notes(network)
+    notes += _weakness_notes(result)
+    if result.doubtful:
+        notes.append(_doubt_note(result))
+    lost = int(((solution.points.rank < 3) & (network.rays_per_point > 0)).sum())
+    if lost:
+        notes.append(f"{lost} object points are not determined by their rays and have no coordinates in points.csv")
+    return notes
+
+
+def _doubt_note(result: BatchResult) -> str:
+    """Which points are doubtful, and which of them are missing in the statistics of the check points."""
+    network, doubtful = result.network, result.doubtful
+    shown = ", ".join(f"{network.point_ids[d.point]} ({d.lost} of {d.rays} rays out)" for d in doubtful[:MOST_LISTED])
+    more = f" and {len(doubtful) - MOST_LISTED} more" if len(doubtful) > MOST_LISTED else ""
+    check = set(network.check.point.tolist())
+    out = sum(d.point in check for d in doubtful)
+    left = f"; {out} of them check points, left out of the statistics" if out else ""
+    return f"{len(doubtful)} object points are doubtful, their remaining rays do not confirm them: {shown}{more}{left}"
+
+
+def _sigma0_note(result: BatchResult) -> str:
+    """Why the chi-square test may have failed."""
+    test, image = result.test, result.image_test
+    said = f"sigma0 {test.sigma0:.3f} outside [{test.low:.3f}, {test.high:.3f}] (95 %)"
+    if test.sigma0 > test.high:
+        return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit"
+    if image.sigma0 >= image.low:
+        return f"{said}: the a-priori weights of the trajectory are loose; of the image points it is {image.sigma0:.3f}"
+    return f"{said}: the errors are smaller than the a-priori sigmas"
+
+
+def _weakness_notes(result: BatchResult) -> list[str]:
+    if result.weak is None:
+        return ["too many unknowns to search for undetermined combinations"]
+    if not result.weak:
+        return []
+    free = len(result.solution.factor.undetermined) > 0
+    shown = "; ".join(c.words for c in result.weak[:MOST_NAMED])
+    if len(result.weak) > MANY_WEAK:  # flexible models are meant to lean on their weights where rays are few
+        count = f"{len(result.weak)} combinations of the {result.solution.layout.n_unknowns} unknowns"
+        return [f"{count} rest on a-priori weights, as flexible models do between rays; least determined: {shown}"]
+    more = f"; and {len(result.weak) - MOST_NAMED} more" if len(result.weak) > MOST_NAMED else ""
+    return [("not determined: " if free else "resting on a-priori weights alone: ") + shown + more]
+
+
+def _test_notes(adjustment: Adjustment) -> list[str]:
+    """What the tests of single observations say beside what was left out."""
+    result, critical = adjustment.result, adjustment.job.critical
+    network, notes = result.network, []
+    if result.given_up:
+        notes.append(
+            f"data snooping would leave out {100 * result.given_up:.0f} % of the image points: model or a-priori sigma "
+            "does not fit, so nothing was left out; a richer model (ppm, lim) or --reweight may help"
+        )
+    elif not adjustment.job.snoop:
+        failing = int((result.rays.largest_w[result.solution.ray_weight > 0] > critical).sum())
+        if failing > 0.01 * len(network.rays):
+            notes.append(f"{failing} image points have |w| > {critical:g}; --snoop leaves out outliers")
+    w = control_tests(result.solution, result.cofactors)
+    worst = [(p, a) for p, a in np.argwhere(np.abs(w) > critical)]
+    worst.sort(key=lambda key: -abs(w[key]))
+    if worst:
+        names = ", ".join(f"{network.point_ids[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
+        more = " ..." if len(worst) > 5 else ""
+        notes.append(f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}")
+    return notes
+
+
+def worst_strip(adjustment: Adjustment) -> str:
+    """Where to look when nothing fits: the strip with the largest median residual, in words."""
+    result = adjustment.result
+    network = result.network
+    size = np.linalg.norm(result.rays.v_px, axis=1)
+    median = {s.id: float(np.median(size[network.rays.strip == i])) for i, s in enumerate(network.strips)
+              if (network.rays.strip == i).any()}  # fmt: skip
+    worst = max(median, key=lambda id: median[id])
+    return f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
+
+
+def _control_notes(network: Any) -> list[str]:
+    control: Control = network.control
+    full = np.isfinite(control.sigma_m)
+    if not full.any():
+        return ["no control: position, rotation and scale of the block come from its trajectories"]
+    xyz = control.xyz_l[full.any(axis=1)]
+    if len(xyz) < 3:
+        return [f"{len(xyz)} control point{'s' if len(xyz) > 1 else ''}: too few to check the datum of the block"]
+    spread = np.linalg.svd(xyz[:, :2] - xyz[:, :2].mean(axis=0), compute_uv=False)
+    seen = network.approximate_l[:, :2]
+    if spread[1] < 0.02 * spread[0]:
+        return ["control points lie on a line: the rotation about it comes from the trajectories"]
+    if np.ptp(xyz[:, :2], axis=0).max() < 0.25 * np.ptp(seen, axis=0).max():
+        return ["control lies in one part of the block only: away from it the trajectories decide"]
+    return []
+
+
+def _reliability(result: BatchResult) -> dict[str, Any]:
+    """Summary over the image points that take part, line and sample."""
+    used = result.solution.ray_weight > 0
+    rays = result.rays
+    r = reliability(rays.redundancy[used], rays.sigma_px[used])
+    found: dict[str, Any] = {}
+    for k, name in enumerate(("line", "sample")):
+        number, detectable = r.redundancy[:, k], r.detectable[:, k]
+        finite = detectable[np.isfinite(detectable)]
+        found[name] = {
+            "redundancy_mean": float(number.mean()) if len(number) else None,
+            "redundancy_min": float(number.min()) if len(number) else None,
+            "detectable_px_median": float(np.median(finite)) if len(finite) else None,
+            "detectable_px_max": float(finite.max()) if len(finite) else None,
+            "uncontrolled": int((~np.isfinite(detectable)).sum()),
+        }
+    return found
+
+
+def _correlations(solution: Solution) -> list[dict[str, Any]]:
+    """The strongest correlations above 0.9 between orientation and additional parameters."""
+    names = solution.layout.names
+    if len(names) > 1500:
+        return []
+    pairs = strongest_correlations(solution.factor.cofactors(np.arange(len(names))), names)
+    return [{"between": [p.first, p.second], "r": p.correlation} for p in pairs[:MOST_LISTED]]
+
+
+def _plain(value: Any) -> Any:
+    """The same with Python numbers; NaN and infinity, which JSON does not have, as None."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -1,0 +1,171 @@
+"""The tables of a batch adjustment: adjusted points, residuals, refined trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ...solver.adjustment.adjustment import Solution
+from ...solver.adjustment.layout import CorrectionSet
+from ...solver.adjustment.reliability import reliability
+from ...solver.geometry.rotation import angles_from_matrix, corrected_angles, matrix_from_angles
+from ..formats.line_orientation import OrientedLines
+from .adjustment_result import TABLES, Adjustment, set_name
+
+Array = NDArray[np.floating]
+
+_AXES = ("X", "Y", "Z")
+_ANGLES = ("omega", "phi", "kappa")
+
+
+def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
+    """Write ``points.csv``, ``residuals.csv`` and ``trajectory_refined.csv``; returns their paths."""
+    paths = []
+    for name, table in zip(TABLES, (points_table, residuals_table, trajectory_table), strict=True):
+        path = folder / name
+        table(adjustment).to_csv(path, index=False)
+        paths.append(path)
+    return paths
+
+
+def points_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined."""
+    block, result = adjustment.block, adjustment.result
+    network = result.network
+    order = np.array([network.point_index[id] for id in block.point_ids if id in network.point_index], dtype=np.int64)
+    xyz, C = result.adjusted_points()[order], result.point_covariance[order]
+    known = np.isfinite(xyz).all(axis=1)
+    places = np.full_like(xyz, np.nan)
+    sigma = np.full_like(xyz, np.nan)
+    frame = block.frame
+    if known.any():
+        places[known] = frame.to_crs(xyz[known])
+        R = frame.R_l_crs(places[known])
+        sigma[known] = np.sqrt(np.maximum(np.einsum("pji,pjk,pki->pi", R, C[known], R), 0.0))
+    in_use = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points).astype(int)
+    decimals = 9 if frame.is_geographic else 5
+    columns: dict[str, object] = {"point": [network.point_ids[i] for i in order]}
+    columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+    columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
+    doubtful = np.isin(order, [d.point for d in result.doubtful]).astype(int)
+    role = network.role()
+    if adjustment.surface is not None:  # a height of the raster makes no control of a tie point
+        role[np.isfinite(adjustment.surface.difference_m)] = "tie"
+    return pd.DataFrame(columns | {"rays": in_use[order], "role": role[order], "doubtful": doubtful})
+
+
+def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Residuals of all image points that could be used, in the order of the input, pixels."""
+    block, result = adjustment.block, adjustment.result
+    rays, s = result.network.rays, result.rays
+    order = np.argsort(rays.source)
+    names = [block.image_name(int(row)) for row in rays.source[order]]
+    r = reliability(s.redundancy, s.sigma_px)
+    out = np.zeros(len(rays), dtype=bool)
+    out[[x.ray for x in result.rejected if x.ray >= 0]] = True
+    columns: dict[str, object] = {
+        "point": [n[0] for n in names],
+        "strip": [n[1] for n in names],
+        "ccd": [n[2] for n in names],
+        "line": rays.line[order],
+        "sample": rays.sample[order],
+    }
+    detectable, outer = (np.where(np.isfinite(values), values, np.nan) for values in (r.detectable, r.outer))
+    for prefix, values, digits in (
+        ("v", s.v_px, 5),
+        ("w", s.w, 4),
+        ("redundancy", r.redundancy, 5),
+        ("detectable", detectable, 4),
+        ("outer", outer, 4),
+    ):
+        unit = "_px" if prefix in ("v", "detectable") else ""
+        for k, coordinate in enumerate(("line", "sample")):
+            columns[f"{prefix}_{coordinate}{unit}"] = np.round(values[order, k], digits)
+    return pd.DataFrame(columns | {"rejected": out[order].astype(int)})
+
+
+def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
+    """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas."""
+    frame, reference = adjustment.block.frame, adjustment.block.time_reference_ns
+    parts = []
+    for item in adjustment.result.solution.layout.sets:
+        time = adjustment.block.strips[item.strip].trajectory.time_s
+        position, angles, sigma = _refined(adjustment, item, time)
+        places = frame.to_crs(position)
+        if frame.crs != "local":
+            R = np.swapaxes(frame.R_l_crs(places), 1, 2) @ matrix_from_angles(*angles.T)
+            angles = angles_from_matrix(R)
+        angles = np.degrees(angles)
+        angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
+        decimals = 9 if frame.is_geographic else 5
+        columns: dict[str, object] = {"strip": set_name(adjustment, item), "time_s": _seconds(time, reference)}
+        columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+        columns |= {f"{a}_deg": np.round(angles[:, k], 9) for k, a in enumerate(_ANGLES)}
+        columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
+        columns |= {f"sigma_{a}_deg": np.round(np.degrees(sigma[:, 3 + k]), 9) for k, a in enumerate(_ANGLES)}
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _seconds(time_s: Array, reference_ns: int) -> Array | list[str]:
+    """Seconds as they stand in tables: of a recording UTC since 1970, with all digits."""
+    if not reference_ns:
+        return np.round(time_s, 9)
+    whole = [divmod(reference_ns + round(float(t) * 1e9), 10**9) for t in time_s]
+    return [f"{seconds}.{rest:09d}" for seconds, rest in whole]
+
+
+def _refined(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array, Array]:
+    """Position (n, 3) and angles (n, 3) in the local frame, and the sigmas (n, 6) of their corrections."""
+    poses = adjustment.block.strips[item.strip].trajectory.at(time_s)
+    correction, sigma = correction_functions(adjustment, item, time_s)
+    turn = correction[:, 3:]
+    angles = corrected_angles(poses.angles, turn) if adjustment.block.heading else poses.angles + turn
+    return poses.position_l + correction[:, :3], angles, sigma
+
+
+def oriented_lines(adjustment: Adjustment) -> Iterator[OrientedLines]:
+    """Refined orientation of all lines of each strip, as far as its trajectory goes."""
+    reference = adjustment.block.time_reference_ns
+    for item in adjustment.result.solution.layout.sets:
+        strip = adjustment.block.strips[item.strip]
+        path = strip.trajectory
+        last = strip.lines - 1 if strip.lines else int((path.end_s - strip.first_line_time_s) * strip.line_rate_hz)
+        line = np.arange(last + 1)
+        time = np.asarray(strip.time_of(line), dtype=float)
+        line, time = line[path.covers(time)], time[path.covers(time)]
+        if not len(line):
+            continue
+        position, angles, sigma = _refined(adjustment, item, time)
+        stamps = reference + np.rint(time * 1e9).astype(np.int64)
+        yield OrientedLines(set_name(adjustment, item), line, stamps, position, matrix_from_angles(*angles.T), sigma)
+
+
+def correction_functions(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array]:
+    """Corrections (n, 6) of all stages together, and their a-posteriori sigmas (n, 6); metres and radians.
+
+    The sigmas are those of the last stage, which estimates what the stages before it left.
+    """
+    result = adjustment.result
+    total = np.zeros((len(time_s), 6))
+    for stage in result.stages:
+        mine = next(s for s in stage.layout.sets if (s.strip, s.lens) == (item.strip, item.lens))
+        total += mine.model.evaluate(stage.state.theta[mine.columns], time_s)
+    return total, result.sigma0 * correction_sigma(result.solution, item, time_s)
+
+
+def correction_sigma(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
+    """Sigmas (n, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
+    design = item.model.design(time_s)
+    Q = solution.factor.cofactors(np.arange(item.columns.start, item.columns.stop))
+    Q = np.pad(Q, ((0, 1), (0, 1)))  # column -1 reads zeros
+    variance = np.zeros((len(time_s), 6))
+    for a in range(design.columns.shape[1]):
+        for b in range(design.columns.shape[1]):
+            weight = design.coefficients[:, a] * design.coefficients[:, b]
+            variance += weight[:, None] * Q[design.columns[:, a], design.columns[:, b]]
+    return np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,62 @@
+"""Object points of a recording, one row a point, each by its best answer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...schemas import messages as m
+from .. import convert
+from ..errors import UserError
+from ..recording.reader import RecordingReader
+
+_AXES = ("X_m", "Y_m", "Z_m")
+
+
+def write_points(reader: RecordingReader, path: Path, *, covariance: bool = False) -> int:
+    """Write ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,rays,role,status`` in the project's CRS.
+
+    The best answer for a point is that of the whole strip, else the final one, else the first; of several of a kind the
+    last. Returns the number of points.
+
+    Parameters
+    ----------
+    covariance : also the covariances ``cov_XY_m2,cov_XZ_m2,cov_YZ_m2``
+
+    Raises
+    ------
+    UserError : no object points in the recording
+    """
+    best: dict[str, Any] = {}
+    for message in reader.sorted_messages(["point/object"]):
+        body = message.body
+        if np.isfinite([body.x, body.y, body.z]).all() and (
+            body.point not in best or body.status >= best[body.point].status
+        ):
+            best[body.point] = body
+    if not best:
+        raise UserError(f"{reader.path}: no message on point/object: `triline process` makes them")
+    project = reader.first("configuration/project")
+    frame = convert.local_frame(project if project is not None else m.Project())
+    xyz = np.array([(p.x, p.y, p.z) for p in best.values()])
+    none = np.full(9, np.nan)
+    C = np.array([p.covariance if len(p.covariance) == 9 else none for p in best.values()]).reshape(-1, 3, 3)
+    place = frame.to_crs(xyz)
+    R = frame.R_l_crs(place)
+    C = np.swapaxes(R, 1, 2) @ C @ R
+    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", C), 0.0))
+    flat = ".9f" if frame.is_geographic else ".4f"
+    more = ("cov_XY_m2", "cov_XZ_m2", "cov_YZ_m2") if covariance else ()
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        file.write(",".join(("point", *_AXES, *(f"sigma_{a}" for a in _AXES), *more, "rays", "role", "status")) + "\n")
+        for i, p in enumerate(best.values()):
+            values = [format(v, f) for v, f in zip(place[i], (flat, flat, ".4f"), strict=True)]
+            values += ["" if np.isnan(s) else f"{s:.4f}" for s in sigma[i]]
+            if covariance:
+                values += ["" if np.isnan(c) else f"{c:.6e}" for c in C[i][[0, 0, 1], [1, 2, 2]]]
+            name = f'"{p.point}"' if set(p.point) & set(',"\n') else p.point
+            status = m.ObjectPoint.Status.Name(p.status).lower()
+            file.write(",".join([name, *values, str(p.rays), p.role, status]) + "\n")
+    return len(best)

@@ -1,0 +1,438 @@
+"""From a recording with image lines to an orthoimage: orientation, ground, and the lines of each strip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas.image_lines import LineBlock
+from ...solver.camera.line_camera import LineCamera
+from ...solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
+from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation
+from ...solver.geometry.rotation import quaternion_from_matrix
+from ...solver.models.base import COMPONENTS
+from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
+from ...solver.orthoimage.heights_of_points import heights_of_points
+from ...solver.orthoimage.mosaic import Mosaic
+from ...solver.orthoimage.orientation import LineOrientation
+from ...solver.orthoimage.strip import StripRectifier, rays_of
+from ...solver.orthoimage.surface import HeightField, Surface
+from ...solver.simulation.flight import Flight
+from .. import convert
+from ..errors import UserError
+from ..formats.geotiff import Heights
+from ..formats.line_orientation import OrientedLines
+from ..formats.projection import refuse_missing_grids
+from ..formats.trajectory_csv import read_local_poses, read_trajectory_csv
+from ..recording.access import PoseTable, Recording
+
+Array = NDArray[np.floating]
+
+#: Orientations that a recording may hold, best first, and the topic of each.
+ORIENTATIONS: dict[str, str] = {
+    "whole": "orientation/whole",
+    "final": "orientation/final",
+    "live": "orientation/live",
+    "measured": "trajectory/",
+    "truth": "truth/trajectory",
+}
+#: Those that an adjustment has refined, with the camera that it estimated.
+REFINED = ("whole", "final", "live")
+#: Lines that are missing are left black, so that the others stay in their places, if there are not more than this.
+LARGEST_GAP = 5000
+#: First words of the names of a strip's own parameters in reports.
+_OF_STRIP = tuple(f"d{c}" for c in COMPONENTS) + COMPONENTS
+
+
+@dataclass
+class Rectified:
+    """What came of it.
+
+    Attributes
+    ----------
+    mosaic : the orthoimage
+    strips : lines of each strip that went into it
+    left_out : lines that did not, by reason
+    missed_rays : rays that did not meet the ground
+    """
+
+    mosaic: Mosaic
+    strips: dict[str, int] = field(default_factory=dict)
+    left_out: dict[str, int] = field(default_factory=dict)
+    missed_rays: int = 0
+
+
+def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOrientation, int]:
+    """The orientation of a recording: which it is, the orientation, and the stamp (ns) that its times count from.
+
+    Parameters
+    ----------
+    name : of `ORIENTATIONS`; None for the best there is
+
+    Raises
+    ------
+    UserError : the recording does not hold it
+    """
+    path = recording.reader.path
+    topics = (*(t for t in ORIENTATIONS.values() if not t.endswith("/")), "trajectory/filtered", "trajectory/smoothed")
+    held = {topic for topic in topics if len(recording.reader.select([topic])) > 1}
+    there = [key for key, topic in ORIENTATIONS.items() if any(h.startswith(topic) for h in held)]
+    measured = any(h.startswith("trajectory/") for h in held)
+    if not measured:  # refined orientation alone comes too seldom to carry the motion of the platform
+        there = [key for key in there if key == "truth"]
+    if name is None:
+        name = next(iter(there), None)
+        if name is None:
+            raise UserError(f"{path}: no orientation in it; 'triline process' makes one from sensor data")
+    if name not in there:
+        has = f"it has {', '.join(there)}" if there else "it has none"
+        missing = ORIENTATIONS[name].rstrip("/") if measured or name == "measured" else "trajectory"
+        raise UserError(f"{path}: no {name} orientation ({missing}): {has}; 'triline process' makes it")
+    if name == "truth":
+        base = _sorted(recording.poses("truth/trajectory"))
+    else:
+        base = _measured(recording, held, smoothed=name != "live")
+    reference_ns = int(base.time_ns[0])
+    gap_s = max(0.3, 2.5 * float(np.median(np.diff(base.time_ns))) * 1e-9)
+    orientation = LineOrientation((base.time_ns - reference_ns) * 1e-9, base.position_l, base.quaternion, gap_s)
+    if name in REFINED:
+        refined = recording.poses(ORIENTATIONS[name])
+        if name == "whole" and "orientation/final" in held:  # of a strip whose backward pass is missing
+            refined = _with_final(recording, refined)
+        try:
+            orientation.refine((refined.time_ns - reference_ns) * 1e-9, refined.position_l, refined.quaternion)
+        except ValueError as error:
+            raise UserError(f"{path}: {ORIENTATIONS[name]}: {error}") from None
+    return name, orientation, reference_ns
+
+
+def _measured(recording: Recording, held: set[str], smoothed: bool) -> PoseTable:
+    """Filtered poses, or smoothed ones and filtered ones where there are none yet."""
+    best = "trajectory/smoothed" if smoothed else "trajectory/filtered"
+    other = "trajectory/filtered" if smoothed else "trajectory/smoothed"
+    if best not in held:
+        return _sorted(recording.poses(other))
+    poses = _sorted(recording.poses(best))
+    if smoothed and other in held:
+        more = _sorted(recording.poses(other))
+        poses = _joined(poses, more, (more.time_ns < poses.time_ns[0]) | (more.time_ns > poses.time_ns[-1]))
+    return poses
+
+
+def _with_final(recording: Recording, whole: PoseTable) -> PoseTable:
+    """Poses of whole strips, and the final ones of strips that have none."""
+    final = recording.poses("orientation/final")
+    return _joined(_sorted(whole), final, ~np.isin(final.strip, whole.strip))
+
+
+def _sorted(poses: PoseTable) -> PoseTable:
+    _, first = np.unique(poses.time_ns, return_index=True)
+    return PoseTable(*(values[first] for values in vars(poses).values()))
+
+
+def _joined(one: PoseTable, other: PoseTable, which: NDArray[np.bool_]) -> PoseTable:
+    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
+    return _sorted(PoseTable(*(np.concatenate([a, b[which]]) for a, b in pairs)))
+
+
+def estimated_camera(recording: Recording, camera: LineCamera) -> tuple[LineCamera, int]:
+    """The camera with the additional parameters of the last report, and how many there are (0: the camera itself)."""
+    last = None
+    for message in recording.messages("adjustment/report"):
+        last = message.body if message.body.parameters else last
+    values = {p.name: p.value for p in (last.parameters if last is not None else ()) if p.value}
+    for make in SELF_CALIBRATIONS.values():
+        try:
+            parameters = make(camera)
+        except ValueError:
+            continue
+        mine = {name: value for name, value in values.items() if name in parameters.names}
+        # a strip has parameters of its own beside those of the camera, which have other names
+        if mine and all(name in parameters.names or name.split(" ")[0] in _OF_STRIP for name in values):
+            return calibrated(camera, parameters, mine), len(mine)
+    return camera, 0
+
+
+def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines]]:
+    """Which orientation it is (of `ORIENTATIONS`), and all lines of all strips with it.
+
+    Raises
+    ------
+    UserError : the recording does not hold it, or no strip
+    """
+    name, orientation, reference_ns = orientation_of(recording, name)
+    strips = {message.body.id: message.body for message in recording.messages("configuration/strip")}
+    if not strips:
+        raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
+    topic = ORIENTATIONS[name]
+    poses = None if topic.endswith("/") else _sorted(recording.poses(topic))
+
+    def parts() -> Iterator[OrientedLines]:
+        for strip in strips.values():
+            stamps = _line_stamps(recording, strip)
+            time_s = (stamps - reference_ns) * 1e-9
+            known = np.flatnonzero(orientation.covers(time_s))
+            if not len(known):
+                continue
+            position, R = orientation.at(time_s[known])
+            sigma = np.full((len(known), 6), np.nan)
+            if poses is not None:
+                stated = np.sqrt(np.einsum("nii->ni", poses.covariance))
+                nearest = np.clip(np.searchsorted(poses.time_ns, stamps[known]), 0, len(stated) - 1)
+                sigma = stated[nearest]
+            yield OrientedLines(strip.id, known, stamps[known], position, R, sigma)
+
+    return name, parts()
+
+
+def _line_stamps(recording: Recording, strip: Any) -> NDArray[np.int64]:
+    """UTC of the lines of a strip, ns: of its image lines where it has some, which know them best."""
+    for topic in sorted({c.topic for c in recording.reader.channels.values() if c.topic.startswith("sensor/lines/")}):
+        stamps: dict[int, NDArray[np.int64]] = {}
+        for message in recording.messages(topic):
+            if message.body.strip == strip.id:
+                stamps[int(message.body.first_line)] = message.body.times_ns()
+        if stamps:
+            total = max(first + len(times) for first, times in stamps.items())
+            found = _regular(strip, total)
+            for first, times in stamps.items():
+                found[first : first + len(times)] = times
+            return found
+    return _regular(strip, int(strip.lines))
+
+
+def _regular(strip: Any, lines: int) -> NDArray[np.int64]:
+    return int(strip.first_line_time_ns) + np.rint(np.arange(lines) * (1e9 / strip.line_rate_hz)).astype(np.int64)
+
+
+def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrientation, int]:
+    """The orientation in a table that `triline adjust` or `triline export --per-line` wrote, and its reference stamp.
+
+    Raises
+    ------
+    UserError : no such table, or one of another flight
+    """
+    frame = project_frame(recording)
+    if frame.crs == "local":
+        position, R, time_ns = read_local_poses(path)
+    else:
+        refuse_missing_grids(frame.crs, path)
+        track = read_trajectory_csv(path, frame.crs)
+        position = frame.from_geodetic(*track.geodetic.T)
+        R, time_ns = R_lc_from_navigation(frame, position, track.rpy), track.time_ns
+    spans = [int(message.body.first_line_time_ns) for message in recording.messages("configuration/strip")]
+    if not any(time_ns[0] <= start <= time_ns[-1] for start in spans):
+        raise UserError(f"{path}: its times do not reach the strips of {recording.reader.path}, wanted the same flight")
+    seconds = (time_ns - time_ns[0]) * 1e-9
+    gap_s = max(0.3, 2.5 * float(np.median(np.diff(seconds))))
+    return LineOrientation(seconds, position, quaternion_from_matrix(R), gap_s), int(time_ns[0])
+
+
+def known_points(recording: Recording) -> Array:
+    """(n, 3) local coordinates of object points as adjusted last, and of ground control."""
+    points: dict[str, Any] = {}
+    for message in recording.messages("observation/control"):
+        points[message.body.point] = message.body
+    for message in recording.messages("point/object"):
+        points[message.body.point] = message.body
+    xyz = np.array([(p.x, p.y, p.z) for p in points.values()]).reshape(-1, 3)
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
+def ground_of_points(recording: Recording) -> HeightField:
+    """The relief between the object points and the ground control of a recording.
+
+    Raises
+    ------
+    UserError : too few of them
+    """
+    points = known_points(recording)
+    try:
+        return heights_of_points(points)
+    except ValueError as error:
+        raise UserError(f"{recording.reader.path}: no relief from object points: {error}") from None
+
+
+def pixel_on_ground(camera: LineCamera, ccd: int, above_m: float) -> float:
+    """Size of a pixel in the middle of a CCD line, m."""
+    line = camera.lines[ccd]
+    xy = line.xy_mm - camera.principal_point_mm[ccd]
+    pitch = float(np.linalg.norm(line.xy_mm[-1] - line.xy_mm[0])) / (line.pixels - 1)
+    c = float(camera.focal_length_mm[ccd])
+    slant = float(np.hypot(c, xy[line.pixels // 2, 0])) / c
+    return above_m * pitch / c * slant
+
+
+class Rectification:
+    """Rectifies the lines of one CCD line, strip by strip, as they come.
+
+    Parameters
+    ----------
+    camera, ccd : camera, and the index of its CCD line
+    surface, grid, resampling : as in `StripRectifier`
+    orientation, reference_ns : of the lines
+    factor : pixels that are put together to one, along and across, where cells are that much larger
+    """
+
+    def __init__(
+        self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
+        orientation: LineOrientation, reference_ns: int, factor: int = 1,
+    ) -> None:  # fmt: skip
+        self.rays = rays_of(camera, ccd, factor=factor)
+        self.surface, self.grid, self.resampling = surface, grid, resampling
+        self.orientation, self.reference_ns, self.factor = orientation, reference_ns, factor
+        self.result: Rectified | None = None
+        self._strip = ""
+        self._rectifier: StripRectifier | None = None
+        self._next_line = 0
+        self._rest: tuple[NDArray[Any], NDArray[np.bool_], Array] | None = None
+
+    def add(self, block: LineBlock) -> None:
+        """Lines of the CCD line.
+
+        Raises
+        ------
+        ValueError : lines of another length
+        """
+        if self.result is None:
+            self.result = Rectified(Mosaic(block.pixels.dtype))
+        if block.strip != self._strip:
+            self._close()
+            self._strip = block.strip
+            self._rectifier = StripRectifier(self.rays, self.surface, self.grid, self.resampling)
+            self._next_line = int(block.first_line)
+        pixels, first = block.pixels, int(block.first_line)
+        time_s = (block.times_ns() - self.reference_ns) * 1e-9
+        late = min(max(self._next_line - first, 0), len(pixels))
+        self._leave_out("twice or late", late)
+        pixels, time_s, first = pixels[late:], time_s[late:], first + late
+        if not len(pixels):
+            return
+        usable = np.ones(len(pixels), dtype=bool)
+        gap = first - self._next_line
+        if 0 < gap <= LARGEST_GAP:
+            self._leave_out("missing", gap)
+            step = block.line_period_ns * 1e-9 or float(time_s[-1] - time_s[0]) / max(len(time_s) - 1, 1)
+            time_s = np.concatenate([time_s[0] - step * np.arange(gap, 0, -1), time_s])
+            pixels = np.concatenate([np.zeros((gap, pixels.shape[1]), dtype=pixels.dtype), pixels])
+            usable = np.concatenate([np.zeros(gap, dtype=bool), usable])
+            first -= gap
+        elif gap > 0:
+            self._rest = None
+        self._next_line = first + len(pixels)
+        self._reduced(pixels, usable, time_s, first)
+
+    def _reduced(self, pixels: NDArray[Any], usable: NDArray[np.bool_], time_s: Array, first: int) -> None:
+        """Put pixels together; what does not fill a group of lines waits for the next block."""
+        f = self.factor
+        if f == 1:
+            self._place(pixels, usable, time_s, first)
+            return
+        if self._rest is not None:
+            rest, rest_usable, rest_s = self._rest
+            pixels, time_s = np.concatenate([rest, pixels]), np.concatenate([rest_s, time_s])
+            usable, first = np.concatenate([rest_usable, usable]), first - len(rest)
+        skip = min(-first % f, len(pixels))
+        pixels, usable, time_s, first = pixels[skip:], usable[skip:], time_s[skip:], first + skip
+        n, width = len(pixels) // f, pixels.shape[1] // f
+        used = n * f
+        self._rest = pixels[used:], usable[used:], time_s[used:]
+        if n:
+            grey = pixels[:used, : width * f].reshape(n, f, width, f).mean(axis=(1, 3), dtype=np.float32)
+            small = np.rint(grey).astype(pixels.dtype)
+            together = np.logical_and.reduce(usable[:used].reshape(n, f), axis=1)
+            self._place(small, together, time_s[:used].reshape(n, f).mean(axis=1), first // f)
+
+    def _place(self, pixels: NDArray[Any], usable: NDArray[np.bool_], time_s: Array, first: int) -> None:
+        assert self.result is not None and self._rectifier is not None
+        known = self.orientation.covers(time_s)
+        self._leave_out("without orientation", self.factor * int((usable & ~known).sum()))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            position, R = self.orientation.at(time_s[begin:end])
+            for patch in self._rectifier.add(first + begin, pixels[begin:end], usable[begin:end], position, R):
+                self.result.mosaic.add(patch)
+            lines = self.factor * int(usable[begin:end].sum())
+            self.result.strips[self._strip] = self.result.strips.get(self._strip, 0) + lines
+
+    def _leave_out(self, reason: str, lines: int) -> None:
+        assert self.result is not None
+        if lines:
+            self.result.left_out[reason] = self.result.left_out.get(reason, 0) + lines
+
+    def _close(self) -> None:
+        if self._rectifier is not None and self.result is not None:
+            for patch in self._rectifier.finish():
+                self.result.mosaic.add(patch)
+            self.result.missed_rays += self._rectifier.missed
+        self._rectifier = self._rest = None
+
+    def finish(self) -> Rectified | None:
+        """The orthoimage; None if no lines came."""
+        self._close()
+        return self.result
+
+
+def line_blocks(
+    recording: Recording, ccd: str, strips: list[str] | None, told: Callable[[float], None] | None = None
+) -> Iterator[LineBlock]:
+    """Blocks of lines of a CCD line and some strips (None: of all), in order."""
+    topic = f"sensor/lines/{ccd}"
+    total = max(len(recording.reader.select([topic])), 1)
+    for i, message in enumerate(recording.messages(topic)):
+        if told is not None and i % 20 == 0:
+            told(i / total)
+        block = message.body
+        if strips is None or block.strip in strips:
+            yield block
+
+
+def frame_for(frame: LocalFrame, crs: str) -> LocalFrame:
+    """The local frame with another CRS.
+
+    Raises
+    ------
+    UserError : PROJ does not know the CRS, or it is geographic
+    """
+    other = LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
+    if crs == "local":
+        return other
+    try:
+        other.to_crs(np.zeros((1, 3)))
+        geographic = other.is_geographic
+    except ValueError as error:
+        raise UserError(f"--crs: {error}") from None
+    if geographic:
+        raise UserError(f"--crs {crs}: is geographic, wanted a projected CRS such as EPSG:32632")
+    return other
+
+
+def true_relief(flight: Flight, step_m: float = 10.0) -> Heights:
+    """The ground of a simulated flight, as far as its cameras look, on a grid of its UTM zone."""
+    low, high = flight.truth.position_l.min(axis=0), flight.truth.position_l.max(axis=0)
+    above = high[2] - flight.terrain.height_m
+    c = float(flight.camera.focal_length_mm.min())
+    reach = 1.3 * above * max(float(np.abs(line.xy_mm).max()) for line in flight.camera.lines) / c
+    utm = replace(flight.frame, crs=utm_of(flight.frame))
+    corners = [(x, y, 0.0) for x in (low[0] - reach, high[0] + reach) for y in (low[1] - reach, high[1] + reach)]
+    border = utm.to_crs(np.array(corners))
+    (x0, y0), (x1, y1) = border[:, :2].min(axis=0), border[:, :2].max(axis=0)
+    x, y = np.meshgrid(np.arange(x0, x1, step_m), np.arange(y1, y0, -step_m))
+    place = np.stack([x.ravel(), y.ravel(), np.full(x.size, flight.frame.height_m + flight.terrain.height_m)], axis=1)
+    for _ in range(3):  # the plumb lines of the local frame and of the map differ a little
+        local = utm.from_crs(place)
+        local[:, 2] = flight.terrain.height(local[:, 0], local[:, 1])
+        place[:, 2] = utm.to_crs(local)[:, 2]
+    return Heights(
+        utm.crs, place[:, 2].reshape(x.shape), float(x[0, 0]), float(y[0, 0]), step_m, -step_m, above_ellipsoid=True
+    )
+
+
+def project_frame(recording: Recording) -> LocalFrame:
+    """The local frame of a recording, with the CRS of its project."""
+    return convert.local_frame(recording.project())

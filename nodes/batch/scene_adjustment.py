@@ -1,0 +1,585 @@
+"""The adjustment of a block of satellite scenes: images from a folder's scenes, stages, ``result.json`` and tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ...solver.adjustment.reliability import CRITICAL_W, reliability
+from ...solver.adjustment.statistics import GlobalTest, global_test, mean_sigma, point_accuracy, strongest_correlations
+from ...solver.camera.self_calibration import SELF_CALIBRATIONS, unit_of
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.rpc_fit import fit_to_model
+from ...solver.models import MODELS
+from ...solver.models.base import Extent, ModelOptions
+from ...solver.orbit.time_scales import iso_utc
+from ...solver.scene_adjustment.images import CAMERA, IMAGE, ORIENTATION, ImageModel
+from ...solver.scene_adjustment.rigorous import CorrectionSet, RigorousImage, calibration_of, flight_axes_b
+from ...solver.scene_adjustment.snooping import SceneSnooping, snoop
+from ...solver.scene_adjustment.solution import (
+    NotAdjustableError,
+    Problem,
+    SceneSolution,
+    adjust,
+    intersect,
+    points_enu,
+    prepare,
+)
+from ..errors import UserError
+from ..formats.satellite.rpc_files import write_rpb
+from ..formats.scene_block import ImageEntry, SceneBlockData
+from ..formats.table import write_table
+
+Array = NDArray[np.floating]
+
+#: Sigmas of the corrections where neither the project nor the metadata state them: what a satellite with GNSS and star
+#: trackers has, rounded up. Tuned.
+DEFAULTS: Mapping[str, object] = {
+    "offset_sigma_m": [5.0, 5.0, 5.0],
+    "shift_sigma_deg": [0.01, 0.01, 0.01],
+    "drift_sigma_deg": [0.001, 0.001, 0.001],
+    "first_sigma_m": [1.0, 1.0, 1.0],
+    "first_sigma_deg": [0.001, 0.001, 0.001],
+    "second_sigma_m": [0.5, 0.5, 0.5],
+    "second_sigma_deg": [0.0005, 0.0005, 0.0005],
+    "continuity_sigma_m": [0.1, 0.1, 0.1],
+    "continuity_sigma_deg": [0.00001, 0.00001, 0.00001],
+    "segments": 2,
+}
+#: Trajectory models that correct a scene, and sets of additional parameters that a line of detectors can have.
+SCENE_MODELS = ("dgr", "ppm", "lim")
+SCENE_CALIBRATIONS = ("none", "lens", "prism30")
+#: What shares a correction set.
+SETS = ("lens", "scene")
+#: Lines between two rows of trajectory_refined.csv.
+_ROWS = 101
+#: Heights of a fitted RPC reach so far beyond those of the points, metres.
+_BEYOND_M = 500.0
+#: Pairs of correlated unknowns that are listed.
+_MOST_LISTED = 20
+TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """What to do.
+
+    Attributes
+    ----------
+    model, then : names of trajectory models; ``then`` corrects what the first one left, None for one stage
+    settings : of the models: sigmas, segments, fixes
+    self_calibration : name of a set, or "none"
+    free : additional parameters without a-priori weight
+    sets : a correction set for each "lens", or for each "scene" with all its lenses
+    snoop, critical : data snooping, and its critical value
+    iterations : at most
+    """
+
+    model: str = "dgr"
+    then: str | None = None
+    settings: Mapping[str, object] | None = None
+    self_calibration: str = "none"
+    free: bool = False
+    sets: str = "lens"
+    snoop: bool = False
+    critical: float = CRITICAL_W
+    iterations: int = 30
+
+
+@dataclass(frozen=True)
+class SceneAdjustment:
+    """A finished job.
+
+    Attributes
+    ----------
+    data, job : input
+    problem : before the adjustment of the last stage
+    solution : after it
+    snooping : what was left out; None where nothing was looked for
+    seconds : wall time of the adjustment
+    """
+
+    data: SceneBlockData
+    job: SceneJob
+    problem: Problem
+    solution: SceneSolution
+    snooping: SceneSnooping | None
+    seconds: float
+
+    @property
+    def test(self) -> GlobalTest:
+        """Chi-square test of sigma0."""
+        return global_test(self.solution.weighted_squares, max(self.solution.redundancy, 0))
+
+    def values_of(self, image: int) -> Array:
+        """Unknowns of an image."""
+        return self.solution.state.values[self.problem.block.layout.columns[image]]
+
+
+def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
+    """Adjust a block of scenes.
+
+    Raises
+    ------
+    UserError : a block from which nothing can be computed, settings that no model takes
+    """
+    start = time.perf_counter()
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is refused
+            sensors: list[PushbroomSensor | None] = [
+                e.location if isinstance(e.location, PushbroomSensor) else None for e in data.images
+            ]
+            problem, solution, found = _stage(data, job, job.model, sensors)
+            if job.then:
+                sensors = _corrected(problem, solution, sensors)
+                problem, solution, found = _stage(data, job, job.then, sensors)
+    except NotAdjustableError as error:
+        raise UserError(f"{data.name}: {error}") from None
+    except ValueError as error:
+        raise UserError(f"{data.name}: cannot be adjusted: {error}") from None
+    return SceneAdjustment(data, job, problem, solution, found, time.perf_counter() - start)
+
+
+def _stage(
+    data: SceneBlockData, job: SceneJob, model: str, sensors: Sequence[PushbroomSensor | None]
+) -> tuple[Problem, SceneSolution, SceneSnooping | None]:
+    problem = prepare(data.block(images_of(data, job, model, sensors)))
+    solution = adjust(problem, max_iterations=job.iterations)
+    if not job.snoop:
+        return problem, solution, None
+    found = snoop(solution, job.critical)
+    return problem, found.solution, found
+
+
+def _corrected(
+    problem: Problem, solution: SceneSolution, sensors: Sequence[PushbroomSensor | None]
+) -> list[PushbroomSensor | None]:
+    """Sensors with the orbit and attitude of a stage; their lenses as they were."""
+    out: list[PushbroomSensor | None] = []
+    for image, columns, sensor in zip(problem.block.images, problem.block.layout.columns, sensors, strict=True):
+        if isinstance(image, RigorousImage) and sensor is not None:
+            located = image.located(solution.state.values[columns])
+            sensor = sensor.changed(located.motion, sensor.look)
+        out.append(sensor)
+    return out
+
+
+def images_of(
+    data: SceneBlockData, job: SceneJob, model: str, sensors: Sequence[PushbroomSensor | None]
+) -> tuple[ImageModel, ...]:
+    """The images of a block with their unknowns."""
+    options = _options(data, job, model)
+    spans = [None if s is None else _span(s) for s in sensors]
+    shared: dict[str, CorrectionSet] = {}
+    images: list[ImageModel] = []
+    for k, (entry, sensor, span) in enumerate(zip(data.images, sensors, spans, strict=True)):
+        if entry.scene.model != "rigorous" or sensor is None or span is None:
+            images.append(data.functional_image(entry))
+            continue
+        key = entry.name if job.sets == "lens" else entry.scene.name
+        if key not in shared:
+            mine = [i for i, e in enumerate(data.images) if (e.name if job.sets == "lens" else e.scene.name) == key]
+            ends = [s for i in mine if (s := spans[i]) is not None]
+            whole = min(s for s, _ in ends), max(e for _, e in ends)
+            rays = [i in mine for i in data.rays.image]
+            times = np.concatenate(
+                [s.line_times.time_of(data.rays.line[data.rays.image == i]) for i in mine if (s := sensors[i])]
+                or [np.empty(0)]
+            )
+            extent = Extent(f"strip {key}", *whole, times if any(rays) else np.empty(0), np.empty(0),
+                            job.self_calibration != "none")  # fmt: skip
+            shared[key] = CorrectionSet(key, options.build(extent), flight_axes_b(sensor, 0.5 * sum(whole)))
+        images.append(RigorousImage(entry.name, sensor, shared[key], _calibration(data.images[k], sensor, job)))
+    return tuple(images)
+
+
+def _calibration(entry: ImageEntry, sensor: PushbroomSensor, job: SceneJob) -> Any:
+    if job.self_calibration == "none" or entry.view is None:
+        return None
+    key = f"{entry.scene.camera}/{entry.ccd}" if entry.ccd else entry.scene.camera
+
+    def make(camera: Any) -> Any:
+        parameters = SELF_CALIBRATIONS[job.self_calibration](camera)
+        return parameters.free() if job.free else parameters
+
+    return calibration_of(key, sensor, entry.view, make)
+
+
+def _options(data: SceneBlockData, job: SceneJob, model: str) -> ModelOptions:
+    settings = {**DEFAULTS, **_stated(data), **data.trajectory, **(job.settings or {})}
+    try:
+        return MODELS[model].from_settings(settings)
+    except ValueError as error:
+        raise UserError(f"{data.name}: model {model}: {error}") from None
+
+
+def _stated(data: SceneBlockData) -> dict[str, object]:
+    """Sigmas that the metadata of all scenes state, the largest of each."""
+    stated = [e.scene.scene.sigmas for e in data.images if e.scene.model == "rigorous"]
+    found: dict[str, object] = {}
+    for key, values in (
+        ("offset_sigma_m", [s.position_m for s in stated]),
+        ("shift_sigma_deg", [np.degrees(s.attitude_rad) for s in stated]),
+    ):
+        if values and np.min(values) > 0:
+            found[key] = np.max(values, axis=0).tolist()
+    return found
+
+
+def _span(sensor: PushbroomSensor) -> tuple[float, float]:
+    ends = np.sort(sensor.line_times.time_of(np.array([0.0, max(sensor.lines - 1.0, 1.0)])))
+    return float(ends[0]), float(ends[1])
+
+
+# result.json
+
+
+def scene_result(a: SceneAdjustment) -> dict[str, Any]:
+    """The content of ``result.json``: keys as of any adjustment, what cannot be computed is None."""
+    s, data = a.solution, a.data
+    sigma = a.test.sigma0 * np.sqrt(np.maximum(np.diag(s.values_covariance), 0.0))
+    image_sigma = float(np.median(data.rays.sigma_px))
+    layout = a.problem.block.layout
+    strips: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
+    models = {image.corrections.key: image.corrections.model for image in _rigorous(a)}
+    for k, group in enumerate(layout.groups):
+        part = slice(int(layout.first[k]), int(layout.first[k + 1]))
+        value, spread = s.state.values[part], sigma[part]
+        if group.kind == ORIENTATION:
+            strips[group.key] = {"model": "rigorous"} | models[group.key].describe(value, spread)
+        elif group.kind == IMAGE:
+            kind = next(i.kind for i in a.problem.block.images if i.name == group.key)
+            coefficients = {
+                name.removesuffix(f" of {group.key}"): {"value": v, "sigma": e}
+                for name, v, e in zip(group.names, value, spread, strict=True)
+            }
+            strips[group.key] = {"model": kind, "coefficients": coefficients}
+        elif group.kind == CAMERA:
+            for name, v, e in zip(group.names, value, spread, strict=True):
+                parameters[_unique(name, group.key, parameters)] = {
+                    "value": v, "sigma": e, "t": v / e if e > 0 else 0.0, "status": "estimated", "reason": "",
+                    "unit": unit_of(name), "lens": group.key,
+                }  # fmt: skip
+    seen = a.problem.block.rays
+    content = {
+        "project": data.name,
+        "crs": data.frame.crs,
+        "model": a.job.model,
+        "then": a.job.then,
+        "selfcal": a.job.self_calibration,
+        "sets": a.job.sets,
+        "images": {i.name: i.kind for i in a.problem.block.images},
+        "sigma0": a.test.sigma0,
+        "sigma0_px": a.test.sigma0 * image_sigma,
+        "image_sigma_px": image_sigma,
+        "chi_square_test": {"low": a.test.low, "high": a.test.high, "passed": a.test.passed},
+        "n_observations": s.n_observations,
+        "n_unknowns": s.n_unknowns,
+        "redundancy": s.redundancy,
+        "n_image_points": len(seen),
+        "n_points": len(data.point_ids),
+        "iterations": s.iterations,
+        "converged": s.converged,
+        "seconds": a.seconds,
+        "strips": strips,
+        "additional_parameters": parameters,
+        **_accuracies(a),
+        "rejected": _rejected(a),
+        "rejected_control": [
+            {"point": data.point_ids[p], "coordinate": "XYZ"[axis], "w": _given_w(a, p, axis)}
+            for p, axis in (a.snooping.coordinates if a.snooping else ())
+        ],
+        "doubtful_points": [],
+        "variance_components": {},
+        "reliability": _reliability(a),
+        "correlations": _correlations(a, sigma),
+        "undetermined": [{"words": words, "share": 0.0, "unknowns": [words]} for words in s.undetermined],
+        "notes": _notes(a),
+    }
+    return _plain(content)
+
+
+def _unique(name: str, lens: str, taken: Mapping[str, Any]) -> str:
+    """A name for an additional parameter: its own, with the lens where two lenses have it."""
+    return name if name not in taken else f"{name} of {lens}"
+
+
+def _rigorous(a: SceneAdjustment) -> list[RigorousImage]:
+    return [image for image in a.problem.block.images if isinstance(image, RigorousImage)]
+
+
+def _known(a: SceneAdjustment, *roles: str) -> NDArray[np.int64]:
+    known = a.problem.block.known
+    places = [k for k, role in enumerate(known.role) if role in roles]
+    return np.array([k for k in places if a.solution.determined[known.point[k]]], dtype=np.int64)
+
+
+def point_sigmas(a: SceneAdjustment) -> Array:
+    """Sigmas (p, 3) in metres of all points, east, north, up, a posteriori; NaN where not determined."""
+    return a.test.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", a.solution.points_covariance), 0.0))
+
+
+def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
+    block, sigma = a.problem.block, point_sigmas(a)
+    known = block.known
+    found: dict[str, Any] = {}
+    for key, roles in (("check", ("check",)), ("control", ("control", "planimetric", "height"))):
+        k = _known(a, *roles)
+        points = known.point[k]
+        d = points_enu(a.problem, a.solution.state.position_e, known.position_e[k], points)
+        if key == "control":
+            d = np.where(known.given[k], d, np.nan)
+        found[key] = _accuracy(d, sigma[points])
+    tie = a.solution.determined.copy()
+    tie[known.point] = False
+    found["tie"] = {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()}
+    against = "check" if "check" in known.role else "control"
+    k = _known(a, against)
+    locating = np.array([image.locates for image in block.images])[block.rays.image]
+    position, determined = intersect(a.problem, _beforehand(a), locating)
+    k = k[determined[known.point[k]]] if len(k) else k
+    points = known.point[k]
+    d = points_enu(a.problem, position, known.position_e[k], points)
+    found["direct_georeferencing"] = _accuracy(d, np.full_like(d, np.nan)) | {"against": against}
+    return found
+
+
+def _beforehand(a: SceneAdjustment) -> Any:
+    """Points as they are, with the unknowns of images that locate by themselves at zero."""
+    values = a.solution.state.values.copy()
+    for image, columns in zip(a.problem.block.images, a.problem.block.layout.columns, strict=True):
+        if image.locates:
+            values[columns] = 0.0
+    return type(a.solution.state)(a.solution.state.position_e, values)
+
+
+def _accuracy(difference: Array, sigma: Array) -> dict[str, Any]:
+    found = point_accuracy(difference, sigma)
+    return {
+        "n": found.n,
+        "rmse_m": found.rmse_m,
+        "mean_m": found.mean_m,
+        "max_m": found.max_m,
+        "sigma_m": found.sigma_m,
+    }
+
+
+def _rejected(a: SceneAdjustment) -> list[dict[str, Any]]:
+    if a.snooping is None:
+        return []
+    out = []
+    for ray, w in zip(a.snooping.rays, a.snooping.w, strict=True):
+        entry = a.data.images[a.data.rays.image[ray]]
+        out.append(
+            {
+                "point": a.data.point_ids[a.data.rays.point[ray]],
+                "strip": entry.scene.name,
+                "ccd": entry.ccd,
+                "w": float(w),
+                "reason": "snooping",
+            }
+        )
+    return out
+
+
+def _reliability(a: SceneAdjustment) -> dict[str, Any]:
+    """Summary over the image points that take part, line and sample."""
+    used = a.solution.ray_weight
+    r = reliability(a.solution.redundancy_numbers[used], a.data.rays.sigma_px[used, None])
+    found: dict[str, Any] = {}
+    for k, name in enumerate(("line", "sample")):
+        number, detectable = r.redundancy[:, k], r.detectable[:, k]
+        finite = detectable[np.isfinite(detectable)]
+        found[name] = {
+            "redundancy_mean": float(number.mean()) if len(number) else None,
+            "redundancy_min": float(number.min()) if len(number) else None,
+            "detectable_px_median": float(np.median(finite)) if len(finite) else None,
+            "detectable_px_max": float(finite.max()) if len(finite) else None,
+            "uncontrolled": int((~np.isfinite(detectable)).sum()),
+        }
+    return found
+
+
+def _given_w(a: SceneAdjustment, p: int, axis: int) -> float:
+    problem, s = a.problem, a.solution
+    miss = problem.R_e_enu[p][:, axis] @ (problem.given_e[p] - s.state.position_e[p])
+    variance = problem.covariance_enu[p, axis, axis] + np.nan_to_num(s.points_covariance[p, axis, axis])
+    return float(miss / np.sqrt(variance))
+
+
+def _correlations(a: SceneAdjustment, sigma: Array) -> list[dict[str, Any]]:
+    if not len(sigma) or len(sigma) > 1500:
+        return []
+    pairs = strongest_correlations(a.solution.values_covariance, a.problem.block.layout.names)
+    return [{"between": [p.first, p.second], "r": p.correlation} for p in pairs[:_MOST_LISTED]]
+
+
+def _notes(a: SceneAdjustment) -> list[str]:
+    notes = list(a.data.notes)
+    s, data = a.solution, a.data
+    lost = [data.point_ids[p] for p in np.flatnonzero(~s.determined) if (data.rays.point == p).any()]
+    if lost:
+        shown = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if len(lost) > 5 else "")
+        notes.append(f"{len(lost)} points are not determined by their rays and were left out: {shown}")
+    blind = int((~np.isfinite(s.residual_px).all(axis=1)).sum())
+    if blind:
+        notes.append(f"{blind} rays look away from their point and take no part")
+    if a.snooping is not None and a.snooping.given_up:
+        share = 100 * a.snooping.given_up
+        notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
+    if not a.problem.given.any():
+        notes.append("no control: position and attitude of the block come from the a-priori sigmas of its orbits")
+    if not s.converged:
+        notes.append(f"not converged after {s.iterations} iterations")
+    if s.redundancy <= 0:
+        notes.append("no redundancy: nothing is checked")
+    notes += [f"undetermined: {words}" for words in s.undetermined]
+    for image in _rigorous(a):
+        notes += [n for n in image.corrections.model.notes if n not in notes]
+    if _rigorous(a):
+        notes.append("corrections: X along the track, Y across it to the right, Z up; omega about forward, phi about "
+                     "right, kappa about down")  # fmt: skip
+    return notes
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+# tables
+
+
+def write_scene_tables(a: SceneAdjustment, folder: Path) -> list[str]:
+    """Write points, residuals, refined orientation, and an RPC for every image; returns notes."""
+    _write_points(a, folder / "points.csv")
+    _write_residuals(a, folder / "residuals.csv")
+    _write_orientation(a, folder / "trajectory_refined.csv")
+    return _write_rpcs(a, folder / "rpc")
+
+
+def _write_points(a: SceneAdjustment, path: Path) -> None:
+    data, s = a.data, a.solution
+    frame = data.frame
+    n = len(data.point_ids)
+    places, sigma = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    known = s.determined
+    if known.any():
+        local = (s.state.position_e[known] - frame.origin_e) @ frame.R_el
+        places[known] = frame.to_crs(local)
+        R = np.swapaxes(frame.R_l_crs(places[known]), -1, -2) @ frame.R_el.T @ a.problem.R_e_enu[known]
+        C = R @ s.points_covariance[known] @ np.swapaxes(R, -1, -2)
+        sigma[known] = a.test.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", C), 0.0))
+    rays = np.bincount(data.rays.point, s.ray_weight, n).astype(int)
+    role = np.full(n, "tie", dtype=object)
+    role[a.problem.block.known.point] = a.problem.block.known.role
+    flat = ".10f" if frame.is_geographic else ".5f"
+    columns: dict[str, Any] = {"point": data.point_ids}
+    columns |= {f"{axis}_m": places[:, k] for k, axis in enumerate("XYZ")}
+    columns |= {f"sigma_{axis}_m": sigma[:, k] for k, axis in enumerate("XYZ")}
+    columns |= {"rays": rays, "role": role}
+    formats = {"X_m": flat, "Y_m": flat, "Z_m": ".5f"} | {f"sigma_{axis}_m": ".6f" for axis in "XYZ"}
+    write_table(path, columns, formats)
+
+
+def _write_residuals(a: SceneAdjustment, path: Path) -> None:
+    data, s = a.data, a.solution
+    entries = [data.images[k] for k in data.rays.image]
+    r = reliability(s.redundancy_numbers, data.rays.sigma_px[:, None])
+    columns: dict[str, Any] = {
+        "point": [data.point_ids[p] for p in data.rays.point],
+        "strip": [e.scene.name for e in entries],
+        "ccd": [e.ccd for e in entries],
+        "line": data.rays.line,
+        "sample": data.rays.sample,
+    }
+    formats = {"line": ".5f", "sample": ".5f"}
+    detectable = np.where(np.isfinite(r.detectable), r.detectable, np.nan)
+    for name, values, spec in (
+        ("v_{}_px", s.residual_px, ".5f"), ("w_{}", s.test, ".4f"), ("redundancy_{}", r.redundancy, ".5f"),
+        ("detectable_{}_px", detectable, ".4f"),
+    ):  # fmt: skip
+        for k, coordinate in enumerate(("line", "sample")):
+            columns[name.format(coordinate)] = values[:, k]
+            formats[name.format(coordinate)] = spec
+    out = np.zeros(len(data.rays), dtype=int)
+    if a.snooping is not None:
+        out[a.snooping.rays] = 1
+    write_table(path, columns | {"rejected": out}, formats)
+
+
+_AXES = ("X_m", "Y_m", "Z_m", "qx", "qy", "qz", "qw")
+_SIGMAS = ("sigma_along_m", "sigma_across_m", "sigma_up_m", "sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
+
+
+def _write_orientation(a: SceneAdjustment, path: Path) -> None:
+    """Earth-fixed pose of the body at lines of the rigorous images, with sigmas of the corrections."""
+    columns: dict[str, list[Any]] = {
+        name: [] for name in ("strip", "ccd", "line", "time_s", "time_utc", *_AXES, *_SIGMAS)
+    }
+    layout = a.problem.block.layout
+    for k, (entry, image) in enumerate(zip(a.data.images, a.problem.block.images, strict=True)):
+        if not isinstance(image, RigorousImage):
+            continue
+        sensor = image.located(a.values_of(k))
+        line = np.unique(np.round(np.linspace(0.0, sensor.lines - 1.0, min(_ROWS, sensor.lines))))
+        pose, t = sensor.pose(line), sensor.line_times.time_of(line)
+        model = image.corrections.model
+        numbers, functions = model.design(t).functions()
+        own = layout.columns[k][: model.n_unknowns][numbers]
+        Q = a.solution.values_covariance[np.ix_(own, own)]
+        sigma = a.test.sigma0 * np.sqrt(np.maximum(np.einsum("nci,ij,ncj->nc", functions, Q, functions), 0.0))
+        sigma[:, 3:] = np.degrees(sigma[:, 3:])
+        columns["strip"] += [entry.scene.name] * len(line)
+        columns["ccd"] += [entry.ccd] * len(line)
+        columns["line"] += line.tolist()
+        columns["time_s"] += t.tolist()
+        stamps = sensor.reference_ns + np.round(t * 1e9).astype(np.int64)
+        columns["time_utc"] += [iso_utc(int(ns)) if sensor.reference_ns else "" for ns in stamps]
+        values = np.hstack([pose.position_e, Rotation.from_matrix(pose.R_eb).as_quat(), sigma])
+        for name, column in zip((*_AXES, *_SIGMAS), values.T, strict=True):
+            columns[name] += column.tolist()
+    formats = {"line": ".0f", "time_s": ".9f"} | dict.fromkeys(_AXES[:3], ".4f") | dict.fromkeys(_AXES[3:], ".12f")
+    formats |= dict.fromkeys(_SIGMAS[:3], ".5f") | dict.fromkeys(_SIGMAS[3:], ".9f")
+    write_table(path, columns, formats)
+
+
+def _write_rpcs(a: SceneAdjustment, folder: Path) -> list[str]:
+    """Rational polynomials of the adjusted images that have a size; where none fits well a note says so."""
+    heights = a.problem.block.ellipsoid.geodetic(a.solution.state.position_e[a.solution.determined])[:, 2]
+    low, high = float(heights.min()) - _BEYOND_M, float(heights.max()) + _BEYOND_M
+    notes = []
+    for k, (entry, image) in enumerate(zip(a.data.images, a.problem.block.images, strict=True)):
+        if entry.size_px is None:
+            continue
+        name = entry.name.replace("/", "_")
+        located: Any = image.located(a.values_of(k))
+        try:
+            fit = fit_to_model(located, low, high)
+        except ValueError as error:
+            notes.append(f"image {entry.name}: no RPC written: {error}")
+            continue
+        folder.mkdir(exist_ok=True)
+        write_rpb(folder / f"{name}.RPB", fit.rpc)
+        if fit.max_px > 0.05:
+            notes.append(f"image {entry.name}: its RPC differs from the adjusted model by up to {fit.max_px:.2g} px")
+    return notes

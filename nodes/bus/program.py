@@ -1,0 +1,88 @@
+"""What a program on the bus is started with."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..config import Tables
+from .bundle import Bundle
+from .session import Bus
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+@dataclass
+class ProgramOptions:
+    """Options of ``triline node NAME``.
+
+    Attributes
+    ----------
+    name : of the node
+    platform, port, bus_file, secure : which bus; see `session.Bus`
+    tables : the configuration file, one table a node; ``--set key=value`` is merged in
+    stop : set when the program shall end
+    report : takes one line for a person
+    """
+
+    name: str
+    platform: str = "demo"
+    port: int | None = None
+    bus_file: Path | None = None
+    secure: Bundle | None = None
+    tables: Tables = field(default_factory=dict)
+    stop: threading.Event = field(default_factory=threading.Event)
+    report: Callable[[str], None] = _silent
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """The configuration of this node."""
+        return self.tables.get(self.name, {})
+
+    def open_bus(self) -> Bus:
+        """The bus, with the node's name as source."""
+        bus = Bus(self.platform, source=self.name, port=self.port, file=self.bus_file, secure=self.secure)
+        if alone := bus.why_alone():
+            self.report(alone)
+        return bus
+
+
+#: Names the process that a node must not outlive.
+PARENT_VARIABLE = "TRILINE_PARENT"
+
+
+def stop_with_parent(stop: threading.Event) -> None:
+    """End cleanly when the program that started this one has died, however it died; only where it asked for that."""
+    parent = os.environ.get(PARENT_VARIABLE, "")
+    if not parent.isdigit():
+        return
+
+    def watch() -> None:
+        while os.getppid() == int(parent) and not stop.wait(0.5):
+            pass
+        stop.set()
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+def stop_on_signals(stop: threading.Event) -> None:
+    """SIGINT and SIGTERM ask for a clean end; the third one ends at once."""
+    count = 0
+
+    def handle(number: int, frame: object) -> None:
+        nonlocal count
+        count += 1
+        stop.set()
+        if count > 2:
+            sys.exit(1)
+
+    signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGTERM, handle)

@@ -1,0 +1,503 @@
+"""The bus: Zenoh sessions that find each other on one machine, or as a configuration file says. The only file that
+knows Zenoh.
+
+Every session is a peer. Who comes first listens on the meeting port; all others connect to it, learn of each other
+there and link directly. When its owner dies they stay linked, and who comes next takes the port over: all others try it
+again and again. Nobody is a hub that all depend on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from ...schemas import codec, topics
+from ...schemas.envelope import Envelope, RawMessage, pack, unpack
+from ..errors import UserError
+from ..node import Message
+from .authority import DESK
+from .bundle import Bundle, speaks_tls
+from .links import BEAT_S, LinkWatch
+
+DEFAULT_PORT = 17447
+#: Messages of a latched topic that a publisher keeps for whoever joins later.
+LATCHED_KEPT = 100_000
+_RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+
+Receive = Callable[[RawMessage], None]
+Malformed = Callable[[str, str], None]
+Answer = Callable[[dict[str, str]], Any]
+Recipe = Callable[[Any, int], Any]
+#: For so long a session stays open beside the one that takes its place, s.
+BOTH_S = 1.0
+#: Names of topics that others tell are shorter than this.
+LONGEST_TOPIC = 200
+
+
+def default_port() -> int:
+    """The meeting port: the environment variable TRILINE_PORT, or 17447."""
+    text = os.environ.get("TRILINE_PORT", str(DEFAULT_PORT))
+    if not text.isdigit() or not 0 < int(text) < 65536:
+        raise UserError(f"TRILINE_PORT is {text!r}, wanted a port number")
+    return int(text)
+
+
+def configuration(port: int | None = None, file: str | Path | None = None) -> zenoh.Config:
+    """The Zenoh configuration: of a file, or peer to peer on loopback."""
+    if file is not None:
+        if not Path(file).is_file():
+            raise UserError(f"{file}: no such Zenoh configuration file")
+        try:
+            config = zenoh.Config.from_file(file)
+        except Exception as error:
+            raise UserError(f"{file}: not a Zenoh configuration: {_one_line(error)}") from None
+        config.insert_json5("timestamping/enabled", "true")  # late joiners are served by time
+        if port is not None:  # of a bundle, on another port than it says
+            for key in ("listen/endpoints", "connect/endpoints"):
+                there = json.loads(config.get_json(key))
+                moved = [re.sub(r":(?!0$)\d+$", f":{port}", endpoint) for endpoint in there]
+                config.insert_json5(key, json.dumps(moved))
+        return config
+    endpoint = f"tcp/127.0.0.1:{port or default_port()}"
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "listen/endpoints": [endpoint, "tcp/127.0.0.1:0"],
+        "listen/timeout_ms": 0,
+        "listen/exit_on_failure": False,
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": _RETRY,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": 4000,  # ms after which a frozen peer counts as gone
+        # us for which one who does not read may hold a publisher; then the link is closed, and made anew
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 2_000_000,
+        "timestamping/enabled": True,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def port_is_held(port: int) -> bool:
+    """Whether a program listens on a port of loopback."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just given up is free
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
+class Bus:
+    """A session on the bus of one platform.
+
+    Parameters
+    ----------
+    platform : name of the platform, a part of every key
+    source : id under which this program publishes
+    port : meeting port on loopback; None = TRILINE_PORT or 17447
+    file : a Zenoh configuration file instead
+    secure : a bundle of certificates and access lists; with a port it meets there instead of where the bundle says
+    """
+
+    def __init__(
+        self,
+        platform: str = "demo",
+        *,
+        source: str = "",
+        port: int | None = None,
+        file: str | Path | None = None,
+        secure: Bundle | None = None,
+    ) -> None:
+        if not platform or any(c in platform for c in "/*$?#@ "):
+            raise UserError(f"platform {platform!r}, wanted a name without blanks and any of / * $ ? # @")
+        zenoh.init_log_from_env_or("off")
+        self.platform = platform
+        self.source = source
+        self.start = time.time_ns()
+        self._secure = secure
+        if secure is not None:
+            file = secure.configuration
+            self._port = port
+        else:
+            self._port = None if file is not None else port or default_port()
+        held = secure is None and self._port is not None and port_is_held(self._port)
+        self._file = file
+        try:
+            self._session = zenoh.open(configuration(self._port, file))
+        except zenoh.ZError as error:
+            raise UserError(f"cannot open the bus: {_one_line(error)}") from None
+        self._publishers: dict[str, Any] = {}
+        self._recipes: list[Recipe] = []  # how all that is declared is declared again
+        self._declared: list[Any] = []
+        self._sequences: dict[str, int] = {}
+        self._held = held  # by others, when this session was opened
+        self._lock = threading.RLock()
+        self._opening = threading.Lock()
+        self._generation = 0  # of the session: what comes from an earlier one is not handed on
+        self._latched: deque[RawMessage] = deque(maxlen=LATCHED_KEPT)
+        self._links = LinkWatch()
+        self._ended = threading.Event()
+        #: Why this session was opened anew, the newest last.
+        self.opened_anew: list[str] = []
+        self._declare(self._hear_of_others)
+        threading.Thread(target=self._watch_links, name="links", daemon=True).start()
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def key(self, topic: str) -> str:
+        """Key expression of a topic."""
+        return topics.key_expression(self.platform, topic)
+
+    # ---- publishing
+
+    def prepare(self, names: Iterable[str]) -> None:
+        """Declare topics ahead of their first message, so that nobody has to learn of them while it is on its way."""
+        for name in names:
+            if not name.endswith("*"):
+                self._publisher(name)
+
+    def publish(self, message: Message) -> None:
+        """Publish a message; one without source or number gets this session's source and the next number."""
+        sequence = message.sequence
+        if sequence < 0:
+            sequence = self._sequences.get(message.topic, 0)
+            self._sequences[message.topic] = sequence + 1
+        envelope = Envelope(message.stamp_ns, message.source or self.source, sequence, self.start)
+        self.publish_raw(RawMessage(message.topic, envelope, codec.encode(message.body)))
+
+    def publish_raw(self, raw: RawMessage) -> None:
+        """Publish an encoded message with the envelope it has."""
+        data = raw.data if isinstance(raw.data, bytes) else bytes(raw.data)
+        attachment = pack(raw.envelope)
+        if topics.find(raw.topic).latched:
+            self._latched.append(raw)
+        try:
+            self._publisher(raw.topic).put(data, attachment=attachment)
+        except zenoh.ZError:
+            if self._ended.is_set():
+                raise
+            self._publisher(raw.topic).put(data, attachment=attachment)  # the session was opened anew meanwhile
+
+    def _publisher(self, topic: str) -> Any:
+        if self._secure is not None and topic not in self._publishers:
+            refused = self._secure.refuses(self.platform, topic)
+            if refused:
+                raise UserError(refused)
+        with self._lock:
+            if topic not in self._publishers:
+                self._publishers[topic] = self._declare_publisher(topic, self._session)
+            return self._publishers[topic]
+
+    def _declare_publisher(self, topic: str, session: Any) -> Any:
+        row = topics.find(topic)
+        encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name)
+        if row.latched:
+            return zenoh.ext.declare_advanced_publisher(
+                session,
+                self.key(topic),
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cache=zenoh.ext.CacheConfig(max_samples=LATCHED_KEPT),
+                publisher_detection=True,
+            )
+        # Status is the one thing that must never slow anybody down.
+        dropped = row.family is topics.Family.STATUS
+        congestion = zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK
+        return session.declare_publisher(self.key(topic), encoding=encoding, congestion_control=congestion)
+
+    # ---- receiving
+
+    def subscribe(self, name: str, receive: Receive, malformed: Malformed | None = None) -> Callable[[], None]:
+        """Call ``receive`` with every message of a topic (a name of the table, wildcard included).
+
+        Returns a function that ends it.
+
+        It is called in the thread that takes messages off the wire: while it waits, the publisher waits. For a latched
+        topic it also gets what was sent before. What has no readable envelope goes to ``malformed(topic, why)``.
+        """
+        prefix = len(self.key(""))
+
+        def take(sample: Any, generation: int) -> None:
+            receive_ns = time.time_ns()
+            topic = str(sample.key_expr)[prefix:]
+            if sample.kind != zenoh.SampleKind.PUT or generation != self._generation:
+                return
+            self._links.heard(topic, time.monotonic())
+            try:
+                if sample.attachment is None:
+                    raise ValueError("message without an envelope")
+                envelope = unpack(sample.attachment.to_bytes())
+            except ValueError as error:
+                if malformed is not None:
+                    malformed(topic, str(error))
+                return
+            receive(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
+
+        def declare(session: Any, generation: int) -> Any:
+            handler = zenoh.handlers.Callback(lambda sample: take(sample, generation), indirect=False)
+            if topics.find(name).latched:
+                return zenoh.ext.declare_advanced_subscriber(
+                    session,
+                    self.key(name),
+                    handler,
+                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_KEPT),
+                )
+            return session.declare_subscriber(self.key(name), handler)
+
+        return self._declare(declare)
+
+    # ---- liveliness and queries
+
+    def announce(self, node: str) -> None:
+        """Show that a node lives, until this session ends in whatever way."""
+        self._declare(lambda session, _: session.liveliness().declare_token(self.key(f"alive/{node}")))
+
+    def watch(self, changed: Callable[[str, bool], None]) -> None:
+        """Call ``changed(node, alive)`` for the nodes that live now and whenever one comes or goes."""
+
+        def take(sample: Any) -> None:
+            changed(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
+
+        def declare(session: Any, _: int) -> Any:
+            handler = zenoh.handlers.Callback(take, indirect=False)
+            return session.liveliness().declare_subscriber(self.key("alive/*"), handler, history=True)
+
+        self._declare(declare)
+
+    def alive(self, timeout_s: float = 1.0) -> set[str]:
+        """Names of the nodes that live now."""
+        replies = self._session.liveliness().get(self.key("alive/*"), timeout=timeout_s)
+        return {str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None}
+
+    def answer(self, name: str, answer: Answer) -> None:
+        """Answer queries ``query/<name>?key=value;..``: ``answer`` gives a message body, or None for none."""
+        key = self.key(f"query/{name}")
+
+        def take(query: Any) -> None:
+            with query:
+                try:
+                    body = answer(dict(_parameters(str(query.parameters))))
+                except ValueError as error:
+                    query.reply_err(str(error).encode(), encoding="text/plain")
+                    return
+                if body is not None:
+                    encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(body.DESCRIPTOR.full_name)
+                    query.reply(key, codec.encode(body), encoding=encoding)
+
+        self._declare(lambda session, _: session.declare_queryable(key, zenoh.handlers.Callback(take)))
+
+    def query(self, name: str, topic: str, timeout_s: float = 2.0, **parameters: object) -> list[Any]:
+        """Bodies (of the type of ``topic``) that answer a query; raises ValueError with the reason of a refusal."""
+        selector = self.key(f"query/{name}")
+        if parameters:
+            selector += "?" + ";".join(f"{key}={value}" for key, value in parameters.items())
+        bodies = []
+        for reply in self._session.get(selector, timeout=timeout_s):
+            if reply.ok is None:
+                raise ValueError(reply.err.payload.to_string() if reply.err is not None else "no reason given")
+            bodies.append(codec.decode(topic, reply.ok.payload.to_bytes()))
+        return bodies
+
+    def peers(self) -> int:
+        """How many sessions this one is linked with."""
+        info = self._session.info
+        return len(info.peers_zid()) + len(info.routers_zid())
+
+    def why_alone(self, patience_s: float = 3.0) -> str:
+        """Why this session meets nobody: a program that is none of ours holds the meeting port; "" if none does."""
+        until = time.monotonic() + patience_s
+        if self._secure is not None and self._secure.kind == DESK:  # an aircraft's first node is alone for a while
+            while not self.peers():
+                if time.monotonic() > until:
+                    endpoints = json.loads(configuration(self._port, self._file).get_json("connect/endpoints"))
+                    why = self._secure.why_nobody(endpoints)
+                    return f"nobody can be met: {why or 'no node answers'}"
+                time.sleep(0.02)
+            return ""
+        while self._held and not self.peers():
+            if time.monotonic() > until:
+                if speaks_tls("127.0.0.1", self._port or 0):
+                    return f"nobody can be met: port {self._port} answers in TLS alone, wanted --secure BUNDLE"
+                return (
+                    f"nobody can be met: port {self._port} is held by a program that does not answer on it; "
+                    "choose another with --port or TRILINE_PORT"
+                )
+            time.sleep(0.02)
+        return ""
+
+    def close(self) -> None:
+        """Withdraw everything and close the session; callbacks have ended when this returns."""
+        self._ended.set()
+        with self._opening:
+            pass  # a session that is being opened anew is closed here, too
+        _withdraw(self._session, (*self._declared, *self._publishers.values()))
+        self._declared.clear()
+        self._publishers.clear()
+
+    # ---- links that are gone
+
+    def _declare(self, recipe: Recipe) -> Callable[[], None]:
+        """Declare something, here and whenever the session is opened anew; returns a function that ends it."""
+        with self._lock:
+            self._recipes.append(recipe)
+            self._declared.append(recipe(self._session, self._generation))
+
+        def end() -> None:
+            with self._lock:
+                if recipe not in self._recipes or self._ended.is_set():
+                    return
+                place = self._recipes.index(recipe)
+                del self._recipes[place]
+                declared = self._declared.pop(place)
+            declared.undeclare()
+
+        return end
+
+    def _hear_of_others(self, session: Any, generation: int) -> Any:
+        """Subscribe to what other nodes say that they receive."""
+
+        def take(sample: Any) -> None:
+            if sample.kind != zenoh.SampleKind.PUT or generation != self._generation:
+                return
+            try:
+                status = codec.parse("status/any", sample.payload.to_bytes())
+                for row in status.topics:
+                    if row.rate_hz > 0 and len(row.topic) < LONGEST_TOPIC:
+                        self._links.told(row.topic, time.monotonic())
+            except (ValueError, KeyError):  # those who want to know count it
+                return
+
+        return session.declare_subscriber(self.key("status/*"), zenoh.handlers.Callback(take, indirect=False))
+
+    def _watch_links(self) -> None:
+        while not self._ended.wait(BEAT_S):
+            try:
+                peers = frozenset(str(peer) for peer in self._session.info.peers_zid())
+                why = self._links.beat(time.monotonic(), peers)
+                if why:
+                    self._open_anew(why)
+            except zenoh.ZError as error:  # it is tried again
+                self.opened_anew.append(f"cannot be opened anew: {_one_line(error)}")
+
+    def _open_anew(self, why: str) -> None:
+        """Open another session, declare everything there, change over, and close the one before."""
+        with self._opening:
+            if self._ended.is_set():
+                return
+            session, generation = zenoh.open(configuration(self._port, self._file)), self._generation + 1
+            with self._lock:
+                old, withdrawn = self._session, (*self._declared, *self._publishers.values())
+                declared = [recipe(session, generation) for recipe in self._recipes]
+                publishers = {topic: self._declare_publisher(topic, session) for topic in self._publishers}
+                self._session, self._generation = session, generation
+                self._declared, self._publishers = declared, publishers
+                for raw in list(self._latched):  # whoever joins later gets it from here
+                    publishers[raw.topic].put(bytes(raw.data), attachment=pack(raw.envelope))
+                self._links.opened(time.monotonic())
+                self.opened_anew.append(why)
+            # others are just learning of both sessions; one that is closed now can stay linked as a ghost
+            self._ended.wait(BOTH_S)
+            _withdraw(old, withdrawn)
+
+
+def _withdraw(session: Any, declared: Iterable[Any]) -> None:
+    for one in declared:
+        with contextlib.suppress(zenoh.ZError):  # a link that has just broken takes its declarations along
+            one.undeclare()
+    with contextlib.suppress(zenoh.ZError):
+        session.close()
+
+
+def listen_elsewhere(
+    endpoint: str, keys: Iterable[str], receive: Callable[[str, bytes], None]
+) -> contextlib.AbstractContextManager[None]:
+    """Hear what others publish on a Zenoh network that is not the bus; ends with the context.
+
+    The session is a peer that connects to ``endpoint`` (``tcp/127.0.0.1:7447``), again and again, and links directly
+    with those it learns of there.
+
+    Parameters
+    ----------
+    endpoint : of a router or a peer
+    keys : key expressions
+    receive : called with the key and the payload of each sample, in the thread that takes them off the wire
+
+    Raises
+    ------
+    UserError : an endpoint or a key expression that Zenoh refuses
+    """
+
+    @contextlib.contextmanager
+    def open_session() -> Iterator[None]:
+        zenoh.init_log_from_env_or("off")
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "peer",
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": True,
+            "listen/endpoints": ["tcp/127.0.0.1:0"],
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": _RETRY,
+            "transport/shared_memory/enabled": False,
+        }.items():
+            try:
+                config.insert_json5(key, json.dumps(value))
+            except zenoh.ZError as error:
+                raise UserError(f"{endpoint}: not a Zenoh endpoint: {_one_line(error)}") from None
+
+        def take(sample: Any) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                receive(str(sample.key_expr), sample.payload.to_bytes())
+
+        try:
+            with zenoh.open(config) as session:
+                subscribers = [
+                    session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False)) for key in keys
+                ]
+                yield
+                for subscriber in subscribers:
+                    subscriber.undeclare()
+        except zenoh.ZError as error:
+            raise UserError(f"{endpoint}: {_one_line(error)}") from None
+
+    return open_session()
+
+
+def _parameters(text: str) -> list[tuple[str, str]]:
+    return [(key, value) for key, _, value in (part.partition("=") for part in text.split(";") if part)]
+
+
+def _one_line(error: Exception) -> str:
+    """What Zenoh says, without the place in its own source and the picture of the line."""
+    text = str(error)
+    found = re.search(r"JSON error: Message \{ msg: \"(.*?)\", location: Some\(Location \{ line: (\d+)", text)
+    if found:
+        return f"line {found[2]}: {found[1]}"[:300]
+    text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", text)
+    picture = re.search(r"--> (\d+):(\d+)\n.*\n\s*=\s*(.*)", text, re.DOTALL)
+    if picture:
+        text = f"line {picture[1]}, column {picture[2]}: {picture[3]}"
+    return " ".join(text.split())[:300]

@@ -1,0 +1,92 @@
+"""``triline adjust`` of a block of satellite scenes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from ..batch.adjustment_summary import summary_lines
+from ..batch.scene_adjustment import (
+    SCENE_CALIBRATIONS,
+    SCENE_MODELS,
+    TABLES,
+    SceneAdjustment,
+    SceneJob,
+    run_scene_job,
+    scene_result,
+    write_scene_tables,
+)
+from ..errors import UserError
+from ..formats.scene_block import SceneBlockData, read_scene_block
+
+#: More unknowns of correction functions a lens than this want more memory than they are worth.
+MOST_PIECES = 60
+
+
+def run_scenes(args: argparse.Namespace) -> int:
+    """Adjust a folder, print and write the result."""
+    data = read_scene_block(Path(args.input))
+    adjustment = run_scene_job(data, scene_job(args, data))
+    content = scene_result(adjustment)
+    if args.output:
+        content["notes"] += write_scene_result(adjustment, content, Path(args.output))
+    if args.json:
+        print(json.dumps(content, indent=2))
+    else:
+        for line in summary_lines(content, verbose=args.verbose):
+            print(line)
+        if args.output and not args.quiet:
+            print(f"written to {args.output}")
+    return 0
+
+
+def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
+    """The job that the options ask for.
+
+    Raises
+    ------
+    UserError : an option that does not go with satellite scenes
+    """
+    for option, given in (
+        ("--robust", args.robust), ("--reweight", args.reweight), ("--variance-components", args.variance_components),
+        ("--plots", args.plots),
+    ):  # fmt: skip
+        if given:
+            raise UserError(f"{option} does not go with a block of satellite scenes")
+    for model in (args.model, args.then):
+        if model is not None and model not in SCENE_MODELS:
+            raise UserError(f"model {model}: does not go with satellite scenes, wanted {', '.join(SCENE_MODELS)}")
+    if args.selfcal not in SCENE_CALIBRATIONS:
+        wanted = ", ".join(SCENE_CALIBRATIONS)
+        raise UserError(f"--selfcal {args.selfcal}: does not go with satellite scenes, wanted {wanted}")
+    model = args.model or "dgr"
+    settings: dict[str, object] = {}
+    for option, owner in (("segments", "ppm"), ("fixes", "lim")):
+        value = getattr(args, option)
+        if value is None:
+            continue
+        if owner not in (model, args.then):
+            raise UserError(f"--{option} is for the model {owner}; asked for is {model}")
+        if not 1 <= value <= MOST_PIECES:
+            raise UserError(f"--{option} {value}, wanted 1 to {MOST_PIECES}")
+        settings[option] = value
+    return SceneJob(
+        model, args.then, settings, args.selfcal, args.free, args.sets or "lens", args.snoop, args.critical,
+        args.iterations,
+    )  # fmt: skip
+
+
+def write_scene_result(adjustment: SceneAdjustment, content: dict[str, object], folder: Path) -> list[str]:
+    """Write ``result.json``, the tables and ``rpc/``; returns notes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in [folder / name for name in ("result.json", *TABLES)] + list(folder.glob("rpc/*.RPB")):
+        old.unlink(missing_ok=True)
+    notes = write_scene_tables(adjustment, folder)
+    with_notes = content | {"notes": [*_texts(content["notes"]), *notes]}
+    (folder / "result.json").write_text(json.dumps(with_notes, indent=2) + "\n")
+    return notes
+
+
+def _texts(notes: object) -> list[str]:
+    return [str(note) for note in notes] if isinstance(notes, list) else []

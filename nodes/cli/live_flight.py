@@ -1,0 +1,359 @@
+"""A live flight: nodes as processes on the bus, watched, started again, stopped in order. `demo` and `fly` share it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..bus.bundle import load_bundle
+from ..bus.folder_lock import locked
+from ..bus.processes import NodeGroup, NodeProcess
+from ..errors import UserError
+from ..monitor.monitor import display
+
+if TYPE_CHECKING:
+    from ..bus.session import Bus
+    from ..monitor.sensor_watch import SensorWatch
+
+#: Nodes between sensors and orthoimages, in the order in which they are stopped.
+ESTIMATORS = ("navigator", "matcher", "adjuster", "rectifier")
+#: Longest wait until all nodes are there, s; one that has ended is told at once.
+READY_S = 60.0
+#: Longest wait after the flight until every node has processed all its messages.
+DRAIN_S = 15.0
+#: A sensor program that has ended by itself is started again after so long, s; twice as long each time, up to a minute.
+SENSOR_AGAIN_S, SENSOR_AGAIN_MOST_S = 3.0, 60.0
+
+
+class LiveFlight:
+    """The processes of a flight, from start to results. A command says what its sensors are.
+
+    Parameters
+    ----------
+    args : of the command: output, port, headless, web, quiet, json
+    platform : name on the bus
+    title : of the screen
+    estimators : nodes between sensors and results, in the order in which they are stopped
+    """
+
+    def __init__(self, args: argparse.Namespace, platform: str, title: str, estimators: tuple[str, ...]) -> None:
+        self.args, self.platform, self.title, self.estimators = args, platform, title, estimators
+        self.secure = load_bundle(args.secure) if args.secure is not None else None
+        if self.secure is not None and self.secure.kind != "aircraft":
+            raise UserError(f"--secure {args.secure}: is of a desk, wanted the bundle of an aircraft")
+        self.folder: Path = args.output
+        self.recording = self.folder / "flight.mcap"
+        self.stop = threading.Event()
+        self.restarts = 0
+        self.watch: SensorWatch | None = None
+        self._lost: dict[str, int] = {}
+        self._again: dict[str, float] = {}  # sensor programs that have ended, and when they are started again
+        self._ended: Counter[str] = Counter()  # how often they have
+        self.viewer_mode = self._viewer_mode()
+        self._silent = args.quiet or args.json
+
+    # ---- what a command says
+
+    def node_arguments(self, name: str) -> tuple[str, ...]:
+        """Arguments of ``triline node`` for a node."""
+        return ()
+
+    def start_sensors(self, group: NodeGroup) -> None:
+        """Start the programs that make data."""
+        raise TypeError(f"{type(self).__name__} does not define start_sensors")
+
+    def ready_line(self) -> str:
+        """Said when all nodes are there; "" for nothing."""
+        return ""
+
+    def sensor_ids(self) -> tuple[str, ...]:
+        """The processes that `start_sensors` started."""
+        raise TypeError(f"{type(self).__name__} does not define sensor_ids")
+
+    def start_sensor(self, group: NodeGroup, id: str) -> None:
+        """Start one of them that has ended by itself again; only where `sensors_go_on`."""
+
+    def tend(self, bus: Bus) -> None:
+        """Called again and again in flight."""
+
+    def over(self, group: NodeGroup) -> bool:
+        """Whether the flight has ended by itself."""
+        raise TypeError(f"{type(self).__name__} does not define over")
+
+    def drain_s(self) -> float:
+        """For how long to wait at the end until all messages have been processed, s."""
+        return DRAIN_S
+
+    #: Whether a sensor program that ends is started again; else its end is that of the flight.
+    sensors_go_on = False
+
+    # ---- the flight
+
+    def fly(self) -> dict[str, Any]:
+        """Run the flight; returns the evaluation of its recording. Nobody else writes into its folder meanwhile."""
+        with locked(self.folder):
+            return self._fly()
+
+    def _fly(self) -> dict[str, Any]:
+        self.clear()
+        port = self.port()
+        bus_file: Path | None = getattr(self.args, "bus", None)
+        if bus_file is not None and self.secure is not None:
+            raise UserError("--bus and --secure: wanted one of them, a bundle has its own Zenoh configuration")
+        logs = self.folder / "log"
+        with NodeGroup(logs, self.platform, port, bus_file, self.args.secure) as group, _interruptible(self.stop):
+            where = f"127.0.0.1:{port}" if bus_file is None else str(bus_file)
+            self.say(f"bus on {where}; logs in {group.log_folder}; Ctrl-C ends the flight")
+            group.start("recorder", "-o", str(self.recording))
+            for name in self.estimators:
+                group.start(name, *self.node_arguments(name))
+            if self.viewer_mode:
+                group.start("viewer", "--set", f"mode={json.dumps(self.viewer_mode)}")
+            with self._monitor(port) as (bus, overview, alive):
+                self._wait_ready(group, alive)
+                self._tell_web_address(group)
+                if ready := self.ready_line():
+                    self.say(ready)
+                self.start_sensors(group)
+                with display(overview, self.title, quiet=self._silent, watch=self.watch) as show:
+                    self._watch(group, bus, show)
+                    self._land(group, overview, show)
+            self.landed(group)
+        return self._evaluate()
+
+    def port(self) -> int:
+        """Where the nodes meet."""
+        return self.args.port or free_port()
+
+    def clear(self) -> None:
+        """Make the folder of results ready."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def landed(self, group: NodeGroup) -> None:
+        """Called when all processes have ended; may raise UserError."""
+
+    def _viewer_mode(self) -> str:
+        """Setting of the viewer, "" for none."""
+        if getattr(self.args, "no_viewer", False):
+            return ""
+        if self.args.web:
+            return "web"
+        no_display = sys.platform.startswith("linux") and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        )
+        if self.args.headless or no_display:
+            return f"rrd:{self.folder / 'flight.rrd'}"
+        return "native"
+
+    def _wait_ready(self, group: NodeGroup, alive: Callable[[], set[str]]) -> None:
+        wanted = set(group.processes)
+        until = time.monotonic() + READY_S
+        while not wanted <= alive():
+            for dead in group.dead():
+                if dead.name == "viewer":  # it also works without a viewer
+                    self.say(f"no viewer: {dead.last_line()}")
+                    wanted.discard("viewer")
+                    del group.processes["viewer"]
+                    continue
+                raise UserError(f"the {dead.name} failed: {dead.last_line()} (see {dead.log_path})")
+            if time.monotonic() > until:
+                missing = ", ".join(sorted(wanted - alive()))
+                raise UserError(f"{missing} did not come up within {READY_S:.0f} s (see {group.log_folder})")
+            if self.stop.wait(0.1):
+                break
+
+    def _tell_web_address(self, group: NodeGroup) -> None:
+        if self.viewer_mode == "web" and "viewer" in group.processes:
+            log = group.processes["viewer"].log_path.read_text(errors="replace")
+            address = next((word for word in log.split() if word.startswith("http://")), None)
+            self.say(f"scene at {address}" if address else f"no address of the scene; see {group.log_folder}")
+
+    # ---- in flight
+
+    def _watch(self, group: NodeGroup, bus: Bus, show: Callable[[], None]) -> None:
+        """Wait until the flight has ended; a node that dies is started again."""
+        while not self.over(group) and not self.stop.wait(0.25):
+            self.tend(bus)
+            show()
+            for dead in group.dead():
+                if dead.name in self.sensor_ids():
+                    if self.sensors_go_on:
+                        self._sensor_ended(dead)
+                        del group.processes[dead.name]
+                    continue
+                if dead.name == "viewer":  # the user closed its window
+                    del group.processes["viewer"]
+                    continue
+                self.restarts += 1
+                recorder = dead.name == "recorder"
+                group.start(
+                    dead.name, *(("-o", str(self._next_recording())) if recorder else self.node_arguments(dead.name))
+                )
+            for id in [id for id, due_s in self._again.items() if time.monotonic() >= due_s]:
+                del self._again[id]
+                self.start_sensor(group, id)
+        for id in self.sensor_ids():
+            if id in group.processes:
+                group.processes[id].stop()
+
+    def _sensor_ended(self, dead: NodeProcess) -> None:
+        after_s = min(SENSOR_AGAIN_S * 2 ** self._ended[dead.name], SENSOR_AGAIN_MOST_S)
+        self._ended[dead.name] += 1
+        self._again[dead.name] = time.monotonic() + after_s
+        if self.watch is not None:
+            self.watch.tell(f"{dead.name} has ended: {dead.last_line()}; again in {after_s:.0f} s")
+
+    def _next_recording(self) -> Path:
+        return self.folder / f"flight-{len(list(self.folder.glob('flight*.mcap'))) + 1}.mcap"
+
+    def _land(self, group: NodeGroup, overview: Any, show: Callable[[], None]) -> None:
+        """Wait until the nodes have processed all messages, then stop them along the data flow, the recorder last."""
+        # messages long after the last image line, as the navigator's last second of smoothing, concern no image line
+        late = self._lost_so_far(("late",))
+        until = time.monotonic() + self.drain_s()
+        quiet_since = time.monotonic()
+        seen = -1
+        while time.monotonic() < until and time.monotonic() - quiet_since < 2.5:
+            time.sleep(0.1)
+            show()
+            received = sum(
+                t.received for s in overview.nodes.values() for t in s.topics if not t.topic.startswith("st")
+            )
+            busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in self.estimators)
+            if received != seen or busy:
+                seen, quiet_since = received, time.monotonic()
+        self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
+        for name in (*self.estimators, "viewer", "recorder"):
+            if name in group.processes:
+                group.processes[name].stop(30.0)
+                time.sleep(0.7)  # its last messages still have to reach the other nodes
+                show()
+
+    @contextmanager
+    def _monitor(self, port: int) -> Iterator[tuple[Bus, Any, Callable[[], set[str]]]]:
+        """Run the monitor on the bus in a thread; yields the bus, its overview and the nodes that are alive."""
+        from ..bus.live import BusRunner, in_thread
+        from ..bus.session import Bus
+        from ..monitor.monitor import Monitor
+
+        monitor, living = Monitor(), set[str]()
+        self._overview = monitor.overview
+
+        def changed(node: str, is_alive: bool) -> None:
+            (living.add if is_alive else living.discard)(node)
+
+        bus_file: Path | None = getattr(self.args, "bus", None)
+        with Bus(self.platform, source="monitor", port=port, file=bus_file, secure=self.secure) as bus:
+            bus.watch(changed)
+            self.joined(bus)
+            with in_thread(BusRunner(monitor, bus)):
+                yield bus, monitor.overview, lambda: set(living)
+
+    def joined(self, bus: Bus) -> None:
+        """Called when this program is on the bus, before it looks for nodes."""
+
+    def say(self, text: str) -> None:
+        """A line for a person."""
+        if not self._silent:
+            print(text, flush=True)
+
+    # ---- after it
+
+    def _evaluate(self) -> dict[str, Any]:
+        recordings = sorted(self.folder.glob("flight*.mcap"), key=lambda path: path.stat().st_mtime)
+        if not recordings:
+            raise UserError(f"no recording in {self.folder}; see {self.folder / 'log' / 'recorder.log'}")
+        self.recording = max(recordings, key=lambda path: path.stat().st_size)
+        result = {} if getattr(self.args, "no_report", False) else self._report()
+        result.update(
+            recordings=[str(path) for path in recordings], restarts=self.restarts,
+            landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost,
+        )  # fmt: skip
+        return result
+
+    def _report(self) -> dict[str, Any]:
+        from .analyze import write_report
+
+        self.say("evaluating the recording")
+        report = self.folder / "report.html"
+        return {**write_report(self.recording, report), "report": str(report)}
+
+    def _lost_so_far(self, kinds: tuple[str, ...]) -> dict[str, int]:
+        """Messages that nodes lost, by kind; not those of the viewer, nor a status that a newer one replaced."""
+        sums: dict[str, int] = {}
+        for name, status in self._overview.nodes.items():
+            for topic in status.topics if name != "viewer" else ():
+                for kind in kinds:
+                    if getattr(topic, kind) and not topic.topic.startswith("status/"):
+                        sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
+        return sums
+
+    def summary(self, result: dict[str, Any]) -> str:
+        """The lines that are printed at the end."""
+        from ..report.accuracy_table import accuracy_lines
+
+        lines = ["", *(accuracy_lines(result) if "report" in result else [])]
+        lines += [f"missing: {text}" for text in result.get("missing", [])]
+        lines += [f"damaged recording: {text}" for text in result.get("damage", [])]
+        lines += self.remarks(result)
+        if result["lost"]:
+            lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
+        if self.restarts:
+            lines.append(f"{self.restarts} nodes were started again")
+        lines += ["", f"recording  {self.recording}"]
+        lines += [f"report     {result['report']}"] if "report" in result else []
+        if self.viewer_mode.startswith("rrd:"):
+            lines.append(
+                f"scene      {self.viewer_mode[4:]}   (no display: open it with `triline view {self.recording}`)"
+            )
+        lines += [
+            f"replay it  triline replay {self.recording}",
+            f"again      triline process {self.recording} -o {self.folder / 'processed.mcap'} "
+            f"--nodes {','.join(self.estimators)}{self.settings_again()}",
+        ]
+        return "\n".join(lines)
+
+    def remarks(self, result: dict[str, Any]) -> list[str]:
+        """Lines of the summary that only this kind of flight has."""
+        return []
+
+    def settings_again(self) -> str:
+        """Arguments of `process` that give the nodes the settings that they had in flight."""
+        return ""
+
+
+def add_view_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--headless``, ``--web`` and ``--secure``."""
+    parser.add_argument("--headless", action="store_true", help="no window; the scene goes to a .rrd file instead")
+    parser.add_argument("--web", action="store_true", help="show the scene in a browser (loopback only)")
+    parser.add_argument("--secure", type=Path, metavar="BUNDLE", help="of the aircraft, by `triline keys`: encrypted")
+
+
+@contextmanager
+def _interruptible(stop: threading.Event) -> Iterator[None]:
+    """Make Ctrl-C, SIGTERM and a closed terminal end the flight in good order."""
+    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def free_port() -> int:
+    """A port of loopback that nobody listens on."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]

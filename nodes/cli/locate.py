@@ -1,0 +1,193 @@
+"""``triline locate``: pixels to the ground and back, by the rigorous model or the RPC of any satellite scene."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.geometry.ellipsoid import WGS84
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
+from ...solver.location.rpc import Rpc
+from ...solver.location.uncertainty import Sigmas, ground_covariance, pixel_covariance
+from ..errors import UserError
+from ..formats.new_file import new_file
+from ..formats.satellite.read import KINDS, read_scene
+from ..formats.table import Column, read_table, write_table
+
+EXAMPLE = "triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv"
+
+Array = NDArray[np.floating]
+
+_PIXELS = (Column("column"), Column("row"), Column("height_m"))
+_GROUND = (Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0), Column("height_m"))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sensor", metavar="META", help="metadata of a scene: " + "; ".join(KINDS.values()))
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--pixels", metavar="CSV", help="column,row,height_m: 0-based, integers at pixel centres, above the ellipsoid"
+    )
+    what.add_argument("--ground", metavar="CSV", help="lon_deg,lat_deg,height_m")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="CSV",
+        help="lon_deg,lat_deg,height_m, or column,row; note where a row misses",
+    )
+    parser.add_argument("--model", choices=("rigorous", "rpc"), help="where the file has both (default: rigorous)")
+    parser.add_argument(
+        "--ccd", metavar="ID", help="line of detectors, where the scene has several (default: the first)"
+    )
+    parser.add_argument(
+        "--refraction",
+        nargs="*",
+        type=float,
+        metavar="VALUE",
+        help="bend the rays in the air: alone for the standard atmosphere, or temperature (K), pressure (hPa) and "
+        "vapour pressure (hPa) at sea level (default: straight rays)",
+    )
+    parser.add_argument(
+        "--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"), help="of the orbit, m"
+    )
+    parser.add_argument(
+        "--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"), help="about the axes of the body, degrees"
+    )
+    parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
+    parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given")
+
+
+def run(args: argparse.Namespace) -> int:
+    scene = read_scene(Path(args.sensor))
+    model = scene.model(args.model, args.ccd)
+    model = with_refraction(args, model)
+    sigmas = stated_sigmas(args, scene.sigmas)
+    if sigmas.any and isinstance(model, Rpc):
+        raise UserError(f"{args.sensor}: sigmas go with a rigorous model, this is an RPC")
+    notes = list(scene.notes)
+    if args.pixels:
+        columns, missed = _to_ground(Path(args.pixels), model, sigmas, notes)
+    else:
+        columns, missed = _to_pixels(Path(args.ground), model, sigmas, notes)
+    with new_file(Path(args.output)) as part:
+        write_table(part, columns, _FORMATS)
+    result = {
+        "sensor": str(args.sensor),
+        "kind": scene.kind,
+        "model": "rpc" if isinstance(model, Rpc) else "rigorous",
+        "output": str(args.output),
+        "rows": len(next(iter(columns.values()))),
+        "missed": missed,
+        "notes": notes,
+    }
+    if args.json:
+        print(json.dumps(result, indent=2))
+    elif not args.quiet:
+        print(f"{args.sensor} ({KINDS[scene.kind]}, {result['model']} model) -> {args.output}")
+        print(f"  {result['rows']} rows, {missed} of them miss")
+        for note in notes:
+            print(f"  note: {note}")
+    return 0
+
+
+_FORMATS = {
+    "lon_deg": ".10f", "lat_deg": ".10f", "height_m": ".4f", "column": ".6f", "row": ".6f",
+    "sigma_e_m": ".4f", "sigma_n_m": ".4f", "sigma_u_m": ".4f", "sigma_column": ".4f", "sigma_row": ".4f",
+}  # fmt: skip
+
+
+def with_refraction(args: argparse.Namespace, model: Any) -> Any:
+    """The model with the air that the command line asks for."""
+    if args.refraction is None:
+        return model
+    if isinstance(model, Rpc):
+        raise UserError(f"{args.sensor}: --refraction goes with a rigorous model, this is an RPC")
+    if abs(model.ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
+        raise UserError(f"{args.sensor}: --refraction knows the air of the Earth only, this is another planet")
+    if len(args.refraction) not in (0, 3):
+        raise UserError(
+            f"--refraction: {len(args.refraction)} values, wanted none, or temperature (K), pressure (hPa) and vapour "
+            "pressure (hPa)"
+        )
+    try:
+        air = Atmosphere(*args.refraction) if args.refraction else STANDARD
+    except ValueError as error:
+        raise UserError(f"--refraction: {error}") from None
+    return model.with_refraction(Refraction(air, model.ellipsoid))
+
+
+def stated_sigmas(args: argparse.Namespace, stated: Sigmas) -> Sigmas:
+    """Sigmas of the command line, and those of the file where it has none."""
+    pixel = stated.pixel if args.pixel_sigma is None else (args.pixel_sigma, args.pixel_sigma)
+    attitude = stated.attitude_rad if args.attitude_sigma is None else tuple(np.radians(args.attitude_sigma).tolist())
+    position = stated.position_m if args.position_sigma is None else tuple(args.position_sigma)
+    height = stated.height_m if args.height_sigma is None else args.height_sigma
+    try:
+        return Sigmas(position, attitude, stated.time_s, pixel, height)
+    except ValueError:
+        raise UserError(
+            "--position-sigma, --attitude-sigma, --pixel-sigma, --height-sigma: wanted numbers of at least 0"
+        ) from None
+
+
+def _to_ground(
+    path: Path, model: PushbroomSensor | Rpc, sigmas: Sigmas, notes: list[str]
+) -> tuple[dict[str, Any], int]:
+    table = read_table(path, _PIXELS, notes)
+    u, v, h = table["row"], table["column"], table["height_m"]
+    note = _outside(model, u, v)
+    inside = np.flatnonzero(note == "")
+    located = np.full((len(u), 3), np.nan)
+    located[inside] = model.direct(u[inside], v[inside], h[inside])
+    note[inside[np.isnan(located[inside, 0])]] = "the ray misses the ground"
+    seen = np.flatnonzero(np.isfinite(located[:, 0]))
+    columns: dict[str, Any] = {
+        "column": v, "row": u, "lon_deg": np.degrees(located[:, 1]), "lat_deg": np.degrees(located[:, 0]),
+        "height_m": located[:, 2],
+    }  # fmt: skip
+    if sigmas.any and isinstance(model, PushbroomSensor):
+        covariance = np.full((len(u), 3, 3), np.nan)
+        covariance[seen] = ground_covariance(model, u[seen], v[seen], h[seen], sigmas)
+        for k, name in enumerate(("sigma_e_m", "sigma_n_m", "sigma_u_m")):
+            columns[name] = np.sqrt(covariance[:, k, k])
+    columns["note"] = note
+    return columns, len(u) - len(seen)
+
+
+def _outside(model: PushbroomSensor | Rpc, u: Array, v: Array) -> NDArray[np.object_]:
+    """A note for pixels outside the image; an RPC may not know its size."""
+    note = np.full(len(u), "", dtype=object)
+    if model.lines and model.samples:
+        inside = (u >= -0.5) & (u <= model.lines - 0.5) & (v >= -0.5) & (v <= model.samples - 0.5)
+        note[~inside] = f"outside the image of {model.samples} columns and {model.lines} rows"
+    return note
+
+
+def _to_pixels(
+    path: Path, model: PushbroomSensor | Rpc, sigmas: Sigmas, notes: list[str]
+) -> tuple[dict[str, Any], int]:
+    table = read_table(path, _GROUND, notes)
+    table.refuse(np.abs(table["lat_deg"]) > 90.0, "lat_deg", lambda row: "a latitude beyond 90 degrees")
+    lat, lon, h = np.radians(table["lat_deg"]), np.radians(table["lon_deg"]), table["height_m"]
+    pixel = model.inverse(lat, lon, h, 0.0)
+    seen = np.flatnonzero(np.isfinite(pixel[:, 0]))
+    note = np.full(len(pixel), "not in the image", dtype=object)
+    note[seen] = ""
+    columns: dict[str, Any] = {
+        "lon_deg": table["lon_deg"], "lat_deg": table["lat_deg"], "height_m": h,
+        "column": pixel[:, 1], "row": pixel[:, 0],
+    }  # fmt: skip
+    if sigmas.any and isinstance(model, PushbroomSensor):
+        covariance = np.full((len(pixel), 2, 2), np.nan)
+        covariance[seen] = pixel_covariance(model, pixel[seen, 0], pixel[seen, 1], h[seen], sigmas)
+        for k, name in enumerate(("sigma_row", "sigma_column")):
+            columns[name] = np.sqrt(covariance[:, k, k])
+    columns["note"] = note
+    return columns, len(pixel) - len(seen)

@@ -1,0 +1,485 @@
+"""``triline rectify IMAGE --sensor META``: any image of a sensor that can be located, to an orthoimage."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
+from ...solver.location.affine_bias import BiasFit, CorrectedModel, fit_bias
+from ...solver.location.cropped import CroppedModel
+from ...solver.location.frame_camera import FrameCamera
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.rpc import Rpc
+from ...solver.location.uncertainty import Sigmas, pixel_covariance
+from ...solver.rectification.grid import MapGrid, default_crs
+from ...solver.rectification.pixel_to_cell import meet_terrain
+from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
+from ..batch.image_rectification import ErrorMap, Ground, ImageRectification, SourceImage, edge_of
+from ..errors import UserError
+from ..formats.frame_json import is_frame_json, read_frame
+from ..formats.height_raster import DATUMS, HeightRaster
+from ..formats.new_file import refuse_unless_file
+from ..formats.satellite.read import KINDS, read_scene
+from ..formats.table import Column, read_table
+from .locate import with_refraction
+from .progress import progress
+
+Array = NDArray[np.floating]
+
+_CONTROL = (
+    Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0), Column("height_m"), Column("column"), Column("row"),
+)  # fmt: skip
+#: An orthoimage with more cells a side is refused: GDAL counts rows and columns in 31 bits.
+MOST_SIDE = 2_000_000_000
+#: Options (as attributes) that a recording does not take.
+OPTIONS = (
+    "model", "first_pixel", "refraction", "control", "dem_crs", "dem_datum", "bounds", "nodata", "direct", "occlusions",
+    "mask", "sigma", "compress", "plain", "position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma", "workers",
+)  # fmt: skip
+#: Rasters that are looked for in a folder of heights.
+_DEM_NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options that go with an image."""
+    group = parser.add_argument_group("an image of a sensor (with --sensor)")
+    group.add_argument(
+        "--sensor", metavar="META",
+        help="metadata of the image: JSON of a frame camera (docs/rectification.md); " + "; ".join(KINDS.values()),
+    )  # fmt: skip
+    group.add_argument("--model", choices=("rigorous", "rpc"), help="where the metadata have both (default: rigorous)")
+    group.add_argument("--first-pixel", type=int, nargs=2, metavar=("COLUMN", "ROW"), help="of the image in the scene")
+    group.add_argument("--refraction", nargs="*", type=float, metavar="VALUE", help="as in 'triline locate'")
+    group.add_argument("--control", metavar="CSV", help="lon_deg,lat_deg,height_m,column,row: corrects the model")
+    group.add_argument(
+        "--correction", choices=("shift", "affine"), default="affine", help="of the image, by control (default: affine)"
+    )
+    group.add_argument("--dem-crs", metavar="CRS", help="of the heights; of a recording: ellipsoid, EPSG:5773 ..")
+    group.add_argument("--dem-datum", metavar="DATUM", help=f"what heights are above: {DATUMS}")
+    group.add_argument(
+        "--bounds",
+        type=float,
+        nargs=4,
+        metavar=("LEFT", "BOTTOM", "RIGHT", "TOP"),
+        help="of the orthoimage, in its CRS",
+    )
+    group.add_argument(
+        "--nodata", type=float, metavar="VALUE", help="in the image and the orthoimage (default: 0, NaN)"
+    )
+    group.add_argument("--direct", action="store_true", help="from pixels to the ground, not from the ground to pixels")
+    group.add_argument("--occlusions", action="store_true", help="leave out what relief hides from the sensor")
+    group.add_argument("--mask", metavar="FILE", help="GeoTIFF that says why cells are missing")
+    group.add_argument("--sigma", metavar="FILE", help="GeoTIFF of planimetric and height sigma, metres")
+    group.add_argument("--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"), help="m")
+    group.add_argument("--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"), help="degrees")
+    group.add_argument("--pixel-sigma", type=float, metavar="PX", help="of what is measured in the image (matching)")
+    group.add_argument("--height-sigma", type=float, metavar="M", help="of the heights")
+    group.add_argument(
+        "--compress", choices=("deflate", "zstd", "lzw", "none"), help="of the GeoTIFF (default: deflate)"
+    )
+    group.add_argument("--plain", action="store_true", help="no overviews and no compression: half the time")
+    group.add_argument("--workers", type=int, metavar="N", help="threads (default: as many as cores)")
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """A location model of the image, and what is known of it.
+
+    Attributes
+    ----------
+    model : of the image, corrected
+    bare : the model as it was read
+    kind : for people
+    offset : line and sample of the image's first pixel in the scene
+    sigmas : of the sensor
+    fit : of the correction, None without control
+    """
+
+    model: Any
+    bare: Any
+    kind: str
+    offset: tuple[float, float]
+    sigmas: Sigmas
+    fit: BiasFit | None
+    ellipsoid: Ellipsoid
+    notes: list[str]
+
+
+def run(args: argparse.Namespace) -> int:
+    begun = time.perf_counter()
+    _check(args)
+    image = SourceImage(Path(args.input), args.nodata)
+    sensor = _sensor(args, image)
+    ground = ground_under(args, sensor)
+    lat, lon = edge_of(sensor.model, ground)
+    grid, pixel_m = _grid(args, sensor, ground, lat, lon)
+    nodata = image.nodata if image.nodata is not None else float("nan") if image.dtype.kind == "f" else 0.0
+    factor = 1 if args.resampling == "nearest" else max(int(_metres(grid, lat, lon) / pixel_m + 0.1), 1)
+    factor = max(min(factor, image.lines // 8, image.samples // 8), 1)
+    work = ImageRectification(
+        sensor.model, image, grid, ground, args.resampling, factor, float(nodata), args.occlusions, args.direct,
+        ellipsoid=sensor.ellipsoid, **({} if args.workers is None else {"workers": args.workers}),
+    )  # fmt: skip
+    sigma = _error_map(args, sensor, ground)
+    tags = {
+        "TIFFTAG_IMAGEDESCRIPTION": f"{Path(args.input).name} by {sensor.kind}, {ground.words}, {args.resampling}, "
+        + ("pixel to ground" if args.direct else "ground to pixel")
+    }
+    with progress("rectifying", args.quiet or args.json) as told:
+        counts = work.run(
+            args.output, mask=None if args.mask is None else Path(args.mask), sigma=sigma, tags=tags,
+            compress="plain" if args.plain else args.compress or "deflate", told=told,
+        )  # fmt: skip
+    _tell(args, sensor, ground, grid, factor, counts.cells, time.perf_counter() - begun)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    for path in (args.output, args.mask, args.sigma):
+        if path is not None:
+            refuse_unless_file(Path(path))
+            if Path(path).resolve() == Path(args.input).resolve():
+                raise UserError(f"{path}: would overwrite the image")
+    named = [str(Path(p).resolve()) for p in (args.output, args.mask, args.sigma) if p is not None]
+    if len(set(named)) < len(named):
+        raise UserError("-o, --mask, --sigma: wanted different files")
+    for name in ("orientation", "trajectory", "ccd", "strip"):
+        if name != "ccd" and getattr(args, name):
+            raise UserError(f"--{name}: goes with a recording, not with --sensor")
+    if args.gsd is not None and not (np.isfinite(args.gsd) and args.gsd > 0):
+        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
+    if args.height is not None and not np.isfinite(args.height):
+        raise UserError(f"--height {args.height}: wanted a number")
+    if args.dem and args.height is not None:
+        raise UserError("--height and --dem: wanted one of them")
+    if args.direct and (args.sigma or args.occlusions):
+        raise UserError("--direct: sees nothing hidden and makes no sigmas, wanted without --occlusions and --sigma")
+    if args.bounds is not None:
+        left, bottom, right, top = args.bounds
+        if not (left < right and bottom < top):
+            raise UserError(f"--bounds {args.bounds}: wanted left below right and bottom below top")
+    for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
+        value = getattr(args, name)
+        if value is not None and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
+            raise UserError(f"--{name.replace('_', '-')}: wanted numbers of at least 0")
+    if args.plain and args.compress is not None:
+        raise UserError("--plain and --compress: wanted one of them")
+    if args.workers is not None and args.workers < 1:
+        raise UserError(f"--workers {args.workers}: wanted at least 1")
+
+
+# -- the sensor ----------------------------------------------------------------------------------------------------
+
+
+def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
+    path = Path(args.sensor)
+    notes: list[str] = []
+    if is_frame_json(path):
+        bare, stated = read_frame(path, notes)
+        kind, sigmas = "frame camera", Sigmas(stated["position_m"], stated["attitude_rad"])
+    else:
+        scene = read_scene(path)
+        bare = scene.model(args.model, args.ccd)
+        notes += scene.notes
+        kind, sigmas = ("RPC" if isinstance(bare, Rpc) else "rigorous model"), scene.sigmas
+    bare = with_refraction(args, bare)
+    ellipsoid = WGS84 if isinstance(bare, Rpc) else bare.ellipsoid
+    if isinstance(bare, Rpc) and not (bare.lines and bare.samples):
+        bare = replace(bare, lines=image.lines, samples=image.samples)
+        unknown = True
+    else:
+        unknown = False
+    line, sample = _first_pixel(args, image, bare, unknown, notes)
+    model: Any = bare
+    if (line, sample) != (0, 0) or (bare.lines, bare.samples) != (image.lines, image.samples):
+        model = CroppedModel(bare, line, sample, image.lines, image.samples)
+    fit = None
+    if args.control is not None:
+        fit = _correction(args, Path(args.control), model, image, sigmas)
+        model = CorrectedModel(model, fit.bias)
+        if fit.rejected.any():
+            notes.append(f"{args.control}: {int(fit.rejected.sum())} points rejected by data snooping")
+    return _Sensor(model, bare, kind, (line, sample), sigmas, fit, ellipsoid, notes)
+
+
+def _first_pixel(
+    args: argparse.Namespace, image: SourceImage, model: Any, unknown: bool, notes: list[str]
+) -> tuple[int, int]:
+    """Line and sample of the image's first pixel in the scene."""
+    if args.first_pixel is not None:
+        sample, line = args.first_pixel
+    else:
+        crop = image.crop()
+        if crop is None:
+            line = sample = 0
+            if not unknown and (model.lines, model.samples) != (image.lines, image.samples):
+                raise UserError(
+                    f"{args.input}: {image.samples} x {image.lines} pixels, but {args.sensor} is of {model.samples} x "
+                    f"{model.lines}: wanted that image, or --first-pixel COLUMN ROW for a part of it"
+                )
+        else:
+            line, sample = crop
+            notes.append(
+                f"{Path(args.input).name}: a part of the scene, first pixel at column {sample}, row {line} by its "
+                "geotransform"
+            )
+    end = line + image.lines, sample + image.samples
+    if not unknown and (min(line, sample) < 0 or end[0] > model.lines or end[1] > model.samples):
+        raise UserError(
+            f"{args.input}: columns {sample} to {end[1] - 1}, rows {line} to {end[0] - 1} of the scene, but "
+            f"{args.sensor} is of {model.samples} x {model.lines} pixels"
+        )
+    return line, sample
+
+
+def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas) -> BiasFit:
+    table = read_table(path, _CONTROL, [])
+    u, v = table["row"], table["column"]
+    size = f"the image has {image.samples} columns and {image.lines} rows"
+    outside = (u < -0.5) | (u > image.lines - 0.5)
+    table.refuse(outside, "row", lambda k: f"{u[k]:g}: outside, {size}")
+    table.refuse((v < -0.5) | (v > image.samples - 0.5), "column", lambda k: f"{v[k]:g}: outside, {size}")
+    lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
+    sigma = args.pixel_sigma or 0.5
+    try:
+        # the image may be off by more than its size: the model alone says where a point would appear
+        return fit_bias(
+            _Wide(image.lines, image.samples, model),
+            lat,
+            lon,
+            table["height_m"],
+            u,
+            v,
+            sigma,
+            affine=args.correction == "affine",
+        )
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None
+
+
+@dataclass
+class _Wide:
+    """A model that answers as far as its own size around the image."""
+
+    lines: int
+    samples: int
+    model: Any
+
+    def direct(self, line: Any, sample: Any, height_m: Any) -> Array:
+        return self.model.direct(line, sample, height_m)
+
+    def inverse(self, lat: Any, lon: Any, height_m: Any, margin_px: float = 0.0) -> Array:
+        return self.model.inverse(lat, lon, height_m, float(max(self.lines, self.samples)))
+
+
+# -- the ground ----------------------------------------------------------------------------------------------------
+
+
+def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
+    """The ground that the command line asks for, under the image."""
+    model = sensor.model
+    guess = float(sensor.bare.to_image.in_offset[2]) if isinstance(sensor.bare, Rpc) else 0.0
+    if not args.dem:
+        for name in ("dem_crs", "dem_datum"):
+            if getattr(args, name) is not None:
+                raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
+        h = guess if args.height is None else args.height
+        ground = Ground(h, h, h, 1.0, f"height {h:.1f} m above the ellipsoid")
+        if not np.isfinite(edge_of(model, ground)[0]).any():
+            raise UserError(f"{args.sensor}: the image does not see the ground at {h:g} m")
+        return ground
+    raster = HeightRaster(_rasters(args.dem), args.dem_crs, args.dem_datum, sensor.ellipsoid)
+    low = high = guess
+    for _ in range(2):
+        places = [edge_of(model, Ground(h, h, h, 1.0, ""), 60) for h in {low, high}]
+        lat, lon = (np.concatenate(a) for a in zip(*places, strict=True))
+        seen = np.isfinite(lat)
+        if not seen.any():
+            raise UserError(f"{args.sensor}: the image does not see the ground at {low:g} m")
+        lat, lon = lat[seen], lon[seen]
+        found = raster.range_over(lat, lon)
+        if found is None:
+            degrees = f"{np.degrees(lat.mean()):.4f} N, {np.degrees(lon.mean()):.4f} E"
+            raise UserError(f"{raster.name}: does not cover the image, which lies around {degrees}")
+        low, high = found
+    u, v = np.meshgrid(np.linspace(0, model.lines - 1, 25), np.linspace(0, model.samples - 1, 25))
+    met = meet_terrain(model, u.ravel(), v.ravel(), raster, low, high)
+    covered = float(np.isfinite(met.lat).mean())
+    if covered == 0.0:
+        raise UserError(f"{raster.name}: knows no height under the image")
+    if covered < 1.0:
+        sensor.notes.append(f"{raster.name}: covers {100 * covered:.0f} % of the image, the rest is missing")
+    return Ground(raster, low, high, covered, f"heights of {raster.name} {raster.datum}")
+
+
+def _rasters(names: list[str]) -> list[Path]:
+    """Rasters that are named, and those in folders."""
+    out: list[Path] = []
+    for name in names:
+        path = Path(name)
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _DEM_NAMES)
+            if not inside:
+                raise UserError(f"{path}: no rasters of heights in it ({', '.join(_DEM_NAMES)})")
+            out += inside
+        else:
+            out.append(path)
+    return out
+
+
+# -- the cells -----------------------------------------------------------------------------------------------------
+
+
+def _grid(args: argparse.Namespace, sensor: _Sensor, ground: Ground, lat: Array, lon: Array) -> tuple[MapGrid, float]:
+    """The cells, and the size of a pixel on the ground, metres."""
+    seen = np.isfinite(lat)
+    if not seen.any():
+        raise UserError(f"{args.input}: none of its pixels sees the ground")
+    mean = np.stack([np.cos(lat[seen]) * np.cos(lon[seen]), np.cos(lat[seen]) * np.sin(lon[seen]), np.sin(lat[seen])])
+    x, y, z = mean.mean(axis=1)
+    middle = float(np.arctan2(z, np.hypot(x, y))), float(np.arctan2(y, x))
+    crs = args.crs or default_crs(*middle, sensor.ellipsoid)
+    if crs == "local":
+        raise UserError("--crs local: goes with a recording, an image wants a projected or geographic CRS")
+    try:
+        unit = MapGrid(crs, 0.0, 0.0, 1.0, 1, 1, sensor.ellipsoid)
+        x, y = unit.map(lat[seen], lon[seen])
+    except ValueError as error:
+        raise UserError(f"--crs: {error}") from None
+    model = sensor.model
+    h = np.array([0.5 * (ground.low_m + ground.high_m)])
+    centre = SomeCells(np.zeros((1, 2)), np.array([0.5 * (model.lines - 1)]), np.array([0.5 * (model.samples - 1)]), h)
+    by_pixel = ground_steps(model, centre, sensor.ellipsoid)[0][0]
+    pixel_m = float(np.sqrt(abs(np.linalg.det(by_pixel))))
+    longest = float(np.linalg.norm(by_pixel, axis=0).max())
+    if not np.isfinite(pixel_m):
+        raise UserError(f"{args.sensor}: the middle of the image does not see the ground")
+    a_metre = 1.0 / _metres(unit, lat, lon)
+    gsd = args.gsd or float(f"{pixel_m * a_metre:.2g}")
+    try:
+        grid = replace(unit, gsd=gsd)
+        if args.bounds is None:
+            grid = grid.over(x, y, 1.0 + float(np.ceil(longest * a_metre / gsd)))
+        else:
+            left, bottom, right, top = args.bounds
+            grid = grid.over(np.array([left, right]), np.array([bottom, top]), 0.0)
+    except (ValueError, OverflowError) as error:
+        raise UserError(f"--crs {crs}: {error}") from None
+    if max(grid.rows, grid.columns) > MOST_SIDE:
+        raise UserError(f"--gsd {gsd:g}: {grid.columns:.3g} x {grid.rows:.3g} cells are too many, wanted a larger one")
+    return grid, pixel_m
+
+
+def _metres(grid: MapGrid, lat: Array, lon: Array) -> float:
+    """Size of a cell in metres, at the middle of places (n,)."""
+    seen = np.isfinite(lat)
+    x, y = grid.map(lat[seen], lon[seen])
+    x0, y0 = np.nanmean(x), np.nanmean(y)
+    column, row = (x0 - grid.left) / grid.gsd - 0.5, (grid.top - y0) / grid.gsd - 0.5
+    a, o = grid.where(np.array([column, column + 1.0, column]), np.array([row, row, row + 1.0]))
+    east, north = metres_a_radian(a[:1], np.zeros(1), grid.ellipsoid)
+    en = np.stack([(o[1:] - o[0]) * east, (a[1:] - a[0]) * north], axis=1)
+    return float(np.sqrt(abs(np.linalg.det(en))))
+
+
+# -- errors --------------------------------------------------------------------------------------------------------
+
+
+def _error_map(args: argparse.Namespace, sensor: _Sensor, ground: Ground) -> ErrorMap | None:
+    if args.sigma is None:
+        return None
+    stated = sensor.sigmas
+    position = stated.position_m if args.position_sigma is None else tuple(args.position_sigma)
+    attitude = stated.attitude_rad if args.attitude_sigma is None else tuple(np.radians(args.attitude_sigma).tolist())
+    pixel = stated.pixel if args.pixel_sigma is None else (args.pixel_sigma, args.pixel_sigma)
+    height = stated.height_m if args.height_sigma is None else args.height_sigma
+    bare, fit = sensor.bare, sensor.fit
+    oriented = any((*position, *attitude))
+    rpc_m2 = 0.0
+    if isinstance(bare, Rpc):
+        if oriented:
+            raise UserError(
+                f"{args.sensor}: --position-sigma and --attitude-sigma go with a rigorous model, not with RPC"
+            )
+        rpc_m2 = 0.5 * (bare.error_bias_m**2 + bare.error_random_m**2)
+    if fit is not None:
+        sensor.notes.append("sigma: of the correction by control, in place of the orientation's")
+    elif not (oriented or rpc_m2 or stated.time_s):
+        sensor.notes.append(
+            "sigma: no sigma of the orientation is known (--position-sigma, --attitude-sigma, --control)"
+        )
+    if not (any(pixel) or height or oriented or rpc_m2 or fit is not None or stated.time_s):
+        raise UserError("--sigma: no sigma is known, wanted --height-sigma, --pixel-sigma, --position-sigma or others")
+    sensor_sigmas = Sigmas(position, attitude, stated.time_s, (0.0, 0.0), 0.0)  # type: ignore[arg-type]
+    matching = np.diag(np.square(pixel))
+
+    def errors(line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:
+        Q = np.broadcast_to(matching, (len(line), 2, 2)).copy()
+        level = np.zeros(len(line))
+        if fit is not None:
+            T = np.column_stack(
+                [np.ones(len(line)), (np.column_stack([line, sample]) - fit.bias.middle) / fit.bias.half]
+            )
+            J = np.zeros((len(line), 2, 6))
+            J[:, 0, :3], J[:, 1, 3:] = T, T
+            return Q + J @ fit.bias.covariance @ np.swapaxes(J, 1, 2), level
+        u, v = line + sensor.offset[0], sample + sensor.offset[1]
+        if isinstance(bare, PushbroomSensor) and sensor_sigmas.any:
+            u = np.clip(u, 0.0, bare.lines - 1.0)
+            Q += pixel_covariance(bare, u, v, height_m, sensor_sigmas)
+        elif isinstance(bare, FrameCamera) and sensor_sigmas.any:
+            J = bare.image_derivatives(u, v, height_m)
+            Q += J @ np.diag(np.square([*position, *attitude])) @ np.swapaxes(J, 1, 2)
+        return Q, level + rpc_m2
+
+    return ErrorMap(Path(args.sigma), errors, float(height))
+
+
+# -- what is told --------------------------------------------------------------------------------------------------
+
+
+def _tell(
+    args: argparse.Namespace, sensor: _Sensor, ground: Ground, grid: MapGrid, factor: int, cells: dict[str, int],
+    seconds: float,
+) -> None:  # fmt: skip
+    result: dict[str, Any] = {
+        "output": str(args.output), "sensor": str(args.sensor), "model": sensor.kind, "crs": grid.crs, "gsd": grid.gsd,
+        "rows": grid.rows, "columns": grid.columns, "ground": ground.words, "resampling": args.resampling,
+        "path": "direct" if args.direct else "indirect", "pixels_together": factor, "cells": cells,
+        "mask": args.mask, "sigma": args.sigma, "notes": sensor.notes, "seconds": round(seconds, 3),
+    }  # fmt: skip
+    fit = sensor.fit
+    if fit is not None:
+        used = ~fit.rejected
+        result["control"] = {
+            "points": len(used), "rejected": int(fit.rejected.sum()), "sigma0": fit.sigma0,
+            "redundancy": fit.redundancy, "correction": args.correction,
+            "shift_px": fit.bias.coefficients[:, 0].tolist(),
+            "rms_px": np.sqrt(np.mean(fit.residual_px[used] ** 2, axis=0)).tolist(),
+        }  # fmt: skip
+    if args.json:
+        print(json.dumps(result, indent=2))
+        return
+    print(
+        f"{args.output}: {grid.rows} x {grid.columns} cells of {grid.gsd:g} in {grid.crs}, {sensor.kind}, "
+        f"{ground.words}, {seconds:.1f} s"
+    )
+    missing = [f"{n} cells {name}" for name, n in cells.items() if n and name != "value"]
+    print(f"  {cells['value']} cells with a value" + (", " + ", ".join(missing) if missing else ""))
+    if fit is not None:
+        line, sample = result["control"]["shift_px"]
+        print(
+            f"  control: {len(fit.rejected)} points, {int(fit.rejected.sum())} rejected, sigma0 {fit.sigma0:.2f}, "
+            f"shift of lines {line:+.2f} px, of samples {sample:+.2f} px"
+        )
+    if not args.quiet:
+        for note in sensor.notes:
+            print(f"  note: {note}")

@@ -1,0 +1,143 @@
+"""``triline study misspecified``: worlds that are not as they are stated, on line beside the batch."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from ...solver.simulation.misspecified_study import (
+    ROWS,
+    SETTINGS,
+    Cell,
+    FlightFigures,
+    cells_of,
+    fly,
+    through_window,
+)
+from ..errors import UserError
+from ..formats.new_file import new_file
+from ..simulator.world_settings import world_text
+from .misspecified_nodes import through_nodes
+from .progress import progress
+
+ONLINE = {"nodes": through_nodes, "window": through_window}
+EXAMPLE = "triline study misspecified --seeds 3 --rows stated sine-slow boresight --settings rtk"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=int, default=6, metavar="N", help="flights a row and setting (6)")
+    parser.add_argument("--first", type=int, default=1, metavar="N", help="first seed (1)")
+    parser.add_argument("--strips", type=int, default=1, metavar="N", help="parallel strips (1)")
+    parser.add_argument("--seconds", type=float, default=60.0, metavar="X", help="length of a strip (60)")
+    text = f"of {', '.join(ROWS)} (all)"
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="ROW", help=text)
+    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS), help="stated (all)")
+    parser.add_argument(
+        "--online", choices=list(ONLINE), default="nodes",
+        help="nodes: a recording through navigator and adjuster, as `process` does (default); window: the window alone "
+        "with updates at fixed times, in two thirds of the time",
+    )  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
+    parser.add_argument("--csv", metavar="FILE", help="also write a row of figures for each row and setting")
+
+
+def run(args: argparse.Namespace) -> int:
+    if min(args.seeds, args.jobs, args.strips) < 1 or args.first < 0 or not args.seconds > 0:
+        raise UserError("wanted --seeds, --jobs, --strips 1 at least, --first 0 at least, --seconds more than 0")
+    rows = [row for row in ROWS if row in args.rows]
+    keys = [(setting, row) for setting in args.settings for row in rows]
+    seeds = range(args.first, args.first + args.seeds)
+    cases = [(setting, row, seed, args.strips, args.seconds, args.online) for setting, row in keys for seed in seeds]
+    flights: dict[tuple[str, str], list[FlightFigures]] = {key: [] for key in keys}
+    with progress("flights", args.quiet or args.json) as tell, ProcessPoolExecutor(args.jobs) as pool:
+        for i, found in enumerate((pool.map if args.jobs > 1 else map)(_fly, cases)):
+            flights[cases[i][:2]].append(found)
+            if tell is not None:
+                tell((i + 1) / len(cases))
+    cells = cells_of(flights)
+    if args.csv:
+        write_csv(cells, Path(args.csv))
+    if args.json:
+        print(json.dumps(document(args, cells, flights), indent=2))
+    else:
+        print("\n".join(lines(cells, args.seeds, args.strips, args.seconds)))
+    return 0
+
+
+def _fly(case: tuple[str, str, int, int, float, str]) -> FlightFigures:
+    setting, row, seed, strips, seconds, online = case
+    return fly(setting, row, seed, strips, seconds, ONLINE[online])
+
+
+def document(
+    args: argparse.Namespace, cells: Sequence[Cell], flights: dict[tuple[str, str], list[FlightFigures]]
+) -> dict[str, Any]:
+    """The machine-readable result: figures of each row and setting, and of each flight."""
+    return {
+        "seeds": args.seeds, "first": args.first, "strips": args.strips, "seconds": args.seconds, "online": args.online,
+        "cells": [
+            {**cell.plain(), "true": world_text(ROWS[cell.row].world),
+             "each": [f.plain() for f in flights[cell.setting, cell.row]]}
+            for cell in cells
+        ],
+    }  # fmt: skip
+
+
+def write_csv(cells: Sequence[Cell], path: Path) -> None:
+    """One line a row and setting; a column a figure, `limit ...` 1 where it holds."""
+    table = []
+    for cell in cells:
+        plain = cell.plain()
+        limits, lights = plain.pop("limits"), plain.pop("lights")
+        table.append(
+            {**plain, **{name: lights.get(name, 0) for name in ("good", "weak", "failed")}}
+            | {f"limit {name}": int(held) for name, held in limits.items()}
+        )
+    with new_file(path) as part, part.open("w", newline="") as out:
+        writer = csv.DictWriter(out, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
+
+
+def lines(cells: Sequence[Cell], seeds: int, strips: int, seconds: float) -> list[str]:
+    """The figures as a table a setting, what the light said in the worst flight, and which limits do not hold."""
+    flown = f"{seeds} flights a row, {strips} strip{'s' if strips > 1 else ''} of {seconds:g} s"
+    out = [f"worlds that are not as stated: {flown}; 3D RMSE of points, m"]
+    for setting in dict.fromkeys(cell.setting for cell in cells):
+        out += ["", _HEAD.format(setting)]
+        mine = [cell for cell in cells if cell.setting == setting]
+        out += [_line(cell) for cell in mine]
+        for cell in mine:
+            if ROWS[cell.row].unknowable:
+                title = ROWS[cell.row].title
+                out.append(f"  {title}: in the datum of control; against truth on line {cell.in_truth_m:.2f} m")
+        out += [f"  the worst of {ROWS[c.row].title}, seed {c.worst_seed}: {c.worst_words or '-'}" for c in mine]
+    missed = sum(not held for cell in cells for held in cell.limits.values())
+    total, took = sum(len(cell.limits) for cell in cells), sum(cell.seconds for cell in cells)
+    count = sum(cell.flights for cell in cells)
+    out += ["", f"{total - missed} of {total} limits hold; {count} flights, {took:.0f} s of processor time"]
+    return out
+
+
+_HEAD = (
+    "stated: {:<18s} on line  worst(seed)  direct   batch  +vc   position attitude  NEES     NEES  sigma0 rejected "
+    "control  good/weak/  not met\n"
+    "                                                                         m      mdeg  orient. points"
+    "                refused     failed"
+)
+
+
+def _line(c: Cell) -> str:
+    lights = "/".join(str(c.lights.get(name, 0)) for name in ("good", "weak", "failed"))
+    missed = ", ".join(name for name, held in c.limits.items() if not held) or "-"
+    return (
+        f"  {ROWS[c.row].title:<25s}{c.online_m:7.3f} {c.worst_m:7.2f} ({c.worst_seed:2d}) {c.direct_m:8.2f} "
+        f"{c.batch_m:7.3f} {c.components_m:6.3f} {c.position_m:7.3f} {1e3 * c.attitude_deg:8.2f} "
+        f"{c.orientation_nees:7.2f} {c.points_nees:7.2f} {c.sigma0:7.2f} {100 * c.rejected:6.1f} % "
+        f"{c.control_refused:7.1f}  {lights:>10s}  {missed}"
+    )

@@ -1,0 +1,152 @@
+"""``triline study rectification``: transforms of the plane, RPC and the differential method on the same points.
+
+A frame image like BILSAT's (2048 x 2048 pixels of 27.6 m) over level ground and over relief. Each method is estimated
+from the control points and judged by check points that it has not seen; RMSE of check points in east and north, metres,
+and what an estimation takes. A second table has control with blunders, a third starts of the differential method that
+are far off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...solver.rectification.comparison import METHODS, Compared, Noise, compare
+from ..errors import UserError
+from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.table import write_table
+
+EXAMPLE = "triline study rectification --control 25 --plot comparison.png --csv comparison.csv"
+#: Errors of starts: position m, attitude degrees.
+_STARTS = ((100.0, 0.02), (1e3, 0.1), (1e4, 1.0), (3e4, 4.0))
+#: Share of control points that are blunders in the second table.
+_BLUNDERS = 0.12
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--control", type=int, default=25, metavar="N", help="control points (25)")
+    parser.add_argument("--check", type=int, default=100, metavar="N", help="check points (100)")
+    parser.add_argument("--relief", type=float, default=1000.0, metavar="M", help="from valley to top (1000)")
+    parser.add_argument("--pixel-sigma", type=float, default=0.3, metavar="PX", help="of what is measured (0.3)")
+    parser.add_argument("--ground-sigma", type=float, default=5.0, metavar="M", help="of control, each way (5)")
+    parser.add_argument("--height-sigma", type=float, default=5.0, metavar="M", help="of the terrain model (5)")
+    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="draws (10)")
+    parser.add_argument("--csv", metavar="FILE", help="write one row a scene and method")
+    parser.add_argument("--plot", metavar="FILE", help="write a picture of the comparison (PNG, SVG, PDF)")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.control < 3 or args.check < 1 or args.seeds < 1:
+        raise UserError("--control: wanted at least 3, --check and --seeds: at least 1")
+    for name in ("relief", "pixel_sigma", "ground_sigma", "height_sigma"):
+        if not (np.isfinite(getattr(args, name)) and getattr(args, name) >= 0):
+            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: wanted a number of at least 0")
+    if args.pixel_sigma == args.ground_sigma == 0:
+        raise UserError("--pixel-sigma, --ground-sigma: wanted one above 0")
+    for path in (args.csv, args.plot):
+        if path:
+            refuse_unless_file(Path(path))
+    noise = Noise(args.pixel_sigma, args.ground_sigma, args.height_sigma)
+    sizes = (args.control, args.check)
+    wrong = replace(noise, blunders=_BLUNDERS)
+    tables: dict[str, dict[str, Compared]] = {
+        "level ground": compare(METHODS, *sizes, 0.0, noise, args.seeds),
+        f"relief of {args.relief:g} m": compare(METHODS, *sizes, args.relief, noise, args.seeds),
+        f"relief, {round(wrong.blunders * args.control)} blunders": compare(
+            METHODS, *sizes, args.relief, wrong, args.seeds
+        ),
+    }
+    starts = {}
+    for position, attitude in _STARTS:
+        sigma = np.array([position] * 3 + [np.radians(attitude)] * 3)
+        found = compare(
+            ("differential",),
+            *sizes,
+            args.relief,
+            noise,
+            args.seeds,
+            lambda rng, s=sigma: s * rng.choice([-1.0, 1.0], 6),
+        )
+        starts[f"{position / 1e3:g} km, {attitude:g} deg"] = found["differential"]
+    if args.csv:
+        _write_csv(Path(args.csv), tables)
+    if args.plot:
+        _plot(Path(args.plot), tables)
+    if args.json:
+        scenes = {scene: {name: _plain(got) for name, got in table.items()} for scene, table in tables.items()}
+        print(json.dumps({"scenes": scenes, "starts": {name: _plain(got) for name, got in starts.items()}}, indent=2))
+    else:
+        print(_text(args, tables, starts))
+    return 0
+
+
+def _plain(got: Compared) -> dict[str, Any]:
+    return {
+        "rmse_east_m": _number(got.rmse_m[0]), "rmse_north_m": _number(got.rmse_m[1]),
+        "control_rmse_east_m": _number(got.control_rmse_m[0]), "control_rmse_north_m": _number(got.control_rmse_m[1]),
+        "seconds": _number(got.seconds), "failed": got.failed,
+    }  # fmt: skip
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _text(args: argparse.Namespace, tables: dict[str, dict[str, Compared]], starts: dict[str, Compared]) -> str:
+    lines = [
+        f"{args.control} control points, {args.check} check points, {args.seeds} draws; RMSE of check points east, "
+        "north, m (a pixel is 27.6 m)",
+        f"{'':14s}" + "".join(f"{scene:>26s}" for scene in tables) + f"{'ms':>10s}",
+    ]
+    for name in METHODS:
+        row = f"{name:14s}"
+        for table in tables.values():
+            got = table[name]
+            text = f"{got.rmse_m[0]:.1f} {got.rmse_m[1]:7.1f}" if np.isfinite(got.rmse_m).all() else "too few points"
+            row += f"{text:>26s}"
+        lines.append(row + f"{1e3 * next(iter(tables.values()))[name].seconds:10.1f}")
+    lines += [
+        "",
+        "differential method, first orientation wrong by",
+        f"{'':22s}{'RMSE east, north, m':>22s}{'failed':>8s}",
+    ]
+    for name, got in starts.items():
+        text = f"{got.rmse_m[0]:.1f} {got.rmse_m[1]:7.1f}" if np.isfinite(got.rmse_m).all() else "-"
+        lines.append(f"{name:22s}{text:>22s}{got.failed:8d}")
+    return "\n".join(lines)
+
+
+def _write_csv(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
+    rows = [(scene, name, *_plain(got).values()) for scene, table in tables.items() for name, got in table.items()]
+    keys = ("scene", "method", *_plain(next(iter(next(iter(tables.values())).values()))))
+    columns = {key: [np.nan if row[k] is None else row[k] for row in rows] for k, key in enumerate(keys)}
+    with new_file(path) as part:
+        write_table(part, columns, dict.fromkeys((k for k in keys if k.endswith("_m")), ".3f") | {"seconds": ".6f"})
+
+
+def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    width = 0.8 / len(tables)
+    for k, (scene, table) in enumerate(tables.items()):
+        rmse = [float(np.hypot(*table[name].rmse_m)) for name in METHODS]
+        axes.bar(np.arange(len(METHODS)) + (k - 0.5 * (len(tables) - 1)) * width, rmse, width, label=scene)
+    axes.axhline(27.6, color="black", linewidth=0.8, linestyle=":", label="one pixel")
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(METHODS)), METHODS, rotation=30, ha="right")
+    axes.set_ylabel("RMSE of check points, m")
+    axes.legend(frameon=False, fontsize="small")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    with new_file(path) as part:
+        figure.savefig(part, format=path.suffix.lstrip(".") or "png", dpi=120)
+    plt.close(figure)

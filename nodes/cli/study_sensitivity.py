@@ -1,0 +1,289 @@
+"""``triline study sensitivity``: which parameter a location owes its error to, by four methods.
+
+A pixel of a satellite scene, of a simulated one, or of an ADS40 strip is located with errors in orbit, attitude, time,
+image and height. The table has, for each parameter and for east and north, what its sigma moves the point by (from the
+derivative), its share of the variance by covariance propagation, and its first-order and total index by FAST and
+Sobol. Below stands the sigma by covariance propagation and by Monte Carlo, with its standard error and percentiles; a
+note says where the two differ, because the function is not linear within the sigmas.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...solver.camera.sensors import preset
+from ...solver.geometry.ellipsoid import WGS84
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.refraction import Refraction
+from ...solver.location.uncertainty import Sigmas
+from ...solver.sensitivity.inputs import Function, Normal
+from ...solver.sensitivity.located_pixel import (
+    AIRCRAFT,
+    RESULTS,
+    SATELLITE,
+    AircraftPixel,
+    SatellitePixel,
+    aircraft_inputs,
+    satellite_inputs,
+)
+from ...solver.sensitivity.monte_carlo import PERCENTILES
+from ...solver.sensitivity.study import Study, study
+from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
+from ..errors import UserError
+from ..formats.new_file import new_file
+from ..formats.satellite.read import read_scene
+from ..formats.table import write_table
+
+EXAMPLE = "triline study sensitivity aster-vnir ads40 --attitude-sigma 0.001 0.001 0.001 --csv shares.csv"
+#: Scenes of the study without arguments.
+_SCENES = ("aster-vnir", "ads40")
+#: The strip of the worked example: flown north, so high, m, over ground so high; CCD line.
+_FLOWN_M, _GROUND_M, _AIR_CCD = 3000.0, 300.0, "N"
+#: Place below the satellite of simulated scenes, degrees.
+_PLACE_DEG = (36.0, 139.6)
+#: Sigmas where neither file nor command line states any: position m, attitude degrees, time s, pixel, height m. Tuned:
+#: a satellite with receiver and star tracker; an aircraft with GNSS and inertial measurement after processing.
+_SATELLITE = ((2.0, 2.0, 2.0), (5e-4, 5e-4, 1e-3), 1e-4, 0.3, 10.0)
+_AIR = ((0.05, 0.05, 0.1), (0.003, 0.003, 0.006), 0.0, 0.3, 0.5)
+#: Of the focal length of the aircraft's camera, mm; the usual one of a laboratory calibration.
+_FOCAL_MM = 0.002
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A pixel to be looked at: its name, where it is, the function and what its parameters scatter by."""
+
+    name: str
+    where: dict[str, float | str]
+    function: Function
+    inputs: Normal
+    units: dict[str, str]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    simulated = ", ".join(ORBITAL_SENSORS)
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help=f"metadata of a satellite scene, a simulated sensor ({simulated}), or ads40 (aster-vnir ads40)",
+    )
+    parser.add_argument("--pixel", type=float, nargs=2, metavar=("COLUMN", "ROW"), help="0-based (middle of the image)")
+    parser.add_argument("--height", type=float, metavar="M", help="of the ground above the ellipsoid (300)")
+    parser.add_argument("--ccd", metavar="ID", help="line of detectors, where the sensor has several")
+    parser.add_argument("--refraction", action="store_true", help="bend the rays of satellites in the air")
+    parser.add_argument("--position-sigma", type=float, nargs=3, metavar="M", help="along, across, up; X, Y, Z")
+    parser.add_argument(
+        "--attitude-sigma", type=float, nargs=3, metavar="DEG", help="roll, pitch, yaw; omega, phi, kappa"
+    )
+    parser.add_argument("--time-sigma", type=float, metavar="S", help="of line times of a satellite")
+    parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
+    parser.add_argument("--height-sigma", type=float, metavar="M", help="of the ground")
+    parser.add_argument("--runs", type=int, default=20_000, metavar="N", help="of Monte Carlo (20000)")
+    parser.add_argument("--samples", type=int, default=2048, metavar="N", help="for indices, a power of 2 (2048)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the draws (1)")
+    parser.add_argument("--csv", metavar="FILE", help="write one row a scene, result and parameter")
+
+
+def run(args: argparse.Namespace) -> int:
+    results = []
+    for name in args.scenes or _SCENES:
+        scene = _aircraft(args) if name == "ads40" else _satellite(args, name)
+        try:
+            found = study(scene.function, scene.inputs, args.runs, args.samples, args.seed)
+        except ValueError as error:
+            raise UserError(f"{name}: {error}") from None
+        results.append(_as_table(scene, found))
+    if args.csv:
+        _write_csv(Path(args.csv), results)
+    if args.json:
+        print(json.dumps({"scenes": results}, indent=2))
+    else:
+        print("\n\n".join(_as_text(result) for result in results))
+    return 0
+
+
+def _sigmas(args: argparse.Namespace, usual: tuple[Any, ...], stated: Sigmas | None = None) -> Sigmas:
+    """Those of the command line; else what the file states; else, where the file states none at all, the usual."""
+    position, attitude_deg, time_s, pixel, height = usual
+    of_file = stated if stated is not None and stated.any else None
+    pixels = (pixel, pixel) if of_file is None else of_file.pixel
+    attitude = np.radians(attitude_deg) if of_file is None else of_file.attitude_rad
+    if args.attitude_sigma is not None:
+        attitude = np.radians(args.attitude_sigma)
+    if args.pixel_sigma is not None:
+        pixels = (args.pixel_sigma, args.pixel_sigma)
+    if of_file is not None:
+        position, time_s, height = of_file.position_m, of_file.time_s, of_file.height_m
+    position = position if args.position_sigma is None else args.position_sigma
+    time_s = time_s if args.time_sigma is None else args.time_sigma
+    height = height if args.height_sigma is None else args.height_sigma
+    try:
+        return Sigmas(tuple(position), tuple(float(a) for a in attitude), time_s, pixels, height)  # pyright: ignore[reportArgumentType]
+    except ValueError:
+        raise UserError(
+            "--position-sigma, --attitude-sigma, --time-sigma, --pixel-sigma, --height-sigma: wanted numbers of at "
+            "least 0"
+        ) from None
+
+
+def _satellite(args: argparse.Namespace, name: str) -> _Scene:
+    stated = None
+    if name in ORBITAL_SENSORS:
+        sensors = overpass(ORBITAL_SENSORS[name], *_PLACE_DEG).sensors
+        ccd = args.ccd or next(iter(sensors))
+        if ccd not in sensors:
+            raise UserError(f"{name}: line of detectors {ccd!r}, wanted one of {', '.join(sensors)}")
+        sensor = sensors[ccd]
+    else:
+        if not Path(name).exists():
+            known = ", ".join([*ORBITAL_SENSORS, "ads40"])
+            raise UserError(f"{name}: neither a file nor a simulated sensor, wanted metadata or one of {known}")
+        scene = read_scene(Path(name))
+        stated = scene.sigmas
+        model = scene.model("rigorous", args.ccd)
+        assert isinstance(model, PushbroomSensor)
+        sensor = model
+    if args.refraction:
+        if abs(sensor.ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
+            raise UserError(f"{name}: --refraction knows the air of the Earth only, this is another planet")
+        sensor = sensor.with_refraction(Refraction(ellipsoid=sensor.ellipsoid))
+    column, row = _pixel(args, name, sensor.samples, sensor.lines)
+    height = _GROUND_M if args.height is None else args.height
+    try:
+        function = SatellitePixel(sensor, row, column, height)
+    except ValueError as error:
+        raise UserError(f"{name}: {error}") from None
+    where = {"column": column, "row": row, "height_m": height}
+    return _Scene(name, where, function, satellite_inputs(_sigmas(args, _SATELLITE, stated)), SATELLITE)
+
+
+def _aircraft(args: argparse.Namespace) -> _Scene:
+    camera = preset("ads40")
+    ccd = args.ccd or _AIR_CCD
+    if ccd not in camera.line_index:
+        raise UserError(f"ads40: line of detectors {ccd!r}, wanted one of {', '.join(camera.line_index)}")
+    k = camera.line_index[ccd]
+    column, _ = _pixel(args, "ads40", camera.lines[k].pixels, 1)
+    xy, pitch = camera.image_coordinates(np.array([k]), [column])
+    height = _GROUND_M if args.height is None else args.height
+    if not height < _FLOWN_M:
+        raise UserError(f"ads40: --height {height:g}, wanted ground below the aircraft at {_FLOWN_M:g} m")
+    function = AircraftPixel(
+        (0.0, 0.0, _FLOWN_M), (0.0, 0.0, np.pi / 2), (float(xy[0, 0]), float(xy[0, 1])),
+        float(camera.focal_length_mm[k]), float(np.hypot(*pitch[0])), height,
+    )  # fmt: skip
+    s = _sigmas(args, _AIR)
+    inputs = aircraft_inputs(s.position_m, s.attitude_rad, _FOCAL_MM, s.pixel, s.height_m)
+    where = {"ccd": ccd, "column": column, "height_m": height, "flying_height_m": _FLOWN_M}
+    return _Scene("ads40", where, function, inputs, AIRCRAFT)
+
+
+def _pixel(args: argparse.Namespace, name: str, samples: int, lines: int) -> tuple[float, float]:
+    """Column and row; without ``--pixel`` a quarter of the width from the edge, in the middle line."""
+    column, row = args.pixel or (0.25 * (samples - 1), 0.5 * (lines - 1))
+    if not (-0.5 <= column <= samples - 0.5 and (lines == 1 or -0.5 <= row <= lines - 0.5)):
+        raise UserError(
+            f"{name}: --pixel {column:g} {row:g}, wanted one of the image of {samples} columns and {lines} rows"
+        )
+    return float(column), float(row)
+
+
+def _as_table(scene: _Scene, found: Study) -> dict[str, Any]:
+    """The study as it goes to JSON; results that do not scatter are left out."""
+    per_result = {}
+    for k, result in enumerate(RESULTS[:2]):
+        drawn, sigma = found.drawn, float(found.covariance.sigma[k])
+        per_result[result] = {
+            "sigma_m": sigma,
+            "sigma_monte_carlo_m": float(drawn.sigma[k]),
+            "sigma_standard_error_m": float(drawn.sigma_error[k]),
+            "mean_m": float(drawn.mean[k]),
+            "percentiles_m": dict(zip(map(str, PERCENTILES), (float(v) for v in drawn.percentiles[:, k]), strict=True)),
+            "convergence": [
+                {"runs": int(n), "sigma_m": float(s[k])} for n, s in zip(drawn.stops, drawn.sigma_at_stops, strict=True)
+            ],
+            "nearly_linear": bool(found.linear[k]),
+            "parameters": {
+                name: {
+                    "unit": scene.units[name],
+                    "sigma": float(scene.inputs.sigma[j]),
+                    "derivative": float(found.covariance.jacobian[k, j]),
+                    "moves_m": float(abs(found.covariance.jacobian[k, j]) * scene.inputs.sigma[j]),
+                    "share": _number(found.covariance.share[k, j]),
+                    "fast_first": _number(found.fast.first[k, j]),
+                    "fast_total": _number(found.fast.total[k, j]),
+                    "sobol_first": _number(found.sobol.first[k, j]),
+                    "sobol_total": _number(found.sobol.total[k, j]),
+                }
+                for j, name in enumerate(scene.inputs.names)
+            },
+        }
+    return {
+        "scene": scene.name,
+        **scene.where,
+        "runs": found.drawn.runs,
+        "missed": found.drawn.missed,
+        "converged": found.drawn.converged,
+        "results": per_result,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _as_text(table: dict[str, Any]) -> str:
+    where = ", ".join(
+        f"{key.removesuffix('_m').replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
+        + (" m" if key.endswith("_m") else "")
+        for key, value in table.items()
+        if key in ("ccd", "column", "row", "height_m", "flying_height_m")
+    )
+    lines = [f"{table['scene']}: {where}"]
+    for result, of in table["results"].items():
+        lines.append(f"  {result:9s}     sigma          moves it  share   FAST first total  Sobol first total")
+        for name, p in of["parameters"].items():
+            if p["sigma"] == 0:
+                continue
+            factor, unit = (np.degrees(1.0), "deg") if p["unit"] == "rad" else (1.0, p["unit"])
+            shares = [p[key] for key in ("share", "fast_first", "fast_total", "sobol_first", "sobol_total")]
+            text = ["  -  " if s is None else f"{s if abs(s) >= 5e-4 else 0.0:5.3f}" for s in shares]
+            lines.append(
+                f"  {name:9s} {p['sigma'] * factor:9.4g} {unit:4s} {p['moves_m']:9.4f} m  {text[0]}"
+                f"        {text[1]} {text[2]}        {text[3]} {text[4]}"
+            )
+        low, high = of["percentiles_m"]["2.5"], of["percentiles_m"]["97.5"]
+        lines.append(
+            f"  sigma {of['sigma_m']:.4f} m by covariance, {of['sigma_monte_carlo_m']:.4f} +- "
+            f"{of['sigma_standard_error_m']:.4f} m by Monte Carlo; 95 % within {low:.3f} .. {high:.3f} m"
+        )
+        if not of["nearly_linear"]:
+            lines.append("  note: not linear within the sigmas; Monte Carlo is right, covariance propagation is not")
+    if not table["converged"]:
+        lines.append("  note: Monte Carlo has not converged to 2 %; take more --runs")
+    if table["missed"]:
+        lines.append(f"  note: {table['missed']} of {table['runs']} runs missed the ground")
+    return "\n".join(lines)
+
+
+def _write_csv(path: Path, results: list[dict[str, Any]]) -> None:
+    keys = (
+        "unit", "sigma", "derivative", "moves_m", "share", "fast_first", "fast_total", "sobol_first", "sobol_total",
+    )  # fmt: skip
+    columns: dict[str, list[Any]] = {name: [] for name in ("scene", "result", "parameter", *keys)}
+    for table in results:
+        for result, of in table["results"].items():
+            for name, p in of["parameters"].items():
+                for key, value in zip(("scene", "result", "parameter"), (table["scene"], result, name), strict=True):
+                    columns[key].append(value)
+                for key in keys:
+                    columns[key].append(float("nan") if p[key] is None else p[key])
+    with new_file(path) as part:
+        write_table(part, columns, dict.fromkeys(keys[1:], ".8g"))

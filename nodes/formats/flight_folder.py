@@ -1,0 +1,579 @@
+"""The flight folder: ``flight.toml`` names what a flight consists of, and the folder becomes a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from datetime import date
+from heapq import merge
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ...schemas import messages as m
+from ...schemas.topics import rank
+from ...solver.adjustment.block_data import Apriori
+from ...solver.camera.line_camera import LineCamera
+from ...solver.camera.sensors import PRESETS, preset
+from ...solver.geometry.frames import CrsError, LocalFrame
+from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
+from .. import config, registry
+from ..convert import camera_message, ground_point_message
+from ..errors import UserError
+from ..node import Message
+from .block_folder import read_ground_points
+from .camera_json import read_camera
+from .detect import KINDS, Imported, Options, check_within, kind_of_path, read_any, read_track
+from .geocal_xml import read_glas_camera
+from .image_lines import ImageStrip, LinesGiven, open_strip
+from .keys import Keys, read_toml
+from .projection import missing_grids
+from .sensor_folder import read_grade
+from .time_columns import instant_ns
+from .track import Accuracy, Mounting, NavigationTrack
+
+FILE = "flight.toml"
+#: What `navigation.file` may be.
+NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon")
+#: Slow errors of positions by kind of GNSS solution, m: constant in a strip, and wandering (east, north, up), and the
+#: correlation time, s. Usual figures of such solutions, to be replaced by what is known of the own one.
+POSITION_ERRORS = {
+    "RTK": ((0.03, 0.03, 0.05), (0.02, 0.02, 0.03), 60.0),
+    "PPP": ((0.1, 0.1, 0.2), (0.05, 0.05, 0.1), 120.0),
+    "code": ((1.0, 1.0, 2.0), (0.5, 0.5, 1.0), 60.0),
+}
+#: Slow errors of attitudes by grade of the inertial unit, degrees: constant in a strip, drift over it, and wandering
+#: (omega, phi, kappa). Usual figures of such units, to be replaced by what is known of the own one.
+ATTITUDE_ERRORS = {
+    "tactical": ((0.005, 0.005, 0.01), (0.002, 0.002, 0.005), (0.002, 0.002, 0.004)),
+    "MEMS": ((0.05, 0.05, 0.15), (0.02, 0.02, 0.05), (0.02, 0.02, 0.05)),
+}
+_GRADES = {"tactical": TACTICAL, "MEMS": MEMS}
+_SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg")
+_IMU = ("gyro_noise_deg_sqrt_h", "gyro_bias_deg_h", "accel_noise_m_s_sqrt_h", "accel_bias_mgal", "bias_time_s")
+#: Table of a flight.toml -> its keys; "" has the tables themselves.
+_KEYS = {
+    "": ("flight", "camera", "mounting", "navigation", "trajectory", "imu", "control", "strips", "nodes", "sensor"),
+    "flight": ("name", "platform", "crs", "vertical_datum", "ground_height_m", "origin_deg"),
+    "camera": ("file", "preset"),
+    "mounting": ("lever_arm_m", "camera_lever_arm_m", "boresight_deg"),
+    "navigation": ("file", "kind", "date", "gnss", "imu"),
+    "trajectory": (*_SIGMAS, "wander_time_s"),
+    "imu": (*_IMU, "gyro_scale_ppm", "accel_scale_ppm"),
+    "control": ("file",),
+    "strips": ("id", "images", "line_times", "first_time", "line_rate_hz", "band", "grey_range"),
+}
+_ZERO = (0.0, 0.0, 0.0)
+T = TypeVar("T")
+
+
+@dataclass
+class Flight:
+    """What a ``flight.toml`` says, read and checked.
+
+    Attributes
+    ----------
+    folder : it stands in
+    name, platform : of the flight; the platform is the first word of the topics on the bus
+    crs : of control and results, with the vertical datum
+    ground_height_m : above the ellipsoid, the height of the local frame's origin
+    camera : LineCamera
+    lever_arm_m : antenna from the inertial sensor, body axes forward-right-down
+    mounting : of the camera on the body
+    navigation, kind, day : file of poses or sensors, one of `NAVIGATION`, and the day of the flight
+    track : the poses, where the file has poses and not sensors
+    sigmas : slow errors, named as in `configuration/project`
+    grade : of the inertial unit
+    control : file, or None
+    strips : images, opened
+    origin_deg : latitude and longitude of the local frame of a live flight, where they are stated
+    announced : strips of a live flight that are known beforehand: id, time of the first line in ns, lines a second
+    sensors : tables of the sensor programs of a live flight
+    notes : remarks
+    problems : what is wrong or missing, a line each; an empty list for a flight that can be imported
+    """
+
+    folder: Path
+    name: str = ""
+    platform: str = "aircraft"
+    crs: str = ""
+    ground_height_m: float = 0.0
+    camera: LineCamera | None = None
+    lever_arm_m: tuple[float, ...] = _ZERO
+    mounting: Mounting = field(default_factory=Mounting)
+    navigation: Path | None = None
+    kind: str = ""
+    day: date | None = None
+    track: NavigationTrack | None = None
+    sigmas: dict[str, Any] = field(default_factory=dict)
+    grade: InertialGrade = MEMS
+    control: Path | None = None
+    strips: list[ImageStrip] = field(default_factory=list)
+    origin_deg: tuple[float, float] | None = None
+    announced: list[tuple[str, int, float]] = field(default_factory=list)
+    sensors: list[Keys] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def attempt(self, work: Callable[[], T]) -> T | None:
+        """What ``work`` returns; None where it raises, with its line among the problems."""
+        try:
+            return work()
+        except UserError as error:
+            self.problems.append(str(error))
+        except OSError as error:
+            self.problems.append(f"{error.filename}: {(error.strerror or str(error)).lower()}")
+        return None
+
+
+def read_flight(folder: Path, live: bool | None = None) -> Flight:
+    """A flight folder with all that is wrong in it among its ``problems``.
+
+    Parameters
+    ----------
+    folder : with a flight.toml
+    live : the data are still to come: files of navigation and images are not wanted. None = where the file names
+        sensors and no file of navigation
+
+    Raises
+    ------
+    UserError : no flight.toml, or one that is not TOML
+    """
+    path = folder / FILE
+    if not path.is_file():
+        raise UserError(f"{folder}: no {FILE}; `triline new flight {folder}` writes one")
+    file = read_toml(path)
+    flight = Flight(folder)
+    tables = {}
+    for name in (name for name in _KEYS[""] if name not in ("strips", "sensor")):
+        tables[name] = flight.attempt(lambda name=name: file.table(name)) or Keys(path, {}, name)
+    strips = flight.attempt(lambda: file.tables("strips")) if file.has("strips") else []
+    flight.sensors = (flight.attempt(lambda: file.tables("sensor")) or []) if file.has("sensor") else []
+    if live is None:
+        live = bool(flight.sensors) and not tables["navigation"].has("file")
+    flight.attempt(lambda: _general(flight, tables["flight"]))
+    flight.attempt(lambda: _camera(flight, tables["camera"]))
+    flight.attempt(lambda: _mounting(flight, tables["mounting"]))
+    flight.attempt(lambda: _navigation(flight, tables["navigation"], live))
+    flight.attempt(lambda: _errors(flight, tables["navigation"], tables["trajectory"], tables["imu"]))
+    flight.attempt(lambda: _control(flight, tables["control"], tables["flight"]))
+    for keys in strips or []:
+        flight.attempt(lambda keys=keys: (_announced if live else _strip)(flight, keys))
+    if not strips and not live:
+        flight.notes.append(f"{FILE}: no [[strips]]: the recording has no image lines")
+    ids = [id for id, _, _ in flight.announced] if live else [strip.id for strip in flight.strips]
+    for id in sorted({id for id in ids if ids.count(id) > 1}):
+        flight.problems.append(f"{path}: strips: {id!r} comes twice, wanted another id for each strip")
+    for name in tables["nodes"].values:
+        flight.attempt(lambda name=name: _node(tables["nodes"], name))
+    for keys in (file, *tables.values(), *(strips or [])):
+        known = _KEYS.get(keys.where.partition("[")[0], tuple(keys.values))
+        unknown = [key for key in keys.values if key not in known]
+        flight.problems.extend(f"{path}: {keys.name(key)}: not known, wanted {', '.join(known)}" for key in unknown)
+    return flight
+
+
+def refuse_problems(flight: Flight) -> None:
+    """Raise UserError with the first problem of a folder and the number of the others, if there is any."""
+    if flight.problems:
+        more = len(flight.problems) - 1
+        others = f" (and {more} more: `triline check {flight.folder}` names them)" if more else ""
+        raise UserError(f"{flight.problems[0]}{others}")
+
+
+def live_configuration(flight: Flight, origin_deg: tuple[float, float], stamp_ns: int, source: str) -> list[Message]:
+    """Project, camera, control and announced strips of a live flight, all of them with one stamp.
+
+    Parameters
+    ----------
+    flight : read with ``live``, without problems
+    origin_deg : latitude and longitude of the local frame's origin; its height is that of the ground
+    stamp_ns : platform time from which they hold
+    source : name of the publisher
+    """
+    lat, lon = origin_deg
+    project = m.Project(
+        origin_latitude=lat, origin_longitude=lon, origin_height=flight.ground_height_m,
+        image_sigma_px=Apriori.image_sigma_px,
+    )  # fmt: skip
+    strips = [
+        m.Strip(id=id, first_line_time_ns=first_ns, line_rate_hz=rate_hz) for id, first_ns, rate_hz in flight.announced
+    ]
+    return [
+        *_configuration(flight, project, stamp_ns, source),
+        *(Message("configuration/strip", stamp_ns, strip, source) for strip in strips),
+    ]
+
+
+def flight_messages(folder: Path) -> tuple[Imported, str]:
+    """The messages of a flight folder sorted by stamp and rank, and the name of its platform.
+
+    Raises
+    ------
+    UserError : the first problem of the folder and the number of the others, or what a reader finds
+    """
+    flight = read_flight(folder, live=False)
+    refuse_problems(flight)
+    if flight.navigation is None or flight.camera is None:
+        raise UserError(f"{folder / FILE}: navigation or camera missing")
+    options = Options(
+        flight.day,
+        flight.crs,
+        flight.mounting,
+        accuracy=_accuracy(flight.sigmas),
+        ground_height_m=flight.ground_height_m,
+        poses_only=bool(flight.strips),
+        grade=flight.grade,
+    )
+    imported = read_any(flight.navigation, flight.kind, options)
+    notes = imported.notes
+    notes[:] = [note for note in notes if "--position-sigma" not in note]  # flight.toml has said them
+    notes[:0] = [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
+    return Imported("flight", _messages(flight, imported, notes), notes), flight.platform
+
+
+def _accuracy(sigmas: dict[str, Any]) -> Accuracy:
+    """Of poses that come without: all slow errors together."""
+
+    def total(*names: str) -> tuple[float, float, float]:
+        a, b, c = np.sqrt(np.sum([np.square(sigmas[name]) for name in names], axis=0)).tolist()
+        return a, b, c
+
+    position = total("offset_sigma_m", "wander_sigma_m")
+    return Accuracy(position, total("shift_sigma_deg", "drift_sigma_deg", "wander_sigma_deg"))
+
+
+def _messages(flight: Flight, imported: Imported, notes: list[str]) -> Iterator[Message]:
+    """Project, camera and control, then sensors or poses with the image lines among them."""
+    messages = iter(imported.messages)
+    first = next(messages)
+    start = min([first.stamp_ns, *(int(strip.time_ns[0]) for strip in flight.strips)])
+    yield from _configuration(flight, first.body, start, first.source)
+    yield from merge(
+        messages,
+        *(strip.messages(notes) for strip in flight.strips),
+        key=lambda message: (message.stamp_ns, rank(message.topic)),
+    )
+
+
+def _configuration(flight: Flight, project: Any, start: int, source: str) -> Iterator[Message]:
+    """Project, camera and control; the project has its origin already."""
+    project.name, project.crs = flight.name, flight.crs
+    frame = LocalFrame(project.origin_latitude, project.origin_longitude, project.origin_height, flight.crs)
+    arm = np.asarray(flight.lever_arm_m) - np.asarray(flight.mounting.lever_arm_m)
+    for key, values in (("lever_arm_m", arm), ("boresight_deg", flight.mounting.boresight_deg), *flight.sigmas.items()):
+        if key == "wander_time_s":
+            project.wander_time_s = values
+            continue
+        del getattr(project, key)[:]
+        getattr(project, key).extend(float(v) for v in values)
+    yield Message("configuration/project", start, project, source)
+    if flight.camera is not None:
+        yield Message("configuration/camera", start, camera_message(flight.camera), source)
+    if flight.control is not None:
+        points, _ = read_ground_points(flight.control, flight.crs, frame, [])
+        columns = points.id, points.xyz_l, points.covariance, points.role, points.target_radius_m
+        for id, xyz, covariance, role, radius in zip(*columns, strict=True):
+            body = ground_point_message(id, xyz, covariance, role, radius)
+            yield Message("observation/control", start, body, source)
+
+
+def _general(flight: Flight, keys: Keys) -> None:
+    flight.name = keys.text("name", flight.folder.resolve().name)
+    flight.platform = keys.text("platform", "aircraft")
+    if not flight.platform.replace("_", "").replace("-", "").isalnum():
+        flight.problems.append(str(keys.refuse("platform", "a word of letters, digits, _ and -")))
+    height = flight.attempt(lambda: keys.number("ground_height_m", 0.0))
+    flight.ground_height_m = height or 0.0
+    if keys.has("origin_deg"):
+        flight.attempt(lambda: _origin(flight, keys))
+    crs = flight.attempt(lambda: keys.text("crs"))
+    datum = flight.attempt(lambda: _datum(keys))
+    if not crs or not datum:
+        return
+    whole = crs if datum == "ellipsoid" else f"{crs}+{datum}"
+    if crs == "local":
+        raise keys.refuse("crs", "one that PROJ understands, for example EPSG:32632: a real flight is on the Earth")
+    if "+" in crs and not crs.strip().startswith("+"):
+        raise keys.refuse("crs", "the horizontal part alone, the vertical one in vertical_datum")
+    try:
+        LocalFrame.around(np.zeros((1, 3)), whole)
+    except CrsError as error:
+        if "outside" not in str(error):  # the origin of the coordinates may lie there
+            raise UserError(f"{keys.path}: flight.crs: {error}") from None
+    grids = missing_grids(whole)
+    flight.crs = whole
+    if grids:
+        what = f"PROJ lacks the grid {', '.join(grids[:3])} for {whole!r}: heights would be off by the geoid"
+        flight.problems.append(f"{keys.path}: flight.vertical_datum: {what} (`projsync --file {grids[0]}` fetches it)")
+
+
+def _origin(flight: Flight, keys: Keys) -> None:
+    lat, lon = keys.numbers("origin_deg", 2)
+    if not (abs(lat) <= 90 and abs(lon) <= 180):
+        raise keys.refuse("origin_deg", "latitude and longitude in degrees, as [47.9, 11.1]")
+    flight.origin_deg = lat, lon
+
+
+def _datum(keys: Keys) -> str:
+    wanted = 'a vertical CRS such as "EPSG:5773" (EGM96), or "ellipsoid" for heights above the ellipsoid'
+    value = keys.raw("vertical_datum")
+    if not isinstance(value, str) or not value.strip():
+        raise keys.refuse("vertical_datum", wanted)
+    if value != "ellipsoid":
+        import pyproj
+        import pyproj.exceptions
+
+        try:
+            if not pyproj.CRS.from_user_input(value).is_vertical:
+                raise keys.refuse("vertical_datum", wanted)
+        except pyproj.exceptions.CRSError:
+            raise keys.refuse("vertical_datum", wanted) from None
+    return value
+
+
+def _beside(flight: Flight, keys: Keys, key: str, text: str) -> Path:
+    """A file by its name in the folder."""
+    path = flight.folder / text
+    if not path.exists():
+        raise UserError(f"{keys.path}: {keys.name(key)}: no {text} in the folder")
+    return path
+
+
+def _camera(flight: Flight, keys: Keys) -> None:
+    if keys.has("file") == keys.has("preset"):
+        raise UserError(
+            f'{keys.path}: camera: wanted either file = "camera.json" or preset, one of {", ".join(PRESETS)}'
+        )
+    if keys.has("preset"):
+        if keys.text("preset") not in PRESETS:
+            raise keys.refuse("preset", f"one of {', '.join(PRESETS)}")
+        flight.camera = preset(keys.text("preset"))
+        return
+    path = _beside(flight, keys, "file", keys.text("file"))
+    flight.camera = read_glas_camera(path) if path.suffix.lower() == ".xml" else read_camera(path, flight.notes)
+
+
+def _mounting(flight: Flight, keys: Keys) -> None:
+    def three(key: str) -> tuple[float, float, float]:
+        if not keys.has(key):
+            flight.notes.append(f"{FILE}: {keys.name(key)} is not given, taken as zero")
+        a, b, c = keys.numbers(key, 3, _ZERO)
+        return a, b, c
+
+    for key, most in (("lever_arm_m", 50.0), ("camera_lever_arm_m", 50.0)):
+        if keys.has(key) and np.abs(keys.numbers(key, 3)).max() > most:
+            raise keys.refuse(key, f"metres within {most:g}; are they mm?")
+    flight.lever_arm_m = three("lever_arm_m")
+    flight.mounting = Mounting(three("camera_lever_arm_m"), three("boresight_deg"))
+
+
+def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
+    day = keys.raw("date")
+    if day is not None and (not isinstance(day, date) or hasattr(day, "hour")):
+        raise keys.refuse("date", "a day as 2024-05-17, without quotes")
+    flight.day = day
+    kind = keys.text("kind", "")
+    if kind and kind not in NAVIGATION:
+        raise keys.refuse("kind", f"one of {', '.join(NAVIGATION)}")
+    if live:
+        return
+    if not keys.has("file"):
+        raise keys.refuse("file", "poses or sensors of the flight; or, for `triline fly`, [[sensor]] tables")
+    path = _beside(flight, keys, "file", keys.text("file"))
+    kind = kind or kind_of_path(path)
+    if kind not in NAVIGATION:
+        raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
+    options = Options(day, flight.crs or None)
+    if kind in ("sensors", "ros2"):
+        next(iter(read_any(path, kind, options).messages), None)
+    else:
+        flight.track = read_track(path, kind, options)
+    flight.navigation, flight.kind = path, kind
+
+
+def _errors(flight: Flight, navigation: Keys, trajectory: Keys, imu: Keys) -> None:
+    def choice(key: str, table: dict[str, Any], default: str) -> str:
+        if not navigation.has(key):
+            flight.notes.append(f"{FILE}: {navigation.name(key)} is not given, {default!r} taken")
+        name = navigation.text(key, default)
+        if name not in table:
+            raise navigation.refuse(key, f"one of {', '.join(table)}")
+        return name
+
+    gnss, unit = choice("gnss", POSITION_ERRORS, "code"), choice("imu", ATTITUDE_ERRORS, "MEMS")
+    offset, wander_m, time_s = POSITION_ERRORS[gnss]
+    shift, drift, wander_deg = ATTITUDE_ERRORS[unit]
+    defaults = {
+        "offset_sigma_m": offset, "shift_sigma_deg": shift, "drift_sigma_deg": drift,
+        "wander_sigma_m": wander_m, "wander_sigma_deg": wander_deg,
+    }  # fmt: skip
+    flight.sigmas = {key: trajectory.numbers(key, 3, value, positive=True) for key, value in defaults.items()}
+    flight.sigmas["wander_time_s"] = trajectory.number("wander_time_s", time_s, positive=True)
+    flight.grade = read_grade(imu, flight.notes, FILE, _GRADES[unit])
+
+
+def _control(flight: Flight, keys: Keys, general: Keys) -> None:
+    stated = general.has("ground_height_m")
+    if not keys.values:
+        if not stated:
+            flight.problems.append(
+                f"{keys.path}: neither [control] nor flight.ground_height_m, wanted one: where is the ground?"
+            )
+        return
+    path = _beside(flight, keys, "file", keys.text("file"))
+    if not flight.crs:
+        return
+    points, frame = read_ground_points(path, flight.crs, None, flight.notes)
+    if not stated:
+        flight.ground_height_m = round(float(np.median(frame.to_geodetic(points.xyz_l)[:, 2])), 1)
+        flight.notes.append(
+            f"{path.name}: median height {flight.ground_height_m:g} m above the ellipsoid is the origin's"
+        )
+    flight.control = path
+    if flight.origin_deg is None:
+        flight.origin_deg = frame.lat_deg, frame.lon_deg
+
+
+def _announced(flight: Flight, keys: Keys) -> None:
+    """A strip of a live flight: what is said of it beforehand; its image lines are still to come."""
+    id = keys.text("id")
+    if not keys.has("first_time") and not keys.has("line_rate_hz"):
+        flight.notes.append(f"{FILE}: {keys.name('id')}: {id!r} has no first_time: it begins with its first line")
+        return
+    value = keys.raw("first_time")
+    text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
+    rate_hz = keys.number("line_rate_hz", positive=True)
+    flight.announced.append((id, instant_ns(text, f"{keys.path}: {keys.name('first_time')}"), rate_hz))
+
+
+def _strip(flight: Flight, keys: Keys) -> None:
+    id = keys.text("id")
+    images = keys.table("images")
+    if not images.values:
+        raise keys.refuse("images", 'one file for each CCD line: {F = "forward.img", N = "nadir.img"}')
+    files = []
+    for view in images.values:
+        name, band = images.text(view), None
+        if "@" in name and not (flight.folder / name).exists():
+            name, _, band = name.rpartition("@")
+        files.append((view, _beside(flight, images, view, name), band))
+    times = _beside(flight, keys, "line_times", keys.text("line_times")) if keys.has("line_times") else None
+    first = None
+    if keys.has("first_time") or keys.has("line_rate_hz"):
+        value = keys.raw("first_time")
+        text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
+        first = (text, keys.number("line_rate_hz", positive=True))
+    span = keys.numbers("grey_range", 2) if keys.has("grey_range") else None
+    if span is not None and span[0] >= span[1]:
+        raise keys.refuse("grey_range", "two numbers, the lower one first")
+    band = keys.text("band") if keys.has("band") else None
+    pair = None if span is None else (span[0], span[1])
+    given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day)
+    track = flight.track
+    pose_times = track.time_ns if track is not None and track.line_rate_hz > 0 else None
+    if times is None and first is None and pose_times is None:
+        raise UserError(
+            f"{keys.path}: {keys.where}: times of the lines missing, wanted line_times, or first_time and line_rate_hz"
+        )
+    strip = open_strip(given, flight.camera, pose_times)
+    if track is not None:
+        check_within(strip, track)
+    if flight.camera is None:  # told once, with the camera
+        strip = replace(strip, notes=())
+    flight.strips.append(strip)
+
+
+def _node(nodes: Keys, name: str) -> None:
+    """Whether a node takes its settings."""
+    if name not in registry.names():
+        raise nodes.refuse(name, f"a node: {', '.join(registry.names())}")
+    table = nodes.table(name)
+    if name in registry.STEP_NODES:
+        try:
+            config.build(registry.node_class(name), {name: dict(table.values)})
+        except UserError as error:
+            raise UserError(f"{nodes.path}: nodes: {error}") from None
+
+
+TEMPLATE = """\
+# A flight for triline. Files are named relative to this folder. `triline check DIR` says what is missing,
+# `triline import DIR -o flight.mcap` makes a recording of it. Lines that begin with # are defaults or examples.
+
+[flight]
+name = "{name}"
+platform = "aircraft"             # first word of the topics on the bus
+crs = "EPSG:32632"                # horizontal CRS of control and results: anything that PROJ understands
+vertical_datum = "ellipsoid"      # "ellipsoid", or the vertical CRS of the heights, as "EPSG:5773" for EGM96
+#origin_deg = [47.9, 11.1]        # latitude, longitude of a live flight's local frame; else by control or GNSS
+#ground_height_m = 300.0          # height of the ground above the ellipsoid; needed without control
+
+[camera]
+file = "camera.json"              # or: preset = "ads40"
+
+[mounting]                        # body axes forward, right, down
+lever_arm_m = [0.0, 0.0, 0.0]     # antenna, seen from the inertial sensor
+camera_lever_arm_m = [0.0, 0.0, 0.0]   # perspective centre, seen from the inertial sensor (or from what poses describe)
+boresight_deg = [0.0, 0.0, 0.0]   # roll, pitch, heading of the camera against the body
+
+[navigation]
+file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, ROS 2 bag, imu_gps.txt, .lcf ...
+#kind = "csv"                     # where the file does not show it: {kinds}
+#date = 2024-05-17                # day of the flight, for files with GPS seconds of the week
+gnss = "code"                     # RTK, PPP or code: slow errors of the positions
+imu = "MEMS"                      # tactical or MEMS: slow errors of the attitudes, noise of the sensor
+
+#[trajectory]                     # slow errors left in the trajectory, in place of those of the grades; 1 sigma
+#offset_sigma_m = [1.0, 1.0, 2.0]             # constant over a strip
+#shift_sigma_deg = [0.05, 0.05, 0.15]
+#drift_sigma_deg = [0.02, 0.02, 0.05]         # over a strip
+#wander_sigma_m = [0.5, 0.5, 1.0]
+#wander_sigma_deg = [0.02, 0.02, 0.05]
+#wander_time_s = 60.0
+
+#[imu]                            # data sheet of the inertial sensor, in place of that of its grade
+#gyro_noise_deg_sqrt_h = 0.2
+#gyro_bias_deg_h = 20.0
+#accel_noise_m_s_sqrt_h = 0.05
+#accel_bias_mgal = 2000.0
+
+#[control]
+#file = "control.csv"             # point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role[,target_radius_m]
+
+#[[strips]]                       # one for each strip
+#id = "S1"
+#images = {{F = "forward.img", N = "nadir.img", B = "backward.img"}}   # ENVI with .hdr; "all.img@2" is band 2
+#line_times = "S1_times.csv"      # line,time; or:
+#first_time = 2024-05-17T09:30:00Z
+#line_rate_hz = 200.0
+#band = "1"                       # number, name, or sum as "2:0.5,3:0.5"
+#grey_range = [0.0, 1.0]          # values that become black and white
+
+#[[sensor]]                       # one for each sensor program that `triline fly` starts
+#kind = "nmea"                    # nmea, lines, ros2 or stream
+#id = "gnss"
+#address = "serial:/dev/ttyUSB0"  # or tcp://HOST:PORT, udp://HOST:PORT, file:NAME
+#clock_offset_s = 0.0             # its stamps minus UTC
+#delay_s = 0.0                    # from the measurement until it is here
+
+#[nodes.matcher]                  # settings of nodes: triline process --config DIR/flight.toml
+"""
+
+
+def write_template(folder: Path) -> Path:
+    """Write a commented flight.toml into a folder, which is made where it is not there.
+
+    Raises
+    ------
+    UserError : there is one already, or the folder cannot be made
+    """
+    path = folder / FILE
+    if path.exists():
+        raise UserError(f"{path}: is there already, and is not overwritten")
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file, wanted a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    name = folder.resolve().name.replace("\\", "").replace('"', "")
+    path.write_text(TEMPLATE.format(name=name, kinds=", ".join(NAVIGATION)), encoding="utf-8")
+    return path

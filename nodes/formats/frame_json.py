@@ -1,0 +1,108 @@
+"""The orientation of a frame image: interior and exterior in one small JSON file (docs/rectification.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...solver.geometry.earth import ROTATION_RATE
+from ...solver.geometry.ellipsoid import WGS84
+from ...solver.geometry.frames import CrsError, LocalFrame
+from ...solver.geometry.rotation import (
+    R_BC_NOMINAL,
+    R_ENU_NED,
+    matrix_from_angles,
+    matrix_from_navigation,
+    matrix_from_quaternion,
+)
+from ...solver.location.frame_camera import FrameCamera
+from ...solver.orbit.motion import R_from_orbital
+from ..errors import UserError
+from .keys import Keys, read_json
+
+_DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+_WAYS = (
+    "omega_phi_kappa_deg or roll_pitch_heading_deg with lat_deg, lon_deg, height_m or crs and position; "
+    "roll_pitch_yaw_deg (orbital frame) or quaternion_xyzw with position_e_m"
+)
+
+
+def is_frame_json(path: Path) -> bool:
+    """Whether a file is the orientation of a frame image."""
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return b'"exterior"' in file.read(65536)
+
+
+def read_frame(path: Path, notes: list[str]) -> tuple[FrameCamera, dict[str, tuple[float, float, float]]]:
+    """A frame camera with its orientation, and its sigmas: ``position_m`` (east, north, up), ``attitude_rad``.
+
+    Raises
+    ------
+    UserError : naming file, key and what was wanted
+    """
+    file = read_json(path)
+    interior, exterior = file.table("interior"), file.table("exterior")
+    pixel = interior.raw("pixel_size_mm")
+    size = interior.numbers("pixel_size_mm", 2, positive=True) if isinstance(pixel, list) else (
+        (interior.number("pixel_size_mm", positive=True),) * 2
+    )  # fmt: skip
+    lens = interior.table("distortion")
+    C, R = _orientation(path, exterior)
+    sigma = file.table("sigma")
+    position = sigma.numbers("position_m", 3, (0.0, 0.0, 0.0))
+    attitude = sigma.numbers("attitude_deg", 3, (0.0, 0.0, 0.0))
+    try:
+        camera = FrameCamera(
+            C, R, interior.number("focal_length_mm", positive=True), size, interior.integer("lines", low=1),
+            interior.integer("samples", low=1),
+            principal_point_mm=interior.numbers("principal_point_mm", 2, (0.0, 0.0)),
+            distortion=[lens.number(name, 0.0) for name in _DISTORTION],
+        )  # fmt: skip
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None
+    file.raw("name")
+    for keys in (file, interior, exterior, lens, sigma):
+        notes.extend(f"{path.name}: key {key} is not known and was ignored" for key in keys.unread())
+    x, y, z = np.radians(attitude).tolist()
+    return camera, {"position_m": (position[0], position[1], position[2]), "attitude_rad": (x, y, z)}
+
+
+def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
+    """Perspective centre and rotation from the image frame, Earth-fixed."""
+    if exterior.has("position_e_m"):
+        C = np.array(exterior.numbers("position_e_m", 3))
+        if exterior.has("quaternion_xyzw"):
+            q = np.array(exterior.numbers("quaternion_xyzw", 4))
+            if not np.linalg.norm(q) > 1e-6:
+                raise exterior.refuse("quaternion_xyzw", "a quaternion with a length")
+            return C, matrix_from_quaternion(q)
+        velocity = np.array(exterior.numbers("velocity_e_m_s", 3))
+        R_eo = R_from_orbital(C, velocity + np.cross([0.0, 0.0, ROTATION_RATE], C))
+        angles = np.radians(exterior.numbers("roll_pitch_yaw_deg", 3))
+        return C, R_eo @ matrix_from_navigation(*angles) @ R_BC_NOMINAL
+    if exterior.has("crs"):
+        position = np.array(exterior.numbers("position", 3))
+        try:
+            frame = LocalFrame.around(position, exterior.text("crs"))
+            local = frame.from_crs(position[None])[0]
+            R_axes = frame.R_l_crs(position[None])[0]
+        except CrsError as error:
+            raise UserError(f"{path}: {exterior.name('crs')}: {error}") from None
+        C, R_el = frame.origin_e + frame.R_el @ local, frame.R_el
+        if exterior.has("omega_phi_kappa_deg"):
+            return C, R_el @ R_axes @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
+        lat, lon, _ = WGS84.geodetic(C)
+    elif exterior.has("lat_deg"):
+        lat, lon = np.radians([exterior.number("lat_deg"), exterior.number("lon_deg")])
+        C = WGS84.cartesian(lat, lon, exterior.number("height_m"))
+        if exterior.has("omega_phi_kappa_deg"):
+            R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+            return C, R_el @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
+    else:
+        raise UserError(f"{path}: {exterior.where}: no orientation, wanted {_WAYS}")
+    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+    rph = np.radians(exterior.numbers("roll_pitch_heading_deg", 3))
+    return C, R_el @ R_ENU_NED @ matrix_from_navigation(*rph) @ R_BC_NOMINAL

@@ -1,0 +1,347 @@
+"""Heights of the ground out of one or several rasters, window by window, with the vertical datum that was stated."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
+from ...solver.rectification.terrain import bilinear
+from ..errors import UserError
+
+Array = NDArray[np.floating]
+
+#: What ``--dem-datum`` may be, in words.
+DATUMS = "ellipsoid, a vertical CRS (EPSG:5773), a raster of geoid heights, or the geoid's height in metres"
+#: Ellipsoids whose half axes differ by a larger share are of different planets.
+SAME_PLANET = 1e-3
+#: The range of heights is looked up in at most so many values a side; then it is widened by so much, metres. Tuned.
+MOST_SIDE, THIN_SLACK_M = 3000, 100.0
+#: Units of heights that count as metres.
+_METRES = ("", "m", "metre", "meter", "metres", "meters")
+
+
+class RasterFile:
+    """One raster, open once in every thread that reads it.
+
+    Raises
+    ------
+    UserError : not there, not a raster
+    """
+
+    def __init__(self, path: Path):
+        from rasterio.errors import RasterioError
+
+        self.path = path
+        self._local = threading.local()
+        if not path.exists():
+            raise UserError(f"{path}: no such file")
+        try:
+            source = self.source
+        except RasterioError as error:
+            raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
+        self.rows, self.columns, self.count = source.height, source.width, source.count
+        self.crs, self.transform, self.dtype = source.crs, source.transform, np.dtype(source.dtypes[0])
+
+    @property
+    def source(self) -> Any:
+        """The dataset of this thread."""
+        import rasterio
+        from rasterio.errors import NotGeoreferencedWarning
+
+        if not hasattr(self._local, "source"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                self._local.source = rasterio.open(self.path)
+        return self._local.source
+
+
+class HeightRaster:
+    """Heights of one or several rasters on one grid, as `solver.rectification.terrain.Terrain`.
+
+    Parameters
+    ----------
+    paths : rasters of one CRS and cell size (tiles of SRTM, say); values stand for the middle of their cells
+    crs : in place of that of the files
+    datum : of the heights, of `DATUMS`; may be left out where the CRS says it
+    ellipsoid : of the sensor that looks at them
+
+    Raises
+    ------
+    UserError : no raster, turned, without CRS, of another planet, in feet, without a vertical datum, rasters that do
+        not fit, a geoid that is not at hand
+    """
+
+    def __init__(
+        self, paths: list[Path], crs: str | None = None, datum: str | None = None, ellipsoid: Ellipsoid = WGS84
+    ):
+        self._files = [RasterFile(path) for path in paths]
+        first = self._files[0]
+        self.name = ", ".join(path.name for path in paths)
+        self.ellipsoid = ellipsoid
+        whole = _crs(first, crs)
+        self._check_planet(first.path, whole, ellipsoid)
+        flat, stated = _split(whole)
+        self._flat = flat
+        for file in self._files:
+            self._check_file(file, first, crs is not None)
+        t = first.transform
+        self._t = t
+        self._rows, self._columns = self._offsets()
+        self.rows = max(row + file.rows for row, file in zip(self._rows, self._files, strict=True))
+        self.columns = max(column + file.columns for column, file in zip(self._columns, self._files, strict=True))
+        from pyproj import Transformer
+
+        self._geographic = bool(flat.is_geographic)
+        base = flat.geodetic_crs if ellipsoid != WGS84 else "EPSG:4326"
+        self._to_flat = Transformer.from_crs(base, flat, always_xy=True)
+        width = abs(t.a), abs(t.e)
+        if self._geographic:
+            middle = np.radians(t.f + 0.5 * t.e * first.rows)
+            metres = np.radians(1.0) * ellipsoid.semi_major_m
+            width = width[0] * metres * max(float(np.cos(middle)), 1e-3), width[1] * metres
+        self.cell_m = float(min(width))
+        self.datum, self._above = self._datum(first.path, datum, stated)
+
+    # -- what is checked -----------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _check_planet(path: Path, crs: Any, ellipsoid: Ellipsoid) -> None:
+        axis = crs.ellipsoid.semi_major_metre if crs.ellipsoid is not None else None
+        if axis is not None and abs(axis / ellipsoid.semi_major_m - 1.0) > SAME_PLANET:
+            raise UserError(
+                f"{path}: heights of another planet: half axis {axis / 1e3:.1f} km, the sensor's is "
+                f"{ellipsoid.semi_major_m / 1e3:.1f} km"
+            )
+
+    @staticmethod
+    def _check_file(file: RasterFile, first: RasterFile, has_crs: bool) -> None:
+        t, path = file.transform, file.path
+        if t.b or t.d:
+            raise UserError(f"{path}: is turned, wanted a raster along its axes")
+        unit = (file.source.units[0] or "").strip().lower()
+        if unit not in _METRES:
+            raise UserError(f"{path}: heights in {unit}, wanted metres")
+        if file.rows < 2 or file.columns < 2:
+            raise UserError(f"{path}: {file.rows} x {file.columns} heights, wanted at least 2 x 2")
+        other = abs(t.a / first.transform.a - 1.0) + abs(t.e / first.transform.e - 1.0)
+        if other * max(file.rows, file.columns) > 0.01 or (not has_crs and file.crs != first.crs):
+            raise UserError(f"{path}: another CRS or cell size than {first.path.name}, wanted rasters of one grid")
+
+    def _offsets(self) -> tuple[list[int], list[int]]:
+        """First row and column of every raster, counted from the first raster's upper left after shifting to 0."""
+        t = self._t
+        rows, columns = [], []
+        for file in self._files:
+            row, column = (file.transform.f - t.f) / t.e, (file.transform.c - t.c) / t.a
+            if abs(row - round(row)) > 0.01 or abs(column - round(column)) > 0.01:
+                raise UserError(f"{file.path}: lies between the cells of {self._files[0].path.name}")
+            rows.append(round(row))
+            columns.append(round(column))
+        top, left = min(rows), min(columns)
+        self._t = type(t)(t.a, 0.0, t.c + left * t.a, 0.0, t.e, t.f + top * t.e)
+        return [row - top for row in rows], [column - left for column in columns]
+
+    def _datum(self, path: Path, datum: str | None, stated: Any) -> tuple[str, Any]:
+        """Words of the datum, and a function of latitudes and longitudes (degrees) that gives its height."""
+        if datum is None and stated is None:
+            raise UserError(
+                f"{path}: its CRS ({self._flat.name}) does not say what its heights are above: wanted --dem-datum "
+                f"{DATUMS}"
+            )
+        if datum is not None:
+            if datum.lower() in ("ellipsoid", "ellipsoidal"):
+                return "above the ellipsoid", None
+            try:
+                constant = float(datum)
+            except ValueError:
+                constant = None
+            if constant is not None:
+                if not abs(constant) < 1e5:
+                    raise UserError(f"--dem-datum {datum}: wanted {DATUMS}")
+                return f"{constant:g} m above the ellipsoid", lambda lat, lon: np.full(np.shape(lat), constant)
+            if Path(datum).exists():
+                return f"above {Path(datum).name}", _GeoidRaster(Path(datum), self.ellipsoid)
+            stated = _vertical(datum)
+        if isinstance(stated, str):
+            return "above the ellipsoid", None
+        return f"above {stated.name}", _proj_geoid(path, stated)
+
+    # -- terrain -------------------------------------------------------------------------------------------------------
+
+    def place(self, lat: Array, lon: Array) -> tuple[Array, Array]:
+        """See `Terrain.place`."""
+        x, y = self._to_flat.transform(np.degrees(lon), np.degrees(lat))
+        x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+        t = self._t
+        if self._geographic:
+            middle = t.c + 0.5 * t.a * self.columns
+            x = middle + (x - middle + 180.0) % 360.0 - 180.0
+        x, y = np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
+        return (y - t.f) / t.e - 0.5, (x - t.c) / t.a - 0.5
+
+    def undulation(self, lat: Array, lon: Array) -> Array:
+        """See `Terrain.undulation`."""
+        if self._above is None:
+            return np.zeros(np.shape(lat))
+        return self._above(np.degrees(lat), np.degrees(lon))
+
+    def heights(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.float32]:
+        """See `Terrain.heights`."""
+        out = np.full((rows, columns), np.nan, dtype=np.float32)
+        for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
+            top, left = max(row, first_row), max(column, first_column)
+            bottom = min(row + rows, first_row + file.rows)
+            right = min(column + columns, first_column + file.columns)
+            if top >= bottom or left >= right:
+                continue
+            z = _window(file, top - first_row, left - first_column, bottom - top, right - left)
+            part = out[top - row : bottom - row, left - column : right - column]
+            part[:] = np.where(np.isnan(part), z, part)
+        return out
+
+    def range_over(self, lat: Array, lon: Array) -> tuple[float, float] | None:
+        """Lowest and highest height above the ellipsoid around points, by a thinned-out window; None for none."""
+        row, column = self.place(lat, lon)
+        if not (np.isfinite(row).any() and np.isfinite(column).any()):
+            return None
+        top, left = int(np.nanmin(row)) - 2, int(np.nanmin(column)) - 2
+        height, width = int(np.nanmax(row)) + 3 - top, int(np.nanmax(column)) + 3 - left
+        low, high, slack = np.inf, -np.inf, 0.0
+        for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
+            r0, c0 = max(top, first_row) - first_row, max(left, first_column) - first_column
+            r1 = min(top + height, first_row + file.rows) - first_row
+            c1 = min(left + width, first_column + file.columns) - first_column
+            if r0 >= r1 or c0 >= c1:
+                continue
+            thin = max(1, -(-max(r1 - r0, c1 - c0) // MOST_SIDE))
+            z = _window(file, r0, c0, r1 - r0, c1 - c0, thin)
+            if np.isfinite(z).any():
+                low, high = min(low, float(np.nanmin(z))), max(high, float(np.nanmax(z)))
+                slack = THIN_SLACK_M if thin > 1 else slack
+        if low > high:
+            return None
+        low, high = low - slack, high + slack
+        N = self.undulation(lat, lon)
+        return low + float(np.nanmin(N)), high + float(np.nanmax(N))
+
+    def at(self, lat: Array, lon: Array) -> Array:
+        """Heights above the ellipsoid (n,) at latitudes and longitudes (n,), radians, by one window."""
+        row, column = self.place(lat, lon)
+        known = np.isfinite(row) & np.isfinite(column)
+        out = np.full(np.shape(lat), np.nan)
+        if not known.any():
+            return out
+        top, left = max(int(row[known].min()) - 1, -2), max(int(column[known].min()) - 1, -2)
+        bottom = min(int(row[known].max()) + 3, self.rows + 2)
+        right = min(int(column[known].max()) + 3, self.columns + 2)
+        if bottom - top < 2 or right - left < 2:
+            return out
+        z = self.heights(top, left, bottom - top, right - left)
+        out[known] = bilinear(z, row[known] - top, column[known] - left) + self.undulation(lat[known], lon[known])
+        return out
+
+
+def _window(file: RasterFile, row: int, column: int, rows: int, columns: int, thin: int = 1) -> NDArray[np.float32]:
+    """Heights of a window of one file, every ``thin``-th."""
+    from rasterio.windows import Window
+
+    source = file.source
+    window = Window(column, row, columns, rows)  # type: ignore[call-arg]
+    shape = None if thin == 1 else (-(-rows // thin), -(-columns // thin))
+    band = source.read(1, window=window, masked=True, out_shape=shape)
+    z = np.ma.filled(band.astype(np.float32), np.nan)
+    if source.scales[0] != 1.0 or source.offsets[0] != 0.0:
+        z = z * np.float32(source.scales[0]) + np.float32(source.offsets[0])
+    return z
+
+
+class _GeoidRaster:
+    """Geoid heights out of a raster, bilinear."""
+
+    def __init__(self, path: Path, ellipsoid: Ellipsoid):
+        self._raster = HeightRaster([path], None, "ellipsoid", ellipsoid)
+        self._path = path
+
+    def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
+        shape = np.shape(lat_deg)
+        N = self._raster.at(np.radians(np.ravel(lat_deg)), np.radians(np.ravel(lon_deg)))
+        if np.isnan(N).any():
+            k = int(np.argmax(np.isnan(N)))
+            raise UserError(
+                f"{self._path}: no geoid height at {np.ravel(lat_deg)[k]:.4f} N, {np.ravel(lon_deg)[k]:.4f} E"
+            )
+        return N.reshape(shape)
+
+
+def _crs(file: RasterFile, wanted: str | None) -> Any:
+    import pyproj
+    from pyproj.exceptions import CRSError
+
+    if wanted is None and file.crs is None:
+        raise UserError(f"{file.path}: has no coordinate reference system, wanted --dem-crs")
+    try:
+        return pyproj.CRS.from_user_input(wanted if wanted is not None else file.crs.to_wkt())
+    except CRSError as error:
+        raise UserError(f"--dem-crs {wanted}: PROJ does not know it: {str(error).splitlines()[0]}") from None
+
+
+def _split(crs: Any) -> tuple[Any, Any]:
+    """The horizontal CRS, and the vertical one, "ellipsoid", or None where nothing is said."""
+    if crs.is_compound:
+        return crs.sub_crs_list[0], crs.sub_crs_list[1]
+    if len(crs.axis_info) > 2:
+        return crs.to_2d(), "ellipsoid"
+    return crs, None
+
+
+def _vertical(name: str) -> Any:
+    import pyproj
+    from pyproj.exceptions import CRSError
+
+    try:
+        crs = pyproj.CRS.from_user_input(name)
+    except CRSError:
+        raise UserError(f"--dem-datum {name}: neither a file nor a CRS that PROJ knows, wanted {DATUMS}") from None
+    if crs.is_compound:
+        crs = crs.sub_crs_list[1]
+    if crs.is_vertical:
+        return crs
+    if len(crs.axis_info) > 2:
+        return "ellipsoid"
+    raise UserError(f"--dem-datum {name}: {crs.name} says nothing of heights, wanted {DATUMS}")
+
+
+def _proj_geoid(path: Path, vertical: Any) -> Any:
+    """Geoid heights by PROJ; its grid has to be installed."""
+    import pyproj
+    from pyproj.crs import CompoundCRS
+    from pyproj.exceptions import ProjError
+
+    source = CompoundCRS("WGS 84 and heights", ["EPSG:4326", vertical])
+    wanted = pyproj.CRS.from_epsg(4979)
+    missing = UserError(
+        f"{path}: PROJ cannot tell {vertical.name} from the ellipsoid: its geoid grid is not installed (projsync gets "
+        "it), wanted --dem-datum with a raster of geoid heights or the geoid's height in metres"
+    )
+    try:
+        transformer = pyproj.Transformer.from_crs(source, wanted, always_xy=True, allow_ballpark=False, only_best=True)
+    except ProjError:
+        raise missing from None
+
+    def above(lat_deg: Array, lon_deg: Array) -> Array:
+        try:
+            N = np.asarray(transformer.transform(lon_deg, lat_deg, np.zeros(np.shape(lat_deg)), errcheck=True)[2])
+        except ProjError:
+            raise missing from None
+        if not np.isfinite(N).all():
+            raise missing
+        return N
+
+    above(np.array([0.5]), np.array([0.5]))
+    return above

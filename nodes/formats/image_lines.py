@@ -1,0 +1,256 @@
+"""Image lines from files: ENVI images with the times of their lines, as the messages of a strip."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date
+from heapq import merge
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...schemas import messages as m
+from ...schemas.image_lines import LineBlock
+from ...schemas.topics import rank
+from ...solver.camera.line_camera import LineCamera
+from ..convert import SECOND_NS
+from ..errors import UserError
+from ..node import Message
+from .envi_image import GreyImage, open_envi
+from .table import Column, read_table, separator_of
+from .time_columns import WANTED, instant_ns, time_columns, times_of
+
+#: Length of a block, s, and the most bytes that it has.
+BLOCK_S = 0.1
+MOST_BYTES = 8_000_000
+#: A strip ends so long after its last line, when its last matches are there, ns.
+CLOSING_NS = 250_000_000
+
+
+@dataclass(frozen=True)
+class LinesGiven:
+    """What the user says about the images of one strip.
+
+    Attributes
+    ----------
+    files : (id of the CCD line or "", image, band or None), one a view
+    strip : id of the strip; the name of the first file where it is empty
+    times : CSV with the time of each line, or None
+    first : time of line 0 in ISO 8601, and lines a second; None with ``times``
+    band : of files that name none
+    span : values that become black and white
+    day : of the flight, for GPS seconds
+    """
+
+    files: tuple[tuple[str, Path, str | None], ...]
+    strip: str = ""
+    times: Path | None = None
+    first: tuple[str, float] | None = None
+    band: str | None = None
+    span: tuple[float, float] | None = None
+    day: date | None = None
+
+
+@dataclass(frozen=True)
+class ImageStrip:
+    """Views of one strip, line by line.
+
+    Attributes
+    ----------
+    id : of the strip
+    views : CCD line -> its image
+    time_ns : (n,) UTC of each line
+    rate_hz : mean line rate
+    equal : the lines are equally spaced by construction
+    notes : remarks
+    """
+
+    id: str
+    views: dict[str, GreyImage]
+    time_ns: NDArray[np.int64]
+    rate_hz: float
+    equal: bool
+    notes: tuple[str, ...]
+
+    def messages(self, notes: list[str], source: str = "import") -> Iterator[Message]:
+        """``configuration/strip`` and ``sensor/lines/*``, by stamp and rank; a block is read when it is asked for.
+
+        A block is stamped when its last line has been imaged.
+        """
+        begin, end = int(self.time_ns[0]), int(self.time_ns[-1]) + CLOSING_NS
+        yield Message("configuration/strip", begin, self._strip(ended=False), source)
+        yield from merge(*(self._blocks(ccd, source) for ccd in self.views), key=_order)
+        yield Message("configuration/strip", end, self._strip(ended=True), source)
+        for image in self.views.values():
+            notes.extend(image.notes())
+
+    def _strip(self, *, ended: bool) -> Any:
+        return m.Strip(
+            id=self.id,
+            first_line_time_ns=int(self.time_ns[0]),
+            line_rate_hz=self.rate_hz,
+            lines=len(self.time_ns),
+            ended=ended,
+        )
+
+    def _blocks(self, ccd: str, source: str) -> Iterator[Message]:
+        image = self.views[ccd]
+        most = max(MOST_BYTES // (2 * image.image.samples), 1)
+        size = min(max(round(BLOCK_S * self.rate_hz), 1), most)
+        period = round(SECOND_NS / self.rate_hz)
+        for first in range(0, len(self.time_ns), size):
+            times = self.time_ns[first : first + size]
+            pixels = image.read(first, len(times))
+            how = (period, None) if self.equal else (0, times)
+            block = LineBlock(pixels, ccd, self.id, first, int(times[0]), *how)
+            yield Message(f"sensor/lines/{ccd}", int(times[-1]), block, source)
+
+
+def files_of(texts: Sequence[str]) -> tuple[tuple[str, Path, str | None], ...]:
+    """CCD line, image and band of ``F=forward.img,N=nadir.img`` and ``F=all.img@1,N=all.img@2``; each may be alone.
+
+    Raises
+    ------
+    UserError : a part without a file, a view that comes twice
+    """
+    found = []
+    for part in (part.strip() for text in texts for part in text.split(",")):
+        view, sign, name = part.partition("=")
+        if not sign:
+            view, name = "", part
+        band = None
+        if "@" in name and not Path(name).exists():
+            name, _, band = name.rpartition("@")
+        if not name or (sign and not view.strip()):
+            raise UserError(f"--lines {part}: wanted VIEW=FILE, as in F=forward.img,N=nadir.img")
+        found.append((view.strip(), Path(name), band))
+    views = [view for view, _, _ in found]
+    if len(set(views)) < len(views) or (len(views) > 1 and "" in views):
+        raise UserError(
+            f"--lines {','.join(texts)}: wanted another view for each file, as in F=forward.img,N=nadir.img"
+        )
+    return tuple(found)
+
+
+def open_strip(
+    given: LinesGiven, camera: LineCamera | None = None, pose_times_ns: NDArray[np.int64] | None = None
+) -> ImageStrip:
+    """The images of a strip, with the time of each line.
+
+    Parameters
+    ----------
+    given : files and times
+    camera : its CCD lines must be those of the views, with as many pixels
+    pose_times_ns : (n,) times of poses that belong to the image lines, where nothing else says the times
+
+    Raises
+    ------
+    UserError : images or times that cannot be read, or do not fit together or to the camera
+    """
+    views: dict[str, GreyImage] = {}
+    notes: list[str] = []
+    first: GreyImage | None = None
+    for name, path, band in given.files:
+        envi = open_envi(path)
+        notes.extend(envi.notes)
+        view = _view(name, path, envi.samples, camera)
+        grey = GreyImage(envi, envi.weights(band or given.band), given.span)
+        if first is not None and envi.lines != first.image.lines:
+            raise UserError(f"{path}: {envi.lines} lines, wanted {first.image.lines} as in {first.image.path.name}")
+        first = first or grey
+        views[view] = grey
+    if first is None:
+        raise UserError("--lines: no image, wanted VIEW=FILE, as in F=forward.img,N=nadir.img")
+    if camera is None:
+        notes.append("no camera given (--camera): recorded without configuration/camera, image lines cannot be matched")
+    elif set(views) < {line.id for line in camera.lines}:
+        lost = [line.id for line in camera.lines if line.id not in views]
+        notes.append(f"no image of the CCD lines {', '.join(lost)} of the camera")
+    lines = first.image.lines
+    if lines < 2:
+        raise UserError(f"{first.image.path}: {lines} line, wanted at least 2")
+    time_ns, equal = _times(given, first, pose_times_ns, notes)
+    rate = (lines - 1) * 1e9 / float(time_ns[-1] - time_ns[0])
+    if equal and given.first is not None:
+        rate = given.first[1]
+    off = float(np.abs((time_ns - time_ns[0]) * (rate * 1e-9) - np.arange(lines)).max())
+    if off > 0.1:
+        what = f"line times are off a constant rate of {rate:.4f} lines/s by {off:.1f} lines at most"
+        notes.append(f"{what}; strip and tie points take the constant rate")
+    return ImageStrip(given.strip or first.image.path.stem, views, time_ns, rate, equal, tuple(notes))
+
+
+def with_lines(messages: Iterable[Message], strip: ImageStrip, notes: list[str]) -> Iterator[Message]:
+    """The messages of a flight with those of an image strip among them, by stamp and rank."""
+    yield from merge(messages, strip.messages(notes), key=_order)
+
+
+def _order(message: Message) -> tuple[int, int]:
+    return message.stamp_ns, rank(message.topic)
+
+
+def _view(name: str, path: Path, samples: int, camera: LineCamera | None) -> str:
+    if camera is None:
+        return name or "N"
+    lines = {line.id: line.pixels for line in camera.lines}
+    if not name and len(lines) == 1:
+        (name,) = lines
+    if not name:
+        raise UserError(f"{path}: its CCD line is not said, wanted --lines {next(iter(lines))}={path.name}")
+    if name not in lines:
+        raise UserError(f"{path}: CCD line {name!r} is not in the camera, wanted one of {', '.join(lines)}")
+    if lines[name] != samples:
+        raise UserError(f"{path}: {samples} samples, wanted {lines[name]} as CCD line {name} of the camera has pixels")
+    return name
+
+
+def _times(
+    given: LinesGiven, image: GreyImage, pose_times_ns: NDArray[np.int64] | None, notes: list[str]
+) -> tuple[NDArray[np.int64], bool]:
+    """Times of the lines (n,), and whether they are equally spaced by construction."""
+    lines, path = image.image.lines, image.image.path
+    if given.times is not None and given.first is not None:
+        raise UserError(f"{given.times}: line times and a first time with a rate, wanted one of them")
+    if given.first is not None:
+        text, rate = given.first
+        if not 0 < rate < np.inf:
+            raise UserError(f"--line-rate {rate:g}, wanted more than 0 Hz")
+        start = instant_ns(text, "--first-time")
+        return start + np.rint(np.arange(lines) * (1e9 / rate)).astype(np.int64), True
+    if given.times is not None:
+        time_ns, source = line_times(given.times, given.day, notes), str(given.times)
+    elif pose_times_ns is not None:
+        time_ns, source = pose_times_ns, "the file of poses, one a line,"
+    else:
+        raise UserError(
+            f"{path}: times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"
+        )
+    if len(time_ns) != lines:
+        raise UserError(f"{path}: {lines} lines, but {source} has the times of {len(time_ns)}")
+    return time_ns, False
+
+
+def line_times(path: Path, day: date | None, notes: list[str]) -> NDArray[np.int64]:
+    """UTC (n,) in ns since the Unix epoch of the lines 0, 1, 2 ... in a CSV ``line,time`` (ISO 8601, seconds, GPS).
+
+    Raises
+    ------
+    UserError : a column that is missing, a line that is missing, a time that does not come after the one before
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file, wanted a CSV with line and time")
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        header = [name.strip() for name in file.readline(4096).split(separator_of(path)[0])]
+    columns = time_columns(header)
+    if not columns:
+        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}")
+    table = read_table(path, [Column("line", "integer", low=0), *columns], notes)
+    line = table["line"]
+    table.refuse(line != np.arange(len(line)), "line", lambda i: f"{line[i]:.0f}, wanted {i} (0, 1, 2, ...)")
+    time_ns = times_of(table, columns, day, notes)
+    late = np.concatenate([[False], np.diff(time_ns) <= 0])
+    table.refuse(late, columns[0].name, lambda i: "does not come after the line before it")
+    return time_ns

@@ -1,0 +1,28 @@
+"""A word to who gives a command a file that it cannot read, but that `triline import` can."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import UserError
+from .detect import KINDS, kind_of_path
+
+
+def refuse_importable(path: Path) -> None:
+    """Raise UserError where something is no recording, but becomes one by ``triline import``.
+
+    Returns silently where nothing is there, or what is there is a recording, or of no known kind.
+    """
+    if not path.exists() or (path.is_file() and _is_mcap(path)):
+        return
+    try:
+        kind = kind_of_path(path)
+    except UserError:
+        return
+    target = "camera.json" if kind == "camera" else f"{path.stem}.mcap"
+    raise UserError(f"{path}: is a {KINDS[kind]}, wanted a recording: `triline import {path} -o {target}` makes one")
+
+
+def _is_mcap(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(8) == b"\x89MCAP0\r\n"

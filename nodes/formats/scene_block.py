@@ -1,0 +1,417 @@
+"""A block of satellite scenes as a folder: project.toml that names the scenes, ground_points.csv, image_points.csv.
+
+The folder is a block folder (`block_folder`) whose strips are satellite scenes: ``[scenes.NAME]`` of ``project.toml``
+with their metadata takes the place of ``camera.json``, ``strips.csv`` and ``trajectory.csv``. docs/satellites.md has
+the keys. Ground points and image points have the columns of any block folder; ``strip`` is the name of the scene.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.adjustment.block_data import KnownPoints
+from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
+from ...solver.geometry.frames import GEOGRAPHIC, BodyFrame, CrsError, Frame, LocalFrame
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.rpc import Rpc
+from ...solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
+from ...solver.scene_adjustment.functional import (
+    SHIFT_SIGMA_PX,
+    SLOPE_SIGMA_PX,
+    ProjectiveImage,
+    R_e_enu,
+    RpcImage,
+)
+from ...solver.scene_adjustment.images import ImageModel
+from ...solver.scene_adjustment.rigorous import LensView, lens_view
+from ..errors import UserError
+from .block_folder import GROUND, known_points
+from .keys import Keys, read_toml
+from .projection import missing_grids
+from .satellite.read import read_scene
+from .satellite.scene import SatelliteScene
+from .table import Column, Table, read_table, write_table
+
+Array = NDArray[np.floating]
+
+#: Models that a scene may be adjusted with.
+MODELS = ("rigorous", "rpc", "affine", "dlt")
+#: Image points so far outside their scene cannot be used, pixels.
+_OUTSIDE_PX = 0.5
+#: Rows that cannot be used and are named one by one.
+_MOST_NAMED = 5
+
+_IMAGE = (
+    Column("point", "text"),
+    Column("strip", "text"),
+    Column("ccd", "text", optional=True, blank=True),
+    Column("line"),
+    Column("sample"),
+    Column("sigma_px", optional=True, blank=True, above=0.0),
+)
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """One scene of a block.
+
+    Attributes
+    ----------
+    name : of the scene, the ``strip`` of its image points
+    metadata : as project.toml writes it
+    scene : what the metadata hold
+    model : one of `MODELS`
+    camera : scenes that name the same share their additional parameters
+    """
+
+    name: str
+    metadata: str
+    scene: SatelliteScene
+    model: str
+    camera: str
+
+
+@dataclass(frozen=True)
+class ImageEntry:
+    """One image: a scene, or one of its lines of detectors.
+
+    Attributes
+    ----------
+    scene : it belongs to
+    ccd : its line of detectors, "" where the scene has one
+    name : ``scene`` or ``scene/ccd``
+    location : its rigorous model or polynomials
+    view : image frame of its lens; None where there is no rigorous model
+    """
+
+    scene: SceneEntry
+    ccd: str
+    name: str
+    location: PushbroomSensor | Rpc
+    view: LensView | None
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """Lines and samples, where they are known."""
+        lines, samples = self.location.lines, self.location.samples
+        return (lines, samples) if lines and samples else None
+
+
+@dataclass(frozen=True)
+class SceneBlockData:
+    """A folder as arrays.
+
+    Attributes
+    ----------
+    name : of the project
+    frame : of the ground points
+    images : of all scenes
+    point_ids : of ground and image points
+    rays : ``image`` is the place in `images`; only those that can be used
+    ground : known points
+    trajectory : the table ``[trajectory]``
+    rpc : the table ``[rpc]``: correction, shift_sigma_px, slope_sigma_px
+    ellipsoid : of the scenes
+    notes : remarks for the user
+    """
+
+    name: str
+    frame: Frame
+    images: tuple[ImageEntry, ...]
+    point_ids: tuple[str, ...]
+    rays: ImagePoints
+    ground: KnownPoints
+    trajectory: Mapping[str, object]
+    rpc: Mapping[str, object]
+    ellipsoid: Ellipsoid
+    image_sigma_px: float
+    notes: tuple[str, ...]
+
+    def known(self) -> KnownGround:
+        """Known points as the adjustment takes them."""
+        place = {id: k for k, id in enumerate(self.point_ids)}
+        position = self.ground.xyz_l @ self.frame.R_el.T + self.frame.origin_e
+        lat, lon, _ = self.ellipsoid.geodetic(position).T
+        R = np.swapaxes(R_e_enu(lat, lon), -1, -2) @ self.frame.R_el
+        covariance = R @ self.ground.covariance @ np.swapaxes(R, -1, -2)
+        return KnownGround(
+            np.array([place[id] for id in self.ground.id], dtype=np.int64), position, covariance, self.ground.role
+        )
+
+    def block(self, images: tuple[ImageModel, ...]) -> SceneBlock:
+        """The block of images made of `images`, in the same order."""
+        return SceneBlock(images, self.point_ids, self.rays, self.known(), self.ellipsoid)
+
+    def functional_image(self, entry: ImageEntry) -> RpcImage | ProjectiveImage:
+        """The image of an entry whose model is not the rigorous one."""
+        if entry.scene.model == "rpc":
+            assert isinstance(entry.location, Rpc)
+            affine = self.rpc.get("correction", "affine") == "affine"
+            shift = float(str(self.rpc.get("shift_sigma_px", SHIFT_SIGMA_PX)))
+            slope = float(str(self.rpc.get("slope_sigma_px", SLOPE_SIGMA_PX)))
+            return RpcImage(entry.name, entry.location, affine, shift, slope, entry.size_px, self.ellipsoid)
+        return ProjectiveImage(entry.name, entry.scene.model, entry.size_px, self.ellipsoid)
+
+
+def is_scene_block(folder: Path) -> bool:
+    """Whether a folder is a block of satellite scenes."""
+    path = folder / "project.toml"
+    if not path.is_file():
+        return False
+    try:
+        return "scenes" in tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):  # whoever reads it as a block says what is wrong with it
+        return False
+
+
+def read_scene_block(folder: Path) -> SceneBlockData:
+    """Read a block of satellite scenes.
+
+    Raises
+    ------
+    UserError : a file that is missing, a value that is missing or malformed, metadata that cannot be read, names that
+        do not fit together
+    """
+    notes: list[str] = []
+    file = read_toml(folder / "project.toml")
+    project, apriori, trajectory = file.table("project"), file.table("apriori"), file.table("trajectory")
+    name, crs = project.text("name", folder.resolve().name), project.text("crs", "EPSG:4979")
+    sigma = apriori.number("image_sigma_px", 0.3, positive=True)
+    rpc = _rpc_settings(file.table("rpc"))
+    scenes = _scenes(folder, file.table("scenes"), notes)
+    for table in (file, project, apriori):
+        notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
+    images = _images(scenes)
+    ellipsoid = _ellipsoid(folder, images)
+    ground, frame = _ground(folder, crs, ellipsoid, notes)
+    ids, rays = _image_points(folder, images, ground, sigma, notes)
+    used = np.unique(rays.image)
+    unused = [image.name for k, image in enumerate(images) if k not in used]
+    notes.extend(f"image {image}: no image points; it takes no part" for image in unused)
+    images = tuple(images[k] for k in used)
+    rays = replace(rays, image=np.searchsorted(used, rays.image))
+    return SceneBlockData(
+        name, frame, images, ids, rays, ground, dict(trajectory.values), rpc, ellipsoid, sigma, tuple(notes)
+    )
+
+
+def _rpc_settings(table: Keys) -> dict[str, object]:
+    settings: dict[str, object] = {"correction": table.text("correction", "affine")}
+    if settings["correction"] not in ("affine", "shift"):
+        raise table.refuse("correction", "affine or shift")
+    for key, default in (("shift_sigma_px", SHIFT_SIGMA_PX), ("slope_sigma_px", SLOPE_SIGMA_PX)):
+        settings[key] = table.number(key, default, positive=True)
+    return settings
+
+
+def _scenes(folder: Path, table: Keys, notes: list[str]) -> list[SceneEntry]:
+    if not table.values:
+        raise UserError(f"{table.path}: scenes: none, wanted a table [scenes.NAME] with metadata for each scene")
+    entries = []
+    for name in table.values:
+        keys = table.table(name)
+        metadata = keys.text("metadata")
+        scene = read_scene(folder / metadata)
+        rigorous = scene.sensor is not None
+        model = keys.text("model", "rigorous" if rigorous else "rpc")
+        if model not in MODELS:
+            raise keys.refuse("model", f"one of {', '.join(MODELS)}")
+        if model == "rigorous" and not rigorous:
+            raise keys.refuse("model", f"another model: {metadata} has no rigorous one")
+        if model == "rpc" and scene.rpc is None:
+            raise keys.refuse("model", f"another model: {metadata} has no rational polynomials")
+        camera = keys.text("camera", scene.camera or name)
+        notes.extend(f"scene {name}: {note}" for note in scene.notes)
+        notes.extend(f"project.toml: key {key} is not known and was ignored" for key in keys.unread())
+        entries.append(SceneEntry(name, metadata, scene, model, camera))
+    return entries
+
+
+def _images(scenes: list[SceneEntry]) -> tuple[ImageEntry, ...]:
+    images = []
+    for entry in scenes:
+        scene = entry.scene
+        if entry.model == "rpc" or scene.sensor is None:
+            assert scene.rpc is not None
+            images.append(ImageEntry(entry, "", entry.name, scene.rpc, None))
+            continue
+        sensors = scene.sensors if len(scene.sensors) > 1 else {next(iter(scene.sensors), ""): scene.sensor}
+        for ccd, sensor in sensors.items():
+            view = scene.views.get(ccd) or lens_view(sensor)
+            name = f"{entry.name}/{ccd}" if len(sensors) > 1 else entry.name
+            images.append(ImageEntry(entry, ccd, name, sensor, view))
+    return tuple(images)
+
+
+def _ellipsoid(folder: Path, images: tuple[ImageEntry, ...]) -> Ellipsoid:
+    """The ellipsoid that all scenes stand on."""
+    found: dict[Ellipsoid, str] = {}
+    for image in images:
+        found.setdefault(getattr(image.location, "ellipsoid", WGS84), image.name)
+    if len(found) > 1:
+        first, second = list(found.values())[:2]
+        raise UserError(f"{folder}: scenes {first} and {second} have different ellipsoids, wanted scenes of one planet")
+    return next(iter(found))
+
+
+def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> tuple[KnownPoints, Frame]:
+    path = folder / "ground_points.csv"
+    if abs(ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3 and crs != GEOGRAPHIC:
+        raise UserError(
+            f"{folder / 'project.toml'}: project.crs: {crs!r} with scenes of another planet, wanted "
+            f'"{GEOGRAPHIC}" (longitude, latitude, height on the ellipsoid of the scenes)'
+        )
+    table = Table(path, {})
+    if path.is_file():
+        table = read_table(path, GROUND, notes, may_be_empty=True)
+    rows = len(table) if table.values else 0
+    if not rows:
+        notes.append("ground_points.csv: no points: the block stands on its orbits alone")
+    if crs == GEOGRAPHIC:
+        frame: Frame = BodyFrame(ellipsoid)
+    else:
+        middle = table.stack("X_m", "Y_m", "Z_m") if rows else np.empty((0, 3))
+        middle = middle[np.isfinite(middle).all(axis=1)]
+        try:
+            frame = LocalFrame.around(middle, crs) if len(middle) else LocalFrame(0.0, 0.0, 0.0, crs)
+            grids = missing_grids(crs)
+        except CrsError as error:
+            raise UserError(f"{folder / 'project.toml'}: project.crs: {error}") from None
+        if grids:
+            notes.append(f"project.toml: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; heights or "
+                         "positions may be off by the geoid or datum shift, all alike")  # fmt: skip
+    if not rows:
+        return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ()), frame
+    return known_points(table, frame, notes), frame
+
+
+def _image_points(
+    folder: Path, images: tuple[ImageEntry, ...], ground: KnownPoints, sigma_px: float, notes: list[str]
+) -> tuple[tuple[str, ...], ImagePoints]:
+    table = read_table(folder / "image_points.csv", _IMAGE, notes)
+    place = {(image.scene.name, image.ccd): k for k, image in enumerate(images)}
+    only = {}  # where a scene has one line of detectors its name need not be written
+    for k, image in enumerate(images):
+        only[image.scene.name] = k if image.scene.name not in only else -1
+    scene = table["strip"]
+    ccd = table["ccd"] if "ccd" in table else np.full(len(table), "", dtype=object)
+    image_of = np.empty(len(table), dtype=np.int64)
+    unusable: list[str] = []
+    for row, key in enumerate(zip(scene, ccd, strict=True)):
+        image_of[row] = place.get(key, only.get(key[0], -1) if not key[1] or only.get(key[0], -1) >= 0 else -1)
+        if image_of[row] < 0:
+            what = f"strip: {key[0]!r} is not in project.toml"
+            if key[0] in only:
+                lines = ", ".join(i.ccd for i in images if i.scene.name == key[0])
+                what = f"ccd: {key[1]!r} is none of scene {key[0]}, which has {lines}"
+            unusable.append(f"image_points.csv:{table.line_of(row)}: {what}; the ray cannot be used")
+    line, sample = table["line"], table["sample"]
+    usable = image_of >= 0
+    for k, image in enumerate(images):
+        if image.size_px is None:
+            continue
+        mine = image_of == k
+        low, high = -_OUTSIDE_PX, np.array(image.size_px) - 1.0 + _OUTSIDE_PX
+        outside = mine & ~((line >= low) & (line <= high[0]) & (sample >= low) & (sample <= high[1]))
+        usable &= ~outside
+        for row in np.flatnonzero(outside):
+            size = f"{image.size_px[0]} lines and {image.size_px[1]} samples"
+            unusable.append(
+                f"image_points.csv:{table.line_of(int(row))}: line: {line[row]:g}, sample {sample[row]:g} lies outside "
+                f"image {image.name} of {size}; the ray cannot be used"
+            )
+    notes.extend(unusable[:_MOST_NAMED])
+    if len(unusable) > _MOST_NAMED:
+        notes.append(f"image_points.csv: {len(unusable) - _MOST_NAMED} more rays cannot be used")
+    rows = np.flatnonzero(usable)
+    twice = _repeats(table["point"][rows], image_of[rows], line[rows], sample[rows])
+    if twice.any():
+        notes.append(f"image_points.csv: {twice.sum()} rows repeat a measurement and were left out")
+        rows = rows[~twice]
+    if not len(rows):
+        raise UserError(f"{table.path}: no row that can be used; the first: {unusable[0] if unusable else 'none'}")
+    ids: dict[str, int] = {id: k for k, id in enumerate(ground.id)}
+    point = np.array([ids.setdefault(str(id), len(ids)) for id in table["point"][rows]], dtype=np.int64)
+    sigma = np.full(len(rows), sigma_px)
+    if "sigma_px" in table:
+        stated = table["sigma_px"][rows]
+        sigma = np.where(np.isnan(stated), sigma, stated)
+    return tuple(ids), ImagePoints(image_of[rows], point, line[rows], sample[rows], sigma)
+
+
+def _repeats(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Rows (n,) that are the same as one before."""
+    seen: set[tuple[object, ...]] = set()
+    out = np.zeros(len(columns[0]), dtype=bool)
+    for row, key in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+        out[row] = key in seen
+        seen.add(key)
+    return out
+
+
+def write_scene_block(
+    folder: Path,
+    name: str,
+    scenes: Mapping[str, Mapping[str, str]],
+    block: SceneBlock | None = None,
+    images: Sequence[str] | None = None,
+    *,
+    image_sigma_px: float = 0.3,
+    trajectory: Mapping[str, object] | None = None,
+) -> None:
+    """Write a folder that `read_scene_block` reads.
+
+    Parameters
+    ----------
+    folder : made if it is not there
+    name : of the project
+    scenes : for each scene its keys (``metadata``, ``model``, ``camera``)
+    block : its points; None for tables with their header alone
+    images : names of its images in the files, ``scene`` or ``scene/ccd``; None for those of the block
+    image_sigma_px : of image points that state none
+    trajectory : sigmas of the corrections
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["[project]", f"name = {json.dumps(name)}", 'crs = "EPSG:4979"  # longitude, latitude, ellipsoidal height']
+    lines += ["[apriori]", f"image_sigma_px = {image_sigma_px!r}"]
+    if trajectory:
+        lines += ["[trajectory]"]
+        lines += [f"{key} = {json.dumps(value)}" for key, value in trajectory.items()]
+    for scene, keys in scenes.items():
+        lines += [f"[scenes.{json.dumps(scene)}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())]
+    (folder / "project.toml").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    known = KnownGround.none() if block is None else block.known
+    ids = np.array(() if block is None else block.point_ids, dtype=object)
+    ellipsoid = WGS84 if block is None else block.ellipsoid
+    lat, lon, height = ellipsoid.geodetic(known.position_e).T if len(known.point) else np.empty((3, 0))
+    sigma = np.sqrt(np.einsum("nii->ni", known.covariance_enu)).reshape(-1, 3)
+    write_table(
+        folder / "ground_points.csv",
+        {"point": ids[known.point], "X_m": np.degrees(lon), "Y_m": np.degrees(lat), "Z_m": height}
+        | {f"sigma_{axis}_m": sigma[:, k] for k, axis in enumerate("XYZ")}
+        | {"role": known.role},
+        {"X_m": ".10f", "Y_m": ".10f", "Z_m": ".4f"} | {f"sigma_{axis}_m": ".6g" for axis in "XYZ"},
+    )
+    names = list(images) if images is not None else [image.name for image in block.images] if block else []
+    image_of = np.empty(0, dtype=np.int64) if block is None else block.rays.image
+    parts = [(n, "") if n in scenes else tuple(n.rsplit("/", 1)) for n in names]
+    empty = np.empty(0)
+    write_table(
+        folder / "image_points.csv",
+        {
+            "point": ids[block.rays.point] if block is not None else empty,
+            "strip": [parts[k][0] for k in image_of],
+            "ccd": [parts[k][1] for k in image_of],
+            "line": block.rays.line if block is not None else empty,
+            "sample": block.rays.sample if block is not None else empty,
+            "sigma_px": block.rays.sigma_px if block is not None else empty,
+        },
+        {"line": ".5f", "sample": ".5f", "sigma_px": ".6g"},
+    )

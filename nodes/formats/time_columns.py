@@ -1,0 +1,135 @@
+"""Times in CSV files: ISO 8601, seconds since the Unix epoch, GPS seconds with week or day."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..convert import SECOND_NS
+from ..errors import UserError
+from .gps_time import DAY_S, WEEK_S, unwrap_weeks, utc_ns_from_gps
+from .table import Column, Table
+from .track import times_from_gps
+
+Array = NDArray[np.floating]
+
+#: Names of columns with a time in words; ``date`` beside one holds its day.
+ISO = ("time", "time_utc", "utc", "timestamp", "datetime")
+#: Names of columns with GPS seconds, of the week or since 1980-01-06.
+GPS = ("gps_s", "gps_time_s", "gps_seconds", "sow_s", "tow_s")
+WEEKS = ("week", "gps_week")
+#: What a file may hold.
+WANTED = "time_s (UTC, since 1970), time (ISO 8601), or gps_s (of the week, with week or --date)"
+
+
+def time_columns(header: Iterable[str]) -> list[Column]:
+    """The columns with the time among the names of a header; empty where there is none."""
+    names = list(header)
+    seconds = [name for name in names if name == "time_s"]
+    gps = [name for name in names if name in GPS]
+    words = [name for name in names if name in ISO]
+    if seconds:
+        return [Column(seconds[0])]
+    if gps:
+        return [Column(gps[0], low=0.0), *(Column(name, "integer", low=0) for name in names if name in WEEKS)]
+    if words:
+        return [Column(name, "text") for name in (*words[:1], *(n for n in names if n == "date"))]
+    return []
+
+
+def times_of(table: Table, columns: list[Column], day: date | None, notes: list[str]) -> NDArray[np.int64]:
+    """UTC (n,) in ns since the Unix epoch, of the columns that `time_columns` found.
+
+    Parameters
+    ----------
+    table : with these columns
+    columns : from `time_columns`
+    day : of the flight, from the user; needed for GPS seconds of the week without a week, compared with all others
+    notes : gets a remark where the day is not known
+
+    Raises
+    ------
+    UserError : a time that cannot be read, by line and column; a day that is not that of the file
+    """
+    name = columns[0].name
+    if name == "time_s":
+        time_ns = _ns(table[name])
+    elif name in GPS:
+        time_ns, given = _from_gps(table, columns, day, notes)
+        if not given:
+            return time_ns
+    else:
+        time_ns = _from_words(table, columns)
+    same_day(table.path, int(time_ns[0]), day)
+    return time_ns
+
+
+def same_day(path: Path, first_ns: int, day: date | None) -> None:
+    """Raise UserError where a file that knows its day knows another than the user's (they may differ by a night)."""
+    if day is None:
+        return
+    own = datetime.fromtimestamp(first_ns // SECOND_NS, UTC).date()
+    if abs((own - day).days) > 1:
+        raise UserError(f"{path}: --date {day}, but its times begin on {own}; wanted the same day, or no --date")
+
+
+def instant_ns(text: str, what: str) -> int:
+    """UTC in ns since the Unix epoch of an ISO 8601 time; one without a zone is UTC.
+
+    Raises
+    ------
+    UserError : naming ``what``
+    """
+    read = pd.to_datetime(pd.Series([text]), format="ISO8601", utc=True, errors="coerce")
+    if read.isna().any():
+        raise UserError(f"{what}: {text!r}, wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z")
+    return int(_datetime_ns(read)[0])
+
+
+def _ns(seconds: Array) -> NDArray[np.int64]:
+    whole = np.floor(seconds)
+    return whole.astype(np.int64) * SECOND_NS + np.rint((seconds - whole) * 1e9).astype(np.int64)
+
+
+def _datetime_ns(times: pd.Series) -> NDArray[np.int64]:
+    return times.dt.tz_convert(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
+
+
+def _from_words(table: Table, columns: list[Column]) -> NDArray[np.int64]:
+    name = columns[0].name
+    words = table[name].astype(str)
+    if len(columns) > 1:
+        words = np.array([f"{d}T{t}" for d, t in zip(table["date"].astype(str), words, strict=True)], dtype=object)
+    else:
+        plain = np.array([word.replace(".", "", 1).isdigit() for word in words])
+        table.refuse(plain, name, lambda i: f"{words[i]} has no scale, wanted an ISO 8601 time, or a column {WANTED}")
+    read = pd.to_datetime(pd.Series(words, dtype=object), format="ISO8601", utc=True, errors="coerce")
+    wanted = "wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z"
+    table.refuse(read.isna().to_numpy(), name, lambda i: f"{str(words[i])!r}, {wanted}")
+    return _datetime_ns(read)
+
+
+def _from_gps(
+    table: Table, columns: list[Column], day: date | None, notes: list[str]
+) -> tuple[NDArray[np.int64], bool]:
+    """Times, and whether the file knows its day by itself."""
+    name = columns[0].name
+    seconds = table[name]
+    if len(columns) > 1:
+        week = table[columns[1].name]
+        bad = ~(seconds < WEEK_S)
+        table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, wanted seconds of the week, 0 to {WEEK_S}")
+        first = int(week[0])
+        return utc_ns_from_gps(first, seconds + (week - first) * WEEK_S), True
+    if (seconds >= 2 * WEEK_S).any():
+        low, high = 20 * 365 * DAY_S, (2100 - 1980) * 366 * DAY_S
+        bad = ~((seconds >= low) & (seconds < high))
+        wanted = f"wanted seconds of the week (0 to {WEEK_S}) or since 1980-01-06"
+        table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, {wanted}")
+        return utc_ns_from_gps(0, seconds), True
+    return times_from_gps(table.path, unwrap_weeks(seconds), day, notes), False

@@ -1,0 +1,132 @@
+"""Pose logs of hyperspectral line scanners: Headwall's ``imu_gps.txt`` and Resonon's ``.lcf``."""
+
+from __future__ import annotations
+
+import re
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..errors import UserError
+from .plausible import check_units
+from .table import MOST_PROBLEMS, one_line
+from .time_columns import same_day
+from .track import NavigationTrack, checked
+
+_HEADWALL = ("Roll", "Pitch", "Yaw", "Lat", "Lon", "Alt")
+_HEADWALL_TIME = "Gps_UTC_Date&Time"
+_LCF = ("time", "roll", "pitch", "yaw", "longitude", "latitude", "altitude")
+
+
+def is_headwall(path: Path) -> bool:
+    """Whether the first line is that of an ``imu_gps.txt``."""
+    with open(path, "rb") as file:
+        names = file.readline(1024).decode("latin-1").strip().lstrip("\ufeff").split("\t")
+    return names[:3] == ["Roll", "Pitch", "Yaw"]
+
+
+def is_resonon(path: Path) -> bool:
+    """Whether a file is named like a Resonon log."""
+    return path.suffix.lower() == ".lcf"
+
+
+def read_headwall(path: Path, day: date | None = None) -> NavigationTrack:
+    """Poses of an ``imu_gps.txt``: tabs, ``Roll Pitch Yaw Lat Lon Alt`` in degrees and metres, and the UTC of the GPS.
+
+    The time of a pose is ``Gps_UTC_Date&Time`` (``2018/08/28 19:34:25.05`` or ``2018/Aug/28 ...``). The first of
+    poses with the same time counts: the log repeats a GPS time between fixes.
+
+    Raises
+    ------
+    UserError : a column that is missing, a value that is malformed (with its line), another day
+    """
+    lines = [(i, text.split("\t")) for i, text in _lines(path)]
+    names = [name.strip() for name in lines[0][1]] if lines else []
+    for name in (*_HEADWALL, _HEADWALL_TIME):
+        if name not in names:
+            wanted = ", ".join((*_HEADWALL, _HEADWALL_TIME))
+            raise UserError(f"{path}:1: {name}: column missing, wanted {wanted}, between tabs")
+    values = _numbers(path, lines[1:], {name: names.index(name) for name in _HEADWALL})
+    place = names.index(_HEADWALL_TIME)
+    words = [fields[place].strip() if place < len(fields) else "" for _, fields in lines[1:]]
+    time_ns, bad = _utc_ns(words)
+    if len(bad):
+        where = f"{path}:{lines[1 + bad[0]][0]}: {_HEADWALL_TIME}"
+        problem = f"{where}: {words[bad[0]]!r}, wanted a UTC time as 2018/08/28 19:34:25.05"
+        raise UserError(one_line([problem], len(bad) - 1))
+    same_day(path, int(time_ns[0]), day)
+    keep = np.concatenate([[True], np.diff(time_ns) != 0])
+    notes = (f"{path.name}: Alt is taken as height above the ellipsoid (WGS 84)",)
+    if not keep.all():
+        notes += (f"{path.name}: {int((~keep).sum())} poses repeat the time of the one before them and were left out",)
+    rpy = np.radians(values[keep, :3])
+    track = NavigationTrack(path.stem, time_ns[keep], values[keep, 3:], rpy, notes=notes)
+    return check_units(checked(track, path), path, {"lat": "Lat", "lon": "Lon", "heading": "Yaw"})
+
+
+def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
+    """Poses of an ``.lcf``: time (s since 1970), roll, pitch, yaw (rad), longitude, latitude (deg), altitude (m).
+
+    Raises
+    ------
+    UserError : a value that is missing or malformed (with its line), degrees where radians are wanted, another day
+    """
+    lines = [(i, text.split()) for i, text in _lines(path) if not text.startswith("#")]
+    values = _numbers(path, lines, {name: i for i, name in enumerate(_LCF)})
+    angles = np.abs(values[:, 1:4])
+    bad = np.argwhere(angles > 2 * np.pi + 1e-3)
+    if len(bad):
+        row, column = bad[0]
+        where = f"{path}:{lines[row][0]}: {_LCF[1 + column]}"
+        raise UserError(
+            one_line([f"{where}: {values[row, 1 + column]:g}, wanted radians; are they degrees?"], len(bad) - 1)
+        )
+    whole = np.floor(values[:, 0])
+    time_ns = whole.astype(np.int64) * 1_000_000_000 + np.rint((values[:, 0] - whole) * 1e9).astype(np.int64)
+    same_day(path, int(time_ns[0]), day)
+    notes = (f"{path.name}: times are taken as seconds since 1970-01-01 (UTC), altitude as height above the ellipsoid",)
+    track = NavigationTrack(path.stem, time_ns, values[:, [5, 4, 6]], values[:, 1:4], notes=notes)
+    return check_units(checked(track, path), path, {"lat": "latitude", "lon": "longitude", "heading": "yaw"})
+
+
+def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Times (n,) in ns since the Unix epoch of ``2018/08/28 19:34:25.05`` (or a month in words), and which are none."""
+    month = "%b" if re.match(r"\d+/[A-Za-z]", words[0]) else "%m"
+    whole = pd.to_datetime([w.partition(".")[0] for w in words], format=f"%Y/{month}/%d %H:%M:%S", errors="coerce")
+    instants = np.asarray(whole, dtype="datetime64[ns]")
+    parts = [w.partition(".")[2] or "0" for w in words]
+    digits = np.array([part.isdigit() for part in parts])
+    fraction_ns = np.array([round(float(f"0.{p}") * 1e9) if p.isdigit() else 0 for p in parts], dtype=np.int64)
+    return instants.astype(np.int64) + fraction_ns, np.flatnonzero(np.isnat(instants) | ~digits)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Number and text of the lines that are not blank."""
+    text = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    return [(i, line) for i, line in enumerate(text, 1) if line.strip()]
+
+
+def _numbers(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, int]) -> NDArray[np.float64]:
+    """Values (n, columns) of the columns at their places."""
+    rows, problems = [], []
+    for number, fields in lines:
+        row = []
+        for name, i in place.items():
+            text = fields[i].strip() if i < len(fields) else ""
+            try:
+                row.append(float(text))
+            except ValueError:
+                row.append(np.nan)
+            if not np.isfinite(row[-1]):
+                problems.append(f"{path}:{number}: {name}: {f'{text!r} is not a number' if text else 'missing'}")
+        rows.append(row)
+        if len(problems) >= MOST_PROBLEMS:
+            break
+    if problems:
+        raise UserError(one_line(problems))
+    if len(rows) < 2:
+        raise UserError(f"{path}: {len(rows)} poses, wanted at least 2")
+    return np.array(rows)

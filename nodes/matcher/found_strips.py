@@ -1,0 +1,94 @@
+"""Strips that nobody announces, found from their image lines."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...schemas import messages as m
+from ...schemas.image_lines import LineBlock
+from ..convert import SECOND_NS
+
+#: A strip has ended when no line of it has come for so long, ns of platform time.
+SILENT_NS = 5 * SECOND_NS
+#: Lines that are off the rate of their strip by more are told, lines; then its tie points are worse than their sigma.
+OFF_LINES = 0.5
+#: Lines that are off by more are not of this strip, lines: the camera was off meanwhile, or the driver began anew.
+OTHER_LINES = 20.0
+
+
+class FoundStrips:
+    """Makes a strip of the first block that names it: its rate is that of the block, its line 0 by this rate.
+
+    A strip ends when lines of another one come, or none for a while.
+    """
+
+    def __init__(self) -> None:
+        self._begun: dict[str, Any] = {}
+        self._lines: dict[str, int] = {}
+        self._newest_ns: dict[str, int] = {}
+        self._off: set[str] = set()
+
+    def __contains__(self, id: str) -> bool:
+        return id in self._begun
+
+    def begin(self, block: LineBlock) -> Any:
+        """The strip of a block, not known before.
+
+        Raises
+        ------
+        ValueError : a block that says neither its period nor times of two lines, or that has no strip
+        """
+        period_ns = float(block.line_period_ns)
+        if not period_ns and len(block.pixels) > 1:
+            times = block.times_ns()
+            period_ns = float(times[-1] - times[0]) / (len(times) - 1)
+        if not block.strip or not period_ns > 0:
+            raise ValueError("lines without a strip, or without line_period_ns and times; wanted both")
+        first_ns = block.time_ns - round(block.first_line * period_ns)
+        strip = m.Strip(id=block.strip, first_line_time_ns=max(first_ns, 0), line_rate_hz=SECOND_NS / period_ns)
+        self._begun[block.strip] = strip
+        return strip
+
+    def note(self, block: LineBlock, stamp_ns: int) -> str:
+        """Keep how far a strip is; returns a line for the operator where lines are off its rate, once a strip.
+
+        Raises
+        ------
+        ValueError : the lines are far off, so their numbers do not go with their times
+        """
+        strip = self._begun.get(block.strip)
+        if strip is None:
+            return ""
+        due_ns = strip.first_line_time_ns + round(block.first_line * SECOND_NS / strip.line_rate_hz)
+        off = (block.time_ns - due_ns) * strip.line_rate_hz / SECOND_NS
+        if abs(off) > OTHER_LINES:
+            raise ValueError(
+                f"line {block.first_line} of strip {strip.id!r} came {off:+.0f} lines off its time; a strip that "
+                "begins anew wants another name"
+            )
+        self._lines[strip.id] = max(self._lines.get(strip.id, 0), int(block.first_line) + len(block.pixels))
+        self._newest_ns[strip.id] = max(self._newest_ns.get(strip.id, 0), stamp_ns)
+        if abs(off) < OFF_LINES or strip.id in self._off:
+            return ""
+        self._off.add(strip.id)
+        return (
+            f"{strip.id}: line {block.first_line} came {off:+.1f} lines off the {strip.line_rate_hz:.4f} lines/s of "
+            "its first block: give line_period_ns, or announce the strip with its rate"
+        )
+
+    def ended(self, stamp_ns: int, block: LineBlock | None = None) -> list[Any]:
+        """Strips that have ended: another one has lines now, or there have been none for a while."""
+        silent = [id for id, newest_ns in self._newest_ns.items() if stamp_ns - newest_ns > SILENT_NS]
+        others = [] if block is None else [id for id in self._newest_ns if id != block.strip]
+        return [self._end(id) for id in dict.fromkeys((*silent, *others))]
+
+    def finish(self) -> list[Any]:
+        """Strips that have not ended yet."""
+        return [self._end(id) for id in list(self._newest_ns)]
+
+    def _end(self, id: str) -> Any:
+        del self._newest_ns[id]
+        strip = m.Strip()
+        strip.CopyFrom(self._begun[id])
+        strip.lines, strip.ended = self._lines[id], True
+        return strip

@@ -1,0 +1,321 @@
+"""The matcher: image lines and the orientation of now in, tie points out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ...schemas import messages as m
+from ...schemas.image_lines import LineBlock
+from ...schemas.topics import CONFIGURATION, POSES, find
+from ...solver.matching.options import MatchedTie, MatchingOptions
+from ...solver.matching.tie_matcher import TieMatcher
+from .. import convert
+from ..governor import Announced, Governor
+from ..node import Message, Node
+from .found_strips import FoundStrips
+from .pace import BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S, SHARES, WINDOW_S, MatcherPace
+from .targets import DoubtfulTargets
+
+DEFAULTS = MatchingOptions()
+PACES = ("load", "normal")
+#: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
+DELAY_S = 0.8
+#: So many places of a strip that came to nothing, without any tie point, are told; the counters of those places.
+PLACES_WITHOUT_TIES = 60
+FAILED = ("too few looks", "looks never came", "contradiction")
+#: Platform time between two words on how far the matcher is, ns.
+PROGRESS_NS = 40_000_000
+
+
+class Matcher(Node):
+    """Runs a `TieMatcher`.
+
+    A tie point is completed by a message: the block of lines with its last look, or the pose that told where that look
+    was taken from. A strip that nobody has announced is found from its image lines, and announced. Signalised control
+    and check points are measured as well, see `DoubtfulTargets`.
+
+    Parameters
+    ----------
+    points_per_s, window_rays, window_points, largest_sigma_px, least_score, least_reach_px, largest_reach_px,
+    relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
+    ground_m : height of the ground about which the search begins, local frame; without it that of control and check
+        points with a height, or 0
+    delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
+        that time, so they may be so long on their way: live and from a recording it sees them at the same place.
+    pace : "load", fewer places where the machine is too slow, and in `process` where it was in flight; "normal", all of
+        them, however long it takes
+    """
+
+    name = "matcher"
+    inputs = (
+        *CONFIGURATION,
+        "sensor/lines/*",
+        *POSES,
+        "orientation/live",
+        "adjustment/report",
+        "observation/control",
+        "observation/verdict",
+    )
+    outputs = ("configuration/strip", "observation/tie", "observation/target", "observation/progress", "event/log")
+    decisions = ("matching/pace",)
+
+    def __init__(
+        self,
+        *,
+        points_per_s: float = DEFAULTS.points_per_s,
+        window_rays: float = DEFAULTS.window_rays,
+        window_points: float = DEFAULTS.window_points,
+        largest_sigma_px: float = DEFAULTS.largest_sigma_px,
+        least_score: float = DEFAULTS.least_score,
+        least_reach_px: float = DEFAULTS.least_reach_px,
+        largest_reach_px: float = DEFAULTS.largest_reach_px,
+        relief_sigma_m: float = DEFAULTS.relief_sigma_m,
+        least_rays: int = DEFAULTS.least_rays,
+        budget_mb: float = DEFAULTS.budget_mb,
+        chips_mb: float = DEFAULTS.chips_mb,
+        full_scale: int = DEFAULTS.full_scale,
+        ground_m: float | None = None,
+        delay_s: float = DELAY_S,
+        pace: str = "load",
+    ) -> None:
+        super().__init__()
+        if ground_m is not None and not np.isfinite(ground_m):
+            raise ValueError(f"ground_m: wanted a height in metres, got {ground_m}")
+        if pace not in PACES:
+            raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
+        if not 0 <= delay_s <= 10:
+            raise ValueError(f"delay_s: wanted 0 to 10, got {delay_s}")
+        self.options = MatchingOptions(
+            points_per_s=points_per_s, window_rays=window_rays, window_points=window_points, chips_mb=chips_mb,
+            largest_sigma_px=largest_sigma_px, least_score=least_score,
+            least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
+            least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
+        )  # fmt: skip
+        self._targets = DoubtfulTargets()
+        self._by_load, self._pace = pace == "load", MatcherPace()
+        self._announced: Announced[MatcherPace] = Announced()
+        self._governor = Governor(len(SHARES), BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S)
+        self._ground_m = ground_m
+        self._heights: dict[str, float] = {}  # of control and check points
+        self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
+        self._delay_ns = round(delay_s * convert.SECOND_NS)
+        self._matcher: TieMatcher | None = None
+        self._camera: Any = None
+        self._strips: dict[str, Any] = {}
+        self._found = FoundStrips()
+        self._reference_ns = 0
+        self._stamp_ns = self._told_ns = 0
+        self._filtered_seen = False
+
+    def step(self, message: Message) -> Iterable[Message]:
+        if message.source == self.name and message.topic == "configuration/strip":
+            return ()
+        out: list[Message] = []
+        if message.stamp_ns >= self._told_ns + PROGRESS_NS and self._keeps_time(message.topic):
+            # all that is older has been worked off; what has the same stamp as this message has not
+            self._told_ns = message.stamp_ns
+            progress = m.Progress(time_ns=message.stamp_ns - 1)
+            out.append(Message("observation/progress", message.stamp_ns - 1 + self._delay_ns, progress))
+        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        out += self._begin_pace(message.stamp_ns)
+        if self._keeps_time(message.topic):
+            out += [self._strip(strip) for strip in self._found.ended(message.stamp_ns)]
+        try:
+            if message.topic.startswith("sensor/lines/") and self._matcher is not None:
+                out += self._find_strip(message.body)
+            out += self._take(message)
+        except ValueError as error:
+            self.problem("malformed", f"{message.topic}: {error}")
+        return out
+
+    def finish(self) -> Iterable[Message]:
+        return [self._strip(strip) for strip in self._found.finish()]
+
+    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
+        if self._matcher is None or not self._by_load or not self._governor.look(lag_s, now_s, 0.0, WINDOW_S):
+            return ()
+        pace = MatcherPace(self._governor.level, lag_s)
+        self._announced.add(self._stamp_ns + 1, pace)
+        return [Message("matching/pace", self._stamp_ns, pace.message(self._stamp_ns + 1))]
+
+    def _begin_pace(self, stamp_ns: int) -> list[Message]:
+        pace = self._announced.take(stamp_ns)
+        if pace is None:
+            return []
+        self._pace = pace
+        if self._matcher is not None:
+            self._matcher.keep(pace.share)
+        return [self._log(pace.words(), warning=pace.level > 0)]
+
+    @staticmethod
+    def _keeps_time(topic: str) -> bool:
+        """Whether a message tells how far the flight is; not those of the adjuster, which goes by the matcher."""
+        told_by_others = "orientation/live", "adjustment/report", *Matcher.decisions
+        return topic not in told_by_others and not find(topic).latched
+
+    def state(self) -> str:
+        if self._matcher is None:
+            return "waiting for configuration/camera"
+        return f"running, {self._pace.words()}" if self._pace.level else "running"
+
+    def _take(self, message: Message) -> list[Message]:
+        topic, body = message.topic, message.body
+        if topic == "configuration/camera":
+            return self._configure(body, message.stamp_ns)
+        if topic == "configuration/strip":
+            if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
+                raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+            self._strips[body.id] = body
+        elif topic.startswith("sensor/lines/"):
+            return self._lines(topic.rpartition("/")[2], body)
+        elif topic.startswith("trajectory/"):
+            self._pose(body, topic == "trajectory/smoothed")
+        elif topic == "orientation/live":
+            self._correction(body)
+        elif topic == "adjustment/report" and self._matcher is not None:
+            self._matcher.window_holds(int(body.points), int(body.rays))
+        elif topic == "matching/pace":
+            if self._by_load:
+                self._announced.add(body.start_ns, MatcherPace(body.level, body.lag_s))
+        elif topic == "observation/control":
+            self._targets.ground_point(body)
+            if convert.role_of(body) != "planimetric" and np.isfinite(body.z):
+                self._heights[body.point] = float(body.z)
+                self._set_ground()
+        elif topic == "observation/verdict":
+            return self._targets.verdict(body, self._observed_ns)
+        return []
+
+    def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
+        if body == self._camera:
+            return []
+        again = self._matcher is not None
+        camera = convert.camera_from(body)
+        self._camera, self._matcher = body, None
+        self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
+        self._matcher = TieMatcher(camera, self.options)
+        self._matcher.keep(self._pace.share)
+        self._set_ground()
+        self._targets.configure(camera, self._matcher.orientation)
+        return [self._log("configuration changed: matching starts again", warning=True)] if again else []
+
+    @property
+    def _height_m(self) -> float:
+        """Of the ground, before any tie point is known."""
+        if self._ground_m is not None:
+            return self._ground_m
+        return float(np.median(list(self._heights.values()))) if self._heights else 0.0
+
+    def _set_ground(self) -> None:
+        if self._matcher is not None:
+            self._matcher.set_mean_height(self._height_m)
+
+    def _without_ties(self, failed: int, ties: int, strip: str) -> list[str]:
+        """A line for the operator where a strip gives no tie points though many places were tried; once a strip."""
+        if self._failed < 0:
+            return []
+        self._failed += failed
+        if not ties and self._failed < PLACES_WITHOUT_TIES:
+            return []
+        tried, self._failed = self._failed, -1
+        if ties:
+            return []
+        return [
+            f"{strip}: no tie point at {tried} places; the ground is taken to be at {self._height_m:.0f} m in the "
+            "local frame: if it is not, give ground_m in [matcher]"
+        ]
+
+    def _pose(self, body: Any, smoothed: bool) -> None:
+        self._filtered_seen |= not smoothed
+        # without a filter (an imported trajectory) the smoothed poses lead
+        if self._matcher is None or (smoothed and self._filtered_seen):
+            return
+        sample = convert.pose_sample(body)
+        if sample.covariance is None:
+            raise ValueError("pose without covariance")
+        time_s = (sample.time_ns - self._reference_ns) * 1e-9
+        if not self._matcher.orientation.add_pose(time_s, sample.position_l, sample.quaternion, sample.covariance):
+            self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
+
+    def _correction(self, body: Any) -> None:
+        if self._matcher is None or body.strip != self._matcher.strip:
+            return
+        sample = convert.pose_sample(body)
+        if sample.correction is None or sample.covariance is None:
+            return
+        if sample.correction.shape != (6,) or not np.isfinite(sample.correction).all():
+            raise ValueError(f"correction {sample.correction.tolist()}, wanted 6 finite values")
+        time_s = (sample.time_ns - self._reference_ns) * 1e-9
+        self._matcher.orientation.add_correction(time_s, sample.correction, sample.covariance)
+
+    def _lines(self, ccd: str, block: LineBlock) -> list[Message]:
+        matcher = self._matcher
+        if matcher is None:
+            self.problem("before configuration", f"lines of {ccd} came before configuration/camera")
+            return []
+        if block.ccd and block.ccd != ccd:
+            raise ValueError(f"a block of CCD line {block.ccd!r}")
+        strip = self._strips[block.strip]
+        if matcher.strip != strip.id:
+            first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
+            matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
+            self._targets.begin_strip(strip, first_s)
+            self._failed = 0
+        if self._pace.blind:
+            self.counters["lines gone by"] += len(block.pixels)
+            return []
+        usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
+        ties = matcher.match()
+        out = [self._tie(strip, tie) for tie in ties]
+        targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
+        out += targets
+        out += [self._log(f"{strip.id}: {text}", warning=True) for text in (*matcher.take_events(), *words)]
+        failed = sum(matcher.counters[name] for name in FAILED)
+        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties), strip.id)]
+        self.counters.update(self._targets.take_counters())
+        self.counters.update(matcher.counters)
+        matcher.counters.clear()
+        return out
+
+    def _find_strip(self, block: LineBlock) -> list[Message]:
+        """Begin the strip of a block if nobody has announced it, and tell how it goes on."""
+        out: list[Message] = []
+        if block.strip not in self._strips:
+            strip = self._strips[block.strip] = self._found.begin(block)
+            out += [self._strip(ended) for ended in self._found.ended(self._stamp_ns, block)]
+            out += [self._strip(strip), self._log(f"{strip.id}: nobody announced it, found from its image lines")]
+        off = self._found.note(block, self._stamp_ns)
+        return out + ([self._log(off, warning=True)] if off else [])
+
+    def _strip(self, strip: Any) -> Message:
+        """A strip that was found; stamped as observations are, so that what the matcher says stays in order."""
+        return Message("configuration/strip", self._observed_ns, strip)
+
+    def _tie(self, strip: Any, tie: MatchedTie) -> Message:
+        period_ns = convert.SECOND_NS / strip.line_rate_hz
+        images = [
+            {
+                "strip": strip.id,
+                "ccd": ray.ccd,
+                "line": ray.line,
+                "sample": ray.sample,
+                "sigma_line": ray.sigma_line,
+                "sigma_sample": ray.sigma_sample,
+                "time_ns": strip.first_line_time_ns + round(ray.line * period_ns),
+            }
+            for ray in tie.rays
+        ]
+        return Message("observation/tie", self._observed_ns, convert.tie_message(tie.name, images))
+
+    @property
+    def _observed_ns(self) -> int:
+        """Stamp of observations that follow from the newest message."""
+        return self._stamp_ns + self._delay_ns
+
+    def _log(self, text: str, warning: bool = False) -> Message:
+        body = m.Log(name=self.name, message=text, level=3 if warning else 2)
+        convert.set_time(body.timestamp, self._stamp_ns)
+        return Message("event/log", self._stamp_ns, body)

@@ -1,0 +1,1 @@
+"""The monitor: what all nodes say of themselves, on one screen."""

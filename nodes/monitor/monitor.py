@@ -1,0 +1,264 @@
+"""The monitor: what all nodes say of themselves, on one screen."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from ...schemas import messages as m
+from ...solver.window.quality.determinability import ESTIMATED
+from .. import convert
+from ..config import build
+from ..node import Message, Node
+from ..terminal import drawing, plain
+
+if TYPE_CHECKING:
+    from ..bus.program import ProgramOptions
+    from .sensor_watch import SensorWatch
+
+#: Counters of a topic that are zero on a good day.
+LOSSES: tuple[str, ...] = ("gaps", "duplicates", "late", "malformed", "dropped")
+#: Nodes that are shown, and characters of a name and of a state or event; others would fill the screen at will.
+MOST_NODES, LONGEST_NAME, LONGEST_TEXT = 40, 24, 200
+#: Alarms on the screen, at most.
+MOST_ALARMS = 6
+
+
+@dataclass
+class Overview:
+    """What is known of a running system; the newest values seen."""
+
+    nodes: dict[str, Any] = field(default_factory=dict)  # node -> NodeStatus
+    report: Any = None  # newest AdjustmentReport
+    parameters: Any = ()  # of the newest report that has any
+    updates: int = 0
+    rejected: int = 0
+    final_until_ns: int = 0
+    events: deque[tuple[int, str, str]] = field(default_factory=lambda: deque(maxlen=5))  # stamp, level, text
+
+    @property
+    def estimated(self) -> int:
+        """Number of parameters that the network sees by now."""
+        return sum(p.status == ESTIMATED for p in self.parameters)
+
+    def not_yet(self, most: int) -> str:
+        """Parameters that the network does not see yet, each with what it goes with: the strongest first."""
+        rest = sorted((p for p in self.parameters if p.status != ESTIMATED), key=lambda p: -abs(p.correlation))
+        told = [f"{p.name} ({p.correlation:+.2f} {p.partner})" if p.partner else p.name for p in rest[:most]]
+        return ", ".join(told) + (f", {len(rest) - most} more" if len(rest) > most else "")
+
+    def topic_rates(self) -> dict[str, float]:
+        """Messages a second of every topic, as the node that receives most of it counts them."""
+        rates: dict[str, float] = {}
+        for status in self.nodes.values():
+            for topic in status.topics:
+                rates[topic.topic] = max(rates.get(topic.topic, 0.0), topic.rate_hz)
+        return rates
+
+    def losses(self) -> dict[str, int]:
+        """Sums over all nodes of what should be zero on a good day."""
+        sums: dict[str, int] = dict.fromkeys(LOSSES, 0)
+        for status in self.nodes.values():
+            for topic in status.topics:
+                for kind in sums:
+                    sums[kind] += getattr(topic, kind)
+        return sums
+
+    def alarms(self) -> list[str]:
+        """What nodes want an operator to look at, each once."""
+        return list(dict.fromkeys(plain(s.alarm, LONGEST_TEXT) for s in self.nodes.values() if s.alarm))
+
+    def line(self) -> str:
+        """One line for logs and terminals that cannot be redrawn."""
+        parts = [f"{len(self.nodes)} nodes"]
+        if self.report is not None:
+            r = self.report
+            parts += [
+                f"sigma0 {r.sigma0:.2f}" if r.redundancy > 0 else "sigma0 -",
+                f"window {_window_s(r):.0f} s",
+                f"{r.rays} rays",
+                f"{r.points} points",
+                f"{self.rejected} rejected",
+                f"update {1e3 * r.compute_s:.0f} ms",
+            ]
+        lag = max((status.lag_s for status in self.nodes.values()), default=0.0)
+        if self.parameters:
+            parts.append(f"{self.estimated} of {len(self.parameters)} parameters estimated")
+        parts.append(f"lag {lag:.2f} s")
+        parts += [
+            text for text in (s.state.removeprefix("flying at ") for s in self.nodes.values()) if "real time" in text
+        ]
+        parts += [f"ALARM: {text}" for text in self.alarms()]
+        lost = {kind: n for kind, n in self.losses().items() if n}
+        if lost:
+            parts.append(", ".join(f"{n} {kind}" for kind, n in lost.items()))
+        return plain(" | ".join(parts))
+
+
+class Monitor(Node):
+    """Collects status, reports and events into an `Overview`; publishes nothing."""
+
+    name = "monitor"
+    inputs = ("status/*", "adjustment/report", "event/log")
+    outputs = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.overview = Overview()
+
+    def step(self, message: Message) -> Iterable[Message]:
+        view, body = self.overview, message.body
+        if message.topic.startswith("status/"):
+            name = message.topic.partition("/")[2]
+            if name in view.nodes or len(view.nodes) < MOST_NODES:
+                view.nodes[name] = body
+            else:
+                self.problem("too many nodes", f"status of a node {plain(name, LONGEST_NAME)} is not shown")
+        elif message.topic == "adjustment/report":
+            view.report = body
+            view.parameters = body.parameters or view.parameters
+            view.updates += 1
+            view.rejected = max(view.rejected, body.rejected_total)
+            view.final_until_ns = max(view.final_until_ns, body.window_start_ns)
+        elif message.topic == "event/log":
+            level = m.Log.Level.Name(body.level).lower()
+            view.events.append((message.stamp_ns, level, plain(f"{body.name}: {body.message}", LONGEST_TEXT)))
+        return ()
+
+
+def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> Any:
+    """The overview as one rich renderable, at most 80 columns; by 24 lines without sensors that are watched."""
+    from rich.console import Group
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    nodes = Table(box=None, pad_edge=False, expand=True)
+    for name, justify in (
+        ("node", "left"),
+        ("state", "left"),
+        ("lag", "right"),
+        ("queue", "right"),
+        ("problems", "left"),
+    ):
+        nodes.add_column(name, justify=justify, no_wrap=True)  # pyright: ignore[reportArgumentType]
+    for name in sorted(overview.nodes):
+        s = overview.nodes[name]
+        bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
+        text = ", ".join(f"{n} {k}" for k, n in bad.items() if n)
+        nodes.add_row(
+            Text(plain(name, LONGEST_NAME)), Text(plain(s.state, LONGEST_TEXT)), f"{s.lag_s:.2f} s", str(s.queued),
+            Text(text or "-", style="yellow" if text else "dim"),
+        )  # fmt: skip
+
+    rates = "   ".join(
+        f"{t} {r:.0f}/s"
+        for t, r in sorted(overview.topic_rates().items())
+        if r >= 0.5 and "status" not in t and not (watch is not None and t.startswith("sensor/"))
+    )
+    lines: list[Any] = [nodes, Text(plain(rates, 8 * LONGEST_TEXT), style="dim")]
+    if watch is not None:
+        lines = [_sensor_table(watch), Text(), *lines]
+    if overview.report is not None:
+        r = overview.report
+        good = r.redundancy <= 0 or 0.8 <= r.sigma0 <= 1.25
+        lines.append(
+            Text.assemble(
+                "sigma0 ",
+                (f"{r.sigma0:.3f}" if r.redundancy > 0 else "-", "green" if good else "bold red"),
+                f"   window {_window_s(r):.1f} s, {r.rays} rays, {r.points} points, {r.control} control",
+                f"   rejected {overview.rejected}   update {1e3 * r.compute_s:.0f} ms",
+            )
+        )
+    if overview.parameters:
+        text = f"parameters: {overview.estimated} of {len(overview.parameters)} estimated"
+        rest = overview.not_yet(3)
+        text += f"; not yet {plain(rest, LONGEST_TEXT)}" if rest else ""
+        lines.append(Text(text, no_wrap=True, overflow="ellipsis"))
+    lines += [Text(text, style="bold red") for text in overview.alarms()[:MOST_ALARMS]]
+    lines += [Text(text, style="red" if level in ("error", "fatal") else "dim") for _, level, text in overview.events]
+    return Panel(Group(*lines), title=Text(plain(title)), title_align="left")
+
+
+def _sensor_table(watch: SensorWatch) -> Any:
+    """What comes in at what rate, what is missing, and what sensor programs said last."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, expand=True)
+    for name, justify in (("sensor", "left"), ("rate", "right"), ("messages", "right"), ("", "left")):
+        table.add_column(name, justify=justify, no_wrap=True)  # pyright: ignore[reportArgumentType]
+    for row in watch.rows():
+        style = {"comes in": "green", "stopped": "bold red"}.get(row.state, "yellow")
+        rate = f"{row.rate_hz:.1f}/s" if row.state == "comes in" else "-"
+        name = Text(plain(row.name, LONGEST_NAME))
+        table.add_row(name, rate, str(row.received), Text(plain(row.words, LONGEST_TEXT), style=style))
+    said = [Text(plain(text, LONGEST_TEXT), style="yellow", no_wrap=True, overflow="ellipsis") for text in watch.said]
+    return Group(table, *([Text(watch.phase, style="bold")] if watch.phase else []), *said)
+
+
+def _window_s(report: Any) -> float:
+    """Length of the window in seconds; 0 while there are no rays in it."""
+    return (report.window_end_ns - report.window_start_ns) / convert.SECOND_NS if report.rays else 0.0
+
+
+@contextmanager
+def display(
+    overview: Overview, title: str, quiet: bool = False, watch: SensorWatch | None = None
+) -> Iterator[Callable[[], None]]:
+    """Gives a function that shows the overview: one screen on a terminal, a line every 5 s elsewhere.
+
+    Sensors that are watched are shown as well; without a screen a line tells at once when one begins or stops.
+    """
+
+    def look() -> list[str]:
+        return [] if watch is None else watch.look(overview.nodes)
+
+    if quiet:
+        yield lambda: (look(), None)[1]
+    elif sys.stdout.isatty():
+        from rich.console import Console
+        from rich.live import Live
+
+        console = Console(file=drawing(sys.stdout))
+        with Live(screen(overview, title, watch), console=console, refresh_per_second=4) as live:
+
+            def draw() -> None:
+                look()
+                live.update(screen(overview, title, watch))
+
+            yield draw
+    else:
+        begun = last = time.monotonic()
+
+        def line() -> None:
+            nonlocal last
+            now = time.monotonic()
+            told = [f"{now - begun:4.0f} s  {text}\n" for text in look()]
+            if now - last >= 5.0:
+                last = now
+                told += [f"{now - begun:4.0f} s  {watch.line()}\n"] if watch is not None else []
+                told.append(f"{now - begun:4.0f} s  {overview.line()}\n")
+            if told:
+                sys.stdout.write("".join(told))
+                sys.stdout.flush()
+
+        yield line
+
+
+def run(options: ProgramOptions) -> int:
+    """Watch a platform until told to stop."""
+    from ..bus.live import BusRunner, in_thread
+
+    monitor = build(Monitor, options.tables)
+    title = f"platform {options.platform}"
+    with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title) as show:
+        while not options.stop.wait(0.25):
+            show()
+    return 0

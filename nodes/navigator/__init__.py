@@ -1,0 +1,1 @@
+"""The navigator: sensors in, measured trajectory of the camera out."""

@@ -1,0 +1,291 @@
+"""The navigator: sensors in, measured trajectory of the camera out."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ...schemas import messages as m
+from ...solver.geometry.frames import LocalFrame
+from ...solver.geometry.rotation import R_ENU_NED
+from ...solver.navigation.clock_check import LARGEST_DELAY_S, ClockCheck, offset_in_words
+from ...solver.navigation.inertial_navigator import InertialNavigator
+from ...solver.navigation.kinematic import KinematicFilter
+from ...solver.navigation.online_poses import OnlineOptions
+from ...solver.navigation.pose import NavigationPose
+from .. import convert
+from ..node import Message, Node
+from .engines import inertial_engine, kinematic_engine, stated_noise
+
+#: A measurement cannot be so much later than its message, s: one clock that runs away must not stop the filter.
+AHEAD_S = 1.0
+#: Fixes that stand so far before the first attitude are of another clock, s: nobody waits on the ground for so long
+#: with one sensor and without the other.
+EARLY_S = 900.0
+#: Numbers of fixes that are missing without time going on: the clock was set back.
+FEW_NUMBERS = 5
+
+
+class Navigator(Node):
+    """Runs a navigation engine.
+
+    Attitude and GNSS go through the kinematic filter. With the first raw inertial sample the inertial filter takes
+    over; measured attitudes are then counted and left aside. Poses carry the stamp of the message that made them
+    possible; the time they are valid for stands in the body.
+
+    Parameters
+    ----------
+    filtered_s : least distance of filtered poses, s; 0 = all of them, which those who want them at once need
+    smooth_every_s : from inertial data smoothed poses come so often, s
+    """
+
+    name = "navigator"
+    inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss")
+    outputs = ("trajectory/filtered", "trajectory/smoothed", "event/log")
+
+    def __init__(self, *, filtered_s: float = 0.0, smooth_every_s: float = OnlineOptions.smooth_every_s) -> None:
+        super().__init__()
+        if not 0.0 <= filtered_s <= 1.0:
+            raise ValueError(f"filtered_s is {filtered_s:g}, wanted 0 to 1 s")
+        if not 0.0 < smooth_every_s <= 10.0:
+            raise ValueError(f"smooth_every_s is {smooth_every_s:g}, wanted more than 0 and at most 10 s")
+        self._filtered_s, self._smooth_every_s = filtered_s, smooth_every_s
+        self._engine: KinematicFilter | InertialNavigator | None = None
+        self._configuration: Any = None
+        self._reference_ns = 0
+        self._seen: Counter[str] = Counter()
+        self._stamp_ns = 0
+        self._project = b""
+        self._notes: list[Message] = []
+        self._frame = LocalFrame(0.0, 0.0, 0.0)
+        self._covariance_key: tuple[float, ...] = ()
+        self._covariance = np.zeros((3, 3))
+        self._clock = ClockCheck()
+        self._newest_ns, self._other = 0, "attitude"
+        self._early_fix_ns = 0  # newest fix before the first attitude or inertial sample
+        self._last_fix, self._period_s = (-1, 0), 0.0
+        self._suspect: int | None = None
+        self._set_back: int | None = None
+
+    def step(self, message: Message) -> Iterable[Message]:
+        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        try:
+            if message.topic in ("sensor/imu", "sensor/attitude"):
+                self._check_time(message)
+            if message.topic == "sensor/imu":
+                poses = self._inertial(message.body)
+            elif message.topic == "sensor/attitude":
+                poses = self._attitude(message.body)
+            elif message.topic == "sensor/gnss":
+                poses = self._gnss(message)
+            else:
+                return self._configure(message)
+        except ValueError as error:
+            self.problem("malformed", f"{message.topic}: {error}")
+            return ()
+        return self._messages(poses)
+
+    def finish(self) -> Iterable[Message]:
+        if self._engine is None:
+            return ()
+        return self._messages(self._engine.finish())
+
+    def state(self) -> str:
+        if self._engine is None:
+            return "waiting for configuration/project"
+        return self._engine.status if isinstance(self._engine, InertialNavigator) else "running"
+
+    def _configure(self, message: Message) -> Iterable[Message]:
+        content = message.body.SerializeToString(deterministic=True)
+        if content == self._project:
+            return ()
+        try:
+            self._engine = kinematic_engine(message.body, self._filtered_s)
+            self._configuration = message.body
+        except ValueError as error:
+            self.problem("bad configuration", f"{message.topic}: {error}")
+            return (self._log(message.stamp_ns, f"configuration/project cannot be used: {error}", warning=True),)
+        self._frame = convert.local_frame(message.body)
+        self._seen = Counter()
+        self._project = content
+        self._reference_ns = message.stamp_ns
+        return ()
+
+    @staticmethod
+    def _check_time(message: Message) -> None:
+        body = message.body
+        time_ns = convert.time_ns(body.timestamp) if message.topic == "sensor/gnss" else body.time_ns
+        ahead = (time_ns - message.stamp_ns) * 1e-9
+        if ahead > AHEAD_S:
+            raise ValueError(f"measured {ahead:.3f} s after the stamp of its message")
+
+    def _right_clock(self, message: Message) -> bool:
+        """Whether a fix has the time that attitude and inertial data have; the operator is told where it has not."""
+        time_ns = convert.time_ns(message.body.timestamp)
+        if self._renumbered(message.sequence, time_ns):
+            return False
+        if not self._newest_ns:
+            self._early_fix_ns = time_ns
+            return True
+        was = self._clock.offset_s
+        right = self._clock.fix(time_ns * 1e-9, self._newest_ns * 1e-9)
+        now = self._clock.offset_s
+        if now is not None:
+            self.counters["gnss of another clock"] += 1
+            if was is None or abs(now - was) > LARGEST_DELAY_S:
+                self._wrong_clock(offset_in_words(now, self._other))
+        elif was is not None:
+            self.alarms.pop("clock", None)
+            self._notes.append(self._log(self._stamp_ns, "GNSS clock agrees again: fixes are used"))
+        return right
+
+    def _wrong_clock(self, words: str) -> None:
+        text = f"{words}: GNSS is left out"
+        self.alarms["clock"] = text
+        self.problem("clock", text)
+        self._notes.append(self._log(self._stamp_ns, text, warning=True))
+
+    def _renumbered(self, number: int, time_ns: int) -> bool:
+        """Whether a fix is from after the receiver's clock was set back: in the order of stamps its number is too high.
+
+        Live such fixes come late, and `ClockCheck` sees them; a recording is sorted by stamps.
+        """
+        last, last_ns = self._last_fix
+        if self._set_back is not None and number >= self._set_back:
+            self.counters["gnss of another clock"] += 1
+            return True
+        if number == last + 1:
+            self._period_s = (time_ns - last_ns) * 1e-9
+        elif number > last + FEW_NUMBERS and last >= 0 and 0 <= time_ns - last_ns < convert.SECOND_NS:
+            self._suspect = number
+        elif self._suspect is not None and number < self._suspect:  # numbers go on from before
+            self._set_back, self._suspect = self._suspect, None
+            self._wrong_clock(f"GNSS clock was set back by about {(self._set_back - number) * self._period_s:.0f} s")
+        self._last_fix = number, time_ns
+        return False
+
+    def _note_time(self, time_ns: int, other: str) -> None:
+        """How far attitude or inertial data have come."""
+        if not self._newest_ns and self._early_fix_ns:
+            off_s = (time_ns - self._early_fix_ns) * 1e-9
+            if abs(off_s) > EARLY_S:  # no fix since: those before were of another time
+                self._wrong_clock(offset_in_words(off_s, other))
+        self._newest_ns, self._other = max(self._newest_ns, time_ns), other
+
+    def _inertial(self, body: Any) -> list[NavigationPose]:
+        if self._engine is None:
+            self.problem("before configuration", "sensor/imu came before configuration/project")
+            return []
+        self._note_time(body.time_ns, "inertial")
+        force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
+        if not math.isfinite(sum(force) + sum(rate)):
+            raise ValueError("specific force or angular rate is not finite")
+        if max(map(abs, force)) > 500.0 or max(map(abs, rate)) > 50.0:
+            raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
+        if not 0 < body.interval_ns <= convert.SECOND_NS:
+            raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
+        if not isinstance(self._engine, InertialNavigator):
+            self._engine = inertial_engine(
+                self._configuration, body, filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s
+            )
+            self._seen = Counter()
+            wrong = stated_noise(body)[2]
+            if wrong:
+                self.problem("inertial noise", f"sensor/imu: {wrong}")
+                self._notes.append(self._log(self._stamp_ns, f"sensor/imu: {wrong}", warning=True))
+        return self._engine.add_inertial(self._seconds(body.time_ns), body.interval_ns * 1e-9, force, rate)
+
+    def _attitude(self, body: Any) -> list[NavigationPose]:
+        if self._engine is None:
+            self.problem("before configuration", "sensor/attitude came before configuration/project")
+            return []
+        if isinstance(self._engine, InertialNavigator):
+            self.counters["attitude beside inertial data"] += 1
+            return []
+        self._note_time(body.time_ns, "attitude")
+        rpy = (body.roll, body.pitch, body.heading)
+        if not np.isfinite(rpy).all():
+            raise ValueError("roll, pitch or heading is not finite")
+        if max(abs(rpy[0]), abs(rpy[1])) > 2.0 or abs(rpy[2]) > 7.0:
+            raise ValueError(f"roll, pitch, heading {rpy} are not radians of an aircraft")
+        return self._engine.add_attitude(self._seconds(body.time_ns), rpy, self._attitude_covariance(body.covariance))
+
+    def _attitude_covariance(self, values: Any) -> Any:
+        """(3, 3); the array of the last message again if it had the same values, so that nothing is computed twice."""
+        key = tuple(values)
+        if key != self._covariance_key:
+            if len(key) != 9 or not np.isfinite(key).all() or min(key[0], key[4], key[8]) <= 0:
+                raise ValueError(f"attitude covariance {list(key)}, wanted 9 values with a positive diagonal")
+            self._covariance_key, self._covariance = key, np.array(key).reshape(3, 3)
+        return self._covariance
+
+    def _gnss(self, message: Message) -> list[NavigationPose]:
+        body = message.body
+        if self._engine is None:
+            self.problem("before configuration", "sensor/gnss came before configuration/project")
+            return []
+        geodetic = np.array([body.latitude, body.longitude, body.altitude])
+        if not np.isfinite(geodetic).all() or abs(geodetic[0]) > 90 or abs(geodetic[1]) > 360:
+            raise ValueError(f"position {geodetic.tolist()} is no latitude, longitude, height")
+        covariance = np.array(body.position_covariance)
+        if covariance.shape != (9,) or not np.isfinite(covariance).all() or covariance[::4].min() <= 0:
+            raise ValueError("position covariance: wanted 9 values with a positive diagonal")
+        if not self._right_clock(message):
+            return []
+        self._check_time(message)
+        frame = self._frame
+        antenna_l = frame.from_geodetic(*geodetic)
+        R_l_enu = frame.R_ln(antenna_l) @ R_ENU_NED
+        time_s = self._seconds(convert.time_ns(body.timestamp))
+        covariance_l = R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
+        if isinstance(self._engine, KinematicFilter):
+            return self._engine.add_gnss(time_s, antenna_l, covariance_l)
+        velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
+        return self._engine.add_gnss(time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
+
+    @staticmethod
+    def _velocity(body: Any, R_l_enu: Any) -> tuple[Any, Any]:
+        """Velocity (3,) and its covariance (3, 3) in the local frame; None, None where the receiver gives none."""
+        covariance = np.array(body.velocity_covariance)
+        velocity = np.array([body.velocity_enu.x, body.velocity_enu.y, body.velocity_enu.z])
+        if covariance.shape != (9,) or not np.isfinite(covariance).all() or covariance[::4].min() <= 0:
+            return None, None
+        if not np.isfinite(velocity).all():
+            raise ValueError(f"velocity {velocity.tolist()} is not finite")
+        return R_l_enu @ velocity, R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
+
+    def _seconds(self, time_ns: int) -> float:
+        return (time_ns - self._reference_ns) * 1e-9
+
+    def _messages(self, poses: list[NavigationPose]) -> list[Message]:
+        if self._engine is None:
+            return []
+        out = [
+            Message(
+                "trajectory/smoothed" if p.smoothed else "trajectory/filtered",
+                self._stamp_ns,
+                convert.pose_message(
+                    self._reference_ns + round(p.time_s * 1e9), p.position_l, p.angles, p.covariance,
+                    quaternion=p.quaternion, valid=p.valid, reason=p.reason, velocity_l=p.velocity_l,
+                    noise_time_s=p.noise_time_s,
+                ),
+            )
+            for p in poses
+        ]  # fmt: skip
+        out += self._notes
+        self._notes = []
+        for kind, n in self._engine.counters.items():
+            self.counters[kind] += n - self._seen[kind]
+            self._seen[kind] = n
+        for event in self._engine.take_events():
+            out.append(self._log(self._reference_ns + round(event.time_s * 1e9), event.text))
+        return out
+
+    def _log(self, time_ns: int, text: str, warning: bool = False) -> Message:
+        body = m.Log(name=self.name, message=text, level=3 if warning else 2)
+        convert.set_time(body.timestamp, time_ns)
+        return Message("event/log", self._stamp_ns, body)

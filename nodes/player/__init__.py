@@ -1,0 +1,1 @@
+"""The player: recorded messages onto the bus."""

@@ -1,0 +1,283 @@
+"""The player: recorded inputs onto the bus, with the timing they were recorded with."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...schemas import codec, topics
+from ...schemas.envelope import RawMessage
+from ...schemas.image_lines import LineBlock
+from ...schemas.topics import Family
+from .. import registry
+from ..bus.pacing import SETTLE_S, Pacer
+from ..bus.program import ProgramOptions
+from ..errors import UserError
+from ..recording.reader import RecordingReader
+from ..recording.runner import active_nodes, is_remade
+
+SECOND_NS = 1_000_000_000
+#: Between the end of a recording and its next round, platform time.
+LOOP_PAUSE_NS = SECOND_NS
+
+
+@dataclass
+class PlayResult:
+    """What was played.
+
+    Attributes
+    ----------
+    counts : messages by topic
+    left_out : recorded messages by topic that nodes make anew
+    rounds : how often
+    worst_late_s, mean_late_s : how late messages were put on the bus, s
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+    rounds: int = 0
+    worst_late_s: float = 0.0
+    mean_late_s: float = 0.0
+
+
+def regenerated(reader: RecordingReader) -> set[int]:
+    """Channels of a recording that the estimating nodes make anew from the rest of it."""
+    known = [channel for channel in reader.channels.values() if channel.known]
+    classes = []
+    for name in registry.ESTIMATING:
+        try:
+            classes.append(registry.node_class(name))
+        except UserError:  # not installed: what it made stays in
+            continue
+    active = active_nodes(classes, {channel.topic for channel in known})
+    made = {output for node in active for output in node.outputs}
+    makers = {node.name for node in active}
+    return {channel.id for channel in known if is_remade(channel.topic, channel.source, made, makers)}
+
+
+def play(
+    reader: RecordingReader,
+    publish: Callable[[RawMessage], None],
+    stop: threading.Event,
+    *,
+    rate: float = 1.0,
+    from_ns: int | None = None,
+    to_ns: int | None = None,
+    loop: bool = False,
+    everything: bool = False,
+    start: int = 0,
+    settle_s: float = SETTLE_S,
+    progress: Callable[[float], None] | None = None,
+    hold: Callable[[], float] | None = None,
+) -> PlayResult:
+    """Publish the messages of a recording at the pace of their times of reception.
+
+    Parameters
+    ----------
+    reader : the recording
+    publish : puts a message on the bus
+    stop : ends it
+    rate : speed, 0 = as fast as it goes
+    from_ns, to_ns : platform time to play, ends included; configuration and control from before are played always
+    loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names
+    everything : also what nodes make anew
+    start : tells this run from others in the envelopes
+    settle_s : waiting time after configuration and control, s
+    hold : called before each message; it may wait, and returns for how long, s (see `Brake.wait`)
+    """
+    result = PlayResult()
+    leave_out = set() if everything else regenerated(reader)
+    numbers = []
+    for number in reader.select():
+        channel = int(reader.index.channel[number])
+        if channel in leave_out:
+            result.left_out[reader.channels[channel].topic] += 1
+        else:
+            numbers.append(int(number))
+    head, body = _split(reader, np.array(numbers, dtype=np.int64), from_ns, to_ns)
+    if not len(head) and not len(body):
+        raise UserError(f"{reader.path}: nothing to play")
+    if not len(body) and (loop or from_ns is not None or to_ns is not None):
+        raise UserError(f"{reader.path}: nothing but configuration in the time asked for")
+    stamps = reader.index.stamp_ns[body]
+    span_ns = int(stamps.max() - stamps.min()) + LOOP_PAUSE_NS if len(body) else 0
+    starts = _Starts(start)
+    while not stop.is_set():
+        shift_ns = result.rounds * span_ns
+        for number in head:
+            _publish(reader.raw(int(number)), publish, starts, shift_ns, result)
+        stop.wait(settle_s if result.rounds == 0 else 0.0)
+        times = reader.index.receive_ns[body]
+        pacer = Pacer(rate, stop)
+        for i, number in enumerate(body):
+            raw = reader.raw(int(number))
+            if hold is not None:
+                pacer.postpone(hold())
+            if not pacer.wait(float(times[i] - times[0]) / SECOND_NS):
+                break
+            _publish(raw, publish, starts, shift_ns, result)
+            if progress is not None and i % 256 == 0:
+                progress(i / len(body))
+        result.rounds += 1
+        result.worst_late_s = max(result.worst_late_s, pacer.worst_late_s)
+        result.mean_late_s = pacer.mean_late_s
+        if not loop or not len(body):
+            break
+        stop.wait(LOOP_PAUSE_NS / SECOND_NS / (rate or 1.0))
+    return result
+
+
+def _split(reader: RecordingReader, numbers: Any, from_ns: int | None, to_ns: int | None) -> tuple[Any, Any]:
+    """Numbers of the latched messages to send at once, and of the others in order of reception."""
+    index = reader.index
+    ordered = numbers[np.argsort(index.receive_ns[numbers], kind="stable")]
+    latched = np.array([topics.find(reader.channels[int(c)].topic).latched for c in index.channel[ordered]], dtype=bool)
+    stamps = index.stamp_ns[ordered]
+    timed = np.flatnonzero(~latched)
+    begin = stamps[timed].min() if len(timed) else 0
+    begin = max(begin, from_ns) if from_ns is not None else begin
+    at_once = latched & (stamps <= begin)
+    inside = ~at_once & (stamps >= begin)
+    if to_ns is not None:
+        inside &= stamps <= to_ns
+    return ordered[at_once], ordered[inside]
+
+
+class _Starts:
+    """Start ids of a replay: one for each recorded run of a publisher, so that nothing looks like a duplicate."""
+
+    def __init__(self, start: int) -> None:
+        self._start = start
+        self._known: dict[tuple[str, str, int], int] = {}
+        self._runs: Counter[tuple[str, str]] = Counter()
+
+    def of(self, raw: RawMessage, round_: int) -> int:
+        key = (raw.topic, raw.envelope.source, raw.envelope.start)
+        if key not in self._known:
+            self._known[key] = self._runs[key[:2]]
+            self._runs[key[:2]] += 1
+        return self._start + round_ * 1000 + self._known[key]
+
+
+def _publish(
+    raw: RawMessage, publish: Callable[[RawMessage], None], starts: _Starts, shift_ns: int, result: PlayResult
+) -> None:
+    envelope = raw.envelope._replace(start=starts.of(raw, result.rounds))
+    data = raw.data
+    if shift_ns:
+        envelope = envelope._replace(stamp_ns=envelope.stamp_ns + shift_ns)
+        data = shifted(raw.topic, data, shift_ns, f"~{result.rounds + 1}")
+    publish(RawMessage(raw.topic, envelope, data))
+    result.counts[raw.topic] += 1
+
+
+def shifted(topic: str, data: bytes | memoryview, shift_ns: int, suffix: str) -> bytes | memoryview:
+    """A payload with all times shifted and a suffix on the names of strips and points.
+
+    What cannot be decoded stays as it is.
+    """
+    try:
+        body = codec.decode(topic, data)
+    except ValueError:
+        return data
+    if isinstance(body, LineBlock):
+        times = None if body.line_times_ns is None else body.line_times_ns + shift_ns
+        body = replace(body, time_ns=body.time_ns + shift_ns, line_times_ns=times, strip=body.strip + suffix)
+    else:
+        _shift(body, shift_ns, suffix)
+        if topic == "configuration/strip":
+            body.id += suffix
+    return codec.encode(body)
+
+
+def _shift(body: Any, shift_ns: int, suffix: str) -> None:
+    for descriptor, value in body.ListFields():
+        name = descriptor.name
+        if descriptor.message_type is not None:
+            if descriptor.message_type.full_name == "google.protobuf.Timestamp":
+                total = value.seconds * SECOND_NS + value.nanos + shift_ns
+                value.seconds, value.nanos = divmod(total, SECOND_NS)
+            else:
+                for part in (value,) if hasattr(value, "ListFields") else value:
+                    _shift(part, shift_ns, suffix)
+        elif name in ("strip", "point"):  # a strip, and what is seen from it, is not the same thing a round later
+            setattr(body, name, value + suffix)
+        elif name.endswith(("time_ns", "start_ns", "end_ns")):
+            setattr(body, name, value + shift_ns)
+
+
+def time_argument(text: str, first_ns: int) -> int:
+    """Platform time in ns of ``12.5`` (seconds after ``first_ns``) or of an ISO time (UTC where it names no zone)."""
+    from datetime import UTC, datetime
+
+    try:
+        return first_ns + round(float(text) * SECOND_NS)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise UserError(f"time {text!r}, wanted seconds from the start or an ISO time") from None
+    moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment
+    whole = moment.replace(microsecond=0)
+    return int(whole.timestamp()) * SECOND_NS + moment.microsecond * 1000
+
+
+def first_stamp_ns(reader: RecordingReader) -> int:
+    """Stamp of the first measurement of a recording (or of whatever there is)."""
+    index = reader.index
+    timed = [
+        c.id
+        for c in reader.channels.values()
+        if c.known and not topics.find(c.topic).latched and topics.find(c.topic).family is not Family.STATUS
+    ]
+    stamps = index.stamp_ns[np.isin(index.channel, timed)]
+    stamps = stamps if len(stamps) else index.stamp_ns
+    return int(stamps.min()) if len(stamps) else 0
+
+
+def run(options: ProgramOptions) -> int:
+    """Play the recording that the configuration names: [player] input, rate, from, to, loop, all."""
+    table = dict(options.table)
+    path = table.pop("input", None)
+    if not path or not isinstance(path, str):
+        raise UserError("the player needs a recording: --set input=FILE, or [player] input in the configuration")
+    unknown = set(table) - {"rate", "from", "to", "loop", "all"}
+    if unknown:
+        raise UserError(f"configuration [player]: {', '.join(sorted(unknown))} is not known")
+    rate = table.get("rate", 1.0)
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 <= rate < 1e6:
+        raise UserError(f"configuration [player]: rate is {rate!r}, wanted a number of at least 0")
+    reader = RecordingReader(Path(path))
+    first = first_stamp_ns(reader)
+    with options.open_bus() as bus:
+        bus.announce("player")
+        bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
+        result = play(
+            reader,
+            bus.publish_raw,
+            options.stop,
+            rate=float(rate),
+            from_ns=time_argument(str(table["from"]), first) if "from" in table else None,
+            to_ns=time_argument(str(table["to"]), first) if "to" in table else None,
+            loop=bool(table.get("loop", False)),
+            everything=bool(table.get("all", False)),
+            start=bus.start,
+        )
+        options.stop.wait(0.5)  # what is still on its way
+    options.report(f"played {sum(result.counts.values())} messages")
+    return 0
+
+
+def iso(stamp_ns: int) -> str:
+    """A stamp as ISO time, UTC, to the microsecond."""
+    from datetime import UTC, datetime
+
+    seconds, rest = divmod(stamp_ns, SECOND_NS)
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"

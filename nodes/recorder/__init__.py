@@ -1,0 +1,1 @@
+"""The recorder: messages of the bus into a recording."""

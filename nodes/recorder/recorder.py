@@ -1,0 +1,373 @@
+"""The recorder: everything the topic table marks as recorded, into a recording, without decoding it."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from ...schemas import topics
+from ...schemas.envelope import RawMessage
+from ..bus.program import ProgramOptions
+from ..bus.session import Bus
+from ..bus.status import StatusPublisher
+from ..errors import UserError
+from ..node import Node
+from ..ordering import StreamCheck, order_key
+from ..recording.writer import COMPRESSIONS, RecordingWriter
+
+#: The open chunk is closed at least so often: what SIGKILL can cost.
+FLUSH_S = 0.3
+#: Bytes that wait for the disk before publishers are slowed down.
+WAITING_BYTES = 256 << 20
+#: What comes in this time after the start is sorted: configuration and control to the head of the file.
+HEAD_S = 0.4
+#: When it is told to stop, a recorder takes what is still on its way until nothing has come for so long, s ...
+QUIET_S = 0.3
+#: ... but no longer than this: sensors may go on.
+LAST_WORDS_S = 2.0
+#: A full disk is tried again after so long.
+RETRY_S = 2.0
+#: The disk is looked at so often, s; it is nearly full with so many minutes at the present rate, or bytes, left.
+DISK_PERIOD_S, FULL_SOON_MIN, FULL_SOON_BYTES = 5.0, 10.0, 200_000_000
+
+
+class RecordingFile:
+    """An unbuffered file that never ends inside a record: a write that fails is taken back."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        self._size = 0
+
+    def write(self, data: bytes | memoryview) -> int:
+        view = memoryview(data).cast("B") if len(data) else memoryview(b"")
+        done = 0
+        try:
+            while done < len(view):
+                done += os.write(self._descriptor, view[done:])
+        except OSError:
+            os.ftruncate(self._descriptor, self._size)
+            os.lseek(self._descriptor, self._size, os.SEEK_SET)
+            raise
+        self._size += done
+        return done
+
+    def tell(self) -> int:
+        return self._size
+
+    def flush(self) -> None:
+        """Every write goes to the operating system at once."""
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
+class Recorder(Node):
+    """Keeps messages in files.
+
+    Parameters
+    ----------
+    output : path of the recording; where there is one already, a number is added to the name
+    compression : ``none``, ``lz4`` or ``zstd``
+    rotate_mb : start a new file after so many megabytes; 0 = one file
+    """
+
+    name = "recorder"
+    inputs = tuple(row.name for row in topics.TOPICS if row.recorded)
+    outputs = ()
+
+    def __init__(self, output: str = "recording.mcap", compression: str = "none", rotate_mb: float = 0) -> None:
+        super().__init__()
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"compression is {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
+        if rotate_mb < 0:
+            raise ValueError(f"rotate_mb is {rotate_mb}, wanted 0 or more")
+        self._path = Path(output)
+        self._compression = compression
+        self._rotate_bytes = int(rotate_mb * 1e6)
+        self.files: list[Path] = []
+        self.platform = "demo"
+        self.newest_ns = 0
+        self._check: StreamCheck[None] = StreamCheck()
+        self._latched: list[RawMessage] = []
+        self._file: RecordingFile | None = None
+        self._writer: RecordingWriter | None = None
+        self._flushed_s = 0.0
+        self._retry_s = 0.0
+        self._unflushed = 0
+        self._lost = 0
+        self._measured_s = 0.0  # when the disk was looked at, and what had been written by then
+        self._written = self._bytes_before = 0
+
+    @property
+    def statistics(self) -> Any:
+        """Counts by topic, see `ordering.TopicCounts`."""
+        return self._check.counts
+
+    def state(self) -> str:
+        return "recording" if self._writer is not None else f"not recording: {self.last_problem}"
+
+    def start(self) -> None:
+        """Open the first file.
+
+        Raises
+        ------
+        UserError : it cannot be written
+        """
+        if self._path.is_dir():
+            raise UserError(f"{self._path}: is a folder, wanted a file")
+        try:
+            self._open()
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+
+    def take(self, messages: list[RawMessage]) -> None:
+        """Write messages; on a disk that is full they are counted and lost, and the recorder goes on."""
+        for raw in messages:
+            self._check.accept(raw.topic, raw.envelope, None)
+            if not raw.topic.startswith("status/"):
+                self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
+            if topics.find(raw.topic).latched:
+                self._latched.append(raw)
+            self._write(raw)
+
+    def tend(self) -> None:
+        """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""
+        now = time.monotonic()
+        self._tell_disk()
+        if self._lost and self._writer is not None:
+            self.alarms["lost"] = f"{self._lost} messages were not recorded"
+        gaps = sum(c.gaps for topic, c in self._check.counts.items() if not topic.startswith("status/"))
+        if gaps > 0:
+            self.alarms["gaps"] = f"{gaps} messages never came to the recorder"
+        if self._writer is None:
+            if now >= self._retry_s:
+                self._try_again(now)
+        elif now - self._flushed_s >= FLUSH_S:
+            self._flushed_s = now
+            try:
+                self._writer.flush()
+                self._unflushed = 0
+                if self._rotate_bytes and self._writer.size > self._rotate_bytes:
+                    self._close()
+                    self._open()
+            except OSError as error:
+                self._fail(error)
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        try:
+            self._close()
+        except OSError as error:
+            self._fail(error)
+
+    # ---- files
+
+    def _open(self) -> None:
+        number = len(self.files)
+        path = self._next_path()
+        self._file = RecordingFile(path)
+        try:
+            self._writer = RecordingWriter(self._file, self._compression, platform=self.platform)  # type: ignore[arg-type]
+            for raw in self._latched if number else ():
+                self._writer.write_raw(raw)
+            if number:
+                self._writer.flush()
+        except OSError:
+            self._writer = None
+            self._file.close()
+            os.unlink(path)
+            raise
+        self.files.append(path)
+        self._flushed_s = time.monotonic()
+        self._unflushed = 0
+
+    def _next_path(self) -> Path:
+        """The path asked for, or the next number after it: a recording is never written over."""
+        number, path = len(self.files), self._path
+        while path in self.files or (path.exists() and path.stat().st_size):
+            number = max(number, 1)
+            path = self._path.with_stem(f"{self._path.stem}_{number:04d}")
+            number += 1
+        return path
+
+    def _close(self) -> None:
+        if self._writer is not None and self._file is not None:
+            self._bytes_before += self._writer.size
+            self._writer.close()
+            self._file.close()
+            self._writer = self._file = None
+
+    def _write(self, raw: RawMessage) -> None:
+        if self._writer is None:
+            self._lose(1)
+            return
+        self._unflushed += 1
+        try:
+            self._writer.write_raw(raw)
+        except OSError as error:
+            self._fail(error)
+
+    def _lose(self, number: int) -> None:
+        self._lost += number
+        self.counters["lost"] += number
+
+    def _tell_disk(self) -> None:
+        """An alarm for who looks at the monitor: nothing is recorded, or not for long any more."""
+        if self._writer is None:
+            self.alarms["disk"] = f"NOT RECORDING: {self.last_problem}; {self._lost} messages lost so far"
+            return
+        if self.alarms.get("disk", "").startswith("NOT"):
+            self.alarms["disk"] = ""
+        now = time.monotonic()
+        if now < self._measured_s + DISK_PERIOD_S:
+            return
+        written = self._bytes_before + self._writer.size
+        rate = (written - self._written) / (now - self._measured_s) if self._measured_s else 0.0
+        self._measured_s, self._written = now, written
+        try:
+            left = shutil.disk_usage(self.files[-1].parent).free
+        except OSError:
+            return
+        minutes = left / rate / 60.0 if rate > 0 else math.inf
+        full = minutes < FULL_SOON_MIN or left < FULL_SOON_BYTES
+        left_min = f", for {minutes:.0f} min" if math.isfinite(minutes) else ""
+        self.alarms["disk"] = f"the disk is nearly full: {left / 1e6:.0f} MB left{left_min}" if full else ""
+
+    def _fail(self, error: OSError) -> None:
+        assert self._file is not None
+        self._file.close()
+        path = self._file.path
+        self._writer = self._file = None
+        self._lose(self._unflushed)  # at most: some of them may be in chunks that were written
+        self._unflushed = 0
+        self._retry_s = time.monotonic() + RETRY_S
+        self.problem("disk", f"{path}: {(error.strerror or str(error)).lower()}")
+
+    def _try_again(self, now: float) -> None:
+        self._retry_s = now + RETRY_S
+        try:
+            self._open()
+        except OSError as error:
+            self.last_problem = f"{self._path}: {(error.strerror or str(error)).lower()}"
+        else:
+            self.problem("resumed", f"recording again, into {self.files[-1]}; {self._lost} messages lost")
+
+
+class _Backlog:
+    """Messages on their way to the disk, bounded by bytes; who puts one waits, but the thread that made the backlog.
+
+    That thread takes them, and what it publishes itself comes back to it: it would wait for itself.
+    """
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._messages: deque[RawMessage] = deque()
+        self._bytes = 0
+        self._open = True
+        self._taker = threading.get_ident()
+
+    def put(self, raw: RawMessage) -> None:
+        with self._condition:
+            while self._bytes >= WAITING_BYTES and self._open and threading.get_ident() != self._taker:
+                self._condition.wait(0.5)
+            self._messages.append(raw)
+            self._bytes += len(raw.data)
+            if len(self._messages) == 1:
+                self._condition.notify_all()
+
+    def take(self, timeout_s: float) -> list[RawMessage]:
+        with self._condition:
+            if not self._messages:
+                self._condition.wait(timeout_s)
+            taken = list(self._messages)
+            self._messages.clear()
+            self._bytes = 0
+            self._condition.notify_all()
+            return taken
+
+    def close(self) -> None:
+        with self._condition:
+            self._open = False
+            self._condition.notify_all()
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+
+def run(options: ProgramOptions) -> int:
+    """Record until told to stop."""
+    from ..config import build
+
+    recorder = build(Recorder, options.tables, "recorder")
+    recorder.platform = options.platform
+    recorder.start()
+    options.report(f"recording to {recorder.files[0]}")
+    with options.open_bus() as bus:
+        record(recorder, bus, options)
+    recorder.close()
+    counts = recorder.statistics
+    total, gaps = sum(c.received for c in counts.values()), sum(c.gaps for c in counts.values())
+    lost = f", {recorder.counters['lost']} lost" if recorder.counters["lost"] else ""
+    names = ", ".join(str(path) for path in recorder.files)
+    options.report(f"{total} messages in {names}; {gaps} missing by number{lost}")
+    return 1 if recorder.counters["disk"] else 0
+
+
+def _take_last_words(recorder: Recorder, backlog: _Backlog) -> None:
+    """What is still on its way when the recorder is told to stop: until nothing comes for a while."""
+    begun = heard = time.monotonic()
+    while (now := time.monotonic()) - heard < QUIET_S and now - begun < LAST_WORDS_S:
+        raws = backlog.take(0.05)
+        if raws:
+            recorder.take(raws)
+            heard = time.monotonic()
+        recorder.tend()
+
+
+def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
+    """Feed a recorder from the bus until ``options.stop`` is set."""
+    backlog = _Backlog()
+
+    def malformed(topic: str, why: str) -> None:
+        recorder.problem("malformed", f"{topic}: {why}")
+
+    def receive(raw: RawMessage) -> None:
+        try:
+            topics.find(raw.topic)
+        except KeyError:
+            malformed(raw.topic, "unknown topic")
+            return
+        backlog.put(raw)
+
+    for name in recorder.inputs:
+        bus.subscribe(name, receive, malformed)
+    bus.announce(recorder.name)
+    status = StatusPublisher(bus, recorder.name)
+    status.publish("starting", {}, recorder, 0.0, 0, 0)
+    problem = ""
+    head: list[RawMessage] = []
+    until = time.monotonic() + HEAD_S
+    while time.monotonic() < until and not options.stop.is_set():
+        head += backlog.take(0.05)
+    latched = [raw for raw in head if topics.find(raw.topic).latched]
+    recorder.take(sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)))
+    recorder.take([raw for raw in head if not topics.find(raw.topic).latched])
+    while not options.stop.is_set():
+        recorder.take(backlog.take(0.05))
+        recorder.tend()
+        if recorder.last_problem != problem:
+            problem = recorder.last_problem
+            options.report(f"recorder: {problem}")
+        if status.due():
+            status.publish(recorder.state(), dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
+    _take_last_words(recorder, backlog)
+    backlog.close()
+    recorder.take(backlog.take(0.0))  # a disk that is slow has left some
+    status.publish("stopping", dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)

@@ -1,0 +1,296 @@
+"""Reading recordings, whole or damaged: MCAP files of messages with their envelopes, laid out as `writer` says."""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel as McapChannel
+from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+from mcap.records import Message as McapMessage
+from numpy.typing import NDArray
+
+from ...schemas import codec, topics
+from ...schemas.envelope import Envelope, RawMessage
+from ..errors import UserError
+from ..node import Message
+from . import mcap_scan as scan
+from .index import CHANNEL_METADATA, Channel, Index
+
+#: Rows of the index that are looked up together.
+_TOGETHER = 8192
+#: Records that the index is made of; the others repeat it for readers that take the file as whole.
+_NOTED = {
+    Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER,
+}  # fmt: skip
+
+
+class RecordingReader:
+    """Reads a recording, whole or damaged: what cannot be read is skipped, counted and named.
+
+    Parameters
+    ----------
+    path : of the file
+    salvage : look for chunks even in a file that does not begin as an MCAP file
+
+    Attributes
+    ----------
+    channels : id -> Channel
+    index : where the messages stand
+    damage : stretches of the file that cannot be read
+    complete : whether the file ends as it should
+    problems : counts of messages that were skipped, by kind; ``last_problem`` says what was wrong with the newest
+    """
+
+    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+        self.path = Path(path)
+        with open(self.path, "rb") as file:
+            self.size = file.seek(0, 2)
+            if self.size == 0:
+                raise UserError(f"{path}: empty, wanted an MCAP recording")
+            self._buffer = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+        self._begins = self._buffer[: len(scan.MAGIC)] == scan.MAGIC
+        if not self._begins and not salvage:
+            raise UserError(f"{path}: not an MCAP recording")
+        self.channels: dict[int, Channel] = {}
+        self.damage: list[scan.Damage] = []
+        self.complete = False
+        self.library = ""
+        self.problems: Counter[str] = Counter()
+        self.last_problem = ""
+        self._schemas: dict[int, tuple[int, str]] = {}
+        self._data_end: tuple[int, int] | None = None  # where it begins, checksum of all before
+        self._trust: dict[int, int] = {}
+        self._copies: set[int] = set()
+        self._chunks: list[Chunk] = []
+        self._content = lru_cache(maxsize=64)(self._load)
+        self.index = self._scan()
+
+    @property
+    def n_chunks(self) -> int:
+        """Whole chunks."""
+        return len(self._chunks)
+
+    # ---- what stands where
+
+    def _scan(self) -> Index:
+        rows = array("Q")
+        if not self._begins:
+            self.damage.append(scan.Damage(0, len(scan.MAGIC), "a damaged beginning"))
+        for found in scan.records(self._buffer):
+            if isinstance(found, scan.Damage):
+                self.damage.append(found)
+                continue
+            try:
+                if isinstance(found, scan.WholeChunk):
+                    self._chunks.append(found.chunk)
+                    self._note_content(found.content, rows)
+                elif found.opcode in _NOTED:
+                    self._note(found, rows)
+            except ValueError as error:
+                self.damage.append(scan.Damage(found.offset, 0, str(error)))
+        index = Index.of_rows(rows)
+        self.problems["without a channel"] += int((~np.isin(index.channel, list(self.channels))).sum())
+        return self._without_copies(index)
+
+    def _without_copies(self, index: Index) -> Index:
+        """Without the copies of messages that are there; those of messages that are lost stand at the head."""
+
+        def whose(c: Channel) -> tuple[str, str, int, str]:
+            return c.topic, c.source, c.start, c.platform
+
+        first = {whose(c): c.id for c in self.channels.values() if c.id not in self._copies}
+        order = np.arange(len(index))
+        channel = index.channel.copy()
+        for copy in sorted(self._copies):
+            rows = np.flatnonzero(index.channel == copy)
+            original = first.get(whose(self.channels[copy]))
+            if original is None:
+                continue
+            del self.channels[copy]
+            lost = ~np.isin(index.sequence[rows], index.sequence[index.channel == original])
+            channel[rows] = original
+            order[rows] = np.where(lost, rows - len(index), len(index))
+        if not self._copies:
+            return index
+        chosen = np.argsort(order, kind="stable")[: int((order < len(index)).sum())]
+        columns = (index.chunk, index.place, channel, index.sequence, index.receive_ns, index.stamp_ns)
+        return Index(*(column[chosen] for column in columns))
+
+    def _note(self, found: scan.Record, rows: array[int]) -> None:
+        """Note a record outside chunks."""
+        record = scan.parse(found.data)
+        match record:
+            case McapMessage():
+                rows.extend((0, found.offset, record.channel_id, record.sequence, record.log_time, record.publish_time))
+            case Header():
+                self.library = record.library
+            case Metadata(name=name, metadata=entries) if name == CHANNEL_METADATA:
+                number = entries.get("id", "")
+                self._add_channel(int(number) if number.isdigit() else 0, entries.get("topic", ""), None, entries, 1)
+            case DataEnd():
+                self._data_end = found.offset, record.data_section_crc
+            case Footer():
+                self.complete = self._buffer[found.end : found.end + len(scan.MAGIC)] == scan.MAGIC
+                self._check_summary(record, found.end)
+            case _:
+                self._define(record, 0)
+
+    def _note_content(self, content: memoryview, rows: array[int]) -> None:
+        """Note what stands in a chunk: messages, and what defines their channels.
+
+        The library makes an object of each message it reads, which takes four times as long.
+        """
+        chunk, position, size = len(self._chunks), 0, len(content)
+        head, head_size, message_head = scan.RECORD_HEAD.unpack_from, scan.RECORD_HEAD.size, scan.MESSAGE_HEAD
+        while position < size:
+            if position + head_size > size:
+                raise ValueError("a chunk that ends inside a record")
+            opcode, length = head(content, position)
+            end = position + head_size + length
+            if end > size:
+                raise ValueError("a chunk that ends inside a record")
+            if opcode == Opcode.MESSAGE:
+                if length < message_head.size:
+                    raise ValueError("a message without a head")
+                rows.extend((chunk, position, *message_head.unpack_from(content, position + head_size)))
+            elif opcode in _NOTED:
+                self._define(scan.parse(content[position:end]), 2)
+            position = end
+
+    def check_outside(self) -> str | None:
+        """What is wrong with the bytes outside chunks; takes as long as reading the whole file."""
+        if self._data_end is None or self.damage:
+            return None
+        end, wanted = self._data_end
+        if wanted and zlib.crc32(self._buffer[:end]) != wanted:
+            return f"a wrong checksum outside the chunks, before byte {end}"
+        return None
+
+    def _check_summary(self, footer: Footer, end: int) -> None:
+        """Raise ValueError where the checksum of summary and footer is wrong; the footer ends there."""
+        start, wanted = footer.summary_start, footer.summary_crc
+        if start and wanted and zlib.crc32(self._buffer[start : end - 4]) != wanted:
+            raise ValueError("an index with a wrong checksum")
+
+    def _define(self, record: McapRecord, trust: int) -> None:
+        """Note a schema or a channel.
+
+        A chunk's checksum vouches for what is defined inside (``trust`` 2); what is repeated outside only fills in.
+        """
+        if isinstance(record, Schema):
+            if trust >= self._schemas.get(record.id, (0, ""))[0]:
+                self._schemas[record.id] = trust, record.name
+        elif isinstance(record, McapChannel):
+            type_name = self._schemas.get(record.schema_id, (0, None))[1]  # lost with its chunk: the topic tells
+            self._add_channel(record.id, record.topic, type_name, record.metadata, trust)
+
+    def _add_channel(
+        self, number: int, topic: str, type_name: str | None, metadata: dict[str, str], trust: int
+    ) -> None:
+        if self._trust.get(number, -1) >= trust:
+            return
+        self._trust[number] = trust
+        try:
+            wanted = topics.find(topic).type_name
+        except KeyError:
+            wanted = None
+        type_name = wanted if type_name is None else type_name
+        if metadata.get("copy"):
+            self._copies.add(number)
+        start = metadata.get("start", "0")
+        self.channels[number] = Channel(
+            number, topic, type_name or "", metadata.get("source", ""), metadata.get("platform", ""),
+            int(start) if start.isdigit() else 0, wanted is not None and wanted == type_name,
+        )  # fmt: skip
+
+    # ---- messages
+
+    def _load(self, number: int) -> memoryview:
+        try:
+            return scan.chunk_content(self._chunks[number])
+        except ValueError as error:  # it was whole when the file was opened
+            raise UserError(f"{self.path}: {error}; the file has changed while it was read") from None
+
+    def raw(self, number: int) -> RawMessage:
+        """A message of the index, not decoded; its data are a view of the file where chunks are not compressed."""
+        return next(self.raws(np.array([number])))
+
+    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """The same for many messages, one after the other."""
+        index, channels = self.index, self.channels
+        for begin in range(0, len(numbers), _TOGETHER):
+            part = numbers[begin : begin + _TOGETHER]
+            columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
+            for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
+                data = scan.payload_at(self._buffer if chunk < 0 else self._content(chunk), place)
+                channel = channels[of]
+                envelope = Envelope(stamp, channel.source, sequence, channel.start)
+                yield RawMessage(channel.topic, envelope, data, receive)
+
+    def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
+        """Numbers of the messages of some topics (all known topics where none are named), in file order.
+
+        A name of the topic table such as ``sensor/lines/*`` stands for all that it matches.
+        """
+        names = None if wanted is None else set(wanted)
+        rows = [row for row in topics.TOPICS if names is not None and row.name in names]
+        chosen = [
+            c.id
+            for c in self.channels.values()
+            if c.known and (names is None or c.topic in names or any(row.matches(c.topic) for row in rows))
+        ]
+        return np.flatnonzero(np.isin(self.index.channel, chosen))
+
+    def sort(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The same messages by stamp, place of the topic in the table, topic, source, start and sequence."""
+        if len(numbers) == 0:
+            return numbers
+        order = {
+            c: place
+            for place, c in enumerate(
+                sorted(
+                    (c for c in self.channels.values() if c.known),
+                    key=lambda c: (topics.rank(c.topic), c.topic, c.source, c.start, c.id),
+                )
+            )
+        }
+        size = max(self.channels, default=0) + 1
+        place_of = np.zeros(size, dtype=np.int64)
+        for channel, place in order.items():
+            place_of[channel.id] = place
+        index = self.index
+        keys = (index.sequence[numbers], place_of[index.channel[numbers]], index.stamp_ns[numbers])
+        return numbers[np.lexsort(keys)]
+
+    def messages(self, wanted: Iterable[str] | None = None) -> Iterator[Message]:
+        """Decoded messages in file order."""
+        return self.decode(self.select(wanted))
+
+    def sorted_messages(self, wanted: Iterable[str] | None = None) -> Iterator[Message]:
+        """Decoded messages by (stamp, rank of the topic, source, sequence)."""
+        return self.decode(self.sort(self.select(wanted)))
+
+    def decode(self, numbers: NDArray[np.int64]) -> Iterator[Message]:
+        """Messages of the index, decoded; what cannot be decoded is counted in ``problems`` and left out."""
+        for raw in self.raws(numbers):
+            try:
+                body = codec.decode(raw.topic, raw.data)
+            except ValueError as error:
+                self.problems["malformed"] += 1
+                self.last_problem = f"{raw.topic} {raw.envelope.sequence} of {raw.envelope.source!r}: {error}"
+                continue
+            yield Message(raw.topic, raw.envelope.stamp_ns, body, raw.envelope.source, raw.envelope.sequence)
+
+    def first(self, topic: str) -> Any | None:
+        """The body of the first message of a topic, None where there is none."""
+        message = next(iter(self.messages([topic])), None)
+        return None if message is None else message.body

@@ -1,0 +1,170 @@
+"""What a recording holds, and whether it is whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...schemas import topics
+from ...schemas.topics import Family
+from .reader import RecordingReader
+
+_NO_END = "the file has no end: it was cut off, or its writer was killed"
+#: Families whose stamps tell when a flight was.
+_TIMED = (Family.SENSOR, Family.OBSERVATION, Family.RESULT, Family.TRUTH)
+
+
+@dataclass
+class TopicSummary:
+    """One topic of a recording.
+
+    Attributes
+    ----------
+    topic, type : names
+    messages : how many
+    first_ns, last_ns : stamps
+    rate_hz : mean rate between first and last stamp, 0 for fewer than two stamps
+    sources : who published it
+    gaps : messages missing by their numbers
+    duplicates : messages whose number came before
+    backwards : messages stamped before the one that was published before them
+    """
+
+    topic: str
+    type: str
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    rate_hz: float = 0.0
+    sources: list[str] = field(default_factory=list)
+    gaps: int = 0
+    duplicates: int = 0
+    backwards: int = 0
+
+
+def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
+    """All topics of a recording, those of the topic table first and in its order."""
+    by_topic: dict[str, TopicSummary] = {}
+    for channel in reader.channels.values():
+        row = by_topic.setdefault(channel.topic, TopicSummary(channel.topic, channel.type_name))
+        chosen = np.flatnonzero(reader.index.channel == channel.id)
+        if channel.source not in row.sources:
+            row.sources.append(channel.source)
+        if not len(chosen):
+            continue
+        stamps, sequences = reader.index.stamp_ns[chosen], reader.index.sequence[chosen]
+        row.first_ns = int(min(stamps.min(), row.first_ns)) if row.messages else int(stamps.min())
+        row.last_ns = max(int(stamps.max()), row.last_ns)
+        row.messages += len(chosen)
+        if channel.known:
+            distinct = np.unique(sequences)
+            row.gaps += int(distinct[-1] - distinct[0]) + 1 - len(distinct)
+            row.duplicates += len(sequences) - len(distinct)
+            if not topics.find(channel.topic).latched and topics.find(channel.topic).family is not Family.STATUS:
+                row.backwards += int((np.diff(stamps[np.argsort(sequences, kind="stable")]) < 0).sum())
+    for row in by_topic.values():
+        span_s = (row.last_ns - row.first_ns) / 1e9 if row.first_ns else 0.0  # 0: said before any time was known
+        row.rate_hz = (row.messages - 1) / span_s if span_s > 0 else 0.0
+        row.sources.sort()
+    return sorted(by_topic.values(), key=lambda row: (_place(row.topic), row.topic))
+
+
+def time_span_ns(reader: RecordingReader) -> tuple[int, int] | None:
+    """First and last stamp of what was measured and computed; None without any.
+
+    What is handed to whoever joins later, such as given ground points, is known before a flight and does not count.
+    """
+    rows = {c.id: topics.find(c.topic) for c in reader.channels.values() if c.known}
+    timed = [id for id, row in rows.items() if row.family in _TIMED and not row.latched]
+    stamps = reader.index.stamp_ns[np.isin(reader.index.channel, timed)]
+    return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
+
+
+@dataclass(frozen=True)
+class Holdings:
+    """What a recording holds, the same for every command that says it.
+
+    Attributes
+    ----------
+    file, size_bytes : of the recording
+    messages : how many it holds, of all topics
+    span_ns : first and last stamp of what was measured and computed, see `time_span_ns`
+    topics : summaries by topic
+    damage : what cannot be read, one line each
+    """
+
+    file: str
+    size_bytes: int
+    messages: int
+    span_ns: tuple[int, int] | None
+    topics: list[TopicSummary]
+    damage: list[str]
+
+    @property
+    def duration_s(self) -> float:
+        """Between first and last stamp, 0 without any."""
+        return (self.span_ns[1] - self.span_ns[0]) / 1e9 if self.span_ns else 0.0
+
+
+def holdings(reader: RecordingReader) -> Holdings:
+    """What a recording holds; messages that were found unusable so far count as damage."""
+    return Holdings(
+        str(reader.path), reader.size, len(reader.index), time_span_ns(reader), topic_summaries(reader),
+        damage_lines(reader),
+    )  # fmt: skip
+
+
+def damage_lines(reader: RecordingReader) -> list[str]:
+    """What of a recording cannot be read or used, in words; the messages are judged as far as they were decoded."""
+    lines = []
+    if reader.damage:
+        n, lost, first = len(reader.damage), sum(d.length for d in reader.damage), reader.damage[0]
+        several = f"{n} damaged places ({lost} bytes); the first: {first}"
+        lines.append("skipped " + (several if n > 1 else f"1 damaged place: {first}"))
+    elif not reader.complete:
+        lines.append(_NO_END)
+    if reader.problems["without a channel"]:
+        lines.append(f"skipped {reader.problems['without a channel']} messages without a channel")
+    if reader.problems["malformed"]:
+        lines.append(f"skipped {reader.problems['malformed']} unusable messages; the last: {reader.last_problem}")
+    return lines
+
+
+def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:
+    """What is wrong with a recording, one line each, the worst first; empty if it is whole.
+
+    ``decode`` looks into every message, ``outside`` at the bytes between chunks, too.
+    """
+    found = [str(damage) for damage in reader.damage]
+    wrong = reader.check_outside() if outside else None
+    if wrong is not None:
+        found.append(wrong)
+    if not reader.complete and not reader.damage:
+        found.append(_NO_END)
+    if not any(channel.known for channel in reader.channels.values()):
+        held = ", ".join(sorted({channel.topic for channel in reader.channels.values()})[:3])
+        found.append(f"foreign: no topic of triline in it{', only ' + held if held else ''}")
+    if reader.problems["without a channel"]:
+        found.append(f"{reader.problems['without a channel']} messages without a channel")
+    for row in topic_summaries(reader):
+        if row.gaps:
+            found.append(f"{row.topic}: {row.gaps} messages missing by their numbers")
+        if row.duplicates:
+            found.append(f"{row.topic}: {row.duplicates} messages twice")
+        if row.backwards:
+            found.append(f"{row.topic}: time goes back {row.backwards} times")
+    if decode:
+        for _ in reader.messages():
+            pass
+        if reader.problems["malformed"]:
+            number = reader.problems["malformed"]
+            found.append(f"{number} messages that cannot be used; the last: {reader.last_problem}")
+    return found
+
+
+def _place(topic: str) -> int:
+    try:
+        return topics.rank(topic)
+    except KeyError:
+        return len(topics.TOPICS)

@@ -1,0 +1,153 @@
+"""Writing recordings: MCAP files of messages with their envelopes. the MCAP library writes them.
+
+One channel stands for one run of one publisher on one topic. What all else depends on, the configuration, stands in a
+chunk of its own at the head, and once more at the end, on channels marked as copies; readers take a copy only where the
+first one is lost. Publish time is the platform stamp, log time the time of reception, and the channel's metadata name
+the source; so a recording explains itself and keeps both times apart.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import IO
+
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from ...schemas import codec, topics
+from ...schemas.envelope import Envelope, RawMessage
+from ..node import Message
+from .index import CHANNEL_METADATA
+
+LIBRARY = "triline"
+COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+_SEQUENCE_MASK = 0xFFFFFFFF
+
+
+class RecordingWriter:
+    """Writes a recording; the same messages give the same bytes.
+
+    Parameters
+    ----------
+    target : path of the file, or an open binary file (which stays open)
+    compression : ``none``, ``lz4`` or ``zstd``
+    platform : name of the platform, kept with each channel
+    chunk_size : bytes after which a chunk is closed
+    """
+
+    def __init__(
+        self,
+        target: str | Path | IO[bytes],
+        compression: str = "none",
+        *,
+        platform: str = "demo",
+        chunk_size: int = 1 << 20,
+    ) -> None:
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"compression {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
+        self._owned = isinstance(target, (str, Path))
+        self._stream: IO[bytes] = (
+            open(target, "wb") if isinstance(target, (str, Path)) else target  # noqa: SIM115  # closed by close
+        )
+        self._writer = Writer(self._stream, chunk_size, COMPRESSIONS[compression], enable_data_crcs=True)
+        self._platform = platform
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, int, str, bool], int] = {}
+        self._configuring: dict[str, bool] = {}  # topics that were met
+        self._last: dict[tuple[str, str], tuple[int, int]] = {}
+        self.counts: Counter[str] = Counter()
+        self._head = True
+        self._configuration: list[tuple[RawMessage, str | None]] = []
+        self._writer.start(library=LIBRARY)
+        self._stream.flush()
+
+    def write(self, message: Message, receive_ns: int | None = None) -> None:
+        """Add a message; its log time is ``receive_ns``, or its stamp where none is given.
+
+        A message without a sequence number (-1) gets the next one of its topic and source.
+
+        Raises
+        ------
+        ValueError : a message without a number whose stamp lies before the one written before it
+        KeyError : a topic that is not in the topic table
+        """
+        sequence = message.sequence
+        if sequence < 0:
+            key = (message.topic, message.source)
+            last, last_stamp = self._last.get(key, (-1, -1))
+            if message.stamp_ns < last_stamp:
+                raise ValueError(
+                    f"{message.topic} of {message.source!r}: stamp {message.stamp_ns} after {last_stamp}; "
+                    "messages of one source are written in the order of their stamps"
+                )
+            sequence = last + 1
+            self._last[key] = (sequence, message.stamp_ns)
+        envelope = Envelope(message.stamp_ns, message.source, sequence)
+        self.write_raw(RawMessage(message.topic, envelope, codec.encode(message.body), receive_ns or message.stamp_ns))
+
+    def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
+        """Add a message that is encoded already."""
+        configuring = self._configuring.get(raw.topic)
+        if configuring is None:
+            configuring = topics.find(raw.topic).family is topics.Family.CONFIGURATION
+            self._configuring[raw.topic] = configuring
+        if configuring:
+            kept = RawMessage(raw.topic, raw.envelope, bytes(raw.data), raw.receive_ns)
+            self._configuration.append((kept, platform))
+        elif self._head:
+            self._head = False
+            self.flush()
+        self._add(raw, platform)
+        self.counts[raw.topic] += 1
+
+    def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> None:
+        topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
+        key = (topic, source, start, platform or self._platform, copy)
+        channel = self._channels.get(key)
+        if channel is None:
+            channel = self._channels[key] = self._register(*key)
+        number = sequence & _SEQUENCE_MASK
+        self._writer.add_message(channel, receive_ns, data, stamp_ns, number)  # type: ignore[arg-type]  # a view serves
+
+    def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
+        row = topics.find(topic)
+        schema = self._schemas.get(row.type_name)
+        if schema is None:
+            schema = self._schemas[row.type_name] = register_schema(self._writer, row.type)
+        metadata = {"source": source, "platform": platform}
+        if start:
+            metadata["start"] = str(start)
+        if copy:
+            metadata["copy"] = "yes"
+        channel = self._writer.register_channel(topic, MessageEncoding.Protobuf, schema, metadata)
+        # A channel stands in the first chunk that uses it; written once more outside chunks it survives that chunk.
+        self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})
+        return channel
+
+    def flush(self) -> None:
+        """Close the open chunk and hand everything to the operating system."""
+        self._writer.flush()
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far, without the open chunk."""
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Write the configuration once more and the index, and close the file."""
+        if not self._head:
+            self.flush()
+            for raw, platform in self._configuration:
+                self._add(raw, platform, copy=True)
+        self._writer.finish()
+        self._stream.flush()
+        if self._owned:
+            self._stream.close()
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

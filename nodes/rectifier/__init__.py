@@ -1,0 +1,1 @@
+"""The rectifier: image lines and orientations in, growing orthoimages out."""

@@ -1,0 +1,1 @@
+"""The simulator: a simulated flight as messages."""

@@ -1,0 +1,84 @@
+"""What is shown on a terminal: names, states and reasons come from files and other programs, and may hold anything.
+
+A terminal obeys control characters: they move the cursor, change its title, hide what was written. None that came with
+data reaches it. `clean_streams` stands around every command; who draws on a terminal asks `drawing` for the stream
+beneath, and cleans with `plain` what it draws.
+"""
+
+from __future__ import annotations
+
+import sys
+import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO, cast
+
+#: Categories of Unicode that are written as escapes: control, surrogate, private use, not assigned, and separators that
+#: break lines; of the format characters those that turn the direction of writing.
+_ESCAPED = frozenset(("Cc", "Cs", "Co", "Cn", "Zl", "Zp"))
+_TURNING = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\ufeff")
+
+
+def plain(text: object, most: int = 0) -> str:
+    r"""A text as one line that a terminal only shows: control characters become escapes such as ``\x1b``.
+
+    Parameters
+    ----------
+    text : anything
+    most : longest text, in characters; what is longer ends in ``...``; 0 = any length
+    """
+    shown = str(text)
+    if most and len(shown) > most:
+        shown = shown[: max(most - 3, 0)] + "..."
+    return _clean(shown, "")
+
+
+def _clean(text: str, kept: str) -> str:
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(c if c in kept or not _is_hostile(c) else _escape(c) for c in text)
+
+
+def _is_hostile(c: str) -> bool:
+    return c in _TURNING or unicodedata.category(c) in _ESCAPED
+
+
+def _escape(c: str) -> str:
+    if c in "\n\r\t":
+        return " "
+    return c.encode("unicode_escape").decode("ascii")
+
+
+class CleanStream:
+    """A text stream that writes lines and tabs as they are, and all other control characters as escapes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        self.stream.write(_clean(text, "\n\t"))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def drawing(stream: Any) -> TextIO:
+    """The stream beneath a `CleanStream`, for who moves the cursor himself."""
+    return stream.stream if isinstance(stream, CleanStream) else stream
+
+
+@contextmanager
+def clean_streams() -> Iterator[None]:
+    """Standard output and standard error take no control characters in this block."""
+    out, err = sys.stdout, sys.stderr
+    sys.stdout = cast(TextIO, CleanStream(drawing(out)))
+    sys.stderr = cast(TextIO, CleanStream(drawing(err)))
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = out, err

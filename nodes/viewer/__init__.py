@@ -1,0 +1,1 @@
+"""The viewer: the scene of a triangulation, and the canvas it is drawn on."""

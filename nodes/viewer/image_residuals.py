@@ -1,0 +1,103 @@
+"""Residual vectors in image space, one view a CCD line."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+
+from ..node import Message
+from .canvas import Canvas
+from .scene_part import CCD_COLORS, REJECTED, Part, faded
+from .scene_state import SceneState, round_number
+
+_NEWEST = 1500  # rays a view shows
+_PERIOD_S = 1.0  # all of them are drawn again
+_LENGTH_S = 60.0  # of a strip whose end is not known
+_BAR = 0.05  # of the view's width is the scale bar,
+_TELLING, _BAR_RMS = 240, 3.0  # which is 1 px, or less: about so many times the residuals, once there are so many
+_SETTLED = 0.5  # of the colour is left of the residuals of final points
+_GREY = (110, 110, 120, 255)
+
+
+class ImagePart(Part):
+    """Rays of the strip that is flown: samples to the right, lines upwards, vectors enlarged as the scale bar says."""
+
+    def __init__(self, state: SceneState) -> None:
+        super().__init__(state)
+        self._rays: dict[str, OrderedDict[tuple[str, int], Any]] = {}
+        self._strip = ""
+        self._changed: set[str] = set()
+        self._drawn_s = 0.0
+        self._framed: tuple[str, int, float] | None = None
+        self._sized = False
+        self._squares: list[float] = []
+
+    def take(self, message: Message) -> None:
+        if message.topic != "point/object":
+            return
+        settled = message.body.status != message.body.LIVE
+        for r in message.body.residuals:
+            if r.strip != self._strip:
+                self._strip = r.strip
+                self._rays = {ccd: OrderedDict() for ccd in self.state.ccds}
+                self._changed = set(self._rays)
+            rays = self._rays.get(r.ccd)
+            if rays is not None:
+                self._size(r)
+                rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected, settled
+                if len(rays) > _NEWEST:
+                    rays.popitem(last=False)
+                self._changed.add(r.ccd)
+
+    def _size(self, residual: Any) -> None:
+        """Decide how long the scale bar is, by the first residuals."""
+        if self._sized or residual.rejected:
+            return
+        self._squares.append(residual.v_line**2 + residual.v_sample**2)
+        if len(self._squares) >= _TELLING:
+            self._sized = True
+            self.state.bar_px = min(round_number(_BAR_RMS * float(np.sqrt(np.mean(self._squares)))), 1.0)
+            self._squares.clear()
+
+    def draw(self, canvas: Canvas) -> None:
+        strip = self.state.strips.get(self._strip)
+        due = self.state.closing or self.state.now_s - self._drawn_s >= _PERIOD_S
+        if strip is None or not self._changed or not due:
+            return
+        self._drawn_s = self.state.now_s
+        width, height = self.state.image_size
+        newest = max((line for rays in self._rays.values() for line, *_ in rays.values()), default=0.0)
+        lines = float(strip.lines or _LENGTH_S * strip.line_rate_hz)
+        while newest > lines:
+            lines *= 2
+        along = height / lines
+        bar = _BAR * width
+        scale = bar / self.state.bar_px
+        for ccd in sorted(self._changed):
+            rows = np.array([row for row in self._rays[ccd].values()], dtype=float).reshape(-1, 6)
+            origin = np.column_stack([rows[:, 1], height - rows[:, 0] * along])
+            vector = scale * np.column_stack([rows[:, 3], -rows[:, 2]])
+            bad = rows[:, 4] > 0
+            length = np.linalg.norm(vector, axis=1)
+            longest = 2 * bar  # a rejected ray may be far off; its arrow shows where to
+            vector[bad] *= np.minimum(1.0, longest / np.maximum(length[bad], 1e-9))[:, None]
+            color = CCD_COLORS[self.state.ccds.index(ccd) % len(CCD_COLORS)]
+            shades = [faded(color, _SETTLED) if settled else color for settled in rows[:, 5] > 0]
+            for name, chosen in (("residuals", ~bad), ("rejected", bad)):
+                own = [REJECTED if bad[i] else shades[i] for i in np.flatnonzero(chosen)]
+                canvas.arrows(f"image/{ccd}/{name}", origin[chosen], vector[chosen], own, 0.9)
+        self._changed.clear()
+        framed = self._strip, round(lines), self.state.bar_px
+        if self._framed != framed:
+            self._framed = framed
+            self._frame(canvas, width, height, bar)
+
+    def _frame(self, canvas: Canvas, width: float, height: float, length: float) -> None:
+        """Outline of the strip and a scale bar."""
+        for ccd in self.state.ccds:
+            box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
+            canvas.lines(f"image/{ccd}/frame", [box], [_GREY], 0.7)
+            bar = np.array([[-0.015 * width - length, 0.9 * height]])
+            canvas.arrows(f"image/{ccd}/scale", bar, np.array([[length, 0.0]]), [(255, 255, 255, 255)], 1.2)
