@@ -1,13 +1,12 @@
 """The golden recording through the real nodes gives what it gave before, to 1 mm and 1 urad."""
 
 import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from places import ROOT
 
-FOLDER = Path(__file__).parents[1] / "recordings"
-_spec = importlib.util.spec_from_file_location("golden", FOLDER / "golden.py")
+_spec = importlib.util.spec_from_file_location("golden", ROOT / "recordings" / "golden.py")
 golden = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(golden)
 

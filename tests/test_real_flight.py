@@ -9,21 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_rig import free_port
+from places import MOTION, needs_motion
 
-from triline.nodes.processes import NodeGroup
-from triline.nodes.recording import RecordingReader
+from triline.nodes.bus.processes import NodeGroup
+from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.report.evaluation import evaluate
 
-MOTION = Path(__file__).parents[1].parent / "shared/data/avirisng/ang20170323t202244_eph_att"
-pytestmark = pytest.mark.skipif(
-    not MOTION.exists(), reason="../shared/data is not here: no real flight to put a camera on"
-)
+pytestmark = needs_motion
 RATE = 6.0
 
 
 def triline(*arguments: object) -> str:
     command = [sys.executable, "-m", "triline.nodes.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -61,12 +59,13 @@ def test_replay_over_the_bus_gives_the_same_orientation(flight: Path, processed:
     port = free_port()
     with NodeGroup(tmp_path / "log", "avirisng", port) as group:
         group.start("recorder", "-o", str(live))
-        group.start("adjuster", "--set", 'pace="normal"')  # six times as fast, a busy machine may fall behind
+        group.start("adjuster", "--set", 'pace="normal"')
         time.sleep(3)
-        triline("replay", flight, "--rate", RATE, "--platform", "avirisng", "--port", port, "-q")
-        time.sleep(4)
+        where = ("--platform", "avirisng", "--port", port)
+        triline("replay", flight, "--rate", RATE, "--wait-for", "adjuster", *where, "-q")
+        time.sleep(8)
         assert group.processes["adjuster"].stop() == 0
-        time.sleep(1)
+        time.sleep(6)
         assert group.processes["recorder"].stop() == 0
     for topic in ("orientation/live", "orientation/final", "point/object"):
         ours = [m.body.SerializeToString() for m in RecordingReader(live).sorted_messages([topic])]

@@ -1,0 +1,437 @@
+"""``triline adjust``: block folders and recordings in, result files and one-line refusals out."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from places import BLOCKS, needs_blocks
+from recording_file import write_recording
+
+from triline.nodes.cli import main
+from triline.nodes.cli.adjust import read_input
+from triline.nodes.formats.block_messages import block_messages
+from triline.solver.camera.self_calibration import tls
+from triline.solver.camera.sensors import preset
+from triline.solver.geometry.frames import LocalFrame
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion
+from triline.solver.models.dgr import DgrOptions
+from triline.solver.simulation.network import parallel_and_cross, scatter_points, simulate_network
+
+CAMERA = preset("ads40")
+AXES, ANGLES = ["X_m", "Y_m", "Z_m"], ["omega_deg", "phi_deg", "kappa_deg"]
+MODEL = DgrOptions((0.1, 0.1, 0.2), (0.005, 0.005, 0.008), (0.005, 0.005, 0.008))
+
+
+def write_block(folder, points=50, control=5, check=15, seed=1, parameters=None, image_sigma=0.3):
+    """A simulated block as a folder; returns the simulation."""
+    rng = np.random.default_rng(seed)
+    ground = scatter_points(points, (-1500, 1500, -1200, 1200), lambda x, y: 60 * np.sin(x / 400 + y / 700), rng)
+    lines = parallel_and_cross(CAMERA, 2000.0, 2, 1, 3000.0)
+    simulated = simulate_network(
+        CAMERA, lines, ground, dict.fromkeys(range(control), "control"), range(control, control + check), MODEL, rng,
+        self_calibration=tls(CAMERA), camera_parameters=parameters, pose_rate_hz=50.0,
+    )  # fmt: skip
+    network = simulated.network
+    folder.mkdir()
+    camera = {
+        "name": "ads40",
+        "lenses": [{"id": "L1", "focal_length_mm": 62.7, "principal_point_mm": [0, 0]}],
+        "lines": [
+            {"id": line.id, "lens": "L1", "pixels": line.pixels, "pixel_size_mm": 0.0065,
+             "center_mm": line.centre_mm.tolist(), "inclination_deg": 0.0}
+            for line in CAMERA.lines
+        ],
+    }  # fmt: skip
+    (folder / "camera.json").write_text(json.dumps(camera))
+    (folder / "project.toml").write_text(
+        f'[project]\nname = "simulated"\n[apriori]\nimage_sigma_px = {image_sigma}\n[trajectory]\n'
+        "offset_sigma_m = [0.1, 0.1, 0.2]\nshift_sigma_deg = [0.005, 0.005, 0.008]\n"
+        "drift_sigma_deg = [0.005, 0.005, 0.008]\n"
+    )
+    strips = [(s.id, s.first_line_time_s + 1000 * i, s.line_rate_hz, s.lines) for i, s in enumerate(network.strips)]
+    names = ["strip", "first_line_time_s", "line_rate_hz", "lines"]
+    pd.DataFrame(strips, columns=names).to_csv(folder / "strips.csv", index=False)
+    parts = []
+    for i, s in enumerate(network.strips):
+        t = s.trajectory
+        pose = np.column_stack([t.position_l, np.degrees(angles_from_matrix(matrix_from_quaternion(t.quaternion)))])
+        part = pd.DataFrame(pose, columns=["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"])
+        part.insert(0, "time_s", t.time_s + 1000 * i)
+        part.insert(0, "strip", s.id)
+        parts.append(part)
+    pd.concat(parts).to_csv(folder / "trajectory.csv", index=False)
+    given = [(network.control, "control"), (network.check, "check")]
+    rows = [
+        (network.point_ids[p], *xyz, *np.maximum(sigma, 1e-3), role)
+        for known, role in given
+        for p, xyz, sigma in zip(known.point, known.xyz_l, known.sigma_m, strict=True)
+    ]
+    names = ["point", "X_m", "Y_m", "Z_m", "sigma_X_m", "sigma_Y_m", "sigma_Z_m", "role"]
+    pd.DataFrame(rows, columns=names).to_csv(folder / "ground_points.csv", index=False)
+    r = network.rays
+    image = pd.DataFrame(
+        {
+            "point": [network.point_ids[p] for p in r.point],
+            "strip": [network.strips[s].id for s in r.strip],
+            "ccd": [CAMERA.lines[k].id for k in r.ccd],
+            "line": r.line,
+            "sample": r.sample,
+        }
+    )
+    image.to_csv(folder / "image_points.csv", index=False)
+    return simulated
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("adjust") / "block"
+    write_block(path)
+    return path
+
+
+def adjust(*words, capsys=None):
+    """Exit code and, with capsys, what went to the two outputs."""
+    code = main(["adjust", *map(str, words)])
+    return (code, *capsys.readouterr()) if capsys else code
+
+
+def result_in(path):
+    return json.loads((path / "result.json").read_text())
+
+
+@needs_blocks
+def test_known_answer_of_an_independent_program(tmp_path, capsys):
+    expected = json.loads((BLOCKS / "dgr" / "expected.json").read_text())
+    code, out, _ = adjust(BLOCKS / "dgr", "--json", "-o", tmp_path, capsys=capsys)
+    result = json.loads(out)
+    assert code == 0 and result == result_in(tmp_path)
+    # the two programs interpolate the trajectory differently, which costs 1e-4 px
+    assert result["sigma0"] == pytest.approx(expected["sigma0"], abs=5e-5)
+    assert (result["n_observations"], result["n_unknowns"]) == (expected["n_obs"], expected["n_unknowns"])
+    for id, strip in expected["strips"].items():
+        np.testing.assert_allclose(result["strips"][id]["offset_m"], strip["offset_m"], atol=1e-5)
+        np.testing.assert_allclose(result["strips"][id]["shift_deg"], strip["shift_deg"], atol=1e-6)
+        np.testing.assert_allclose(result["strips"][id]["drift_deg"], strip["drift_deg_per_strip"], atol=1e-6)
+    points = pd.read_csv(tmp_path / "points.csv", index_col="point")
+    want = np.array([expected["points_m"][id] for id in points.index])
+    np.testing.assert_allclose(points[["X_m", "Y_m", "Z_m"]].to_numpy(), want, atol=1e-4)
+    assert result["check"]["n"] == expected["n_check"]
+    np.testing.assert_allclose(result["check"]["rmse_m"], expected["check_rmse_m"], atol=2e-5)
+    np.testing.assert_allclose(result["check"]["sigma_m"], expected["check_sigma_m"], rtol=1e-4)
+
+
+@needs_blocks
+def test_self_calibration_brings_sigma0_to_one_and_points_to_truth(tmp_path):
+    truth = json.loads((BLOCKS / "selfcal" / "truth.json").read_text())
+    assert adjust(BLOCKS / "selfcal", "--selfcal", "tls18", "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    assert result["chi_square_test"]["passed"]
+    points = pd.read_csv(tmp_path / "points.csv", index_col="point")
+    true = np.array([truth["points"][id] for id in points.index])
+    axes = ["X_m", "Y_m", "Z_m"]
+    ratio = (points[axes].to_numpy() - true) / points[[f"sigma_{a}" for a in axes]].to_numpy()
+    assert 0.9 < np.sqrt(np.mean(ratio**2)) < 1.1
+    parameters = result["additional_parameters"]
+    assert set(truth["ap"]) == {n for n, p in parameters.items() if p["status"] == "estimated"}
+    for name, value in truth["ap"].items():
+        assert abs(parameters[name]["value"] - value) < 3.5 * parameters[name]["sigma"], name
+    gone = [p for p in parameters.values() if p["status"] == "eliminated"]
+    assert len(parameters) == 18 and all(p["reason"] and p["value"] == 0 for p in gone)
+
+
+def test_result_files_have_what_the_interface_says(folder, tmp_path):
+    assert adjust(folder, "--snoop", "--selfcal", "tls18", "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    wanted = "sigma0 sigma0_px n_observations n_unknowns redundancy iterations converged seconds model selfcal strips "
+    wanted += "additional_parameters check control direct_georeferencing rejected"
+    assert set(wanted.split()) <= set(result)
+    for strip in result["strips"].values():
+        for key in ("offset_m", "shift_deg", "drift_deg"):
+            assert len(strip[key]) == len(strip[f"{key}_sigma"]) == 3 and min(strip[f"{key}_sigma"]) > 0
+    assert set(result["strips"]) == {"S1", "S2", "C1"}
+    for name, p in result["additional_parameters"].items():
+        assert set(p) >= {"value", "sigma", "t", "status", "reason"} and p["status"] in ("estimated", "eliminated"), (
+            name
+        )
+    for group in ("check", "control", "direct_georeferencing"):
+        for key in ("rmse_m", "mean_m", "max_m", "sigma_m"):
+            assert len(result[group][key]) == 3
+    assert (result["check"]["n"], result["control"]["n"]) == (15, 5)
+    assert result["redundancy"] == result["n_observations"] - result["n_unknowns"]
+    points = pd.read_csv(tmp_path / "points.csv")
+    columns = "point X_m Y_m Z_m sigma_X_m sigma_Y_m sigma_Z_m rays role doubtful"
+    assert list(points.columns) == columns.split() and set(points.doubtful) <= {0, 1}
+    assert result["doubtful_points"] == [] and points.doubtful.sum() == 0
+    assert points.role.value_counts().to_dict() == {"check": 15, "control": 5, "tie": len(points) - 20}
+    residuals = pd.read_csv(tmp_path / "residuals.csv")
+    image = pd.read_csv(folder / "image_points.csv")
+    assert len(residuals) == len(image) and (residuals.point == image.point).all()
+    assert 0.2 < residuals.v_line_px.std() < 0.32 and 0.2 < residuals.v_sample_px.std() < 0.32
+    refined = pd.read_csv(tmp_path / "trajectory_refined.csv")
+    measured = pd.read_csv(folder / "trajectory.csv")
+    assert list(refined.columns[:8]) == list(measured.columns) and len(refined) == len(measured)
+
+
+def test_refined_trajectory_is_measured_plus_correction(folder, tmp_path):
+    assert adjust(folder, "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    refined, measured = (
+        pd.read_csv(p).set_index("strip") for p in (tmp_path / "trajectory_refined.csv", folder / "trajectory.csv")
+    )
+    for id, strip in result["strips"].items():
+        change = refined.loc[id, ["X_m", "Y_m", "Z_m"]].to_numpy() - measured.loc[id, ["X_m", "Y_m", "Z_m"]].to_numpy()
+        np.testing.assert_allclose(change, np.tile(strip["offset_m"], (len(change), 1)), atol=2e-5)
+        angles = ["omega_deg", "phi_deg", "kappa_deg"]
+        turn = refined.loc[id, angles].to_numpy() - measured.loc[id, angles].to_numpy()
+        turn = (turn + 180.0) % 360.0 - 180.0
+        np.testing.assert_allclose(turn[0], strip["shift_deg"], atol=1e-7)
+        np.testing.assert_allclose(turn[-1] - turn[0], strip["drift_deg"], atol=1e-7)
+        np.testing.assert_allclose(refined.loc[id, "sigma_omega_deg"].iloc[0], strip["shift_deg_sigma"][0], atol=1e-8)
+
+
+def test_adjusted_trajectory_is_better_than_the_measured_one(tmp_path):
+    """Against the truth: measured = true - correction, so the estimated corrections must come near the drawn ones."""
+    simulated = write_block(tmp_path / "block", seed=7)
+    assert adjust(tmp_path / "block", "-q", "-o", tmp_path / "out") == 0
+    for id, strip in result_in(tmp_path / "out")["strips"].items():
+        true = simulated.corrections[id]
+        estimate = np.concatenate([strip["offset_m"], np.radians(strip["shift_deg"]), np.radians(strip["drift_deg"])])
+        sigma = np.concatenate([strip[f"{k}_sigma"] * np.array(u) for k, u in (("offset_m", 1.0),)] + [
+            np.radians(strip["shift_deg_sigma"]), np.radians(strip["drift_deg_sigma"])])  # fmt: skip
+        assert (np.abs(estimate - true) < 4.5 * sigma).all()
+
+
+def test_recording_gives_what_the_folder_gives(folder, tmp_path):
+    recording = tmp_path / "block.mcap"
+    write_recording(recording, block_messages(read_input(folder)))
+    for source, name in ((folder, "a"), (recording, "b")):
+        assert adjust(source, "-q", "--selfcal", "tls12", "-o", tmp_path / name) == 0
+    one, other = result_in(tmp_path / "a"), result_in(tmp_path / "b")
+    assert other["sigma0"] == pytest.approx(one["sigma0"], abs=1e-6)
+    for id, strip in one["strips"].items():
+        np.testing.assert_allclose(other["strips"][id]["offset_m"], strip["offset_m"], atol=1e-5)
+    np.testing.assert_allclose(other["check"]["rmse_m"], one["check"]["rmse_m"], atol=1e-5)
+
+
+def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
+    """Wander and the white noise of the poses are the project's: image points do not get the blame for either."""
+    flight, smoothed = tmp_path / "flight.mcap", tmp_path / "smoothed.mcap"
+    assert main(["simulate", "-o", str(flight), "--seconds", "30", "-q"]) == 0
+    assert main(["process", str(flight), "-o", str(smoothed), "--nodes", "navigator", "-q"]) == 0
+    assert adjust(smoothed, "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    assert result["model"] == "wander"
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.07)
+    (strip,) = read_input(smoothed).strips
+    assert strip.noise is not None and strip.noise.shape == (len(strip.trajectory), 6, 6)
+    assert adjust(smoothed, "-q", "--model", "dgr", "-o", tmp_path / "dgr") == 0
+    assert result_in(tmp_path / "dgr")["model"] == "dgr"
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
+def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
+    """The block moved to 9 deg 30' east, 48 deg north: same adjustment, coordinates and angles in the other system."""
+    there = tmp_path / "there"
+    shutil.copytree(folder, there)
+    frame = LocalFrame(48.0, 9.5, 0.0, crs)
+    ground = pd.read_csv(there / "ground_points.csv")
+    ground[AXES] = frame.to_crs(ground[AXES].to_numpy())
+    ground.to_csv(there / "ground_points.csv", index=False)
+    trajectory = pd.read_csv(there / "trajectory.csv")
+    R = matrix_from_angles(*np.radians(trajectory[ANGLES].to_numpy()).T)
+    places = frame.to_crs(trajectory[AXES].to_numpy())
+    trajectory[ANGLES] = np.degrees(angles_from_matrix(np.swapaxes(frame.R_l_crs(places), 1, 2) @ R))
+    trajectory[AXES] = places
+    trajectory.to_csv(there / "trajectory.csv", index=False)
+    text = (there / "project.toml").read_text()
+    (there / "project.toml").write_text(text.replace("[project]", f'[project]\ncrs = "{crs}"'))
+    for source, name in ((folder, "here"), (there, "out")):
+        assert adjust(source, "-q", "-o", tmp_path / name) == 0
+    one, other = result_in(tmp_path / "here"), result_in(tmp_path / "out")
+    assert other["sigma0"] == pytest.approx(one["sigma0"], abs=2e-3)
+    np.testing.assert_allclose(other["check"]["rmse_m"], one["check"]["rmse_m"], atol=3e-3)
+    points = [pd.read_csv(tmp_path / name / "points.csv", index_col="point").sort_index() for name in ("here", "out")]
+    back = frame.from_crs(points[1][AXES].to_numpy())
+    np.testing.assert_allclose(back, points[0][AXES].to_numpy(), atol=0.02)
+    sigma = [f"sigma_{axis}" for axis in AXES]
+    np.testing.assert_allclose(points[1][sigma].to_numpy(), points[0][sigma].to_numpy(), rtol=0.05)
+    refined = pd.read_csv(tmp_path / "out" / "trajectory_refined.csv")
+    turn = (refined[ANGLES].to_numpy() - trajectory[ANGLES].to_numpy() + 180) % 360 - 180
+    assert np.abs(turn).max() < 0.1, "corrections are hundredths of a degree, convergence is a third"
+
+
+def test_outliers_and_unusable_rays_are_rejected_by_name(folder, tmp_path):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(folder, spoiled)
+    image = pd.read_csv(spoiled / "image_points.csv")
+    rng = np.random.default_rng(5)
+    bad = rng.choice(len(image), round(0.05 * len(image)), replace=False)
+    image.loc[bad, "sample"] += rng.choice([-1, 1], len(bad)) * rng.uniform(6, 40, len(bad))
+    image.loc[len(image)] = [image.point[0], "S1", "Q", 100.0, 100.0]
+    image.loc[len(image)] = [image.point[1], "S9", "N", 100.0, 100.0]
+    image.loc[len(image)] = [image.point[2], "S1", "N", 1e7, 100.0]
+    image.to_csv(spoiled / "image_points.csv", index=False)
+    assert adjust(spoiled, "--snoop", "-q", "-o", tmp_path / "out") == 0
+    rejected = result_in(tmp_path / "out")["rejected"]
+    named = {(r["point"], r["strip"], r["ccd"]) for r in rejected}
+    wanted = {(image.point[i], image.strip[i], image.ccd[i]) for i in bad}
+    assert len(named & wanted) >= 0.98 * len(wanted)
+    assert (image.point[0], "S1", "Q") in named and (image.point[1], "S9", "N") in named
+    reasons = {r["reason"] for r in rejected}
+    assert {"unknown CCD line", "unknown strip", "outside strip or trajectory"} <= reasons
+    assert all(abs(r["w"]) > 3.29 for r in rejected if r["reason"] == "snooping")
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        (["--model", "ppm", "--segments", "2"], "segments"),
+        (["--model", "lim", "--fixes", "5"], "fixes"),
+        (["--model", "dgr", "--then", "lim", "--fixes", "4"], "fixes"),
+        (["--model", "ppm", "--segments", "1", "--then", "ppm"], "segments"),
+    ],
+)
+def test_models(folder, tmp_path, options, key):
+    assert adjust(folder, *options, "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    assert result["converged"] and all(strip[key] for strip in result["strips"].values())
+    if "--then" in options:
+        assert result["then"] == options[options.index("--then") + 1]
+        assert result["before"][0]["model"] == options[1]
+    sigma = np.array(result["check"]["sigma_m"])
+    assert (np.array(result["check"]["rmse_m"]) < 3 * sigma).all()
+
+
+def test_everything_at_once_with_pictures(folder, tmp_path):
+    options = ["--selfcal", "tls18", "--snoop", "--robust", "igg3", "--reweight", "--variance-components", "--plots"]
+    assert adjust(folder, *options, "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    of_trajectory = {"offset", "shift and drift", "wander of position", "wander of attitude"}
+    assert set(result["variance_components"]) == {"image", "control"} | of_trajectory
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.03)
+    for name in ("residuals.png", "points.png", "corrections.png"):
+        assert (tmp_path / name).stat().st_size > 20_000
+
+
+def test_summary_says_what_matters(folder, capsys):
+    code, out, err = adjust(folder, "--selfcal", "tls18", "--snoop", "-v", capsys=capsys)
+    assert code == 0
+    for text in ("sigma0", "chi-square", "check points", "direct georeferencing", "eliminated", "reliability"):
+        assert text in out
+    assert "iteration 1" in err and "data snooping: round 1" in err and "removed" in err
+
+
+def test_quiet_run_says_nothing_on_standard_error(folder, capsys):
+    code, out, err = adjust(folder, "-q", capsys=capsys)
+    assert code == 0 and err == "" and "sigma0" in out
+
+
+def refusal(capsys, *words):
+    code, out, err = adjust(*words, capsys=capsys)
+    assert code == 1 and out == "" and "Traceback" not in err
+    lines = [line for line in err.splitlines() if line.startswith("triline adjust:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_refusals_are_one_line(folder, tmp_path, capsys):
+    assert "no such file" in refusal(capsys, tmp_path / "nowhere")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "camera.json" in refusal(capsys, empty)
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(b"not a recording at all")
+    assert "not an MCAP recording" in refusal(capsys, foreign)
+    assert "needs a folder" in refusal(capsys, folder, "--plots")
+    assert "--fixes is for the model lim" in refusal(capsys, folder, "--fixes", "8")
+    assert "fixes" in refusal(capsys, folder, "--model", "lim", "--fixes", "2")
+    assert "segments" in refusal(capsys, folder, "--model", "ppm", "--segments", "0")
+    assert "--critical" in refusal(capsys, folder, "--critical", "0")
+    occupied = tmp_path / "file"
+    occupied.write_text("")
+    assert "is a file" in refusal(capsys, folder, "-q", "-o", occupied)
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "sealed/below"])
+def test_a_folder_that_cannot_be_is_refused_before_the_work(folder, tmp_path, capsys, place, monkeypatch):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "sealed").mkdir()
+    monkeypatch.setattr(os, "access", lambda where, mode: Path(where).name != "sealed")  # root may write anywhere
+    monkeypatch.setattr("triline.nodes.cli.adjust.run_job", None)
+    monkeypatch.setattr("triline.nodes.cli.navigate.read_sensor_folder", None)
+    assert str(tmp_path / place) in refusal(capsys, folder, "-q", "-o", tmp_path / place)
+    assert main(["navigate", str(folder), "-o", str(tmp_path / place)]) == 1
+    assert str(tmp_path / place) in capsys.readouterr().err
+    assert not list((tmp_path / "sealed").iterdir())
+
+
+@pytest.mark.parametrize("words", [("ppm", "--segments"), ("lim", "--fixes")])
+def test_more_segments_than_the_rays_carry_are_refused_at_once(folder, capsys, words, monkeypatch):
+    monkeypatch.setattr("triline.nodes.cli.adjust.run_job", None)
+    said = refusal(capsys, folder, "--model", words[0], words[1], "100000")
+    assert f"{words[1]} 100000: more than the image points carry, wanted at most" in said
+
+
+def test_a_point_that_lost_most_rays_is_named_in_all_results(folder, tmp_path, capsys):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(folder, spoiled)
+    image = pd.read_csv(spoiled / "image_points.csv")
+    ground = pd.read_csv(spoiled / "ground_points.csv")
+    seen = image[image.point.isin(ground.point[ground.role == "check"])].groupby("point").size()
+    name = seen.idxmax()
+    rng = np.random.default_rng(3)
+    bad = rng.choice(image.index[image.point == name], seen.max() // 2 + 1, replace=False)
+    image.loc[bad, "line"] += rng.uniform(8, 40, len(bad))
+    image.loc[bad, "sample"] += rng.choice([-1, 1], len(bad)) * rng.uniform(8, 40, len(bad))
+    image.to_csv(spoiled / "image_points.csv", index=False)
+    code, out, _ = adjust(spoiled, "--snoop", "-o", tmp_path / "out", capsys=capsys)
+    assert code == 0 and "doubtful: 1 object points" in out and f"{name} ({len(bad)} of {seen.max()} rays out)" in out
+    result = result_in(tmp_path / "out")
+    assert [d["point"] for d in result["doubtful_points"]] == [name] and result["check"]["n"] == 14
+    points = pd.read_csv(tmp_path / "out" / "points.csv", index_col="point")
+    assert list(points.index[points.doubtful == 1]) == [name]
+
+
+def test_block_without_any_usable_ray_is_refused(folder, tmp_path, capsys):
+    lost = tmp_path / "lost"
+    shutil.copytree(folder, lost)
+    image = pd.read_csv(lost / "image_points.csv")
+    image["line"] = 1e8
+    image.to_csv(lost / "image_points.csv", index=False)
+    assert "can be used" in refusal(capsys, lost)
+
+
+def test_block_that_does_not_fit_at_all_is_refused_with_the_strip_to_blame(folder, tmp_path, capsys):
+    turned = tmp_path / "turned"
+    shutil.copytree(folder, turned)
+    trajectory = pd.read_csv(turned / "trajectory.csv")
+    trajectory.loc[trajectory.strip == "S2", "kappa_deg"] += 90.0
+    trajectory.to_csv(turned / "trajectory.csv", index=False)
+    message = refusal(capsys, turned, "-q")
+    assert "does not converge" in message and "strip S2" in message
+
+
+def test_one_control_point_a_kilometre_off_is_left_out(folder, tmp_path):
+    wrong = tmp_path / "wrong"
+    shutil.copytree(folder, wrong)
+    ground = pd.read_csv(wrong / "ground_points.csv")
+    ground.loc[ground.role == "control", "X_m"] += [1000.0, 0.0, 0.0, 0.0, 0.0]
+    ground.to_csv(wrong / "ground_points.csv", index=False)
+    assert adjust(wrong, "--snoop", "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    left_out = {(r["point"], r["coordinate"]) for r in result["rejected_control"]}
+    by_ray = {r["point"] for r in result["rejected"]}
+    culprit = ground.point[ground.role == "control"].iloc[0]
+    assert (culprit, "X") in left_out or culprit in by_ray
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.08)
+    assert max(result["check"]["rmse_m"]) < 0.3
+
+
+def test_unknown_option_is_a_usage_error(folder):
+    with pytest.raises(SystemExit) as stop:
+        adjust(folder, "--model", "spline")
+    assert stop.value.code == 2

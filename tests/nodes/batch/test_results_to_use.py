@@ -1,0 +1,136 @@
+"""Results that other programs take: calibrated camera, orientation of every line, points, heights of a raster."""
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from test_adjust_command import AXES, write_block
+
+from triline.nodes.cli import main
+from triline.nodes.formats.geotiff import Heights, write_heights
+
+ERRORS = {"dc": 0.05, "k1": 3e-6, "xp_F": 0.012, "yp_B": -0.01, "sy_F": 2e-4, "th_B": 2e-4}
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("block") / "b"
+    simulated = write_block(folder, points=70, control=12, check=20, parameters=ERRORS)
+    return folder, simulated
+
+
+def adjusted(folder, out, *options):
+    assert main(["adjust", str(folder), "-o", str(out), "-q", *map(str, options)]) == 0
+    return json.loads((out / "result.json").read_text()), pd.read_csv(out / "points.csv")
+
+
+def test_calibrated_camera_gives_the_same_points_without_parameters(block, tmp_path):
+    folder, _ = block
+    with_parameters, points = adjusted(folder, tmp_path / "one", "--selfcal", "tls18", "--keep", "all")
+    again = tmp_path / "again"
+    shutil.copytree(folder, again)
+    for file in (tmp_path / "one").glob("camera*"):
+        shutil.copy(file, again / file.name)
+    without, same = adjusted(again, tmp_path / "two")
+    assert without["additional_parameters"] == {}
+    assert not (tmp_path / "two" / "camera.json").exists()  # nothing was calibrated
+    assert same[AXES].to_numpy() == pytest.approx(points[AXES].to_numpy(), abs=1e-3)
+    assert without["sigma0"] == pytest.approx(with_parameters["sigma0"], rel=1e-3)
+    # and without either, the block does not fit at all
+    bent, _ = adjusted(folder, tmp_path / "three")
+    assert bent["sigma0"] > 1.5 * without["sigma0"]
+
+
+def test_orientation_of_every_line_is_that_of_the_refined_trajectory(block, tmp_path):
+    folder, _ = block
+    adjusted(folder, tmp_path / "r", "--per-line")
+    lines = pd.read_csv(tmp_path / "r" / "orientation_lines.csv")
+    refined = pd.read_csv(tmp_path / "r" / "trajectory_refined.csv")
+    strips = pd.read_csv(folder / "strips.csv").set_index("strip")
+    for strip, own in lines.groupby("strip"):
+        assert (own.line.diff().dropna() == 1).all()
+        first, rate = strips.loc[strip, ["first_line_time_s", "line_rate_hz"]]
+        assert own.time_s.to_numpy() == pytest.approx(first + own.line / rate, abs=1e-8)
+        track = refined[refined.strip == strip]
+        inside = own[(own.time_s > track.time_s.min()) & (own.time_s < track.time_s.max())]
+        for name in ("X_m", "sigma_Z_m", "phi_deg"):
+            between = np.interp(inside.time_s, track.time_s, track[name])
+            assert inside[name].to_numpy() == pytest.approx(between, abs=2e-4), name
+
+
+def surface_with_houses(folder, path, rng):
+    """The ground that `write_block` takes, on which each tenth cell of 40 m carries 15 m more."""
+    x, y = np.meshgrid(np.arange(-2000, 2000, 10.0), np.arange(2000, -2000, -10.0))
+    z = 60 * np.sin(x / 400 + y / 700)
+    built = np.kron(rng.uniform(size=(100, 100)) < 0.1, np.ones((4, 4)))[: z.shape[0], : z.shape[1]]
+    crs = "EPSG:32632"
+    return Heights(crs, z + 15.0 * built, 5e5 + x[0, 0], 5.4e6 + y[0, 0], 10.0, -10.0, above_ellipsoid=True)
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory):
+    """A block without control, in UTM, and the raster of its ground with houses on it."""
+    folder = tmp_path_factory.mktemp("placed") / "b"
+    simulated = write_block(folder, points=120, control=0, check=40, seed=5)
+    for name, columns in (("trajectory.csv", AXES[:2]), ("ground_points.csv", AXES[:2])):
+        table = pd.read_csv(folder / name)
+        table[columns] += [5e5, 5.4e6]
+        table.to_csv(folder / name, index=False, float_format="%.9f")
+    text = (folder / "project.toml").read_text().replace('name = "simulated"', 'name = "s"\ncrs = "EPSG:32632"')
+    (folder / "project.toml").write_text(text)
+    rng = np.random.default_rng(2)
+    write_heights(folder.parent / "dem.tif", surface_with_houses(folder, folder.parent / "dem.tif", rng))
+    return folder, simulated
+
+
+def test_heights_of_a_raster_hold_the_block_in_spite_of_houses(placed, tmp_path, capsys):
+    folder, _ = placed
+    free, _ = adjusted(folder, tmp_path / "free")
+    held, points = adjusted(folder, tmp_path / "held", "--dem", folder.parent / "dem.tif", "--dem-sigma", 0.3)
+    assert held["check"]["sigma_m"][2] < 0.75 * free["check"]["sigma_m"][2]
+    assert held["check"]["rmse_m"][2] < 2.0 * held["check"]["sigma_m"][2]
+    assert abs(held["check"]["mean_m"][2]) < 0.1  # houses of 15 m on a tenth of the cells would lift it by 1.5 m
+    assert held["dem"]["n"] > 60 and 3 <= held["dem"]["half_weight_or_less"] < 30
+    assert held["control"]["n"] == 0 and set(points.role) == {"tie", "check"}
+    assert main(["adjust", str(folder), "--dem", str(folder.parent / "dem.tif"), "--dem-sigma", "0.3"]) == 0
+    assert "heights of the raster" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--dem", "flat.tif", "--dem-sigma", "1"], "does not say what its heights count from, wanted --dem-crs"),
+        (["--dem", "flat.tif"], "wanted both"),
+        (["--dem-crs", "ellipsoid"], "wanted --dem FILE with it"),
+        (["--dem", "flat.tif", "--dem-sigma", "0"], "--dem-sigma 0, wanted more than 0"),
+        (["--dem", "flat.tif", "--dem-sigma", "1", "--dem-crs", "EPSG:32632"], "says nothing of heights"),
+        (["--dem", "flat.tif", "--dem-sigma", "1", "--dem-crs", "metres"], "--dem-crs metres:"),
+        (["--dem", "flat.tif", "--dem-sigma", "1", "--dem-crs", "EPSG:5773"], "PROJ lacks the grid"),
+        (["--dem", "flat.tif", "--dem-sigma", "1", "--dem-crs", "ellipsoid"], "no height below any tie point"),
+        (["--per-line"], "--per-line needs a folder"),
+    ],
+)
+def test_heights_without_datum_or_sigma_are_refused_in_one_line(placed, tmp_path, capsys, monkeypatch, options, said):
+    folder, _ = placed
+    monkeypatch.chdir(tmp_path)
+    place = Heights("EPSG:32632", np.full((4, 4), 3.0), 5.2e5, 5.5e6, 10.0, -10.0)
+    write_heights(tmp_path / "flat.tif", place)
+    if "PROJ lacks" in said and not _lacks_egm96():
+        pytest.skip("PROJ has the geoid here")
+    assert main(["adjust", str(folder), "-q", *options]) == 1
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+
+
+def _lacks_egm96():
+    from triline.nodes.formats.projection import missing_grids
+
+    return bool(missing_grids("EPSG:32632+EPSG:5773"))
+
+
+def test_a_raster_of_ours_says_its_datum(placed):
+    with rasterio.open(placed[0].parent / "dem.tif") as source:
+        assert source.tags()["VERTICAL_DATUM"] == "ellipsoid"

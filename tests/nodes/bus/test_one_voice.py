@@ -1,0 +1,85 @@
+"""Second voices on a real bus: named, told where the operator looks, and decided by ``triline confirm``."""
+
+from __future__ import annotations
+
+import copy
+import threading
+
+import sample_messages as sample
+from bus_rig import free_port, triline, wait_for
+
+from triline.nodes.bus.live import BusRunner, in_thread
+from triline.nodes.bus.session import Bus
+from triline.nodes.monitor.monitor import Monitor
+from triline.nodes.node import Message, Node
+from triline.schemas.envelope import Envelope, RawMessage
+
+
+class Listening(Node):
+    inputs = ("configuration/camera", "sensor/attitude")
+    outputs = ("event/log",)
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.name = name
+        self.given: list[Message] = []
+
+    def step(self, message):
+        self.given.append(message)
+        return ()
+
+
+def test_two_nodes_of_one_name_are_told_and_no_longer_when_one_has_ended():
+    port, monitor = free_port(), Monitor()
+    with (
+        Bus(port=port, source="monitor") as bus,
+        in_thread(BusRunner(monitor, bus)),
+        Bus(port=port, source="adjuster") as one,
+        in_thread(BusRunner(Listening("adjuster"), one)),
+    ):
+        with Bus(port=port, source="adjuster") as two, in_thread(BusRunner(Listening("adjuster"), two)):
+            wait_for(monitor.overview.alarms, 10, "the alarm")
+            told = "2 nodes 'adjuster' run on platform demo: stop all but one of them"
+            assert monitor.overview.alarms() == [told] and told in monitor.overview.line()
+        wait_for(lambda: not monitor.overview.alarms(), 10, "the end of the alarm")
+
+
+def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
+    camera = sample.body("configuration/camera")
+    other = copy.deepcopy(camera)
+    other.lenses[0].focal_length_mm *= 1.05
+    node, port = Listening("navigator"), free_port()
+    stop = threading.Event()
+    with (
+        Bus(port=port, source="chain") as bus,
+        Bus(port=port, source="test") as sender,
+        in_thread(BusRunner(node, bus)),
+    ):
+        wait_for(lambda: "navigator" in sender.alive(), 10, "the node")
+
+        def fly() -> None:
+            i = 0
+            while not stop.wait(0.02):
+                i += 4
+                sender.publish(sample.message("sensor/attitude", i, "test"))
+
+        sender.publish(Message("configuration/camera", sample.EPOCH_NS, camera, "test"))
+        flight = threading.Thread(target=fly, daemon=True)
+        flight.start()
+        wait_for(lambda: len(node.given) > 10, 10, "attitudes")
+        envelope = Envelope(sample.EPOCH_NS, "intruder", 0, 5)
+        sender.publish_raw(RawMessage("configuration/camera", envelope, b""))
+        wait_for(lambda: node.counters["malformed"], 10, "the empty camera")
+        assert "empty, wanted a triline.Camera" in node.last_problem
+        sender.publish(Message("configuration/camera", sample.EPOCH_NS + 10**9, other, "test"))
+        wait_for(lambda: "is another one than the flight began with" in node.alarm, 10, "the alarm")
+        done = triline("confirm", "configuration/camera", "--by", "Ann", "--port", port)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "configuration/camera of 'test' is used from now on (Ann)\n"
+        stop.set()
+        flight.join()
+    cameras = [message.body for message in node.given if message.topic == "configuration/camera"]
+    assert cameras == [camera, other] and not node.alarm
+    assert triline("confirm", "sensor/nothing", "--source", "x").returncode == 1
+    refused = triline("confirm", "observation/tie")
+    assert refused.returncode == 1 and "anybody may speak on it" in refused.stderr

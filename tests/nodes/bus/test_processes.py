@@ -1,0 +1,40 @@
+"""Nodes as processes: none outlives the program that started it, and what it wrote is whole."""
+
+import subprocess
+import sys
+import time
+
+from bus_rig import free_port
+
+from triline.nodes.recording.reader import RecordingReader
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from triline.nodes.bus.processes import NodeGroup
+with NodeGroup(Path(sys.argv[1]), "orphan", int(sys.argv[2])) as group:
+    node = group.start("recorder", "-o", sys.argv[3])
+    print(node.process.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_nodes_end_cleanly_when_their_parent_is_killed(tmp_path):
+    recording = tmp_path / "flight.mcap"
+    command = [sys.executable, "-c", PARENT, str(tmp_path / "log"), str(free_port()), str(recording)]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert parent.stdout is not None and parent.stdout.readline().strip().isdigit()
+        log = tmp_path / "log" / "recorder.log"
+        until = time.monotonic() + 20
+        while "recording to" not in log.read_text() and time.monotonic() < until:
+            time.sleep(0.1)
+        time.sleep(1)
+    finally:
+        parent.kill()
+        parent.wait()
+    until = time.monotonic() + 15
+    while "messages in" not in log.read_text() and time.monotonic() < until:
+        time.sleep(0.2)
+    assert "messages in" in log.read_text(), "the recorder did not end by itself"
+    assert RecordingReader(recording).complete

@@ -1,0 +1,309 @@
+"""`triline adjust` of a block of satellite scenes: what it writes, other models, bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
+
+from triline.nodes.cli import main
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.rpc_files import write_rpb
+from triline.nodes.formats.scene_block import write_scene_block
+from triline.solver.location.rpc_fit import fit_to_model
+from triline.solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two lenses of SPOT-5 HRS, 40 points, some gross errors."""
+    folder = tmp_path_factory.mktemp("scenes") / "pair"
+    arguments = ["--satellite", "spot5-hrs", "--points", "40", "--control", "9", "--check", "15"]
+    assert main(["simulate", "-q", "-o", str(folder), *arguments, "--outliers", "0.15", "--seed", "3"]) == 0
+    return folder
+
+
+@pytest.fixture
+def block(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "pair")
+
+
+def rows(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def columns(path, *names):
+    return np.array([[float(row[name]) for name in names] for row in rows(path)])
+
+
+def test_result_and_tables(block, tmp_path, capsys):
+    out = tmp_path / "result"
+    assert main(["adjust", str(block), "--snoop", "-o", str(out), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result == json.loads((out / "result.json").read_text())
+    assert set(result["strips"]) == {"scene/F", "scene/B"}
+    for strip in result["strips"].values():
+        assert all(len(strip[key]) == 3 for key in ("offset_m", "shift_deg", "drift_deg", "drift_deg_sigma"))
+    assert result["converged"] and result["chi_square_test"]["passed"] and result["rejected"]
+    check, direct = result["check"], result["direct_georeferencing"]
+    assert check["n"] == 15 and direct["n"] == 15
+    assert np.linalg.norm(direct["rmse_m"]) > 10 * np.linalg.norm(check["rmse_m"])
+    assert np.all(np.array(check["rmse_m"]) < 2.0 * np.array(check["sigma_m"]))
+    # points against the truth, in their sigmas
+    points = {row["point"]: row for row in rows(out / "points.csv")}
+    truth = {row["point"]: row for row in rows(block / "truth.csv")}
+    assert set(points) == set(truth)
+    scale = np.array([111_000.0 * np.cos(np.radians(36.0)), 111_000.0, 1.0])
+    off = [
+        np.array([(float(p[k]) - float(truth[id][k])) for k in ("X_m", "Y_m", "Z_m")])
+        * scale
+        / np.array([float(p[f"sigma_{k}"]) for k in ("X_m", "Y_m", "Z_m")])
+        for id, p in points.items()
+        if p["role"] == "tie" and p["rays"] == "2"
+    ]
+    assert np.sqrt(np.mean(np.square(off))) < 1.6
+    residuals = rows(out / "residuals.csv")
+    assert sum(int(row["rejected"]) for row in residuals) == len(result["rejected"])
+    assert {row["ccd"] for row in residuals} == {"F", "B"}
+
+
+def test_refined_orientation_and_rpc_locate_the_adjusted_points(block, tmp_path):
+    out = tmp_path / "result"
+    assert main(["adjust", str(block), "--snoop", "-q", "-o", str(out)]) == 0
+    poses = rows(out / "trajectory_refined.csv")
+    assert poses[0]["ccd"] == "F" and poses[-1]["line"] == "11999" and poses[0]["time_utc"].startswith("2006-06-17T")
+    radius = np.linalg.norm(columns(out / "trajectory_refined.csv", "X_m", "Y_m", "Z_m"), axis=1)
+    np.testing.assert_allclose(radius, 6_378_137.0 + 832_000.0, atol=100.0)
+    sigma = columns(out / "trajectory_refined.csv", "sigma_along_m", "sigma_roll_deg")
+    assert (sigma > 0).all() and (sigma[:, 0] < 6.0).all()
+    # the polynomials take the adjusted points to their pixels
+    points = {row["point"]: row for row in rows(out / "points.csv")}
+    for ccd in "FB":
+        rpc = read_scene(out / "rpc" / f"scene_{ccd}.RPB").rpc
+        mine = [r for r in rows(out / "residuals.csv") if r["ccd"] == ccd and points[r["point"]]["X_m"]]
+        lon, lat, h = np.array([[float(points[r["point"]][k]) for k in ("X_m", "Y_m", "Z_m")] for r in mine]).T
+        pixel = rpc.inverse(np.radians(lat), np.radians(lon), h)
+        measured, v = (
+            np.array([[float(r[k]) for k in keys] for r in mine])
+            for keys in (("line", "sample"), ("v_line_px", "v_sample_px"))
+        )
+        np.testing.assert_allclose(pixel, measured - v, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--model", "ppm", "--segments", "2"],
+        ["--model", "dgr", "--then", "lim", "--fixes", "4"],
+        ["--selfcal", "lens"],
+        ["--sets", "scene", "--selfcal", "prism30", "--free"],
+    ],
+)
+def test_models_and_sets(options, block, capsys):
+    assert main(["adjust", str(block), "--snoop", *options]) == 0
+    printed = capsys.readouterr().out
+    assert ", converged, " in printed and float(printed.split("sigma0 ")[1].split()[0]) < 1.5
+    if "--selfcal" in options:
+        assert "additional parameters: " in printed and ("sy_F" in printed or "s_F" in printed)
+    assert ("2 correction sets" in printed) == ("scene" not in options)
+
+
+def test_rpc_and_dlt_beside_rigorous(block, capsys):
+    scene = read_scene(block / "spot5-hrs")
+    for ccd in "FB":
+        write_rpb(block / f"{ccd}.RPB", fit_to_model(scene.sensors[ccd], -500.0, 2500.0).rpc)
+    image_points = block / "image_points.csv"
+    text = image_points.read_text()
+    image_points.write_text(text.replace(",scene,F,", ",forward,,").replace(",scene,B,", ",backward,,"))
+    project = block / "project.toml"
+    head = project.read_text().split("[scenes")[0]
+    project.write_text(
+        head
+        + '[rpc]\ncorrection = "affine"\nshift_sigma_px = 100\n'
+        + '[scenes.forward]\nmetadata = "F.RPB"\nmodel = "dlt"\n[scenes.backward]\nmetadata = "B.RPB"\n'
+    )
+    assert main(["adjust", str(block), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["images"] == {"forward": "dlt", "backward": "rpc"}
+    assert len(result["strips"]["forward"]["coefficients"]) == 11
+    assert result["strips"]["backward"]["coefficients"]["line shift"]["sigma"] > 0
+    assert not result["undetermined"] and result["converged"]
+
+
+def put(text, *changes):
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    return text
+
+
+BAD = {
+    "no scenes": ("project.toml", lambda t: t.split("[scenes")[0] + "[scenes]\n", r"scenes: none, wanted"),
+    "metadata missing": ("project.toml", lambda t: put(t, ('metadata = "spot5-hrs"', "")), r"scenes.scene.metadata"),
+    "no such metadata": ("project.toml", lambda t: put(t, ('"spot5-hrs"', '"HRS.XML"')), r"HRS.XML: no such file"),
+    "unknown model": ("project.toml", lambda t: t + 'model = "magic"\n', r"model: .*wanted one of rigorous, rpc"),
+    "no polynomials": ("project.toml", lambda t: t + 'model = "rpc"\n', r"has no rational polynomials"),
+    "crs": ("project.toml", lambda t: put(t, ("EPSG:4979", "EPSG:99999999")), r"project.crs: PROJ does not know"),
+    "sigma": ("project.toml", lambda t: t + "[trajectory]\noffset_sigma_m = [1, 2]\n", r"offset_sigma_m: wanted three"),
+    "bad correction": ("project.toml", lambda t: t + '[rpc]\ncorrection = "cubic"\n', r"correction: .*affine or shift"),
+    "role": ("ground_points.csv", lambda t: put(t, ("control", "anchor")), r"ground_points.csv:2: role: "),
+    "sigma of control": ("ground_points.csv", lambda t: put(t, (",0.5,0.5,0.5,", ",0.5,,0.5,")), r"sigma_Y_m: missing"),
+    "latitude": ("ground_points.csv", lambda t: put(t, (",35.", ",95.")), r"ground_points.csv:\d+: X_m: .* outside"),
+    "number": ("image_points.csv", lambda t: put(t, ("P0,scene,F,", "P0,scene,F,x")), r"image_points.csv:2: line: "),
+    "no usable row": ("image_points.csv", lambda t: t.replace(",scene,", ",other,"), r"no row that can be used"),
+    "gap of the attitude": (
+        "spot5-hrs/attitude.csv",
+        lambda t: "\n".join(r for k, r in enumerate(t.splitlines()) if not 100 < k < 160) + "\n",
+        r"attitude.csv: time: gap from",
+    ),
+    "no ephemeris": ("spot5-hrs/ephemeris.csv", None, r"ephemeris.csv: no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_gets_one_line(name, block, capsys):
+    file, change, match = BAD[name]
+    path = block / file
+    if change is None:
+        path.unlink()
+    else:
+        path.write_text(change(path.read_text()))
+    assert main(["adjust", str(block)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("triline adjust: ") and "fault in triline" not in error
+    assert re.search(match, error), error
+
+
+def test_rays_that_miss_the_earth(block, capsys):
+    with open(block / "spot5-hrs" / "scene.toml", "a") as file:
+        file.write("[mounting]\nboresight_deg = [0.0, 90.0, 0.0]\n")
+    (block / "ground_points.csv").unlink()
+    assert main(["adjust", str(block)]) == 1
+    error = capsys.readouterr().err
+    assert "no ray reaches the ground, and no point is known" in error and error.count("\n") == 1
+
+
+def test_polynomials_with_a_zero_denominator(block, capsys):
+    rpc = fit_to_model(read_scene(block / "spot5-hrs").sensors["F"], -500.0, 2500.0).rpc
+    coefficients = rpc.to_image.coefficients.copy()
+    coefficients[1, 1] = 5.0
+    broken = replace(rpc, to_image=replace(rpc.to_image, coefficients=coefficients))
+    write_rpb(block / "F.RPB", broken)
+    project = block / "project.toml"
+    project.write_text(project.read_text().replace('"spot5-hrs"', '"F.RPB"'))
+    assert main(["adjust", str(block)]) == 1
+    error = capsys.readouterr().err
+    assert "F.RPB" in error and "denominator" in error and error.count("\n") == 1
+
+
+def test_dimap_and_isd_scenes_in_one_block(tmp_path, capsys):
+    """Pleiades-like forward (DIMAP 2), ISD back, SPOT-5-like down (DIMAP 1): located, measured with noise, adjusted."""
+    looks = {"fore": (18.0, write_dimap2), "aft": (-18.0, write_isd), "down": (0.0, write_dimap1)}
+    names = {"fore": "a.xml", "aft": "b.json", "down": "c.dim"}
+    folder = tmp_path / "block"
+    folder.mkdir()
+    sensors = {}
+    for name, (pitch, write) in looks.items():
+        # the orbit goes on while the look comes round, so that all see the same ground
+        truth = Truth(lines=8000, samples=3000, gsd=4e-6, tilt_deg=(0.0, pitch, 0.0), phase_deg=40.0 - 0.1133 * pitch)
+        sensors[name] = read_scene(write(folder / names[name], truth)).sensor
+    rng = np.random.default_rng(1)
+    middle = sensors["down"]
+    P = middle.ground(rng.uniform(0, 7999, 400), rng.uniform(0, 2999, 400), rng.uniform(0, 1500, 400))
+    pixels = [sensor.ground_to_pixel(P) + rng.normal(0, 0.3, (400, 2)) for sensor in sensors.values()]
+    seen = np.flatnonzero(np.all([np.isfinite(p[:, 0]) & (p > 0).all(axis=1) for p in pixels], axis=0))[:40]
+    assert len(seen) == 40
+    rays = ImagePoints(
+        np.repeat(np.arange(3), 40), np.tile(np.arange(40), 3), *np.concatenate([p[seen] for p in pixels]).T,
+        np.full(120, 0.3),
+    )  # fmt: skip
+    covariance = np.tile(0.04 * np.eye(3), (40, 1, 1))
+    known = KnownGround(np.arange(40), P[seen], covariance, ("control",) * 6 + ("check",) * 34)
+    named = tuple(SimpleNamespace(name=name) for name in looks)
+    block = SceneBlock(named, tuple(f"P{k}" for k in range(40)), rays, known)
+    write_scene_block(folder, "mixed makers", {name: {"metadata": names[name]} for name in looks}, block)
+    assert main(["adjust", str(folder), "--selfcal", "lens", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert set(result["strips"]) == set(looks) and result["converged"]
+    assert 0.7 < result["sigma0"] < 1.15
+    assert (np.array(result["check"]["rmse_m"]) < 2.0 * np.array(result["check"]["sigma_m"])).all()
+    assert len(result["additional_parameters"]) == 27
+
+
+def test_new_scenes(made, tmp_path, capsys):
+    folder = tmp_path / "mine"
+    assert main(["new", "scenes", str(folder), str(made / "spot5-hrs")]) == 0
+    assert main(["adjust", str(folder)]) == 1
+    assert "image_points.csv: no rows below the header" in capsys.readouterr().err
+    for arguments, match in (
+        (["scenes", str(folder), str(made / "spot5-hrs")], "project.toml: is there already"),
+        (["scenes", str(tmp_path / "other")], "no metadata: wanted those of the scenes"),
+        (["scenes", str(tmp_path / "other"), str(made / "truth.csv")], "truth.csv: of no known kind"),
+        (["flight", str(tmp_path / "other"), str(made / "spot5-hrs")], "metadata go with `triline new scenes`"),
+    ):
+        assert main(["new", *arguments]) == 1
+        assert match in capsys.readouterr().err
+
+
+def test_import_names_adjust(made, tmp_path, capsys):
+    assert main(["import", str(made), "-o", str(tmp_path / "a.mcap")]) == 1
+    assert "a block of satellite scenes, which `triline adjust` takes" in capsys.readouterr().err
+
+
+def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys):
+    path = block / "image_points.csv"
+    lines = path.read_text().splitlines()
+    lines += [
+        "Q1,scene,N,100,100,0.3",
+        "Q2,elsewhere,F,100,100,0.3",
+        "Q3,scene,F,-70,100,0.3",
+        "Q4,scene,F,100,99999,0.3",
+    ]
+    lines += [lines[1], "Q5,scene,F,200,200,0.3"]
+    path.write_text("\n".join([*lines, ""]))
+    assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+    notes = "\n".join(json.loads(capsys.readouterr().out)["notes"])
+    assert "ccd: 'N' is none of scene scene, which has F, B; the ray cannot be used" in notes
+    assert "strip: 'elsewhere' is not in project.toml" in notes
+    assert "line: -70, sample 100 lies outside image scene/F of 12000 lines and 12000 samples" in notes
+    assert "sample 99999 lies outside" in notes
+    assert "1 rows repeat a measurement" in notes
+    assert "points are not determined by their rays and were left out" in notes
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--selfcal", "tls18"], "--selfcal tls18: does not go with satellite scenes, wanted none, lens, prism30"),
+        (["--model", "wander"], "model wander: does not go with satellite scenes, wanted dgr, ppm, lim"),
+        (["--segments", "3"], "--segments is for the model ppm; asked for is dgr"),
+        (["--model", "ppm", "--segments", "500"], "--segments 500, wanted 1 to 60"),
+        (["--reweight"], "--reweight does not go with a block of satellite scenes"),
+    ],
+)
+def test_options_that_do_not_go(options, match, made, capsys):
+    assert main(["adjust", str(made), *options]) == 1
+    assert match in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--satellite", "sputnik"], "satellite 'sputnik', wanted one of alos-prism"),
+        (["--satellite", "moms-02", "--place", "60", "0"], "wanted one that an orbit of 28.5 deg reaches"),
+        (["--satellite", "spot5-hrs", "--points", "5"], "wanted no more of these than there are points"),
+        (["--satellite", "spot5-hrs", "--strips", "2"], "--strips does not go with --satellite"),
+        (["--points", "5"], "--place and --points go with --satellite"),
+    ],
+)
+def test_simulations_that_do_not_go(options, match, tmp_path, capsys):
+    assert main(["simulate", "-o", str(tmp_path / "x"), *options]) == 1
+    assert match in capsys.readouterr().err

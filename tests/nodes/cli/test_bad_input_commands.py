@@ -1,0 +1,217 @@
+"""Bad input as a user meets it at the commands; the table of who tests what stands in `test_bad_input`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_rig import free_port, simulated_flight
+from recording_file import chunk_spans
+from small_block import simulated_block
+
+from triline.nodes.cli import COMMANDS, main
+from triline.nodes.formats.block_writer import write_block
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
+
+# ---- weak networks and what the files say of them, as a user meets them
+
+
+def run_main(capsys, *arguments) -> tuple[int, str, str]:
+    """Exit code, standard output, standard error of a command."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as exit_:
+        code = int(exit_.code or 0)
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err and "fault in triline" not in err, err
+    return code, out, err
+
+
+def _keep_rows(path: Path, keep: Callable[[list[str]], bool]) -> None:
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *(row for row in rows if keep(row.split(",")))]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "control", "options"),
+    [
+        ("one point", 1, True, ()),
+        ("two points", 2, False, ("--snoop",)),
+        ("three points, all unknowns of the camera", 3, True, ("--selfcal", "prism30", "--free", "--snoop")),
+        ("no control", 12, False, ("--selfcal", "tls18", "--free", "--then", "lim", "--variance-components")),
+        ("no control, many fixes", 12, False, ("--model", "lim", "--fixes", "9")),
+        ("no control, many segments", 12, False, ("--model", "ppm", "--segments", "9", "--robust", "huber")),
+        ("no rays", 0, True, ()),
+    ],
+)
+def test_weak_blocks_get_a_result_that_names_what_is_open_or_one_line(tmp_path, capsys, name, points, control, options):
+    write_block(tmp_path, simulated_block())
+    chosen = {f"P{i}" for i in range(points)}
+    _keep_rows(tmp_path / "image_points.csv", lambda row: row[0] in chosen)
+    if not control:
+        _keep_rows(tmp_path / "ground_points.csv", lambda row: row[-1] == "check")
+    code, out, err = run_main(capsys, "adjust", tmp_path, "--json", *options)
+    if code == 1:
+        assert out == "" and len(err.splitlines()) == 1 and err.startswith("triline adjust: "), (name, err)
+        assert points == 0
+        return
+    result = json.loads(out)  # and nothing else on standard output
+    assert err == "" and result["redundancy"] == result["n_observations"] - result["n_unknowns"]
+    assert np.isfinite(result["sigma0"]) or result["redundancy"] <= 0
+    assert result["undetermined"] or any("a-priori" in note for note in result["notes"]), name
+    for parameter in result["additional_parameters"].values():
+        assert parameter["status"] in ("estimated", "eliminated")
+        assert parameter["reason"] or parameter["status"] == "estimated"
+
+
+@pytest.mark.parametrize("options", [("--control", 0, "--check", 0), ("--ties", 0), ("--ties", 0, "--control", 0)])
+def test_a_flight_without_control_or_ties_is_flown_to_the_end(tmp_path, capsys, options):
+    flight, out_path = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    code, _, err = run_main(capsys, "simulate", "-o", flight, "--seconds", 4, "--lead-in", 3, "-q", *options)
+    assert (code, err) == (0, "")
+    code, out, err = run_main(capsys, "process", flight, "-o", out_path, "--json")
+    assert (code, err) == (0, "")
+    result = json.loads(out)
+    assert result["outputs"]["orientation/final"] > 70 and "failed" not in result["counters"]["adjuster"]
+    final = [message.body for message in RecordingReader(out_path).messages(["orientation/final"])]
+    sigma = np.sqrt([body.covariance[::7] for body in final])
+    assert np.isfinite(sigma).all() and sigma.min() > 0
+    assert sigma[:, :3].max() > 0.3  # what nothing has measured keeps its a-priori sigma
+
+
+# ---- recordings
+
+
+def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, capsys):
+    """Configuration stands in the first chunk and in the last: without both there is nothing to compute."""
+    data = bytearray(simulated_flight(12).read_bytes())
+    first, *_, last = chunk_spans(simulated_flight(12))
+    data[sum(first) // 2] ^= 1
+    data[sum(last) // 2] ^= 1
+    flipped, cut, out = tmp_path / "flipped.mcap", tmp_path / "cut.mcap", tmp_path / "out.mcap"
+    flipped.write_bytes(data)
+    cut.write_bytes(data[: first[1] - 10])
+    code, text, err = run_main(capsys, "process", flipped, "-o", out)
+    assert code == 1 and text == "" and "nothing came out: navigator waiting for configuration/project" in err
+    code, text, err = run_main(capsys, "process", cut, "-o", out)
+    assert code == 1 and text == "" and "no message is left of it (the file ends inside a record" in err
+    assert len(err.splitlines()) == 1 and not out.exists() and not list(tmp_path.glob("*.part"))
+    code, text, err = run_main(capsys, "info", cut)
+    assert code == 0 and "0 messages" in text and "damaged: the file ends inside a record" in text
+    code, text, err = run_main(capsys, "recover", cut, "-o", out)
+    assert code == 1 and "nothing in it that could be recovered" in err and not out.exists()
+
+
+def test_process_tells_what_it_skipped(tmp_path, capsys):
+    data = bytearray(simulated_flight(12).read_bytes())
+    last = chunk_spans(simulated_flight(12))[-1]
+    data[sum(last) // 2] ^= 1
+    path, out = tmp_path / "flipped.mcap", tmp_path / "out.mcap"
+    path.write_bytes(data)
+    code, text, err = run_main(capsys, "process", path, "-o", out, "--json")
+    result = json.loads(text)
+    assert code == 0 and err == "" and result["lost_bytes"] == last[1] - last[0]
+    assert len(result["damage"]) == 1 and "a chunk with a wrong checksum" in result["damage"][0]
+    code, _, err = run_main(capsys, "process", path, "-o", out, "-q")
+    assert code == 0 and "skipped 1 damaged place: a chunk" in err and len(err.splitlines()) == 1
+
+
+# ---- commands
+
+
+def test_no_command_takes_its_input_for_its_output_or_a_device_for_a_file(tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(simulated_flight(12).read_bytes())
+    before = path.read_bytes()
+    for arguments in (
+        ("process", path, "-o", path),
+        ("recover", path, "-o", path),
+        ("analyze", path, "-o", path),
+        ("view", path, "--rrd", path),
+        ("export", path, "--topic", "sensor/gnss", "--csv", path),
+        ("import", path, "-o", path),
+        ("process", path, "-o", os.devnull),
+        ("recover", path, "-o", os.devnull),
+        ("export", path, "--topic", "sensor/gnss", "--csv", os.devnull),
+        ("simulate", "-o", os.devnull, "--seconds", 2),
+        ("simulate", "-o", tmp_path, "--seconds", 2),
+        ("node", "recorder", "-o", tmp_path),
+    ):
+        code, out, err = run_main(capsys, *arguments)
+        assert code == 1 and out == "" and len(err.splitlines()) == 1, (arguments, err)
+        assert path.read_bytes() == before and not Path(os.devnull).is_file()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_an_example_and_the_common_options(command, capsys):
+    code, out, err = run_main(capsys, command, "--help")
+    assert (code, err) == (0, "") and f"example:\n  triline {command}" in out
+    assert all(option in out for option in ("--json", "--quiet", "--verbose"))
+    code, out, err = run_main(capsys, command, "--wings")
+    assert code == 2 and out == "" and err.splitlines()[-1].startswith("triline")
+
+
+def test_what_a_command_cannot_help_is_one_line(tmp_path, capsys, monkeypatch):
+    """A full disk, no memory, a fault of our own: one line, exit code 1, and what was begun is taken away."""
+    import triline.nodes.cli.simulate as module
+
+    for error, text in (
+        (OSError(28, "No space left on device"), "triline simulate: no space left on device"),
+        (MemoryError("Unable to allocate 2 TiB"), "triline simulate: not enough memory: Unable to allocate 2 TiB"),
+        (ZeroDivisionError("two\nlines"), "triline simulate: fault in triline"),
+    ):
+
+        class Failing(RecordingWriter):
+            def write(self, *arguments, error=error, **options):
+                raise error
+
+        monkeypatch.setattr(module, "RecordingWriter", Failing)
+        code = main(["simulate", "-o", str(tmp_path / "a.mcap"), "--seconds", "2"])
+        out, err = capsys.readouterr()
+        assert code == 1 and out == "" and len(err.splitlines()) == 1 and err.startswith(text)
+        assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("node", "setting", "text"),
+    [
+        ("player", "rate=abc", "rate is 'abc', wanted a number of at least 0"),
+        ("player", "rate=-1", "rate is -1, wanted a number of at least 0"),
+        ("player", "input=3", "the player needs a recording"),
+        ("adjuster", "snoop='no'", "snoop is 'no', wanted true or false"),
+        ("adjuster", "update_s=true", "update_s is True, wanted a number"),
+        ("adjuster", "model=3", "model is 3, wanted a text"),
+        ("recorder", "rotate_mb=abc", "rotate_mb is 'abc', wanted a number"),
+    ],
+)
+def test_settings_of_the_wrong_kind_are_refused(tmp_path, capsys, node, setting, text):
+    settings = ["--set", setting] if "input" in setting else ["--set", "input=none.mcap", "--set", setting]
+    settings = settings if node == "player" else ["--set", setting]
+    code, _, err = run_main(capsys, "node", node, *settings, "--port", free_port())
+    assert code == 1 and text in err and len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("times", [("--from", 20, "--to", 10), ("--from", 1000), ("--to", "2001-01-01", "--loop")])
+def test_a_replay_of_nothing_is_refused(capsys, times):
+    code, out, err = run_main(capsys, "replay", simulated_flight(12), "-q", "--port", free_port(), *times)
+    assert code == 1 and out == "" and len(err.splitlines()) == 1
+    assert "nothing but configuration in the time asked for" in err
+
+
+def test_coordinates_outside_the_crs_are_named_with_their_place(tmp_path, capsys):
+    write_block(tmp_path, simulated_block())
+    (tmp_path / "project.toml").write_text('[project]\ncrs = "EPSG:4326"\n')  # metres taken for degrees
+    code, out, err = run_main(capsys, "adjust", tmp_path)
+    assert code == 1 and out == "" and len(err.splitlines()) == 1
+    assert "trajectory.csv:2: " in err and "outside the area of 'EPSG:4326'" in err

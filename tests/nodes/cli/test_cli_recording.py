@@ -1,0 +1,389 @@
+"""The commands that read and write recordings: what they say, and with which exit code."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import socket
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sample_messages as sample
+from bus_rig import Rig, simulated_flight, wait_for
+from bus_rig import triline as command
+from recording_file import write_recording
+
+import triline
+from triline.nodes.bus.session import Bus
+from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.node import Message, Node
+from triline.nodes.player.player import iso, play, time_argument
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.runner import active_nodes, process
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.step_driver import StepDriver
+from triline.schemas import codec
+from triline.schemas import messages as m
+from triline.schemas.envelope import Envelope, RawMessage
+
+
+def run(capsys, *arguments):
+    """Exit code, standard output, standard error."""
+    try:
+        code = main([str(a) for a in arguments])
+    except SystemExit as exit_:
+        code = exit_.code
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    return write_recording(tmp_path_factory.mktemp("cli") / "flight.mcap", sample.flight(3.0, lines=True))
+
+
+# ---- info, check, recover
+
+
+def test_info(capsys, flight):
+    code, out, _ = run(capsys, "info", flight)
+    assert code == 0
+    for text in ("project test, crs local", "camera test, 62.7 mm; lines F (2 px)", "strip S1: from 2026-09-21T"):
+        assert text in out
+    code, out, _ = run(capsys, "info", flight, "--json")
+    summary = json.loads(out)
+    rows = {row["topic"]: row for row in summary["topics"]}
+    assert rows["sensor/attitude"]["messages"] == 600 and rows["sensor/attitude"]["rate_hz"] == pytest.approx(200)
+    assert rows["sensor/gnss"]["rate_hz"] == pytest.approx(5)
+    assert rows["sensor/attitude"]["sources"] == ["test"]
+    assert summary["damage"] == [] and summary["duration_s"] == pytest.approx(2.995)
+
+
+def test_check(capsys, flight, tmp_path):
+    assert run(capsys, "check", flight)[0] == 0
+    data = flight.read_bytes()
+    broken = bytearray(data)
+    broken[len(data) // 2] ^= 4
+    cases = {
+        "cut.mcap": (data[: len(data) * 2 // 3], "the file ends inside a record"),
+        "flipped.mcap": (bytes(broken), "a chunk with a wrong checksum"),
+        "foreign.mcap": (b"GIF89a" + bytes(50), "not an MCAP recording"),
+        "empty.mcap": (b"", "empty"),
+    }
+    for name, (content, text) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        code, out, err = run(capsys, "check", tmp_path / name)
+        assert (code, out) == (1, "")
+        assert len(err.splitlines()) == 1 and text in err and name in err, err
+    code, _, err = run(capsys, "check", tmp_path / "none.mcap")
+    assert code == 1 and err == f"triline check: {tmp_path / 'none.mcap'}: no such file or folder\n"
+    code, out, _ = run(capsys, "check", tmp_path / "cut.mcap", "--json")
+    assert code == 1 and json.loads(out)["whole"] is False
+
+
+def test_check_names_gaps(capsys, tmp_path):
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for i in (0, 1, 5):
+            body = sample.body("sensor/gnss", i)
+            writer.write(Message("sensor/gnss", sample.EPOCH_NS + i, body, "test", i))
+    code, _, err = run(capsys, "check", tmp_path / "a.mcap")
+    assert code == 1 and "sensor/gnss: 3 messages missing by their numbers" in err
+
+
+def test_recover(capsys, flight, tmp_path):
+    path, out_path = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
+    write_recording(tmp_path / "small.mcap", sample.flight(3.0, lines=True), chunk_size=8192)
+    data = (tmp_path / "small.mcap").read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    code, out, _ = run(capsys, "recover", path, "-o", out_path)
+    assert code == 0 and "whole chunks" in out and "the file ends inside a record" in out
+    assert run(capsys, "check", out_path)[0] == 0
+    kept, before = RecordingReader(out_path), RecordingReader(path)
+    assert len(kept.index) == len(before.index) > 100
+    np.testing.assert_array_equal(kept.index.stamp_ns, before.index.stamp_ns)
+    np.testing.assert_array_equal(kept.index.sequence, before.index.sequence)
+    code, _, err = run(capsys, "recover", path, "-o", path)
+    assert code == 1 and "would overwrite" in err
+    (tmp_path / "junk").write_bytes(b"junk" * 100)
+    code, _, err = run(capsys, "recover", tmp_path / "junk", "-o", tmp_path / "x.mcap")
+    assert code == 1 and "nothing in it that could be recovered" in err
+    assert not (tmp_path / "x.mcap").exists()
+
+
+# ---- process
+
+
+def test_process_twice_gives_the_same_bytes(tmp_path):
+    one, two = tmp_path / "1.mcap", tmp_path / "2.mcap"
+    for path in (one, two):
+        done = command("process", simulated_flight(), "-o", path, "--json")
+        assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["nodes"] == ["navigator", "adjuster"] and result["outputs"]["orientation/final"] > 20
+    assert result["dropped"] == {} and result["counters"] == {"navigator": {}, "adjuster": {}}
+    assert one.read_bytes() == two.read_bytes()
+    # what was made is made anew, not taken over
+    three = tmp_path / "3.mcap"
+    done = command("process", one, "-o", three, "--json")
+    assert json.loads(done.stdout)["replaced"]["orientation/final"] == result["outputs"]["orientation/final"]
+    assert three.read_bytes() == one.read_bytes()
+
+
+def test_process_refuses_in_one_line(capsys, flight, tmp_path):
+    out = tmp_path / "out.mcap"
+    ros = tmp_path / "ros.mcap"
+    from mcap.writer import Writer
+
+    with open(ros, "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flight.read_bytes()[:-100])
+    configured = write_recording(tmp_path / "configured.mcap", [sample.message("configuration/camera")])
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[navigator]\nwings = 2\n")
+    for arguments, text in (
+        ((flight, "-o", flight), "would overwrite the recording"),
+        ((ros, "-o", out), "no topic of triline in it"),
+        ((cut, "-o", out, "--strict"), "damaged: "),
+        ((configured, "-o", out), "nothing to process for navigator,adjuster: it holds configuration/camera"),
+        ((flight, "-o", out, "--nodes", "pilot"), "no node 'pilot'"),
+        ((flight, "-o", out, "--config", bad), "configuration [navigator]: wings is not known"),
+        ((flight, "-o", tmp_path / "no" / "out.mcap"), "no such file or directory"),
+    ):
+        code, _, err = run(capsys, "process", *arguments)
+        assert code == 1 and len(err.splitlines()) == 1 and text in err, err
+    assert not out.exists() and not list(tmp_path.glob("*.part"))
+
+
+class Echo(Node):
+    name, inputs, outputs = "echo", ("sensor/gnss",), ("event/log",)
+
+    def step(self, message: Message):
+        return [Message("event/log", message.stamp_ns - 10**9, m.Log(message=str(message.sequence)))]
+
+
+def test_process_skips_damage_and_bad_messages_with_a_count(tmp_path):
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for i in range(5):
+            writer.write(sample.message("sensor/gnss", i))
+        for sequence, data in ((5, b"\xff\xff"), (2, codec.encode(sample.body("sensor/gnss")))):
+            envelope = Envelope(sample.EPOCH_NS + 10**9, "test", sequence)
+            writer.write_raw(RawMessage("sensor/gnss", envelope, data, 1))
+    out: list[RawMessage] = []
+    summary = process(RecordingReader(tmp_path / "a.mcap"), [Echo()], out.append)
+    assert summary.dropped == {"malformed": 1, "duplicate": 1}
+    logs = [raw for raw in out if raw.topic == "event/log"]
+    assert [codec.decode(raw.topic, raw.data).message for raw in logs] == list("01234")
+    # an output is not known before its cause
+    gnss = [raw for raw in out if raw.topic == "sensor/gnss"]
+    assert [raw.envelope.stamp_ns for raw in logs] == [raw.envelope.stamp_ns for raw in gnss]
+    assert [raw.envelope.stamp_ns for raw in out] == sorted(raw.envelope.stamp_ns for raw in out)
+
+
+def test_nodes_may_take_and_give_image_lines(tmp_path):
+    class Negative(Node):
+        name, inputs, outputs = "negative", ("sensor/lines/*",), ("sensor/lines/*",)
+
+        def step(self, message: Message):
+            block = message.body
+            return [Message("sensor/lines/X", message.stamp_ns, replace(block, pixels=4095 - block.pixels, ccd="X"))]
+
+    path = write_recording(tmp_path / "a.mcap", [sample.message("sensor/lines/F", i) for i in range(3)])
+    out: list[Message] = []
+    driver = StepDriver(Negative(), time.perf_counter)
+    for message in RecordingReader(path).messages():
+        out += driver.step(message)
+    assert [m.sequence for m in out] == [0, 1, 2]
+    np.testing.assert_array_equal(out[2].body.pixels, 4095 - sample.line_block(2).pixels)
+
+
+def test_only_nodes_with_something_to_work_on_run():
+    class Relay(Echo):
+        name, inputs, outputs = "relay", ("event/log", "configuration/camera"), ("orientation/live",)
+
+    echo, relay = Echo(), Relay()
+    assert active_nodes([relay, echo], ["sensor/gnss"]) == [echo, relay]  # in the order of the flow
+    assert active_nodes([relay, echo], ["event/log"]) == [relay]
+    assert active_nodes([relay, echo], ["configuration/camera"]) == []
+
+
+# ---- replay
+
+
+def test_replay_keeps_its_time(tmp_path):
+    """Rate 1: nothing early, no falling behind; how exact on an idle machine, `bench/replay_timing.py` measures."""
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0))
+    reader = RecordingReader(path)
+    got: list[tuple[int, float]] = []
+
+    def publish(raw):
+        if raw.topic == "sensor/attitude":
+            got.append((raw.envelope.stamp_ns, time.perf_counter()))
+
+    play(reader, publish, threading.Event(), settle_s=0.0)
+    stamps, times = np.array([s for s, _ in got]), np.array([t for _, t in got])
+    late_s = (times - times[0]) - (stamps - stamps[0]) / 1e9
+    # after the first message, which may itself have been late
+    assert late_s.min() > -0.1 and np.median(np.abs(late_s)) < 0.1
+    assert times[-1] - times[0] > 0.9 * (stamps[-1] - stamps[0]) / 1e9
+
+
+def test_replay_from_to_and_loop(tmp_path):
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0))
+    reader = RecordingReader(path)
+    stop, out = threading.Event(), []
+
+    def publish(raw):
+        out.append(raw)
+        if len(out) > 130:
+            stop.set()
+
+    first = sample.EPOCH_NS
+    times = {"from_ns": time_argument("0.5", first), "to_ns": time_argument(iso(first + 700_000_000), first)}
+    play(reader, publish, stop, rate=0, loop=True, settle_s=0.0, start=10**6, **times)
+    assert {raw.topic for raw in out[:6]} == {
+        "configuration/project", "configuration/camera", "configuration/strip", "observation/control",
+    }  # fmt: skip
+    attitude = [raw for raw in out if raw.topic == "sensor/attitude"]
+    offsets = [raw.envelope.stamp_ns - first for raw in attitude]
+    assert (offsets[0], offsets[40]) == (500_000_000, 700_000_000)
+    again = attitude[41]
+    assert offsets[41] > offsets[40] and again.envelope.start != attitude[0].envelope.start
+    body = codec.decode(again.topic, again.data)
+    assert body.time_ns == again.envelope.stamp_ns
+    strips = [codec.decode(raw.topic, raw.data).id for raw in out if raw.topic == "configuration/strip"]
+    assert strips[:2] == ["S1", "S1~2"]
+    assert all(b > a for a, b in itertools.pairwise(offsets))
+
+
+@pytest.mark.parametrize("text", ["soon", "2026-13-45"])
+def test_a_time_that_is_none_is_refused(text):
+    with pytest.raises(UserError, match="wanted seconds from the start or an ISO time"):
+        time_argument(text, 0)
+
+
+def test_times():
+    assert time_argument("1.5", 10) == 1_500_000_010
+    assert time_argument("2026-05-01T10:00:00.25", 0) == time_argument("2026-05-01T12:00:00.250+02:00", 0)
+    assert iso(time_argument("2026-05-01T10:00:00.25Z", 0)) == "2026-05-01T10:00:00.250000Z"
+
+
+def test_replay_leaves_out_what_nodes_make_anew(tmp_path):
+    messages = [*sample.flight(1.0), *(sample.message("trajectory/filtered", i) for i in range(5))]
+    messages.append(sample.message("status/navigator"))
+    reader = RecordingReader(write_recording(tmp_path / "a.mcap", messages))
+    result = play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0)
+    assert result.left_out == {"trajectory/filtered": 5, "status/navigator": 1}
+    # a trajectory that nobody can make anew is an input
+    reader = RecordingReader(write_recording(tmp_path / "b.mcap", messages[-6:-1]))
+    assert play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0).counts == {"trajectory/filtered": 5}
+
+
+def test_replay_command(tmp_path, flight):
+    with Rig(tmp_path) as rig, Bus(port=rig.port, source="test") as bus:
+        got: dict[str, int] = {}
+        for name in ("sensor/attitude", "sensor/lines/*", "configuration/camera"):
+            bus.subscribe(name, lambda raw: got.update({raw.topic: got.get(raw.topic, 0) + 1}))
+        done = command("replay", flight, "--rate", 3, "--json", "--port", rig.port)
+        assert done.returncode == 0, done.stderr
+        result = json.loads(done.stdout)
+    assert result["messages"]["sensor/attitude"] == got["sensor/attitude"] == 600
+    assert got["sensor/lines/F"] == result["messages"]["sensor/lines/F"] and got["configuration/camera"] == 1
+
+
+def test_replay_says_that_nobody_hears_it(tmp_path, flight):
+    with Rig(tmp_path) as rig:
+        done = command("replay", flight, "--rate", 0, "--port", rig.port)
+        assert done.returncode == 0 and "no node lives on platform demo" in done.stderr
+        rig.start("node", "recorder", "-o", tmp_path / "x.mcap")
+        with Bus(port=rig.port) as bus:
+            wait_for(lambda: bus.alive(), 20, "the recorder")
+        done = command("replay", flight, "--rate", 0, "--port", rig.port)
+        assert done.returncode == 0 and "no node" not in done.stderr
+    with socket.create_server(("127.0.0.1", 0)) as foreign:
+        port = foreign.getsockname()[1]
+        done = command("replay", flight, "--rate", 0, "--port", port)
+        assert f"port {port} is held by a program that does not answer" in done.stderr
+
+
+# ---- node
+
+
+def test_node_command_refuses_in_one_line(capsys, tmp_path):
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[navigator\n")
+    for arguments, code, text in (
+        (("pilot",), 2, "invalid choice: 'pilot'"),
+        (("navigator", "--config", bad), 1, "not a TOML file"),
+        (("navigator", "--set", "wings=2"), 1, "wings is not known"),
+        (("navigator", "--set", "wings"), 1, "wanted KEY=VALUE"),
+        (("recorder", "-o", tmp_path / "no" / "x.mcap"), 1, "cannot be written: no such file or directory"),
+        (("recorder", "--set", "compression=zip"), 1, "compression is 'zip', wanted one of none, lz4, zstd"),
+        (("player",), 1, "the player needs a recording"),
+        (("navigator", "--port", "0"), 2, "wanted a port number"),
+        (("navigator", "--platform", "a b"), 1, "wanted a name without blanks"),
+    ):
+        got, _, err = run(capsys, "node", *arguments)
+        assert got == code and text in err, err
+        assert code == 2 or len(err.splitlines()) == 1
+
+
+def test_an_unknown_option_is_told_with_the_usage_of_its_command(capsys):
+    code, _, err = run(capsys, "adjust", "block", "--selfcall", "tls18")
+    assert code == 2 and "usage: triline adjust" in err and "unrecognized arguments: --selfcall" in err
+
+
+def test_a_place_that_cannot_be_written_to_is_named_as_it_was_given(capsys):
+    code, _, err = run(capsys, "simulate", "-o", "/proc/x.mcap", "--seconds", 2, "-q")
+    assert code == 1 and err.startswith("triline simulate: /proc/x.mcap: cannot be written"), err
+
+
+# ---- access from Python
+
+
+def test_a_recording_as_tables_and_arrays(flight):
+    recording = triline.open(flight)
+    assert recording.topics().loc["sensor/gnss", "messages"] == 15
+    table = recording.table("sensor/gnss")
+    assert len(table) == 15 and table["latitude"].eq(48.9).all()
+    assert list(table["sequence"]) == list(range(15)) and table["velocity_enu.x"].eq(60).all()
+    assert table["timestamp_ns"].iloc[1] == sample.EPOCH_NS + 40 * 5_000_000
+    assert np.allclose(table["position_covariance_8"], 0.04)
+    assert list(recording.strips().index) == ["S1"]
+    assert recording.camera().name == "test" and recording.project().crs == "local"
+    lines = recording.table("sensor/lines/F")
+    assert lines["pixels"].iloc[0].shape == (4, 64)
+    ties = recording.table("observation/tie")
+    assert ties["images"].iloc[3][0].ccd == "F"
+    assert sum(1 for _ in recording.messages("sensor/gnss", "observation/tie")) == 15 + len(ties)
+
+
+def test_poses_as_arrays(tmp_path):
+    path = write_recording(tmp_path / "a.mcap", [sample.message("orientation/final", i) for i in range(4)])
+    poses = triline.open(path).poses()
+    assert poses.position_l.shape == (4, 3) and poses.covariance.shape == (4, 6, 6)
+    np.testing.assert_allclose(poses.angles, np.tile((0.1, 0.2, 0.3), (4, 1)), atol=1e-12)
+    np.testing.assert_array_equal(np.diff(poses.time_ns), 5_000_000)
+    assert poses.valid.all() and set(poses.strip) == {"S1"}
+
+
+def test_access_says_what_is_wrong(flight, tmp_path):
+    recording = triline.open(flight)
+    for call, text in (
+        (lambda: recording.table("sensor/gps"), "no topic 'sensor/gps'; it holds configuration/camera"),
+        (lambda: recording.poses("sensor/gnss"), "carries foxglove.LocationFix, not poses"),
+        (lambda: triline.open(tmp_path / "none.mcap"), "no such file or directory"),
+    ):
+        with pytest.raises(UserError, match=text):
+            call()
+    assert len(recording.poses("orientation/final").time_ns) == 0
+    assert recording.table("orientation/final").empty
+    empty = triline.open(write_recording(tmp_path / "a.mcap", [sample.message("sensor/gnss")]))
+    with pytest.raises(UserError, match="no configuration/camera in it"):
+        empty.camera()

@@ -1,0 +1,124 @@
+"""``triline locate``: pixels to the ground and back."""
+
+from __future__ import annotations
+
+import json
+
+import pandas as pd
+import pytest
+from satellite_scenes import Truth, write_dimap2, write_folder
+
+from triline.nodes.cli import main
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.rpc_files import write_rpb
+from triline.solver.location.rpc_fit import fit_to_model
+
+TRUTH = Truth(lines=4000, samples=500)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_dimap2(tmp_path / "scene.xml", TRUTH)
+
+
+def pixels(tmp_path, rows="0,0,0\n499,3999,500\n250.25,1999.5,-400\n"):
+    path = tmp_path / "pixels.csv"
+    path.write_text("column,row,height_m\n" + rows)
+    return path
+
+
+def test_there_and_back(scene, tmp_path, capsys):
+    ground, back = tmp_path / "ground.csv", tmp_path / "back.csv"
+    assert main(["locate", str(scene), "--pixels", str(pixels(tmp_path)), "-o", str(ground)]) == 0
+    assert "3 rows, 0 of them miss" in capsys.readouterr().out
+    assert main(["locate", str(scene), "--ground", str(ground), "-o", str(back), "-q"]) == 0
+    asked, got = pd.read_csv(tmp_path / "pixels.csv"), pd.read_csv(back)
+    # seven decimals of a degree would be a centimetre; ten are written
+    assert (asked[["column", "row"]] - got[["column", "row"]]).abs().max().max() < 1e-4
+
+
+def test_rows_that_miss_are_empty_with_a_note(scene, tmp_path, capsys):
+    ground, back = tmp_path / "ground.csv", tmp_path / "back.csv"
+    where = pixels(tmp_path, "0,0,0\n900,10,0\n10,10,800000\n")
+    assert main(["locate", str(scene), "--pixels", str(where), "-o", str(ground), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missed"] == 2
+    table = pd.read_csv(ground)
+    assert table["lon_deg"].isna().tolist() == [False, True, True]
+    assert table["note"].tolist()[1:] == ["outside the image of 500 columns and 4000 rows", "the ray misses the ground"]
+    (tmp_path / "far.csv").write_text("lon_deg,lat_deg,height_m\n0,0,0\n")
+    assert main(["locate", str(scene), "--ground", str(tmp_path / "far.csv"), "-o", str(back), "-q"]) == 0
+    row = pd.read_csv(back).iloc[0]
+    assert pd.isna(row["column"]) and row["note"] == "not in the image"
+
+
+def test_sigmas_of_the_command_line_and_of_the_scene(scene, tmp_path):
+    ground = tmp_path / "ground.csv"
+    sigmas = ["--position-sigma", "1", "1", "1", "--attitude-sigma", "0", "0", "0", "--height-sigma", "0"]
+    assert main(["locate", str(scene), "--pixels", str(pixels(tmp_path)), "-o", str(ground), "-q", *sigmas]) == 0
+    table = pd.read_csv(ground)
+    assert table["sigma_e_m"].between(0.9, 1.2).all() and (table["sigma_u_m"] < 1e-6).all()
+    text = "[frames]\nattitude = 'orbital'\n[sigma]\nposition_m = [2.0, 2.0, 2.0]\nheight_m = 3.0\n"
+    folder = write_folder(tmp_path / "folder", TRUTH, settings=text)
+    assert main(["locate", str(folder), "--pixels", str(pixels(tmp_path)), "-o", str(ground), "-q"]) == 0
+    table = pd.read_csv(ground)
+    assert table["sigma_u_m"].between(2.999, 3.001).all() and (table["sigma_n_m"] > 1.9).all()
+
+
+def test_rpc_beside_the_rigorous_model(scene, tmp_path, capsys):
+    write_rpb(tmp_path / "scene.RPB", fit_to_model(read_scene(scene).model("rigorous"), -500.0, 1000.0).rpc)
+    ground, back = tmp_path / "ground.csv", tmp_path / "back.csv"
+    main(["locate", str(scene), "--pixels", str(pixels(tmp_path)), "-o", str(ground), "-q"])
+    assert main(["locate", str(tmp_path / "scene.RPB"), "--ground", str(ground), "-o", str(back)]) == 0
+    assert "rpc model" in capsys.readouterr().out
+    asked, got = pd.read_csv(tmp_path / "pixels.csv"), pd.read_csv(back)
+    assert (asked[["column", "row"]] - got[["column", "row"]]).abs().max().max() < 0.01
+    assert main(["locate", str(scene), "--model", "rpc", "--ground", str(ground), "-o", str(back)]) == 1
+    assert "no rpc model in a file of the kind dimap2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["--ccd", "B"], "line of detectors 'B': not in the scene"),
+        (["--height-sigma", "-1"], "wanted numbers of at least 0"),
+    ],
+)
+def test_one_line_for_what_does_not_go(arguments, match, scene, tmp_path, capsys):
+    assert (
+        main(["locate", str(scene), "--pixels", str(pixels(tmp_path)), "-o", str(tmp_path / "o.csv"), *arguments]) == 1
+    )
+    error = capsys.readouterr().err
+    assert match in error and error.count("\n") == 1
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_refraction_there_and_back(scene, tmp_path, capsys):
+    straight, ground, back = (tmp_path / name for name in ("straight.csv", "ground.csv", "back.csv"))
+    where = str(pixels(tmp_path))
+    assert main(["locate", str(scene), "--pixels", where, "-o", str(straight), "-q"]) == 0
+    assert main(["locate", str(scene), "--pixels", where, "-o", str(ground), "-q", "--refraction"]) == 0
+    assert main(["locate", str(scene), "--ground", str(ground), "-o", str(back), "-q", "--refraction"]) == 0
+    asked, got = pd.read_csv(where), pd.read_csv(back)
+    assert (asked[["column", "row"]] - got[["column", "row"]]).abs().max().max() < 1e-4
+    moved_m = (pd.read_csv(ground)["lat_deg"] - pd.read_csv(straight)["lat_deg"]).abs().max() * 111_000
+    assert 0.05 < moved_m < 20.0
+    stated = ["--refraction", "300", "1023", "16"]
+    assert main(["locate", str(scene), "--pixels", where, "-o", str(ground), "-q", *stated]) == 0
+    for bad, reason in (
+        (["300"], "1 values, wanted none, or temperature"),
+        (["20", "1", "1"], "temperature_k 20, "),
+    ):
+        assert main(["locate", str(scene), "--pixels", where, "-o", str(ground), "--refraction", *bad]) == 1
+        assert f"--refraction: {reason}" in capsys.readouterr().err.replace("atmosphere: ", "")
+    write_rpb(tmp_path / "scene.RPB", fit_to_model(read_scene(scene).model("rigorous"), 0.0, 500.0).rpc)
+    assert main(["locate", str(tmp_path / "scene.RPB"), "--pixels", where, "-o", str(ground), "--refraction"]) == 1
+    assert "--refraction goes with a rigorous model, this is an RPC" in capsys.readouterr().err
+
+
+def test_refraction_on_another_planet_is_refused(tmp_path, capsys):
+    planet = "[planet]\nsemi_major_m = 6300000.0\nsemi_minor_m = 6300000.0\nrotation_rate_rad_s = 0.0\n"
+    folder = write_folder(tmp_path / "folder", TRUTH, settings="[frames]\nattitude = 'orbital'\n" + planet)
+    where, ground = str(pixels(tmp_path)), str(tmp_path / "ground.csv")
+    for command in (["locate", str(folder), "--pixels", where, "-o", ground], ["study", "sensitivity", str(folder)]):
+        assert main([*command, "--refraction"]) == 1
+        assert "--refraction knows the air of the Earth only, this is another planet" in capsys.readouterr().err

@@ -1,0 +1,416 @@
+"""``triline rectify IMAGE --sensor META``: what comes out, beside GDAL, and what is said of bad input."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+from places import DATA
+from relief import Waves
+from satellite_scenes import Truth, write_dimap2
+
+from triline.nodes.cli import main
+from triline.nodes.formats.frame_json import read_frame
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.rpc_files import write_rpb
+from triline.solver.location.rpc_fit import fit_to_model
+
+TRUTH = Truth(lines=400, samples=300, gsd=2.0e-5, period_s=2.0e-3, tilt_deg=(20.0, -7.0, 1.0))
+#: position of an image of which each pixel holds its own line or sample
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def write_image(path, bands, nodata=None, transform=None, **kwargs):
+    bands = np.asarray(bands)
+    count, height, width = bands.shape
+    with rasterio.open(
+        path, "w", driver="GTiff", width=width, height=height, count=count, dtype=bands.dtype, nodata=nodata,
+        transform=transform, **kwargs,
+    ) as target:  # fmt: skip
+        target.write(bands)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A scene: metadata, its model, relief under it, an image whose bands are its lines and samples."""
+    folder = tmp_path_factory.mktemp("scene")
+    path = write_dimap2(folder / "scene.xml", TRUTH)
+    model = read_scene(path).model()
+    relief = Waves.under(model, 120, waves=2.0)
+    dem = relief.write(folder / "dem.tif")
+    line, sample = np.mgrid[0 : TRUTH.lines, 0 : TRUTH.samples]
+    image = write_image(folder / "image.tif", np.stack([line, sample]).astype(np.float32) + 10.0, nodata=-1.0)
+    return folder, path, model, relief, dem, image
+
+
+def rectify(tmp_path, image, sensor, *more, name="ortho.tif"):
+    out = tmp_path / name
+    assert main(["rectify", str(image), "--sensor", str(sensor), "-o", str(out), "-q", *map(str, more)]) == 0
+    return rasterio.open(out)
+
+
+def refused(capsys, *args) -> str:
+    assert main(["rectify", *map(str, args)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "fault in triline" not in error, error
+    return error
+
+
+# -- what comes out ------------------------------------------------------------------------------------------------
+
+
+def test_cells_hold_what_the_model_sees_there(scene, tmp_path):
+    _, path, model, relief, dem, image = scene
+    mask = tmp_path / "mask.tif"
+    out = rectify(tmp_path, image, path, "--dem", dem, "--dem-datum", "ellipsoid", "--gsd", 10, "--mask", mask)
+    assert out.crs.is_projected and out.count == 2 and out.dtypes[0] == "float32" and out.nodata == -1.0
+    from rio_cogeo import cog_validate
+
+    assert cog_validate(out.name)[0] and out.overviews(1)
+    values = out.read()
+    rng = np.random.default_rng(1)
+    known = np.argwhere(values[0] > 0)
+    some = known[rng.integers(0, len(known), 300)]
+    x, y = out.transform.c + (some[:, 1] + 0.5) * out.res[0], out.transform.f - (some[:, 0] + 0.5) * out.res[1]
+    from pyproj import Transformer
+
+    lon, lat = Transformer.from_crs(out.crs, "EPSG:4326", always_xy=True).transform(x, y)
+    lat, lon = np.radians(lat), np.radians(lon)
+    true = model.inverse(lat, lon, relief.at(lat, lon), 1.0)
+    inner = ((true > 0) & (true < np.array([TRUTH.lines, TRUTH.samples]) - 1)).all(axis=1)
+    assert inner.mean() > 0.95
+    assert np.abs(values[:, some[:, 0], some[:, 1]].T - 10.0 - true)[inner].max() < 0.01
+    classes = rasterio.open(mask).read(1)
+    assert ((classes == 0) == (values[0] > 0)).all() and set(np.unique(classes)) == {0, 1}
+
+
+@pytest.mark.parametrize("with_dem", [True, False])
+def test_beside_the_rpc_warp_of_gdal(scene, tmp_path, with_dem):
+    """The same polynomials, DEM and cells: GDAL and triline look at the same place in the image."""
+    from rasterio.enums import Resampling
+    from rasterio.rpc import RPC
+    from rasterio.warp import reproject
+
+    _, _, model, _, dem, image = scene
+    rpb = tmp_path / "scene.RPB"
+    rpc = fit_to_model(model, -100.0, 1100.0).rpc
+    write_rpb(rpb, rpc)
+    ground = ["--dem", dem, "--dem-datum", "ellipsoid"] if with_dem else ["--height", 400.0]
+    out = rectify(tmp_path, image, rpb, *ground)
+    f = rpc.to_image
+    c = f.coefficients.tolist()
+    gdal_rpc = RPC(
+        height_off=f.in_offset[2], height_scale=f.in_scale[2], lat_off=f.in_offset[1], lat_scale=f.in_scale[1],
+        long_off=f.in_offset[0], long_scale=f.in_scale[0], line_off=f.out_offset[1], line_scale=f.out_scale[1],
+        samp_off=f.out_offset[0], samp_scale=f.out_scale[0], samp_num_coeff=c[0], samp_den_coeff=c[1],
+        line_num_coeff=c[2], line_den_coeff=c[3],
+    )  # fmt: skip
+    options = {"RPC_DEM": str(dem), "RPC_DEMINTERPOLATION": "bilinear"} if with_dem else {"RPC_HEIGHT": 400.0}
+    with rasterio.open(image) as source:
+        bands = source.read()
+    theirs = np.full((2, out.height, out.width), -1.0, dtype=np.float32)
+    reproject(
+        bands, theirs, src_crs="EPSG:4326", rpcs=gdal_rpc, dst_transform=out.transform, dst_crs=out.crs,
+        src_nodata=-1.0, dst_nodata=-1.0, resampling=Resampling.bilinear, tolerance=0.0, **options,
+    )  # fmt: skip
+    ours = out.read()
+    both = (ours[0] > 0) & (theirs[0] > 0)
+    assert both.sum() > 0.95 * max((ours[0] > 0).sum(), (theirs[0] > 0).sum())
+    inner = both & (ours.min(axis=0) > 12) & (ours[0] < TRUTH.lines + 7) & (ours[1] < TRUTH.samples + 7)
+    apart = np.abs(ours - theirs)[:, inner]
+    # over level ground rasterio's warp interpolates places, to an eighth of a pixel (its tolerance has no effect)
+    limit = (0.1, 0.01) if with_dem else (0.14, 0.07)
+    assert np.percentile(apart, 99.9) < limit[0] and np.median(apart) < limit[1]
+    if not with_dem:  # GDAL's transformer itself, which does not interpolate
+        from pyproj import Transformer
+        from rasterio.transform import RPCTransformer
+
+        row, column = np.argwhere(inner)[::500].T
+        x, y = out.transform.c + (column + 0.5) * out.res[0], out.transform.f - (row + 0.5) * out.res[1]
+        lon, lat = Transformer.from_crs(out.crs, "EPSG:4326", always_xy=True).transform(x, y)
+        with RPCTransformer(gdal_rpc, rpc_height=400.0) as transformer:
+            line, sample = transformer.rowcol(lon, lat, op=lambda places: places)
+        exact = np.stack([line, sample]) - 0.5 + 10.0
+        assert np.abs(ours[:, row, column] - exact).max() < 0.002
+
+
+def test_direct_way_gives_the_same_orthoimage(scene, tmp_path):
+    _, path, _, _, dem, image = scene
+    args = ("--dem", dem, "--dem-datum", "ellipsoid", "--mask")
+    one = rectify(tmp_path, image, path, *args, tmp_path / "m1.tif").read()
+    two = rectify(tmp_path, image, path, *args, tmp_path / "m2.tif", "--direct", name="direct.tif").read()
+    both = (one[0] > 0) & (two[0] > 0)
+    assert both.sum() > 0.995 * (one[0] > 0).sum() and (both == (two[0] > 0)).mean() > 0.995
+    assert np.abs(one - two)[:, both].max() < 0.05
+    mask = rasterio.open(tmp_path / "m2.tif").read(1)
+    assert ((mask == 0) == (two[0] > 0)).all()
+
+
+def test_bits_bands_no_data_and_resampling(scene, tmp_path):
+    _, path, *_ = scene
+    rng = np.random.default_rng(2)
+    for dtype, method in (("uint8", "nearest"), ("int16", "cubic"), ("uint32", "lanczos"), ("float64", "bilinear")):
+        bands = rng.integers(1, 200, (3, TRUTH.lines, TRUTH.samples)).astype(dtype)
+        bands[:, 100:150, 100:150] = 0
+        image, mask = write_image(tmp_path / f"{dtype}.tif", bands, nodata=0), tmp_path / f"m_{dtype}.tif"
+        args = ("--height", 100, "--gsd", 40, "--resampling", method, "--mask", mask)
+        out = rectify(tmp_path, image, path, *args, name=f"{dtype}{method}.tif")
+        assert out.dtypes == (dtype,) * 3 and out.nodata == 0
+        values, classes = out.read(), rasterio.open(mask).read(1)
+        assert set(np.unique(classes)) == {0, 1, 4}
+        assert (values[:, classes != 0] == 0).all() and (values[:, classes == 0] != 0).all()
+        if method == "nearest":
+            assert set(np.unique(values)) <= set(np.unique(bands))
+
+
+def test_values_that_would_be_taken_for_no_data_stay(scene, tmp_path):
+    _, path, *_ = scene
+    image = write_image(tmp_path / "black.tif", np.zeros((1, TRUTH.lines, TRUTH.samples), dtype=np.uint8))
+    out = rectify(tmp_path, image, path, "--height", 100)
+    assert (out.read(1) == 1).sum() > 0.5 * TRUTH.lines * TRUTH.samples
+
+
+def test_degrees_bounds_and_larger_cells(scene, tmp_path):
+    _, path, model, _, _, image = scene
+    middle = np.degrees(model.direct(np.array([200.0]), np.array([150.0]), np.array([0.0]))[0, :2])
+    bounds = [middle[1] - 0.01, middle[0] - 0.01, middle[1] + 0.01, middle[0] + 0.01]
+    out = rectify(tmp_path, image, path, "--height", 0, "--crs", "EPSG:4326", "--gsd", 0.0005, "--bounds", *bounds)
+    assert out.crs.is_geographic and out.res == pytest.approx((0.0005, 0.0005))
+    assert out.bounds.left <= bounds[0] and out.bounds.right >= bounds[2] and out.width <= 43
+    values = out.read()
+    row, column = out.index(middle[1], middle[0])
+    x, y = out.xy(row, column)
+    true = model.inverse(np.radians([y]), np.radians([x]), 0.0, 0.0)[0]
+    # two to three pixels are put together: the mean of their lines is the line of their middle
+    assert values[:, row, column] - 10.0 == pytest.approx(true, abs=0.02)
+
+
+def test_a_part_of_a_scene_by_its_first_pixel_or_geotransform(scene, tmp_path):
+    _, path, _, _, _, image = scene
+    whole = rectify(tmp_path, image, path, "--height", 100, "--gsd", 20)
+    with rasterio.open(image) as source:
+        part = source.read()[:, 100:300, 50:250]
+    plain = write_image(tmp_path / "part.tif", part, nodata=-1.0)
+    told = write_image(tmp_path / "told.tif", part, nodata=-1.0, transform=rasterio.Affine(1, 0, 50, 0, 1, 100))
+    by_hand = rectify(tmp_path, plain, path, "--height", 100, "--gsd", 20, "--first-pixel", 50, 100, name="a.tif")
+    by_file = rectify(tmp_path, told, path, "--height", 100, "--gsd", 20, name="b.tif")
+    assert (by_hand.read() == by_file.read()).all()
+    window = rasterio.windows.from_bounds(*by_hand.bounds, whole.transform)
+    other = whole.read(window=window.round_offsets().round_lengths(), boundless=True, fill_value=-1.0)
+    both = (by_hand.read() > 0).all(axis=0) & (other[0] > 113) & (other[0] < 307) & (other[1] > 63) & (other[1] < 257)
+    both = np.broadcast_to(both, other.shape)
+    assert both.sum() > 1000 and np.abs(by_hand.read() - other)[both].max() < 0.01
+
+
+FRAME = {
+    "interior": {
+        "focal_length_mm": 150.0, "pixel_size_mm": 0.007, "lines": 300, "samples": 400,
+        "distortion": {"k1": 1e-5},
+    },
+    "exterior": {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 686000.0, "omega_phi_kappa_deg": [3.0, -20.0, 12.0]},
+    "sigma": {"position_m": [5.0, 5.0, 5.0], "attitude_deg": [0.001, 0.001, 0.002]},
+}  # fmt: skip
+
+
+def test_a_frame_camera_and_its_sigmas(tmp_path):
+    meta = tmp_path / "frame.json"
+    meta.write_text(json.dumps(FRAME))
+    camera, _ = read_frame(meta, [])
+    line, sample = np.mgrid[0:300, 0:400]
+    image = write_image(tmp_path / "frame.tif", np.stack([line, sample]).astype(np.float32), nodata=-1.0)
+    sigma = tmp_path / "sigma.tif"
+    out = rectify(tmp_path, image, meta, "--height", 900, "--sigma", sigma, "--height-sigma", 5, "--refraction")
+    values = out.read()
+    row, column = np.argwhere((values[0] > 100) & (values[0] < 200))[777]
+    x, y = out.xy(row, column)
+    from pyproj import Transformer
+
+    lon, lat = np.radians(Transformer.from_crs(out.crs, "EPSG:4326", always_xy=True).transform(x, y))
+    from triline.solver.location.refraction import Refraction
+
+    true = camera.with_refraction(Refraction()).inverse([lat], [lon], 900.0)[0]
+    assert values[:, row, column] == pytest.approx(true, abs=0.01)
+    planimetric, up = rasterio.open(sigma).read()
+    assert (np.isfinite(planimetric) == (values[0] >= 0)).all()
+    # 5 m of position, 0.001 deg at 740 km is 13 m, and 5 m of height under 23 deg
+    assert np.nanmin(planimetric) > 15.0 and np.nanmax(planimetric) < 30.0 and np.nanmax(np.abs(up - 5.0)) < 1e-3
+
+
+@pytest.mark.parametrize("way", ["crs", "orbital", "quaternion", "navigation"])
+def test_the_ways_to_state_an_orientation_agree(tmp_path, way):
+    from pyproj import Transformer
+    from scipy.spatial.transform import Rotation
+
+    from triline.solver.geometry.rotation import R_BC_NOMINAL, navigation_from_matrix
+    from triline.solver.orbit.motion import R_from_orbital
+
+    def read(exterior):
+        (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": exterior}))
+        return read_frame(tmp_path / "f.json", [])[0]
+
+    first = read(FRAME["exterior"])
+    if way == "crs":  # along the meridian of the zone's middle grid and ground north agree
+        middle = {**FRAME["exterior"], "lon_deg": 33.0}
+        first = read(middle)
+        x, y = Transformer.from_crs("EPSG:4326", "EPSG:32636", always_xy=True).transform(33.0, 39.9)
+        exterior = {"crs": "EPSG:32636", "position": [x, y, 686000.0], "omega_phi_kappa_deg": [3.0, -20.0, 12.0]}
+    elif way == "quaternion":
+        q = Rotation.from_matrix(first.R_ec).as_quat()
+        exterior = {"position_e_m": first.position_e.tolist(), "quaternion_xyzw": q.tolist()}
+    elif way == "navigation":
+        from triline.solver.geometry.earth import R_en
+
+        R_nb = R_en(np.radians(39.9), np.radians(32.8)).T @ first.R_ec @ R_BC_NOMINAL.T
+        angles = np.degrees(navigation_from_matrix(R_nb)).tolist()
+        exterior = {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 686000.0, "roll_pitch_heading_deg": angles}
+    else:
+        velocity = np.array([-3000.0, -2000.0, 6500.0])
+        inertial = velocity + np.cross([0, 0, 7.292115e-5], first.position_e)
+        R_ob = R_from_orbital(first.position_e, inertial).T @ first.R_ec @ R_BC_NOMINAL.T
+        roll, pitch, yaw = navigation_from_matrix(R_ob)
+        exterior = {
+            "position_e_m": first.position_e.tolist(), "velocity_e_m_s": velocity.tolist(),
+            "roll_pitch_yaw_deg": np.degrees([roll, pitch, yaw]).tolist(),
+        }  # fmt: skip
+    second = read(exterior)
+    assert np.abs(second.position_e - first.position_e).max() < 1e-3
+    assert np.abs(second.R_ec - first.R_ec).max() < 1e-9
+
+
+def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
+    _, path, model, relief, dem, image = scene
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(20, 380, 12), rng.uniform(20, 280, 12)
+    g = model.direct(u, v, rng.uniform(100, 900, 12))
+    measured_u, measured_v = u + 7.0 + 0.002 * v, v - 4.0 - 0.003 * u
+    measured_u[3] += 40.0
+    rows = [
+        f"{np.degrees(lon):.10f},{np.degrees(lat):.10f},{h!r},{x!r},{y!r}"
+        for (lat, lon, h), x, y in zip(g.tolist(), measured_v.tolist(), measured_u.tolist(), strict=True)
+    ]
+    control = tmp_path / "control.csv"
+    control.write_text("lon_deg,lat_deg,height_m,column,row\n" + "\n".join(rows) + "\n")
+    args = ["--dem", str(dem), "--dem-datum", "0", "--control", str(control), "--pixel-sigma", "0.1"]
+    sigma = tmp_path / "s.tif"
+    args += ["--sigma", str(sigma), "--json"]
+    assert main(["rectify", str(image), "--sensor", str(path), "-o", str(tmp_path / "o.tif"), *args]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["control"]["points"] == 12 and result["control"]["rejected"] == 1
+    assert max(result["control"]["rms_px"]) < 1e-3
+    out = rasterio.open(tmp_path / "o.tif")
+    values = out.read()
+    row, column = np.argwhere((values[0] > 150) & (values[1] > 100))[500]
+    x, y = out.xy(row, column)
+    from pyproj import Transformer
+
+    lon, lat = np.radians(Transformer.from_crs(out.crs, "EPSG:4326", always_xy=True).transform(x, y))
+    a, b = model.inverse([lat], [lon], relief.at([lat], [lon]), 0.0)[0]
+    assert values[:, row, column] - 10.0 == pytest.approx([a + 7.0 + 0.002 * b, b - 4.0 - 0.003 * a], abs=0.01)
+
+
+# -- what is said of bad input -------------------------------------------------------------------------------------
+
+
+def test_heights_are_refused_without_a_datum_elsewhere_and_of_another_planet(scene, tmp_path, capsys):
+    _, path, _, relief, dem, image = scene
+    base = [image, "--sensor", path, "-o", tmp_path / "o.tif", "--dem"]
+    assert "wanted --dem-datum ellipsoid" in refused(capsys, *base, dem)
+    far = replace(relief, lon_deg=relief.lon_deg + 30.0).write(tmp_path / "far.tif")
+    assert "does not cover the image" in refused(capsys, *base, far, "--dem-datum", "ellipsoid")
+    moon = relief.write(tmp_path / "moon.tif", "+proj=longlat +a=1737400 +b=1737400 +no_defs")
+    assert "another planet" in refused(capsys, *base, moon, "--dem-datum", "ellipsoid")
+    assert "neither a file nor a CRS" in refused(capsys, *base, dem, "--dem-datum", "sea")
+    assert "says nothing of heights" in refused(capsys, *base, dem, "--dem-datum", "EPSG:4326")
+    assert "no such file" in refused(capsys, *base, tmp_path / "none.tif", "--dem-datum", "0")
+    (tmp_path / "text.tif").write_text("heights")
+    assert "not a raster" in refused(capsys, *base, tmp_path / "text.tif", "--dem-datum", "0")
+    assert "goes with --dem" in refused(capsys, *base[:-1], "--dem-datum", "0")
+    assert not (tmp_path / "o.tif").exists()
+
+
+def test_a_geoid_without_its_grid_is_named(scene, tmp_path, capsys):
+    import pyproj
+
+    if pyproj.transformer.TransformerGroup("EPSG:4326+5773", "EPSG:4979").best_available:
+        pytest.skip("the grid of EGM96 is installed")
+    _, path, _, _, dem, image = scene
+    error = refused(capsys, image, "--sensor", path, "-o", tmp_path / "o.tif", "--dem", dem, "--dem-datum", "EPSG:5773")
+    assert "geoid grid is not installed" in error
+
+
+def test_geoid_heights_by_number_and_by_raster(scene, tmp_path):
+    _, path, _, relief, dem, image = scene
+    geoid = replace(relief, low_m=40.0, high_m=40.0).write(tmp_path / "geoid.tif")
+    args = ("--dem", dem, "--dem-datum")
+    number = rectify(tmp_path, image, path, *args, 40.0, name="n.tif").read()
+    raster = rectify(tmp_path, image, path, *args, geoid, name="r.tif").read()
+    ellipsoid = rectify(tmp_path, image, path, *args, "ellipsoid", name="e.tif").read()
+    assert number.shape == raster.shape and np.abs(number - raster).max() < 1e-3
+    assert number.shape != ellipsoid.shape or np.abs(number - ellipsoid).max() > 0.3
+
+
+def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys):
+    _, path, _, relief, dem, image = scene
+    half = tmp_path / "tiles"
+    half.mkdir()
+    left, right = (
+        replace(relief, columns=61),
+        replace(relief, lon_deg=relief.lon_deg + 60 * relief.step_deg, columns=60),
+    )
+    left.z, right.z = relief.z[:, :61], relief.z[:, 60:]
+    left.write(half / "left.tif")
+    args = ("--dem-datum", "ellipsoid", "--mask", tmp_path / "m.tif")
+    rectify(tmp_path, image, path, "--dem", half / "left.tif", *args, name="part.tif")
+    assert 2 in np.unique(rasterio.open(tmp_path / "m.tif").read(1))
+    right.write(half / "right.tif")
+    whole = rectify(tmp_path, image, path, "--dem", dem, *args, name="whole.tif").read()
+    tiles = rectify(tmp_path, image, path, "--dem", half, *args, name="tiles.tif").read()
+    assert whole.shape == tiles.shape and np.abs(whole - tiles).max() < 1e-3
+
+
+def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
+    _, path, model, _, dem, image = scene
+    base = [image, "--sensor", path, "-o", tmp_path / "o.tif", "--height", 0]
+    small = write_image(tmp_path / "small.tif", np.ones((1, 50, 60), dtype=np.uint8))
+    error = refused(capsys, small, *base[1:])
+    assert "60 x 50 pixels" in error and "300 x 400" in error
+    assert "columns 280 to 339" in refused(capsys, small, *base[1:], "--first-pixel", 280, 0)
+    control = tmp_path / "control.csv"
+    head = "lon_deg,lat_deg,height_m,column,row\n"
+    lat, lon = np.degrees(model.direct(np.array([5.0]), np.array([5.0]), np.array([0.0]))[0, :2])
+    control.write_text(head + f"{lon},{lat},0,5,5\n")
+    assert "1 control points, wanted at least 3" in refused(capsys, *base, "--control", control)
+    control.write_text(head + f"{lon},{lat},0,5,500\n" * 3)
+    assert "control.csv:2: row: 500: outside" in refused(capsys, *base, "--control", control)
+    control.write_text(head + f"{lon + 40},{lat},0,5,5\n" * 3)
+    assert "not in the image" in refused(capsys, *base, "--control", control)
+    assert "wanted one of them" in refused(capsys, *base, "--dem", dem)
+    assert "would overwrite" in refused(capsys, image, "--sensor", path, "-o", image)
+    assert "no sigma is known" in refused(capsys, *base, "--sigma", tmp_path / "s.tif")
+    assert "PROJ does not know" in refused(capsys, *base, "--crs", "EPSG:1")
+    assert "another planet" in refused(capsys, *base, "--crs", "+proj=longlat +a=1737400 +b=1737400")
+    (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": {"lat_deg": 1.0, "lon_deg": 2.0}}))
+    assert "height_m: missing" in refused(capsys, image, "--sensor", tmp_path / "f.json", "-o", tmp_path / "o.tif")
+    assert "--mask: goes with an image" in refused(
+        capsys, "recordings/strip.mcap", "-o", tmp_path / "o.tif", "--mask", tmp_path / "m.tif"
+    )
+
+
+# -- real images ---------------------------------------------------------------------------------------------------
+
+VENTOUX = DATA / "satellites" / "phr_ventoux"
+
+
+@pytest.mark.skipif(not VENTOUX.is_dir(), reason="the two looks of Ventoux are not there")
+def test_two_looks_of_ventoux_lie_on_each_other(tmp_path):
+    from ventoux import summary
+
+    found = summary(VENTOUX, tmp_path)
+    assert found["matches"] >= 100
+    assert found["corrected_median"] < 0.5 < found["rpc_median"]
+    # across the direction in which SRTM's height errors (some metres, under trees) move the two looks apart
+    assert found["corrected_across"] < 0.5

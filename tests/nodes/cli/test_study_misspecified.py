@@ -1,0 +1,129 @@
+"""``triline study misspecified``: the table, its limits, and what it says beside them."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from triline.nodes.cli import main
+from triline.nodes.cli.misspecified_nodes import answer_of, processed
+from triline.nodes.report.evaluation import evaluate
+from triline.nodes.report.flight import collect
+from triline.nodes.report.source import messages_of
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.misspecified_study import (
+    OBSERVED,
+    ROWS,
+    SETTINGS,
+    FlightFigures,
+    Quality,
+    cell_of,
+    cells_of,
+    online_quality,
+    still_refused,
+    through_window,
+)
+from triline.solver.simulation.scenario import simulate
+from triline.solver.simulation.window_study import navigate
+from triline.solver.window.results import NO_LOOK, TAKEN_BACK, Look, Refusal
+
+GOOD = FlightFigures(
+    seed=1, seconds=1.0, online=Quality(0.2, 1.0, 0.2, (0.1, 0.1, 0.1), (0.001, 0.001, 0.001), 1.0),
+    online_in_truth=Quality(0.2, 1.0), direct_m=2.0, batch=Quality(0.2, 1.0), components=Quality(0.2, 1.0),
+    component_factors={}, sigma0=1.0, rejected=0.001, control_refused=[], accused=[], light="good", words="",
+    good_share=1.0,
+)  # fmt: skip
+
+
+def test_the_command(tmp_path, capsys):
+    """Two rows of one short flight: as stated beside a GNSS datum, which shows in direct georeferencing at least."""
+    table = tmp_path / "table.csv"
+    words = ["study", "misspecified", "--seeds", "1", "--seconds", "12", "--rows", "gnss-datum", "stated"]
+    assert main([*words, "--settings", "rtk", "--online", "window", "--jobs", "1", "--json", "--csv", str(table)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    stated, datum = document["cells"]
+    assert (stated["row"], datum["row"]) == ("stated", "gnss-datum")  # the baseline comes first
+    assert datum["true"] == "gnss-datum=0.5" and len(datum["each"]) == 1
+    assert datum["direct_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.5)
+    assert datum["direct_m"] > 2 * stated["direct_m"]
+    for cell in document["cells"]:
+        for name in ("online_m", "batch_m", "components_m", "points_nees", "orientation_nees", "sigma0"):
+            assert np.isfinite(cell[name]) and cell[name] > 0
+        assert sum(cell["lights"].values()) == 1
+    with table.open() as rows:
+        read = list(csv.DictReader(rows))
+    assert [row["row"] for row in read] == ["stated", "gnss-datum"]
+    assert float(read[1]["direct_m"]) == datum["direct_m"] and read[0]["limit light"] in ("0", "1")
+
+
+def test_the_nodes_give_what_process_gives(tmp_path):
+    """The figures are those of a processed recording; the window alone is close to them as long as nothing is wrong."""
+    plan = FlightPlan(strip_s=12.0, lead_in_s=2.0, lead_out_s=1.0)
+    flown = simulate(plan, 1, replace(SETTINGS["rtk"], attitude_rate_hz=20.0), OBSERVED)
+    out = processed(flown, tmp_path)
+    through, expected = answer_of(collect(messages_of(out))), evaluate(out)
+    found = online_quality(flown, through, np.zeros(3))
+    row = expected["points"]["adjusted_whole"]
+    assert through.sigma0 == pytest.approx(expected["sigma0"], rel=1e-6)
+    assert len(through.points) >= row["n"]
+    assert found.points_m == pytest.approx(np.linalg.norm(row["rmse_m"]), rel=0.1)  # of two rays and more
+    whole = expected["orientation"]["whole"]
+    assert found.position_m == pytest.approx(whole["rmse_m"], rel=0.1)
+    assert found.orientation_nees == pytest.approx(whole["nees"], rel=0.15)
+    alone = online_quality(flown, through_window(flown, navigate(flown)), np.zeros(3))
+    assert alone.points_m == pytest.approx(found.points_m, rel=0.1)
+
+
+def test_a_flight_that_meets_all_limits():
+    assert all(cell_of("rtk", "clock", [GOOD], 0.2).limits.values())
+
+
+@pytest.mark.parametrize(
+    ("change", "limit"),
+    [
+        ({"online": replace(GOOD.online, points_m=0.23)}, "as batch"),
+        ({"online": replace(GOOD.online, points_nees=1.7)}, "NEES points"),
+        ({"online": replace(GOOD.online, orientation_nees=0.5)}, "NEES orientation"),
+        ({"online": replace(GOOD.online, points_nees=2.1)}, "light"),
+        ({"direct_m": 0.1}, "as direct"),
+        ({"rejected": 0.03}, "rejected"),
+        ({"accused": ["F"]}, "no source accused"),
+        ({"control_refused": ["GCP1 X"]}, "no control refused"),
+    ],
+)
+def test_each_limit_can_be_missed(change, limit):
+    limits = cell_of("rtk", "clock", [replace(GOOD, **change)], 0.2).limits
+    missed = {name for name, held in limits.items() if not held}
+    assert limit in missed
+    assert missed <= {limit, "NEES points"}  # which a light that is not true comes with
+
+
+def test_limits_by_row():
+    """Fast vibration and heavy tails are excused in part; of wrong control nobody knows, so it is never good."""
+    worse = replace(GOOD, online=replace(GOOD.online, points_m=0.5), rejected=0.1)
+    missed = {row: {k for k, held in cell_of("rtk", row, [worse], 0.2).limits.items() if not held} for row in ROWS}
+    assert missed["clock"] == {"as batch", "as stated", "rejected"}
+    assert missed["sine-fast"] == {"rejected"}
+    assert missed["noise-t3"] == {"as batch", "as stated"}
+    assert "light" in missed["control-datum"]
+    doubled = replace(GOOD, online=replace(GOOD.online, points_m=0.39), components=Quality(0.38))
+    assert cell_of("rtk", "noise", [doubled], 0.2).limits["as stated"]
+
+
+def test_the_stated_row_is_the_measure_of_its_setting():
+    worse = replace(GOOD, seed=2, online=replace(GOOD.online, points_m=0.35))
+    found = cells_of({("rtk", "stated"): [GOOD], ("rtk", "step"): [worse], ("def", "step"): [worse]})
+    cells = {c.setting: c for c in found if c.row == "step"}
+    assert not cells["rtk"].limits["as stated"] and cells["def"].limits["as stated"]
+    assert cells["rtk"].worst_seed == 2
+
+
+def test_what_was_taken_back_is_not_refused():
+    look = Look("S1", "F", 1.0, 2.0, 0.3, 0.3)
+    refusals = [
+        Refusal("T1", look, "snooping"), Refusal("T2", look, "snooping"), Refusal("T1", look, TAKEN_BACK),
+        Refusal("GCP1", NO_LOOK, "contradicts", coordinate="X"),
+    ]  # fmt: skip
+    assert still_refused(refusals) == {("T2", "S1", "F", ""), ("GCP1", "", "", "X")}

@@ -1,0 +1,67 @@
+"""``triline study sensitivity``: tables, files, bad input."""
+
+from __future__ import annotations
+
+import json
+
+import pandas as pd
+import pytest
+from satellite_scenes import Truth, write_dimap2
+
+from triline.nodes.cli import main
+
+FEW = ["--runs", "6000", "--samples", "512"]
+
+
+def test_worked_examples(tmp_path, capsys):
+    file = tmp_path / "shares.csv"
+    assert main(["study", "sensitivity", *FEW, "--csv", str(file), "--json"]) == 0
+    scenes = json.loads(capsys.readouterr().out)["scenes"]
+    assert [s["scene"] for s in scenes] == ["aster-vnir", "ads40"]
+    for scene in scenes:
+        assert scene["converged"] and scene["missed"] == 0
+        for result in scene["results"].values():
+            assert result["nearly_linear"]
+            assert result["sigma_monte_carlo_m"] == pytest.approx(result["sigma_m"], rel=0.05)
+            for parameter in result["parameters"].values():
+                if parameter["sigma"]:
+                    assert parameter["sobol_total"] == pytest.approx(parameter["share"], abs=0.03)
+                    assert parameter["fast_first"] == pytest.approx(parameter["share"], abs=0.03)
+    table = pd.read_csv(file)
+    assert len(table) == 2 * 2 * 10
+    sums = table.groupby(["scene", "result"])["share"].sum()
+    assert sums.to_numpy() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_better_attitude_buys_something(capsys):
+    def sigma(*options):
+        assert main(["study", "sensitivity", "ads40", *FEW, "--json", *options]) == 0
+        return json.loads(capsys.readouterr().out)["scenes"][0]["results"]["north"]["sigma_m"]
+
+    assert sigma("--attitude-sigma", "0.001", "0.001", "0.002") < 0.7 * sigma()
+
+
+def test_a_scene_from_a_file(tmp_path, capsys):
+    scene = write_dimap2(tmp_path / "scene.xml", Truth(lines=4000, samples=500))
+    options = ["--pixel", "250", "2000", "--height", "100", "--refraction", *FEW]
+    assert main(["study", "sensitivity", str(scene), *options]) == 0
+    text = capsys.readouterr().out
+    assert "column 250, row 2000, height 100 m" in text and "by covariance" in text and "across" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["nowhere.xml"], "nowhere.xml: neither a file nor a simulated sensor, wanted metadata or one of alos-prism"),
+        (["ads40", "--samples", "1000"], "ads40: 1000 samples of a Sobol sequence, wanted a power of 2"),
+        (["ads40", "--runs", "3"], "ads40: 3 runs, wanted at least 100"),
+        (["ads40", "--pixel", "99999", "0"], "--pixel 99999 0, wanted one of the image of 12000 columns"),
+        (["ads40", "--height", "4000"], "wanted ground below the aircraft at 3000 m"),
+        (["aster-vnir", "--ccd", "Q"], "aster-vnir: line of detectors 'Q', wanted one of"),
+        (["aster-vnir", "--time-sigma", "-1"], "wanted numbers of at least 0"),
+    ],
+)
+def test_bad_input(options, message, capsys):
+    assert main(["study", "sensitivity", *options]) == 1
+    error = capsys.readouterr().err
+    assert message in error and len(error.strip().splitlines()) == 1

@@ -1,0 +1,147 @@
+"""RPC in every kind of file: the same numbers come back, and agree with GDAL's."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import rasterio
+from places import DATA, needs_data
+from rasterio.transform import RPCTransformer
+from satellite_scenes import Truth, write_dimap2
+
+from triline.nodes.errors import UserError
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.rpc_files import rasterio_rpc, write_rpb, write_rpc_text
+from triline.solver.location.rpc_fit import fit_to_model
+
+VENTOUX = DATA / "satellites" / "phr_ventoux"
+
+
+@pytest.fixture(scope="module")
+def rpc(tmp_path_factory):
+    path = write_dimap2(tmp_path_factory.mktemp("scene") / "scene.xml", Truth())
+    return fit_to_model(read_scene(path).model("rigorous"), 0.0, 2000.0).rpc
+
+
+def write_geotiff(path, rpc):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with rasterio.open(path, "w", driver="GTiff", width=60, height=50, count=1, dtype="uint8") as image:
+            image.rpcs = rasterio_rpc(rpc)
+    return path
+
+
+def write_geom(path, rpc):
+    f = rpc.to_image
+    names = ("long", "lat", "height", "samp", "line")
+    rows = [f"{n}_off:  {x:.17g}" for n, x in zip(names, (*f.in_offset, *f.out_offset), strict=True)]
+    rows += [f"{n}_scale:  {x:.17g}" for n, x in zip(names, (*f.in_scale, *f.out_scale), strict=True)]
+    for k, name in enumerate(("samp_num", "samp_den", "line_num", "line_den")):
+        rows += [f"{name}_coeff_{i:02d}:  {c:.17g}" for i, c in enumerate(f.coefficients[k])]
+    path.write_text("\n".join([*rows, "polynomial_format:  B", "number_lines:  20000", "number_samples:  6000", ""]))
+    return path
+
+
+def write_dimap(path, rpc):
+    f = rpc.to_image
+    rows = []
+    for k, name in enumerate(("SAMP_NUM", "SAMP_DEN", "LINE_NUM", "LINE_DEN")):
+        rows += [f"<{name}_COEFF_{i + 1}>{c:.17g}</{name}_COEFF_{i + 1}>" for i, c in enumerate(f.coefficients[k])]
+    ends = []
+    offsets = (*f.in_offset, f.out_offset[0] + 1, f.out_offset[1] + 1)  # DIMAP counts from 1
+    scales = (*f.in_scale, *f.out_scale)
+    for name, off, scale in zip(("LONG", "LAT", "HEIGHT", "SAMP", "LINE"), offsets, scales, strict=True):
+        ends.append(f"<{name}_SCALE>{scale:.17g}</{name}_SCALE><{name}_OFF>{off:.17g}</{name}_OFF>")
+    path.write_text(
+        "<Dimap_Document><Metadata_Identification><METADATA_FORMAT version='2.15'>DIMAP</METADATA_FORMAT>"
+        "</Metadata_Identification><Rational_Function_Model><Global_RFM><Inverse_Model>"
+        + "".join(rows)
+        + f"</Inverse_Model><RFM_Validity>{''.join(ends)}</RFM_Validity></Global_RFM></Rational_Function_Model>"
+        "</Dimap_Document>"
+    )
+    return path
+
+
+def _rpb(path, rpc):
+    write_rpb(path, rpc)
+    return path
+
+
+def _text(path, rpc):
+    write_rpc_text(path, rpc)
+    return path
+
+
+WRITERS = {
+    "a.tif": write_geotiff, "a.RPB": _rpb, "a_RPC.TXT": _text, "a.geom": write_geom, "RPC_a.XML": write_dimap,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_same_polynomials_come_back(name, rpc, tmp_path):
+    back = read_scene(WRITERS[name](tmp_path / name, rpc)).model("rpc")
+    rng = np.random.default_rng(1)
+    u, v, h = rng.uniform(0, 20_000, 50), rng.uniform(0, 6000, 50), rng.uniform(0, 2000, 50)
+    located = rpc.direct(u, v, h)
+    np.testing.assert_allclose(back.inverse(*located.T), np.stack([u, v], axis=1), atol=1e-6)
+
+
+def test_gdal_gives_the_same_pixels(rpc):
+    """GDAL counts from the corner of a pixel, half a pixel more."""
+    rng = np.random.default_rng(2)
+    u, v, h = rng.uniform(0, 20_000, 50), rng.uniform(0, 6000, 50), rng.uniform(0, 2000, 50)
+    located = rpc.direct(u, v, h)
+    with RPCTransformer(rasterio_rpc(rpc)) as transformer:
+        row, column = transformer.rowcol(np.degrees(located[:, 1]), np.degrees(located[:, 0]), h, op=lambda x: x)
+    np.testing.assert_allclose(np.stack([row, column], axis=1) - 0.5, np.stack([u, v], axis=1), atol=1e-4)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["left_image", "right_image"])
+def test_geom_of_ossim(name):
+    rpc = read_scene(VENTOUX / f"{name}.geom").model()
+    assert rpc.lines > 40_000 and rpc.samples > 38_000
+    u, v = np.array([0.0, 5000.0, 40_000.0]), np.array([0.0, 5000.0, 39_000.0])
+    located = rpc.direct(u, v, 1000.0)
+    np.testing.assert_allclose(np.degrees(located[1, :2]), [44.2, 5.19], atol=0.03)
+    np.testing.assert_allclose(rpc.inverse(*located.T), np.stack([u, v], axis=1), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "match"),
+    [
+        ("a.RPB", lambda s: s.replace("lineOffset", "lineOfset"), "lineOffset: missing, wanted a number"),
+        ("a.RPB", lambda s: s[: s.index("sampDenCoef") + 60], "sampDenCoef: .*wanted 20 numbers"),
+        ("a_RPC.TXT", lambda s: s.replace("SAMP_SCALE: ", "SAMP_SCALE: x"), "samp_scale: 'x.*wanted a number"),
+        ("a_RPC.TXT", lambda s: s.replace("LINE_DEN_COEFF_7:", "LINE_DEN_COEFF_77:"), "line_den_coeff_07: missing"),
+        ("a.geom", lambda s: s.replace("polynomial_format:  B", "polynomial_format:  A"), "'A', wanted B"),
+        ("RPC_a.XML", lambda s: s.replace("LINE_NUM_COEFF_3>", "X>"), "LINE_NUM_COEFF_3: missing, wanted a number"),
+        ("RPC_a.XML", lambda s: s.replace("<LAT_SCALE>", "<LAT_SCALE>0 "), "LAT_SCALE.*wanted a number"),
+    ],
+)
+def test_what_is_missing_is_named(name, change, match, rpc, tmp_path):
+    path = WRITERS[name](tmp_path / name, rpc)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(UserError, match=match) as caught:
+        read_scene(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_a_denominator_of_zero_is_refused(rpc, tmp_path):
+    path = _text(tmp_path / "a_RPC.TXT", rpc)
+    lines = path.read_text().splitlines()
+    lines = ["SAMP_DEN_COEFF_2: -1.5" if line.startswith("SAMP_DEN_COEFF_2:") else line for line in lines]
+    path.write_text("\n".join(lines))
+    with pytest.raises(UserError, match="denominator of the sample passes zero inside the box"):
+        read_scene(path)
+
+
+def test_an_image_without_rpc(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", width=6, height=5, count=1, dtype="uint8"):
+            pass
+    with pytest.raises(UserError, match="an image without RPC"):
+        read_scene(tmp_path / "a.tif")

@@ -1,0 +1,180 @@
+"""Every format gives the scene that was written: rays through the true pixels, round trips everywhere on the Earth."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, write_isd
+
+from triline.nodes.errors import UserError
+from triline.nodes.formats.satellite.folder_writer import write_overpass
+from triline.nodes.formats.satellite.read import read_scene
+from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
+
+WRITERS = {
+    "dimap2-list": lambda folder, truth: write_dimap2(folder / "scene.xml", truth),
+    "dimap2-polynomial": lambda folder, truth: write_dimap2(folder / "scene.xml", truth, polynomial=True),
+    "dimap2-columns": lambda folder, truth: write_dimap2(folder / "scene.xml", truth, first_col=101),
+    "dimap1": lambda folder, truth: write_dimap1(folder / "scene.dim", truth),
+    "isd": lambda folder, truth: write_isd(folder / "scene.json", truth),
+    "isd-inertial": lambda folder, truth: write_isd(folder / "scene.json", truth, inertial=True),
+    "folder-angles": lambda folder, truth: write_folder(folder / "scene", truth),
+    "folder-quaternions": lambda folder, truth: write_folder(folder / "scene", truth, angles=False, velocities=False),
+}
+#: Somewhere, over the pole, over the date line, over both; the last looks far sideways.
+PLACES = {
+    "middle latitude": Truth(),
+    "north pole": Truth(inclination_deg=90.0, phase_deg=89.9, tilt_deg=(0.0, 0.0, 0.0)),
+    "south pole": Truth(inclination_deg=90.0, phase_deg=-90.1, tilt_deg=(0.0, 0.5, 0.0)),
+    "date line": Truth(inclination_deg=98.0, node_deg=180.73, phase_deg=5.0, tilt_deg=(0.0, 0.0, 0.0)),
+    "oblique": Truth(tilt_deg=(35.0, 20.0, 5.0)),
+}
+
+
+def pixels(sensor, n=9):
+    """Pixels of a grid with the edges of the image, half a pixel outside the outermost centres."""
+    u, v = np.meshgrid(np.linspace(-0.5, sensor.lines - 0.5, n), np.linspace(-0.5, sensor.samples - 0.5, n))
+    return u.ravel(), v.ravel()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_rays_of_the_file_pass_through_the_pixels_of_the_truth(name, tmp_path):
+    truth = Truth()
+    sensor = read_scene(WRITERS[name](tmp_path, truth)).model("rigorous")
+    assert (sensor.lines, sensor.samples) == (truth.lines, truth.samples)
+    u, v = pixels(sensor)
+    for height in (-400.0, 0.0, 9000.0):
+        located = sensor.direct(u, v, height)
+        np.testing.assert_allclose(located[:, 2], height, atol=1e-6)
+        assert truth.miss_m(u, v, located, inertial=name != "dimap1") < 1e-3
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("name", ["dimap2-list", "dimap1", "isd-inertial", "folder-angles"])
+def test_round_trip_at_the_ends_of_the_scene(name, place, tmp_path):
+    sensor = read_scene(WRITERS[name](tmp_path, PLACES[place])).model("rigorous")
+    u, v = pixels(sensor)
+    for height in (-400.0, 9000.0):
+        located = sensor.direct(u, v, height)
+        back = sensor.inverse(*located.T)
+        np.testing.assert_allclose(back, np.stack([u, v], axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("place", ["north pole", "south pole", "date line"])
+def test_scenes_over_poles_and_date_line_really_are(place, tmp_path):
+    sensor = read_scene(write_dimap2(tmp_path / "scene.xml", PLACES[place])).model("rigorous")
+    u, v = pixels(sensor)
+    located = np.degrees(sensor.direct(u, v, 0.0))
+    if place == "date line":
+        assert located[:, 1].min() < -179.9 and located[:, 1].max() > 179.9
+    else:
+        assert np.ptp(located[:, 1]) > 300.0 and np.abs(located[:, 0]).max() > 89.8
+
+
+def test_points_beside_the_image_are_not_in_it(tmp_path):
+    sensor = read_scene(write_dimap2(tmp_path / "scene.xml", Truth())).model("rigorous")
+    u, v = np.array([100.0, 10_000.0]), np.array([3000.0, 5999.0])
+    ground = sensor.ground(u, v, 0.0)
+    assert np.isfinite(sensor.ground_to_pixel(ground)).all()
+    assert np.isnan(sensor.ground_to_pixel(-ground)).all(), "the other side of the Earth"
+    sideways = np.cross(ground, sensor.pose(u).velocity_e)
+    away = ground + 20e3 * sideways / np.linalg.norm(sideways, axis=1, keepdims=True)
+    assert np.isnan(sensor.ground_to_pixel(away)).all()
+    # with a margin they have coordinates outside
+    ahead = sensor.ground(np.array([-300.0, 20_300.0]), v, 0.0)
+    assert np.isnan(sensor.ground_to_pixel(ahead)).all()
+    np.testing.assert_allclose(sensor.ground_to_pixel(ahead, 400.0)[:, 0], [-300.0, 20_300.0], atol=1e-6)
+
+
+def test_another_planet(tmp_path):
+    truth = Truth()
+    flat = read_scene(write_isd(tmp_path / "a.json", truth, semi_minor_km=6300.0)).model("rigorous")
+    u, v = pixels(flat)
+    X = flat.ground(u, v, 0.0)
+    on = (X[:, 0] ** 2 + X[:, 1] ** 2) / 6378137.0**2 + X[:, 2] ** 2 / 6300e3**2
+    np.testing.assert_allclose(on, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(flat.inverse(*flat.direct(u, v, 500.0).T), np.stack([u, v], axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("earth_fixed", [False, True])
+@pytest.mark.parametrize("name", ["alos-prism", "aster-vnir", "eros-a1"])
+def test_a_simulated_overpass_comes_back_from_its_folder(name, earth_fixed, tmp_path):
+    """60 s positions and 0.1 s attitudes, lenses with mountings of their own: a millimetre on the ground."""
+    true = overpass(ORBITAL_SENSORS[name], 36.0, 139.6, roll_deg=1.2)
+    write_overpass(tmp_path / "scene", true, earth_fixed=earth_fixed)
+    scene = read_scene(tmp_path / "scene")
+    assert list(scene.sensors) == list(true.sensors)
+    for id, sensor in true.sensors.items():
+        u, v = pixels(sensor, 5)
+        located = scene.model("rigorous", id).ground(u, v, 500.0)
+        assert np.linalg.norm(located - sensor.ground(u, v, 500.0), axis=1).max() < 2e-3, id
+
+
+def test_a_mounting_of_a_lens_that_is_not_there(tmp_path):
+    write_overpass(tmp_path / "scene", overpass(ORBITAL_SENSORS["eros-a1"], 36.0, 139.6))
+    with open(tmp_path / "scene" / "scene.toml", "a") as file:
+        file.write("[lens.Q]\nboresight_deg = [0.0, 1.0, 0.0]\n")
+    with pytest.raises(UserError, match=r"scene.toml: lens.Q: no lens of camera.json, wanted P"):
+        read_scene(tmp_path / "scene")
+
+
+def test_an_isd_is_read_as_usgscsm_reads_it(tmp_path):
+    """A ball of 1000 km under a camera 50 km above it; the answer is that of a test of usgscsm (release 1.6)."""
+    turn = 0.1 * np.arange(16) / 1050.0
+    times = (999.2 + 0.1 * np.arange(16)).tolist()
+    zero = np.zeros(16)
+    position = 1050.0 * np.stack([np.cos(turn), zero, -np.sin(turn)], axis=1)
+    velocity = -np.stack([np.sin(turn), zero, np.cos(turn)], axis=1)
+    half = 0.5 * (0.5 * np.pi + turn)
+    isd = {
+        "name_model": "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL",
+        "image_lines": 16, "image_samples": 16, "center_ephemeris_time": 1000.0, "line_scan_rate": [[0.5, -0.85, 0.1]],
+        "starting_detector_line": 1, "starting_detector_sample": 0, "detector_center": {"line": 0.5, "sample": 8.0},
+        "focal2pixel_lines": [0.0, -10.0, 0.0], "focal2pixel_samples": [0.0, 0.0, 10.0],
+        "focal_length_model": {"focal_length": 50}, "radii": {"semimajor": 1000, "semiminor": 1000, "unit": "km"},
+        "optical_distortion": {"radial": {"coefficients": [0.0, 0.0, 0.0]}},
+        "instrument_position": {
+            "unit": "km", "positions": position.tolist(), "velocities": velocity.tolist(), "ephemeris_times": times,
+        },
+        "instrument_pointing": {
+            "quaternions": np.stack([np.cos(half), zero, -np.sin(half), zero], axis=1).tolist(),
+            "ephemeris_times": times,
+        },
+        "body_rotation": {"quaternions": [[1.0, 0.0, 0.0, 0.0]] * 16, "ephemeris_times": times},
+    }  # fmt: skip
+    (tmp_path / "ball.json").write_text(json.dumps(isd))
+    # the centre of line 8 and sample 8 counted from 0.5 at the first pixel, as there
+    located = read_scene(tmp_path / "ball.json").model("rigorous").ground([8.5 - 0.5], [8.0 - 0.5], 0.0)
+    np.testing.assert_allclose(located, [[999999.670405, 0.0, -811.905238]], atol=1e-3)
+
+
+def test_several_bands_and_a_file_without_a_range_of_columns(tmp_path):
+    path = write_dimap2(tmp_path / "scene.xml", Truth())
+    text = path.read_text()
+    low, high = text.index("<Swath_Range>"), text.index("</Instrument_Calibration>")
+    band = text[text.index("<Polynomial_Look_Angles>") : high]
+    bands = f"<Band_Calibration_List>{2 * f'<Band_Calibration>{band}</Band_Calibration>'}</Band_Calibration_List>"
+    path.write_text(text[:low] + bands + text[high:])
+    scene = read_scene(path)
+    assert any("2 bands, the look angles of the first" in note for note in scene.notes)
+    assert any("no range of columns" in note for note in scene.notes)
+    u, v = pixels(scene.sensor)
+    assert Truth().miss_m(u, v, scene.sensor.direct(u, v, 0.0)) < 1e-3
+
+
+def test_look_angles_of_some_detectors_are_linear_between_them(tmp_path):
+    """As SPOT-4 gives them; the truth here is linear in the tangent, so that some centimetres are left."""
+    path = write_dimap1(tmp_path / "scene.dim", Truth())
+    full = read_scene(path).sensor
+    text = path.read_text()
+    found = re.findall(r"<Look_Angles>.*?</Look_Angles>", text)
+    for k, element in enumerate(found):
+        if k % 1000 and k != len(found) - 1:
+            text = text.replace(element, "")
+    path.write_text(text)
+    u, v = pixels(full)
+    off = np.linalg.norm(read_scene(path).sensor.ground(u, v, 0.0) - full.ground(u, v, 0.0), axis=1)
+    assert 0.0 < off.max() < 0.05

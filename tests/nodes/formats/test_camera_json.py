@@ -1,0 +1,196 @@
+"""camera.json: values, tables, errors that name file, key and what was wanted; the AVIRIS-NG camera."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from places import DATA
+from small_block import CAMERA
+
+from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.formats.camera_json import read_camera, write_camera
+from triline.nodes.formats.geocal_xml import read_glas_camera
+from triline.solver.camera.sensors import PRESETS, brown_distortion, preset
+
+GLAS = DATA / "avirisng" / "cam_cal_2022_04_11_glas.xml"
+
+
+def _write(folder, change=None):
+    camera = copy.deepcopy(CAMERA)
+    if change is not None:
+        change(camera)
+    path = folder / "camera.json"
+    path.write_text(json.dumps(camera))
+    return path
+
+
+def test_values(tmp_path):
+    camera = read_camera(_write(tmp_path))
+    assert camera.name == "test" and camera.lenses[0].principal_point_mm == (0.01, -0.02)
+    nadir = camera.lines[camera.line_index["N"]]
+    step = nadir.xy_mm[1] - nadir.xy_mm[0]
+    np.testing.assert_allclose(step, 0.01 * np.array([np.sin(np.radians(1)), np.cos(np.radians(1))]))
+    xy, _ = camera.image_coordinates(np.array([0]), np.array([499.5]))
+    np.testing.assert_allclose(xy, [[25.0 - 0.01, 0.02]], atol=1e-12)
+
+
+@pytest.mark.parametrize("as_list", [True, False])
+def test_distortion_goes_into_the_table(tmp_path, as_list):
+    values = {"k1": 1e-5, "k2": 0.0, "k3": 0.0, "p1": 2e-6, "p2": 0.0}
+    given = list(values.values()) if as_list else {"k1": 1e-5, "p1": 2e-6}
+    path = _write(tmp_path, lambda c: c["lenses"][0].update(distortion=given))
+    straight = read_camera(_write(tmp_path))
+    path.write_text(json.dumps({**CAMERA, "lenses": [{**CAMERA["lenses"][0], "distortion": given}]}))
+    camera = read_camera(path)
+    nominal = straight.lines[0].xy_mm
+    wanted = nominal + brown_distortion(nominal - [0.01, -0.02], **values)
+    np.testing.assert_allclose(camera.lines[0].xy_mm, wanted, atol=1e-12)
+
+
+def test_table_and_chips(tmp_path):
+    def change(camera):
+        camera["lines"][0] = {"id": "F", "lens": "L1", "table": "f.csv", "chips": [0, 2]}
+
+    path = _write(tmp_path, change)
+    (tmp_path / "f.csv").write_text("sample,x_mm,y_mm\n0,1.0,-0.02\n1,1.001,-0.01\n2,1.0,0.0\n3,1.0,0.011\n")
+    line = read_camera(path).lines[0]
+    assert line.chips == (0, 2) and line.pixels == 4
+    xy, pitch = line.image_coordinates(np.array([2.5]))
+    np.testing.assert_allclose(xy, [[1.0, 0.0055]])
+    np.testing.assert_allclose(pitch, [[0.0, 0.011]])
+
+
+BAD = {
+    "no lenses": (lambda c: c.pop("lenses"), "camera.json: lenses: missing, wanted a list with at least one entry"),
+    "no focal length": (
+        lambda c: c["lenses"][0].pop("focal_length_mm"),
+        "camera.json: lenses[0].focal_length_mm: missing, wanted a number above 0",
+    ),
+    "text for a number": (
+        lambda c: c["lenses"][0].update(focal_length_mm="60"),
+        "camera.json: lenses[0].focal_length_mm: '60', wanted a number above 0",
+    ),
+    "principal point": (
+        lambda c: c["lenses"][0].update(principal_point_mm=[1]),
+        "camera.json: lenses[0].principal_point_mm: [1], wanted 2 numbers",
+    ),
+    "unknown lens": (
+        lambda c: c["lines"][1].update(lens="X"),
+        "camera.json: lines[1].lens: 'X', wanted one of the lenses L1",
+    ),
+    "same id": (
+        lambda c: c["lines"][1].update(id="F"),
+        "camera.json: lines[1].id: 'F', wanted an id that no other line has",
+    ),
+    "pixels": (
+        lambda c: c["lines"][1].update(pixels=1.5),
+        "camera.json: lines[1].pixels: 1.5, wanted an integer of at least 2",
+    ),
+    "no table": (
+        lambda c: c["lines"][1].update(table="no.csv"),
+        "camera.json: lines[1].table: no file 'no.csv' beside it",
+    ),
+    "distortion": (
+        lambda c: c["lenses"][0].update(distortion=[1, 2]),
+        "camera.json: lenses[0].distortion: [1, 2], wanted 5 numbers: k1, k2, k3, p1, p2",
+    ),
+    "distortion name": (
+        lambda c: c["lenses"][0].update(distortion={"k9": 1}),
+        "camera.json: lenses[0].distortion.k9: unknown, wanted some of k1, k2, k3, p1, p2",
+    ),
+    "chips": (
+        lambda c: c["lines"][0].update(chips=[5, 3]),
+        "camera.json: lines[0].chips: [5, 3], wanted the first sample",
+    ),
+    "list of lines": (lambda c: c.update(lines={"id": 1}), "camera.json: lines: {'id': 1}, wanted a list"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_errors_name_file_key_and_what_was_wanted(tmp_path, case):
+    change, wanted = BAD[case]
+    with pytest.raises(UserError) as error:
+        read_camera(_write(tmp_path, change))
+    assert wanted in str(error.value)
+
+
+def test_table_with_a_gap(tmp_path):
+    path = _write(tmp_path, lambda c: c["lines"][0].update(table="f.csv"))
+    (tmp_path / "f.csv").write_text("sample,x_mm,y_mm\n0,1,0\n2,1,0.01\n")
+    with pytest.raises(UserError, match=r"f.csv:3: sample: 2, wanted 1"):
+        read_camera(path)
+    (tmp_path / "f.csv").write_text("sample,x_mm,y_mm\n0,1,0\n1,1,0.01\n")
+    with pytest.raises(UserError, match=r"lines\[0\].pixels: 1000, wanted 2, the number of samples in f.csv"):
+        read_camera(path)
+
+
+def test_not_json(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text('{"name": "x",\n "lenses": [}')
+    with pytest.raises(UserError, match=r"camera.json:2: not valid JSON"):
+        read_camera(path)
+    path.write_bytes(b"\xff\xfe\0\0")
+    with pytest.raises(UserError, match="not a text file"):
+        read_camera(path)
+    path.write_text("[1, 2]")
+    with pytest.raises(UserError, match=r"top level: \[1, 2\], wanted a table of keys"):
+        read_camera(path)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_the_round_trip(tmp_path, name):
+    camera = preset(name)
+    write_camera(tmp_path / "camera.json", camera)
+    again = read_camera(tmp_path / "camera.json")
+    assert again.lenses == camera.lenses
+    for a, b in zip(again.lines, camera.lines, strict=True):
+        assert (a.id, a.lens, a.chips) == (b.id, b.lens, b.chips)
+        np.testing.assert_allclose(a.xy_mm, b.xy_mm, atol=1e-9)
+
+
+def test_distorted_camera_is_not_distorted_twice(tmp_path):
+    path = _write(tmp_path, lambda c: c["lenses"][0].update(distortion=[1e-5, 0, 0, 0, 0]))
+    camera = read_camera(path)
+    write_camera(tmp_path / "again.json", camera)
+    np.testing.assert_allclose(read_camera(tmp_path / "again.json").lines[0].xy_mm, camera.lines[0].xy_mm, atol=1e-9)
+
+
+@pytest.mark.skipif(not GLAS.is_file(), reason="../shared/data is not there")
+def test_fitted_camera_of_aviris_ng(tmp_path, capsys):
+    camera = read_glas_camera(GLAS)
+    line = camera.lines[0]
+    assert camera.lenses[0].focal_length_mm == 27.5 and line.pixels == 598
+    pitch = np.hypot(*np.diff(line.xy_mm, axis=0).T)
+    # nominal pitch 27 um; the fitted distortion widens it towards the ends of the field
+    assert pitch.mean() == pytest.approx(0.027, rel=0.05)
+    assert pitch[280:320].mean() == pytest.approx(0.027, rel=0.03)
+    assert pitch[0] > pitch[299] and pitch[-1] > pitch[299]
+    # +-18 deg across; sample 0 looks to the right: seen in the tie points, where samples grow to the left of flight
+    angle = np.degrees(np.arctan2(line.xy_mm[[0, -1], 1], 27.5))
+    assert -18.5 < angle[0] < -16 and 15 < angle[1] < 18.5
+    assert np.abs(line.xy_mm[:, 0]).max() < 0.4
+    assert main(["import", str(GLAS), "-o", str(tmp_path / "camera.json")]) == 0
+    assert "598 pixels" in capsys.readouterr().out
+    np.testing.assert_allclose(read_camera(tmp_path / "camera.json").lines[0].xy_mm, line.xy_mm, atol=1e-9)
+
+
+@pytest.mark.skipif(not GLAS.is_file(), reason="../shared/data is not there")
+def test_damaged_camera_archives(tmp_path):
+    text = GLAS.read_text()
+    path = tmp_path / "camera.xml"
+    path.write_text(text[: len(text) // 2])
+    with pytest.raises(UserError, match=r"camera.xml:\d+: not well-formed XML"):
+        read_glas_camera(path)
+    path.write_text(text.replace("<rows>598</rows>", "<rows>597</rows>"))
+    with pytest.raises(UserError, match="field_alignment: 2392 values in 597 x 4"):
+        read_glas_camera(path)
+    path.write_text(text.replace("<field_angle_type>0", "<field_angle_type>1"))
+    with pytest.raises(UserError, match="field_angle_type"):
+        read_glas_camera(path)
+    path.write_text(text.replace("3.52930124904383913e-01", "what"))
+    with pytest.raises(UserError, match="'what', wanted a number"):
+        read_glas_camera(path)

@@ -1,0 +1,328 @@
+"""Export of topics: rows and columns, map features, SBET; round trips and what a user is told."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+from datetime import date
+
+import numpy as np
+import pandas as pd
+import pytest
+from recording_file import write_recording
+from small_block import simulated_block
+
+from triline.nodes.cli import main
+from triline.nodes.convert import gnss_message, ground_point_message, pose_message
+from triline.nodes.formats.block_messages import block_messages
+from triline.nodes.formats.detect import Options, read_any
+from triline.nodes.formats.rows import RowLayout, repeated_messages, spread_by_default
+from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages
+from triline.nodes.node import Message
+from triline.nodes.recording.writer import RecordingWriter
+from triline.schemas import messages as m
+from triline.schemas.image_lines import LineBlock
+from triline.schemas.topics import TOPICS
+from triline.solver.geometry.frames import LocalFrame
+
+FRAME = LocalFrame(47.5, 10.6, 0.0)
+START = 1_600_000_000 * 10**9
+
+
+def _project() -> Message:
+    body = m.Project(
+        name="p", crs="local", origin_latitude=47.5, origin_longitude=10.6, boresight_deg=[0.5, -0.3, 90.0]
+    )
+    return Message("configuration/project", START, body, "test")
+
+
+def _residual(strip: str, v: float):
+    return m.RayResidual(strip=strip, ccd="N", line=10.0, sample=20.0, v_line=v, v_sample=-v)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """One message or more on topics of every shape."""
+    path = tmp_path_factory.mktemp("export") / "flight.mcap"
+    covariance = np.diag([0.01, 0.04, 0.09, 1e-8, 4e-8, 9e-8])
+    messages = [_project()]
+    for i in range(20):
+        t = START + i * 10**8
+        pose = pose_message(
+            t, [10.0 * i, 5.0, 1000.0], [0.01, -0.02, 0.3], covariance if i else None,
+            strip="S1" if i < 12 else "S2", correction=np.arange(6.0) if i else None,
+        )  # fmt: skip
+        messages.append(Message("orientation/final", t, pose, "adjuster"))
+        messages.append(
+            Message("sensor/gnss", t, gnss_message(t, [47.5 + i * 1e-6, 10.6, 600.0], [0.1, 0.2, 0.3]), "gps")
+        )
+    for status, z in ((0, 100.0), (1, 101.0)):
+        point = m.ObjectPoint(point="P1", x=100.0, y=200.0, z=z, covariance=np.diag([1e-4, 4e-4, 9e-4]).ravel(), rays=3)
+        point.role, point.status = "tie", status
+        point.residuals.extend([_residual("S1", 0.1), _residual("S2", 0.2)])
+        messages.append(Message("point/object", START + (1 + status) * 10**9, point, "adjuster"))
+    messages.append(
+        Message("point/object", START + 3 * 10**9, m.ObjectPoint(point="P2", x=1.0, role="check"), "adjuster")
+    )
+    report = m.AdjustmentReport(update=1, sigma0=1.1, strip="S1")
+    report.rejected.append(m.RejectedObservation(point="P9", w=-7.5, reason="snooping"))
+    report.parameters.extend([m.ParameterEstimate(name="dX", value=0.1), m.ParameterEstimate(name="dY", value=0.2)])
+    messages.append(Message("adjustment/report", START + 10**9, report, "adjuster"))
+    ground = ground_point_message("G1", [1.0, 2.0, 3.0], np.diag([1e-4, 1e-4, 4e-4]), "planimetric")
+    messages.append(Message("observation/control", START, ground, "test"))
+    lines = LineBlock(np.zeros((4, 10), dtype="<u2"), "F", "S1", 100, START, 2_000_000)
+    messages.append(Message("sensor/lines/F", START + 10**7, lines, "camera"))
+    messages.sort(key=lambda message: message.stamp_ns)
+    return write_recording(path, messages)
+
+
+def _csv(recording, tmp_path, topic: str, *more: str) -> pd.DataFrame:
+    target = tmp_path / "out.csv"
+    assert main(["export", str(recording), "--topic", topic, "--csv", str(target), "-q", *more]) == 0
+    return pd.read_csv(target)
+
+
+def test_one_row_a_message_with_columns_named_as_the_fields(recording, tmp_path):
+    table = _csv(recording, tmp_path, "orientation/final")
+    assert list(table.columns[:5]) == ["stamp_ns", "sequence", "source", "timestamp.seconds", "timestamp.nanos"]
+    assert len(table) == 20 and (table.source == "adjuster").all()
+    assert table["stamp_ns"].tolist() == [START + i * 10**8 for i in range(20)]
+    assert table["sequence"].tolist() == list(range(20))
+    np.testing.assert_allclose(table["pose.position.x"], 10.0 * np.arange(20))
+    np.testing.assert_allclose(table[["angles_0", "angles_1", "angles_2"]], np.tile([0.01, -0.02, 0.3], (20, 1)))
+    # a vector that was not sent is empty, not zero
+    assert table["covariance_35"].isna().tolist() == [True] + [False] * 19
+    np.testing.assert_allclose(table["covariance_7"][1:], 0.04)
+    np.testing.assert_allclose(table[[f"correction_{i}" for i in range(6)]].iloc[1], np.arange(6))
+    assert table["strip"].tolist() == ["S1"] * 12 + ["S2"] * 8
+    assert table["velocity.x"].isna().all()  # a sub-message that was not sent
+
+
+def test_one_row_an_element(recording, tmp_path):
+    table = _csv(recording, tmp_path, "point/object")
+    assert table["point"].tolist() == ["P1", "P1", "P1", "P1", "P2"]
+    assert table["residuals.strip"].tolist()[:4] == ["S1", "S2", "S1", "S2"]
+    np.testing.assert_allclose(table["residuals.v_line"][:4], [0.1, 0.2, 0.1, 0.2])
+    assert table["status"].tolist() == ["live", "live", "final", "final", "live"]
+    assert np.isnan(table["residuals.v_line"][4]) and table["x"][4] == 1.0  # no element: one row, element columns empty
+    whole = _csv(recording, tmp_path, "point/object", "--rows", "none")
+    assert len(whole) == 3 and whole["residuals.count"].tolist() == [2, 2, 0]
+
+
+def test_which_repeated_field_becomes_rows(recording, tmp_path):
+    table = _csv(recording, tmp_path, "adjustment/report")
+    assert len(table) == 1 and table["rejected.count"][0] == 1 and table["parameters.count"][0] == 2
+    table = _csv(recording, tmp_path, "adjustment/report", "--rows", "parameters")
+    assert table["parameters.name"].tolist() == ["dX", "dY"] and table["rejected.count"].tolist() == [1, 1]
+    table = _csv(recording, tmp_path, "adjustment/report", "--rows", "rejected")
+    assert table["rejected.w"].tolist() == [-7.5]
+
+
+def test_wildcard_topics_name_the_topic_and_leave_the_pixels_out(recording, tmp_path):
+    for topic in ("sensor/lines/F", "sensor/lines/*"):
+        table = _csv(recording, tmp_path, topic)
+        assert table["frame_id"].tolist() == ["F"] and table["first_line"].tolist() == [100]
+        assert not any("data" in column for column in table.columns)
+    assert table["topic"].tolist() == ["sensor/lines/F"]
+
+
+def test_every_nth_message(recording, tmp_path):
+    assert _csv(recording, tmp_path, "orientation/final", "--every", "7")["sequence"].tolist() == [0, 7, 14]
+
+
+@pytest.mark.parametrize("topic", [row.name for row in TOPICS])
+def test_every_topic_of_the_table_has_rows(topic):
+    """Default messages, and the columns fit the rows for every way of spreading."""
+    row = next(row for row in TOPICS if row.name == topic)
+    name = topic.replace("*", "X")
+    for spread in (None, spread_by_default(row.type_name), *repeated_messages(row.type_name)):
+        layout = RowLayout(topic, spread)
+        body = row.type()
+        if spread is not None:
+            getattr(body, spread).add()
+        table = layout.frame([Message(name, 5, body, "s", 3)])
+        assert len(table) == 1 and len(set(table.columns)) == len(table.columns)
+        assert table.loc[0, "stamp_ns"] == 5 and table.loc[0, "sequence"] == 3
+
+
+def test_parquet_has_the_same_table(recording, tmp_path):
+    pytest.importorskip("pyarrow")
+    target = tmp_path / "out.parquet"
+    assert main(["export", str(recording), "--topic", "orientation/final", "--parquet", str(target), "-q"]) == 0
+    table, text = pd.read_parquet(target), _csv(recording, tmp_path, "orientation/final")
+    assert list(table.columns) == list(text.columns) and table["stamp_ns"].dtype == "Int64"
+    np.testing.assert_array_equal(table["stamp_ns"], text["stamp_ns"])
+    np.testing.assert_array_equal(table["covariance_14"].to_numpy(), text["covariance_14"].to_numpy())
+
+
+def test_csv_gives_the_numbers_back_to_the_last_bit(tmp_path):
+    block = simulated_block()
+    path = tmp_path / "b.mcap"
+    write_recording(path, block_messages(block))
+    table = _csv(path, tmp_path, "observation/tie")
+    assert len(table) == len(block.image)
+    got = sorted(zip(table["point"], table["images.strip"], table["images.ccd"], table["images.line"], strict=True))
+    wanted = sorted((*block.image_name(i), float(block.image.line[i])) for i in range(len(block.image)))
+    assert got == wanted
+
+
+# ---- maps
+
+
+def test_geojson(recording, tmp_path):
+    target = tmp_path / "o.geojson"
+    assert main(["export", str(recording), "--topic", "orientation/final", "--geojson", str(target), "-q"]) == 0
+    features = json.loads(target.read_text())["features"]
+    lines = [f for f in features if f["geometry"]["type"] == "LineString"]
+    assert {f["properties"]["line"]: len(f["geometry"]["coordinates"]) for f in lines} == {"S1": 12, "S2": 8}
+    points = [f for f in features if f["geometry"]["type"] == "Point"]
+    lon, lat, height = points[3]["geometry"]["coordinates"]
+    wanted = FRAME.to_geodetic([30.0, 5.0, 1000.0])
+    assert (lat, lon, height) == pytest.approx(tuple(wanted), abs=1e-4)
+    assert points[0]["properties"]["sigma_X_m"] is None
+    assert points[3]["properties"]["sigma_Y_m"] == pytest.approx(0.2)
+    assert points[3]["properties"]["sigma_kappa_deg"] == pytest.approx(np.degrees(3e-4))
+
+
+def test_object_points_count_once_with_their_last_state(recording, tmp_path):
+    target = tmp_path / "p.geojson"
+    assert main(["export", str(recording), "--topic", "point/object", "--geojson", str(target), "-q"]) == 0
+    features = json.loads(target.read_text())["features"]
+    assert [f["properties"]["point"] for f in features] == ["P1", "P2"]
+    assert features[0]["properties"]["status"] == "final"
+    assert features[0]["properties"]["sigma_Z_m"] == pytest.approx(0.03)
+    wanted = FRAME.to_geodetic([100.0, 200.0, 101.0])
+    assert features[0]["geometry"]["coordinates"][2] == pytest.approx(wanted[2], abs=1e-3)
+
+
+def _geometry(blob: bytes) -> tuple[int, np.ndarray]:
+    """WKB type and coordinates of a GeoPackage geometry."""
+    magic, version, flags, srs = struct.unpack_from("<2sBBi", blob)
+    assert (magic, version, flags, srs) == (b"GP", 0, 1, 4326)
+    _, kind = struct.unpack_from("<BI", blob, 8)
+    return kind, np.frombuffer(blob, "<f8", offset=13 if kind == 1001 else 17).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(
+    "topic, points, lines", [("orientation/final", 20, 2), ("observation/control", 1, 0), ("sensor/gnss", 20, 1)]
+)
+def test_geopackage(recording, tmp_path, topic, points, lines):
+    target = tmp_path / "o.gpkg"
+    target.write_text("something old")
+    assert main(["export", str(recording), "--topic", topic, "--gpkg", str(target), "-q"]) == 0
+    assert target.read_bytes()[:15] == b"SQLite format 3" and target.read_bytes()[68:72] == b"GPKG"
+    database = sqlite3.connect(target)
+    table = topic.replace("/", "_")
+    contents = dict(database.execute("SELECT table_name, srs_id FROM gpkg_contents").fetchall())
+    assert contents == {table: 4326} | ({f"{table}_lines": 4326} if lines else {})
+    assert database.execute("SELECT z, m FROM gpkg_geometry_columns").fetchall() == [(1, 0)] * (2 if lines else 1)
+    assert {-1, 0, 4326} <= {row[0] for row in database.execute("SELECT srs_id FROM gpkg_spatial_ref_sys")}
+    rows = database.execute(f'SELECT geom FROM "{table}"').fetchall()
+    assert len(rows) == points
+    kind, place = _geometry(rows[-1][0])
+    low = database.execute("SELECT min_x, min_y, max_x, max_y FROM gpkg_contents").fetchone()
+    assert kind == 1001 and low[0] <= place[0, 0] <= low[2] and low[1] <= place[0, 1] <= low[3]
+    if lines:
+        kind, place = _geometry(database.execute(f'SELECT geom FROM "{table}_lines"').fetchone()[0])
+        assert kind == 1002 and len(place) == (12 if topic.startswith("orient") else 20)
+    names = [row[1] for row in database.execute(f'PRAGMA table_info("{table}")')]
+    assert ("sigma_E_m" if topic == "sensor/gnss" else "sigma_X_m") in names
+    assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    database.close()
+
+
+# ---- SBET
+
+
+def test_sbet_comes_back_as_the_track_it_was(tmp_path):
+    """Track, recording with a turned camera, SBET, track: positions, attitude of the body, times."""
+    n = 60
+    t = np.arange(n) * 0.1
+    geodetic = np.column_stack([48 + t * 6e-4, 11 + t * 9e-4, 2000 + t])
+    rpy = np.radians(np.column_stack([np.sin(t), np.cos(t), 350 + 4 * t]))
+    track = NavigationTrack("t", START + np.rint(t * 1e9).astype(np.int64), geodetic, rpy)
+    path, sbet = tmp_path / "t.mcap", tmp_path / "t.sbet"
+    write_recording(path, track_messages(track, "x", Mounting(boresight_deg=(0.5, -0.3, 90.0))))
+    assert main(["export", str(path), "--topic", "trajectory/smoothed", "--sbet", str(sbet), "-q"]) == 0
+    values = np.fromfile(sbet, "<f8").reshape(-1, 17)
+    speed = np.linalg.norm(values[5:-5, 4:6], axis=1)
+    assert speed == pytest.approx(np.hypot(6e-4 * 111_200, 9e-4 * 74_600), rel=0.01)
+    np.testing.assert_allclose(values[5:-5, 6], -1.0, atol=0.01)  # down
+    again = read_any(sbet, options=Options(day=date(2020, 9, 13))).messages
+    poses = [message.body for message in again if message.topic == "trajectory/smoothed"]
+    plain = [message.body for message in track_messages(track, "x") if message.topic == "trajectory/smoothed"]
+    for a, b in zip(poses, plain, strict=True):
+        assert abs(a.timestamp.nanos - b.timestamp.nanos) < 300 and a.timestamp.seconds == b.timestamp.seconds
+        assert a.pose.position.x == pytest.approx(b.pose.position.x, abs=1e-5)
+        assert np.array(a.angles) == pytest.approx(np.array(b.angles), abs=1e-9)
+
+
+# ---- what a user is told
+
+
+@pytest.mark.parametrize(
+    "args, wanted",
+    [
+        (["--topic", "no/such", "--csv", "o"], "--topic no/such: not a topic; topics: configuration/project"),
+        (["--topic", "sensor/imu", "--csv", "o"], "no message on sensor/imu; it holds adjustment/report"),
+        (
+            ["--topic", "point/object", "--csv", "o", "--rows", "x"],
+            "--rows x: point/object has no such field, wanted one of residuals, none",
+        ),
+        (["--topic", "adjustment/report", "--gpkg", "o"], "adjustment/report has no places for a map"),
+        (["--topic", "sensor/gnss", "--sbet", "o"], "--sbet: sensor/gnss has no poses"),
+        (["--topic", "sensor/gnss", "--csv", "no/o"], "no folder"),
+        (["--topic", "sensor/gnss", "--csv", "o", "--every", "0"], "--every 0, wanted at least 1"),
+    ],
+)
+def test_refusals_are_one_line_and_leave_no_file(recording, tmp_path, capsys, monkeypatch, args, wanted):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(recording), *args]) == 1
+    out, err = capsys.readouterr()
+    assert out == "" and wanted in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_old_file_stays_when_the_new_one_fails(recording, tmp_path, capsys):
+    target = tmp_path / "o.csv"
+    target.write_text("old")
+    assert main(["export", str(recording), "--topic", "point/object", "--csv", str(target), "--rows", "x"]) == 1
+    assert target.read_text() == "old"
+
+
+def test_files_that_are_no_recording(tmp_path, capsys):
+    empty, text = tmp_path / "e.mcap", tmp_path / "t.mcap"
+    empty.touch()
+    text.write_text("hello")
+    for path, wanted in ((empty, "empty"), (text, "not an MCAP recording"), (tmp_path / "none", "no such file")):
+        assert main(["export", str(path), "--topic", "sensor/gnss", "--csv", str(tmp_path / "o.csv")]) == 1
+        assert wanted in capsys.readouterr().err
+
+
+def test_no_project_no_map(tmp_path, capsys):
+    path = tmp_path / "r.mcap"
+    with RecordingWriter(path) as writer:
+        writer.write(Message("orientation/final", START, pose_message(START, [0, 0, 0], [0, 0, 0]), "x"))
+    for option in ("--geojson", "--sbet"):
+        assert main(["export", str(path), "--topic", "orientation/final", option, str(tmp_path / "o")]) == 1
+        assert "no message on configuration/project" in capsys.readouterr().err
+
+
+def test_machine_readable_result(recording, tmp_path, capsys):
+    args = ["export", str(recording), "--topic", "point/object", "--csv", str(tmp_path / "o.csv"), "--json"]
+    assert main(args) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["rows"] == 5 and result["type"] == "triline.ObjectPoint" and result["skipped"] == 0
+
+
+def test_what_a_damaged_recording_lacks_is_named(recording, tmp_path, capsys):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recording.read_bytes()[:-40])
+    args = ["export", str(cut), "--topic", "point/object", "--csv", str(tmp_path / "o.csv")]
+    assert main(args) == 0
+    said = capsys.readouterr()
+    assert "skipped 1 damaged place: the file ends inside a record" in said.err and len(said.err.splitlines()) == 1
+    assert "()" not in said.out + said.err
+    assert main([*args, "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["damage"]) == 1

@@ -1,0 +1,233 @@
+"""A flight folder: what is missing in it is said, and it becomes a recording."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyproj
+import pytest
+from envi_files import write_camera, write_image
+from tracks import ns
+
+from triline.nodes.cli import main
+from triline.nodes.config import load
+from triline.nodes.convert import local_frame, pose_sample
+from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.recording.reader import RecordingReader
+
+START = "2020-06-01T12:00:00"
+LAT, LON, GROUND = 48.0, 11.0, 612.3
+TOML = """
+[flight]
+name = "valley"
+platform = "do228"
+crs = "EPSG:32632"
+vertical_datum = "ellipsoid"
+[camera]
+file = "camera.json"
+[mounting]
+lever_arm_m = [0.2, 0.0, -1.5]
+camera_lever_arm_m = [0.1, 0.0, 0.3]
+boresight_deg = [0.0, 0.1, 0.0]
+[navigation]
+file = "poses.csv"
+date = 2020-06-01
+gnss = "RTK"
+imu = "tactical"
+[trajectory]
+shift_sigma_deg = [0.004, 0.004, 0.008]
+[control]
+file = "control.csv"
+[[strips]]
+id = "S1"
+images = {F = "all.img@1", N = "all.img@2", B = "all.img@3"}
+line_times = "times.csv"
+[[strips]]
+id = "S2"
+images = {N = "nadir.img"}
+first_time = 2020-06-01T12:00:03Z
+line_rate_hz = 50
+[nodes.matcher]
+ground_m = 5.0
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Poses 2 000 m up over ground at 612 m, two strips of images, three control points."""
+    at = tmp_path / "flight"
+    at.mkdir()
+    rows = [f"{129618 + i},{LAT + 0.0009 * i:.6f},{LON},2000,0,0,0" for i in range(6)]
+    (at / "poses.csv").write_text(
+        "gps_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + "\n".join(rows) + "\n"
+    )
+    write_camera(at / "camera.json")
+    rng = np.random.default_rng(1)
+    write_image(at / "all.img", rng.integers(0, 255, (50, 7, 3)).astype("u1"), "bip")
+    write_image(at / "nadir.img", rng.integers(0, 4000, (20, 7, 1)).astype("u2"))
+    (at / "times.csv").write_text("line,time\n" + "".join(f"{i},2020-06-01T12:00:{i / 50:09.6f}Z\n" for i in range(50)))
+    to_utm = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    points = []
+    for i, height in enumerate((GROUND - 10, GROUND, GROUND + 30)):
+        x, y = to_utm.transform(LON + 0.001 * i, LAT + 0.001 * i)
+        points.append(f"P{i},{x:.3f},{y:.3f},{height},0.05,0.05,0.1,control")
+    (at / "control.csv").write_text("point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role\n" + "\n".join(points) + "\n")
+    (at / "flight.toml").write_text(TOML)
+    return at
+
+
+def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
+    assert main(["check", str(folder)]) == 0
+    assert "complete; 2 strips with images, ground at 612.3 m" in capsys.readouterr().out
+    out = tmp_path / "o.mcap"
+    assert main(["import", str(folder), "-o", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "control.csv: median height 612.3 m above the ellipsoid is the origin's" in told and "--position" not in told
+    reader = RecordingReader(out)
+    project = next(iter(reader.messages(["configuration/project"]))).body
+    assert (project.name, project.crs, project.origin_height) == ("valley", "EPSG:32632", GROUND)
+    np.testing.assert_allclose(project.lever_arm_m, [0.1, 0.0, -1.8])
+    np.testing.assert_allclose(project.offset_sigma_m, [0.03, 0.03, 0.05])  # RTK
+    np.testing.assert_allclose(project.shift_sigma_deg, [0.004, 0.004, 0.008])  # stated
+    np.testing.assert_allclose(project.drift_sigma_deg, [0.002, 0.002, 0.005])  # tactical
+    assert project.wander_time_s == 60.0
+    camera = next(iter(reader.messages(["configuration/camera"]))).body
+    assert [line.id for line in camera.lines] == ["F", "N", "B"]
+    control = [message.body for message in reader.messages(["observation/control"])]
+    frame = local_frame(project)
+    for i, point in enumerate(control):
+        lat, lon, height = frame.to_geodetic([point.x, point.y, point.z])
+        np.testing.assert_allclose([lat, lon], [LAT + 0.001 * i, LON + 0.001 * i], atol=1e-7)
+        assert height == pytest.approx(GROUND + (-10, 0, 30)[i], abs=1e-3)
+    assert control[1].z == pytest.approx(0.0, abs=0.1)  # the ground is at the origin's height
+    first = next(iter(reader.messages(["trajectory/smoothed"]))).body
+    pose = pose_sample(first)
+    assert pose.time_ns == ns(START) and pose.position_l[2] == pytest.approx(2000 - GROUND - 0.3, abs=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diag(pose.covariance)[0]), np.hypot(0.03, 0.02), rtol=1e-6)
+    strips = [message.body for message in reader.messages(["configuration/strip"])]
+    assert [(s.id, s.lines, s.ended) for s in strips] == [
+        ("S1", 50, False), ("S1", 50, True), ("S2", 20, False), ("S2", 20, True)
+    ]  # fmt: skip
+    blocks = [message.body for message in reader.messages(["sensor/lines/N"])]
+    assert blocks[-1].strip == "S2" and blocks[-1].pixels.dtype == np.uint16
+    assert load(folder / "flight.toml", ["matcher"]) == {"matcher": {"ground_m": 5.0}}
+
+
+def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
+    at = folder / "sensors"
+    at.mkdir()
+    t = 1591012800 + np.arange(300) * 0.01
+    rows = [f"{x:.2f},0,0,-9.81,0,0,0" for x in t]
+    (at / "imu.csv").write_text("time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s\n" + "\n".join(rows) + "\n")
+    fixes = [f"{1591012800 + i},{LAT},{LON},2000,0.1,0.1,0.2" for i in range(4)]
+    (at / "gnss.csv").write_text(
+        "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n" + "\n".join(fixes) + "\n"
+    )
+    text = TOML.replace('"poses.csv"', '"sensors"') + "[imu]\ngyro_noise_deg_sqrt_h = 0.06\n"
+    (folder / "flight.toml").write_text(text)
+    out = tmp_path / "o.mcap"
+    assert main(["import", str(folder), "-o", str(out), "-q"]) == 0
+    reader = RecordingReader(out)
+    assert next(iter(reader.messages(["configuration/project"]))).body.origin_height == GROUND
+    imu = next(iter(reader.messages(["sensor/imu"]))).body
+    assert imu.rate_sigma == pytest.approx(np.radians(0.06) / 60 / np.sqrt(imu.interval_ns * 1e-9), rel=1e-6)
+
+
+def test_lines_with_a_pose_each_need_no_times(folder, tmp_path):
+    """AVIRIS-NG: gpstime, lat, lon, alt, pitch, roll, heading of each line; the poses make no strip of their own."""
+    records = [(129618 + i / 100, LAT + 9e-6 * i, LON, 2000.0, 0.0, 0.0, 0.0) for i in range(50)]
+    np.array(records, dtype="<f8").tofile(folder / "ang20200601t120000_eph_att")
+    text = TOML[: TOML.index('[[strips]]\nid = "S2"')].replace('line_times = "times.csv"', "")
+    (folder / "flight.toml").write_text(text.replace('"poses.csv"', '"ang20200601t120000_eph_att"'))
+    out = tmp_path / "o.mcap"
+    assert main(["import", str(folder), "-o", str(out), "-q"]) == 0
+    reader = RecordingReader(out)
+    assert [message.body.id for message in reader.messages(["configuration/strip"])] == ["S1", "S1"]
+    blocks = [message.body for message in reader.messages(["sensor/lines/F"])]
+    assert np.concatenate([block.times_ns() for block in blocks])[49] == ns(START) + 490_000_000
+
+
+def test_new_check_import_of_an_empty_folder(tmp_path, capsys):
+    at = tmp_path / "new"
+    assert main(["new", "flight", str(at)]) == 0
+    assert "fill it in" in capsys.readouterr().out
+    assert main(["new", "flight", str(at)]) == 1
+    assert "flight.toml: is there already, and is not overwritten" in capsys.readouterr().err
+    assert main(["check", str(at)]) == 1
+    out, err = capsys.readouterr()
+    for wanted in (
+        "flight.toml: camera.file: no camera.json in the folder",
+        "flight.toml: navigation.file: no navigation.csv in the folder",
+        "flight.toml: neither [control] nor flight.ground_height_m, wanted one",
+        "note: flight.toml: no [[strips]]",
+    ):
+        assert wanted in out
+    assert "3 to be mended" in err
+    assert main(["check", str(at), "--json"]) == 1
+    assert len(json.loads(capsys.readouterr().out)["problems"]) == 3
+    assert main(["import", str(at), "-o", str(tmp_path / "o.mcap")]) == 1
+    err = capsys.readouterr().err
+    assert "no camera.json in the folder (and 2 more" in err and err.count("\n") == 1
+    assert main(["check", str(tmp_path)]) == 1
+    assert "no flight.toml; `triline new flight" in capsys.readouterr().err
+
+
+WRONG = {
+    "vertical datum absent": (
+        'vertical_datum = "ellipsoid"\n',
+        "",
+        "flight.vertical_datum: missing, wanted a vertical CRS",
+    ),
+    "vertical datum not vertical": (
+        '"ellipsoid"',
+        '"EPSG:32632"',
+        "flight.vertical_datum: 'EPSG:32632', wanted a vertical",
+    ),
+    "CRS unknown": ('"EPSG:32632"', '"EPSG:9"', "flight.crs: PROJ does not know the CRS 'EPSG:9"),
+    "CRS local": ('"EPSG:32632"', '"local"', "flight.crs: 'local', wanted one that PROJ understands"),
+    "camera and preset": ('"camera.json"', '"camera.json"\npreset = "ads40"', "camera: wanted either file"),
+    "no such preset": ('file = "camera.json"', 'preset = "x"', "camera.preset: 'x', wanted one of"),
+    "lever arm in mm": (
+        "[0.2, 0.0, -1.5]",
+        "[200, 0, -1500]",
+        "mounting.lever_arm_m: [200, 0, -1500], wanted metres within",
+    ),
+    "two numbers": ("[0.0, 0.1, 0.0]", "[0.0, 0.1]", "mounting.boresight_deg: [0.0, 0.1], wanted 3 numbers"),
+    "another day": (
+        "2020-06-01\ngnss",
+        "2020-06-04\ngnss",
+        "poses.csv: GPS seconds of the week say Monday, but 2020-06-04",
+    ),
+    "day in quotes": ("date = 2020-06-01", 'date = "2020-06-01"', "navigation.date: '2020-06-01', wanted a day"),
+    "grade": ('"RTK"', '"good"', "navigation.gnss: 'good', wanted one of RTK, PPP, code"),
+    "sigma of zero": ("0.004, 0.004", "0, 0.004", "trajectory.shift_sigma_deg: [0, 0.004, 0.008], wanted 3 positive"),
+    "misspelled": ("boresight_deg", "boresigth_deg", "mounting.boresigth_deg: not known, wanted lever_arm_m"),
+    "no control file": ('"control.csv"', '"gcp.csv"', "control.file: no gcp.csv in the folder"),
+    "no image": ('"nadir.img"', '"n.img"', "images.N: no n.img in the folder"),
+    "CCD line": ('images = {N = "nadir.img"}', 'images = {X = "nadir.img"}', "CCD line 'X' is not in the camera"),
+    "no times": ('line_times = "times.csv"', "", "strips[0]: times of the lines missing, wanted line_times"),
+    "rate of zero": ("line_rate_hz = 50", "line_rate_hz = 0", "line_rate_hz: 0, wanted a number above 0"),
+    "another hour": ("T12:00:03Z", "T14:00:03Z", "strip S2: lines from 2020-06-01T14:00:03Z to"),
+    "strip twice": ('"S2"', '"S1"', "strips: 'S1' comes twice"),
+    "node unknown": ("[nodes.matcher]", "[nodes.macher]", "nodes.macher: {'ground_m': 5.0}, wanted a node"),
+    "setting unknown": ("ground_m = 5.0", "ground = 5.0", "[matcher]: ground is not known, wanted one of"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_said_once_and_nothing_else(folder, what):
+    old, new, wanted = WRONG[what]
+    assert TOML.count(old) == 1
+    (folder / "flight.toml").write_text(TOML.replace(old, new))
+    problems = read_flight(folder).problems
+    n = 2 if what == "another day" else 1  # of the poses and of the lines
+    assert len(problems) == n and wanted in problems[0] and "\n" not in problems[0], problems
+
+
+def test_options_that_the_folder_says(folder, tmp_path, capsys):
+    assert main(["import", str(folder), "-o", str(tmp_path / "o.mcap"), "--crs", "EPSG:32633"]) == 1
+    assert "--crs does not go with a flight folder: it stands in flight.toml" in capsys.readouterr().err
+    (folder / "flight.toml").write_text("[flight\n")
+    assert main(["check", str(folder)]) == 1
+    assert "flight.toml: not valid TOML" in capsys.readouterr().err

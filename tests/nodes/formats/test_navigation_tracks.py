@@ -1,0 +1,377 @@
+"""Navigation solutions of other programs: values, times, frames, damaged files."""
+
+from __future__ import annotations
+
+from datetime import date
+
+import numpy as np
+import pytest
+from places import DATA, needs_data
+from tracks import ns, straight_track
+
+from triline.nodes.cli import main
+from triline.nodes.convert import pose_sample
+from triline.nodes.errors import UserError
+from triline.nodes.formats.avirisc import read_avirisc, utm_zone
+from triline.nodes.formats.avirisng import read_avirisng
+from triline.nodes.formats.detect import kind_of_path, read_any
+from triline.nodes.formats.gps_time import gps_from_utc_ns, gps_week, leap_seconds, unwrap_weeks, utc_ns_from_gps
+from triline.nodes.formats.pos_export import mapping_frame, read_pos_export
+from triline.nodes.formats.sbet import read_sbet, write_sbet
+from triline.nodes.formats.track import Accuracy, Mounting, NavigationTrack, camera_poses, frame_of, track_messages
+from triline.nodes.formats.trajectory_csv import read_trajectory_csv
+from triline.nodes.recording.reader import RecordingReader
+from triline.solver.geometry.frames import LocalFrame, navigation_from_R_lc
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
+
+AVIRIS_NG = DATA / "avirisng" / "ang20170323t202244_eph_att"
+AVIRIS_C = DATA / "avirisng" / "f180522t01p00r07_eph"
+AVIRIS_C_LONLAT = DATA / "avirisng" / "f180522t01p00r07rdn_e_lonlat_eph"
+POS = DATA / "pospac" / "s251_sbet_subset.txt"
+
+
+# ---- GPS time
+
+
+def test_gps_time_of_known_instants():
+    assert gps_week(date(1980, 1, 6)) == (0, 0)
+    assert gps_week(date(2017, 3, 23)) == (1941, 4)  # a Thursday
+    assert gps_week(date(2019, 4, 7)) == (2048, 0)  # the second roll-over of ten bits
+    assert utc_ns_from_gps(2048, [18.0])[0] == ns("2019-04-07T00:00:00")
+    for day, seconds in (("1980-01-06", 0), ("2000-01-01", 13), ("2016-12-31", 17), ("2017-01-01", 18)):
+        assert leap_seconds(ns(f"{day}T00:00:00") // 10**9) == seconds
+
+
+def test_gps_time_over_a_leap_second():
+    """The leap second itself has no nanoseconds since the epoch of its own; the seconds about it have."""
+    utc = ns("2016-12-31T23:59:58") + np.array([0, 1, 2, 3]) * 10**9
+    week, seconds = gps_from_utc_ns(utc)
+    np.testing.assert_allclose(np.diff(seconds), [1, 2, 1])
+    np.testing.assert_array_equal(utc_ns_from_gps(week, seconds), utc)
+
+
+def test_weeks_go_on():
+    np.testing.assert_allclose(unwrap_weeks([604799.5, 604799.9, 0.3]), [604799.5, 604799.9, 604800.3])
+
+
+# ---- the camera on the body
+
+
+def test_lever_arm_and_boresight():
+    track = straight_track()
+    track = NavigationTrack("t", track.time_ns, track.geodetic, np.radians(np.tile([0.0, 0.0, 90.0], (50, 1))))
+    frame = frame_of(track)
+    plain, R, _ = camera_poses(track, frame)
+    moved, _, _ = camera_poses(track, frame, Mounting(lever_arm_m=(1.0, 2.0, 3.0)))
+    # flight to the east: forward is east, right is south, down is down (within convergence and curvature)
+    np.testing.assert_allclose(moved - plain, np.tile([1.0, -2.0, -3.0], (50, 1)), atol=2e-3)
+    np.testing.assert_allclose(R[25] @ [1, 0, 0], [1, 0, 0], atol=1e-3)  # x of the image along flight
+    np.testing.assert_allclose(R[25] @ [0, 0, 1], [0, 0, 1], atol=1e-3)  # z up
+    turned = camera_poses(track, frame, Mounting(boresight_deg=(0.0, 0.0, 90.0)))[1]
+    np.testing.assert_allclose(turned[25] @ [1, 0, 0], [0, -1, 0], atol=1e-3)  # heading on: south
+
+
+def test_sigmas_become_a_covariance():
+    n = 50
+    sigma_m, sigma_rpy = np.tile([0.1, 0.2, 0.3], (n, 1)), np.radians(np.tile([0.01, 0.02, 0.05], (n, 1)))
+    track = straight_track(sigma_ned_m=sigma_m, sigma_rpy=sigma_rpy)
+    covariance = camera_poses(track, frame_of(track))[2]
+    sigma = np.sqrt(np.einsum("nii->ni", covariance))
+    np.testing.assert_allclose(sigma[:, :3], np.tile([0.2, 0.1, 0.3], (n, 1)), rtol=1e-3)  # east, north, up
+    np.testing.assert_allclose(np.degrees(sigma[:, 5]), 0.05, rtol=0.01)  # kappa is heading, nearly level
+    np.testing.assert_allclose(np.linalg.eigvalsh(covariance[0])[:2], np.radians([0.01, 0.02]) ** 2, rtol=0.01)
+
+
+def test_angles_come_back_from_the_messages():
+    track = straight_track(line_rate_hz=10.0)
+    frame = frame_of(track)
+    messages = list(track_messages(track, "x", Mounting(boresight_deg=(0.3, -0.2, 1.0))))
+    poses = [pose_sample(message.body) for message in messages if message.topic == "trajectory/smoothed"]
+    position = np.array([pose.position_l for pose in poses])
+    R = matrix_from_quaternion(np.array([pose.quaternion for pose in poses]))
+    rpy = navigation_from_R_lc(frame, position, R, Mounting(boresight_deg=(0.3, -0.2, 1.0)).R_bc)
+    np.testing.assert_allclose(rpy, track.rpy, atol=1e-12)
+    np.testing.assert_allclose(frame.to_geodetic(position), track.geodetic, rtol=1e-12)
+    assert [pose.time_ns for pose in poses] == track.time_ns.tolist()
+    assert [message.stamp_ns for message in messages] == sorted(message.stamp_ns for message in messages)
+    speed = np.linalg.norm([[v.x, v.y, v.z] for v in (messages[i].body.velocity for i in range(5, 40))], axis=1)
+    np.testing.assert_allclose(speed, 100, rtol=0.05)
+
+
+def test_accuracy_where_the_file_gives_none():
+    """Poses get it as covariance, the project as a-priori sigmas of slow errors; what the file says goes before."""
+    accuracy = Accuracy((0.5, 0.6, 0.7), (0.01, 0.02, 0.03))
+    n = 50
+    known = straight_track(sigma_ned_m=np.tile([0.1, 0.2, 0.3], (n, 1)), sigma_rpy=np.radians(np.full((n, 3), 0.1)))
+    for track, wanted_m in ((straight_track(), [0.5, 0.6, 0.7]), (known, [0.2, 0.1, 0.3])):
+        messages = list(track_messages(track, "x", accuracy=accuracy))
+        project, pose = messages[0].body, pose_sample(messages[5].body)
+        np.testing.assert_allclose(project.offset_sigma_m, wanted_m, rtol=1e-3)
+        np.testing.assert_allclose(np.sqrt(np.diagonal(pose.covariance))[:3], wanted_m, rtol=1e-3)
+        np.testing.assert_allclose(np.degrees(np.sqrt(pose.covariance[5, 5])), project.shift_sigma_deg[2], rtol=1e-3)
+    stated = Accuracy((0.5, 0.6, 0.7), (0.01, 0.02, 0.03), stated=True)
+    project = next(iter(track_messages(known, "x", accuracy=stated))).body
+    np.testing.assert_allclose([*project.offset_sigma_m, *project.drift_sigma_deg], [0.5, 0.6, 0.7, 0.01, 0.02, 0.03])
+
+
+# ---- AVIRIS-NG
+
+
+@needs_data
+def test_aviris_ng_poses():
+    track = read_avirisng(AVIRIS_NG)
+    assert len(track) == 17540 and track.name == "ang20170323t202244"
+    # 418977.00417 s of GPS week 1941, less 18 leap seconds; the file name says when recording was started, 5 s later
+    assert track.time_ns[0] == ns("2017-03-23T20:22:39") + 4_166_667
+    assert (np.diff(track.time_ns) > 0).all()
+    np.testing.assert_allclose(track.geodetic[0], [31.4980295, -114.505856, 19871.2583], rtol=1e-8)
+    assert track.line_rate_hz == pytest.approx(10.767, abs=0.001)
+    position, R, _ = camera_poses(track, frame_of(track))
+    velocity = np.gradient(position, (track.time_ns - track.time_ns[0]) * 1e-9, axis=0)
+    assert np.linalg.norm(velocity, axis=1).mean() == pytest.approx(207, abs=3)
+    # the image's x axis points along flight, but for crab and pitch
+    along = np.einsum("ni,ni->n", R[:, :, 0], velocity) / np.linalg.norm(velocity, axis=1)
+    assert np.percentile(np.degrees(np.arccos(along)), 99) < 5.0
+    # real data: the position solution jumps here and there, by tens of metres, which is told
+    assert any("position jumps at" in note for note in track.notes)
+
+
+@needs_data
+def test_aviris_ng_to_a_recording(tmp_path, capsys):
+    out = tmp_path / "ng.mcap"
+    assert main(["import", str(AVIRIS_NG), "-o", str(out), "--camera", "ads40"]) == 0
+    assert "17540" in capsys.readouterr().out
+    reader = RecordingReader(out)
+    assert reader.complete and not reader.damage
+    assert reader.first("configuration/camera").name == "ads40"
+    strips = [message.body for message in reader.messages(["configuration/strip"])]
+    assert [(s.id, s.ended, s.lines) for s in strips] == [
+        ("ang20170323t202244", False, 17540),
+        ("ang20170323t202244", True, 17540),
+    ]
+    poses = [pose_sample(message.body) for message in reader.messages(["trajectory/smoothed"])]
+    assert len(poses) == 17540 and all(pose.strip == "ang20170323t202244" for pose in poses)
+    # the strip's constant rate gives the line times to a tenth of a line
+    start = strips[0].first_line_time_ns
+    lines = (np.array([pose.time_ns for pose in poses]) - start) * 1e-9 * strips[0].line_rate_hz
+    assert np.abs(lines - np.arange(17540)).max() < 0.1
+
+
+@needs_data
+def test_aviris_ng_damaged(tmp_path):
+    path = tmp_path / AVIRIS_NG.name
+    data = AVIRIS_NG.read_bytes()
+    path.write_bytes(data[:-13])
+    with pytest.raises(UserError, match="982227 bytes, wanted a whole number of records of 56 bytes; truncated"):
+        read_avirisng(path)
+    header = AVIRIS_NG.with_name(AVIRIS_NG.name + ".hdr").read_text()
+    (tmp_path / (path.name + ".hdr")).write_text(header)
+    path.write_bytes(data[: 56 * 100])
+    with pytest.raises(UserError, match=r"100 records, but .*hdr says 17540"):
+        read_avirisng(path)
+    values = np.frombuffer(data, "<f8").reshape(-1, 7)[:100].copy()
+    values[16, 1] = np.nan
+    (tmp_path / (path.name + ".hdr")).write_text(header.replace("17540", "100"))
+    values.tofile(path)
+    with pytest.raises(UserError, match="record 17: latitude: nan, wanted -90 to 90 deg"):
+        read_avirisng(path)
+    values[16, 1] = 31.0
+    values[50, 0] = values[49, 0]
+    values.tofile(path)
+    track = read_avirisng(path)
+    assert len(track) == 99 and any("1 poses do not come after" in note for note in track.notes)
+    for old, new, wanted in (
+        ("data type = 5", "data type = 4", "data type: 4, wanted 5"),
+        ("bands = 7", "bands = x", "bands: 'x', wanted an integer"),
+        ("interleave = bip", "interleave = bsq", "interleave: wanted bip"),
+        ("ENVI\n", "ENVO\n", "not an ENVI header"),
+        ("heading", "course", "band heading: missing"),
+    ):
+        (tmp_path / (path.name + ".hdr")).write_text(header.replace("17540", "100").replace(old, new))
+        with pytest.raises(UserError, match=wanted):
+            read_avirisng(path)
+
+
+# ---- AVIRIS-C
+
+
+@needs_data
+def test_aviris_c_pair_agrees_and_headings_differ_by_the_convergence(tmp_path):
+    utm, lonlat = read_avirisc(AVIRIS_C), read_avirisc(AVIRIS_C_LONLAT)
+    raw = [np.fromfile(path, "<f8").reshape(-1, 6)[:, 5] for path in (AVIRIS_C, AVIRIS_C_LONLAT)]
+    assert raw[0] - raw[1] == pytest.approx(0.86, abs=0.01)
+    np.testing.assert_allclose(utm.geodetic, lonlat.geodetic, atol=2e-7)
+    np.testing.assert_allclose(np.degrees(utm.rpy), np.degrees(lonlat.rpy), atol=1e-7)
+    assert len(utm) == 1130 and utm.time_ns[0] == ns("2018-05-22T00:00:00")
+    # 12 lines a second give the speed of the ER-2
+    position = camera_poses(lonlat, frame_of(lonlat))[0]
+    assert np.linalg.norm(np.diff(position, axis=0), axis=1).mean() * 12 == pytest.approx(210, abs=5)
+    path = tmp_path / AVIRIS_C.name
+    path.write_bytes(AVIRIS_C.read_bytes())
+    with pytest.raises(UserError, match=r"unknown zone, wanted --crs"):
+        read_avirisc(path)
+    np.testing.assert_allclose(read_avirisc(path, "EPSG:32611").rpy, utm.rpy)
+    with pytest.raises(UserError, match="not a projected CRS"):
+        read_avirisc(path, "EPSG:4326")
+    with pytest.raises(UserError, match="PROJ does not know"):
+        read_avirisc(path, "zone 11")
+
+
+def test_utm_zones():
+    assert utm_zone(-118.5, 35.7) == "EPSG:32611" and utm_zone(9.0, -1.0) == "EPSG:32732"
+    assert utm_zone(179.9, 0.0) == "EPSG:32660" and utm_zone(-180.0, 0.0) == "EPSG:32601"
+
+
+# ---- POS Export
+
+
+@needs_data
+def test_pos_export_values():
+    track = read_pos_export(POS, date(2009, 3, 5))  # 380430 s: a Thursday
+    assert len(track) == 335
+    np.testing.assert_allclose(track.geodetic[0], [35.97443318, -115.13749165, 711.549])
+    np.testing.assert_allclose(np.degrees(track.rpy[0]), [0.079, 0.192, 271.106])
+    np.testing.assert_allclose(track.sigma_ned_m[0], [0.017, 0.017, 0.034])
+    np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.002, 0.002, 0.009])
+    assert track.time_ns[0] == ns("2009-03-05T09:40:15") + 326_560_000  # 15 leap seconds
+    assert not track.notes  # latitude and longitude agree with the mapping frame
+    assert read_pos_export(POS).time_ns[0] == ns("1980-01-10T09:40:30") + 326_560_000
+    with pytest.raises(UserError, match="seconds of the week say Thursday, but 2009-03-07 is a Saturday"):
+        read_pos_export(POS, date(2009, 3, 7))
+
+
+@needs_data
+def test_pos_export_gives_east_before_north(tmp_path):
+    path = tmp_path / "pos.txt"
+    path.write_text(POS.read_text().replace("0.017    0.017", "0.011    0.022", 1))
+    np.testing.assert_allclose(read_pos_export(path).sigma_ned_m[0], [0.022, 0.011, 0.034])
+
+
+@needs_data
+def test_pos_export_without_latitude(tmp_path):
+    """The mapping frame of the header stands in."""
+    rows = POS.read_text().splitlines()
+    place = next(i for i, row in enumerate(rows) if row.startswith(" TIME"))
+    names = [name.strip() for name in rows[place].split(",")]
+    keep = [i for i, name in enumerate(names) if name not in ("LATITUDE", "LONGITUDE")]
+    rows[place] = ", ".join(names[i] for i in keep)
+    data = [" ".join(row.split()[i] for i in keep) if row[:4] == " 380" else row for row in rows[place + 1 :]]
+    path = tmp_path / "pos.txt"
+    path.write_text("\n".join([*rows[: place + 1], *data]))
+    np.testing.assert_allclose(read_pos_export(path).geodetic, read_pos_export(POS).geodetic, atol=1e-7)
+    assert mapping_frame("\n".join(rows[:place])).startswith("+proj=tmerc +lon_0=-117.000000")
+
+
+@needs_data
+def test_pos_export_damaged(tmp_path):
+    text = POS.read_text()
+    rows = text.splitlines()
+    path = tmp_path / "pos.txt"
+    for change, wanted in (
+        (lambda: text[:-100], "values, wanted 20"),
+        (lambda: text.replace("35.97443318", "35.97x", 1), r"pos.txt:25: LATITUDE: '35.97x' is not a number"),
+        (lambda: text.replace("35.97443318", "nan", 1), r"pos.txt:25: LATITUDE: 'nan' is not a number"),
+        (lambda: text.replace("HEADING,", "COURSE,"), "HEADING: column missing"),
+        (lambda: "\n".join(rows[:18]), "no line of column names"),
+        (lambda: "\n".join(rows[:24]), "0 poses below the header"),
+    ):
+        path.write_text(change())
+        with pytest.raises(UserError, match=wanted):
+            read_pos_export(path)
+
+
+# ---- SBET
+
+
+def test_sbet_round_trip(tmp_path):
+    track = straight_track()
+    path = tmp_path / "sbet.out"
+    write_sbet(path, gps_from_utc_ns(track.time_ns)[1], track.geodetic, track.rpy, np.zeros((50, 3)))
+    assert path.stat().st_size == 50 * 136 and kind_of_path(path) == "sbet"
+    again = read_sbet(path, date(2020, 6, 1))
+    np.testing.assert_allclose(again.time_ns, track.time_ns, atol=200)  # float64 seconds of the week
+    np.testing.assert_allclose(again.geodetic, track.geodetic, rtol=1e-14)
+    np.testing.assert_allclose(again.rpy, track.rpy, atol=1e-14)
+
+
+def test_sbet_wander_angle_and_seconds_of_day(tmp_path):
+    path = tmp_path / "flight.out"
+    values = np.zeros((3, 17))
+    values[:, 0] = [100.0, 101.0, 102.0]
+    values[:, 1:4] = [0.8, 0.2, 1000.0]
+    values[:, 9], values[:, 10] = 1.5, 0.25
+    values.tofile(path)
+    np.testing.assert_allclose(read_sbet(path).rpy[:, 2], 1.25)
+    assert read_sbet(path, date(2020, 6, 3)).time_ns[0] == ns("2020-06-03T00:01:22")  # 18 leap seconds
+    assert read_sbet(path, date(2020, 6, 7)).time_ns[0] == ns("2020-06-07T00:01:22")  # Sunday: seconds of the week
+    with pytest.raises(UserError, match="seconds of the week say Sunday"):
+        read_sbet(path, date(2020, 6, 3), seconds_of_day=False)
+
+
+def test_sbet_over_the_end_of_a_week(tmp_path):
+    path = tmp_path / "flight.out"
+    values = np.zeros((3, 17))
+    values[:, 0] = [604799.0, 604799.5, 0.0]
+    values.tofile(path)
+    track = read_sbet(path, date(2020, 6, 6))  # Saturday
+    np.testing.assert_array_equal(np.diff(track.time_ns), [500_000_000] * 2)
+    assert track.time_ns[0] == ns("2020-06-06T23:59:41")
+    # the same flight, named after its second day
+    np.testing.assert_array_equal(read_sbet(path, date(2020, 6, 7)).time_ns, track.time_ns)
+
+
+def test_sbet_damaged(tmp_path):
+    path = tmp_path / "sbet.out"
+    track = straight_track()
+    write_sbet(path, gps_from_utc_ns(track.time_ns)[1], track.geodetic, track.rpy, np.zeros((50, 3)))
+    data = path.read_bytes()
+    path.write_bytes(data[:-5])
+    with pytest.raises(UserError, match="6795 bytes, wanted a whole number of SBET records of 136 bytes"):
+        read_sbet(path)
+    path.write_bytes(data[8:] + data[:8])  # fields shifted by one
+    with pytest.raises(UserError, match="record 1: "):
+        read_sbet(path)
+
+
+# ---- CSV
+
+
+def test_trajectory_csv_of_both_kinds(tmp_path):
+    path = tmp_path / "trajectory.csv"
+    names = ["time_s", "lat_deg", "lon_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg"]
+    sigmas = [f"{name}_sigma" for name in names[1:]]
+    row = "{0},48.{0},11.{0},2000,0.1,0.2,45," + "0.1,0.2,0.3,0.01,0.02,0.03"
+    path.write_text(",".join(names + sigmas) + "\n" + "\n".join(row.format(i) for i in range(5)) + "\n")
+    track = read_trajectory_csv(path)
+    assert kind_of_path(path) == "csv" and track.time_ns.tolist() == [i * 10**9 for i in range(5)]
+    np.testing.assert_allclose(track.geodetic[3], [48.3, 11.3, 2000])
+    np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.01, 0.02, 0.03])
+
+    frame = LocalFrame(48.2, 11.2, 0.0, "EPSG:32632")
+    position = frame.from_geodetic(*track.geodetic.T)
+    xyz = frame.to_crs(position)
+    R = camera_poses(track, frame)[1]
+    angles = np.degrees(angles_from_matrix(np.swapaxes(frame.R_l_crs(xyz), -1, -2) @ R))
+    rows = [",".join(f"{v:.9f}" for v in (i, *xyz[i], *angles[i])) for i in range(5)]
+    path.write_text("time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg\n" + "\n".join(rows) + "\n")
+    again = read_trajectory_csv(path, "EPSG:32632")
+    np.testing.assert_allclose(again.geodetic, track.geodetic, atol=1e-6)
+    np.testing.assert_allclose(np.degrees(again.rpy), np.degrees(track.rpy), atol=1e-6)
+    with pytest.raises(UserError, match="unknown CRS, wanted --crs"):
+        read_trajectory_csv(path)
+
+
+def test_trajectory_csv_damaged(tmp_path):
+    path = tmp_path / "trajectory.csv"
+    head = "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n"
+    good = "1,48,11,500,0,0,45\n2,48,11.001,500,0,0,45\n"
+    for text, wanted in (
+        (head + good + "2,48,11,500,0,0,45\n", r"trajectory.csv:4: time_s: 2.000000 does not come after 2.000000"),
+        (head + good.replace("11.001", "east"), r"trajectory.csv:3: lon_deg: 'east' is not a number"),
+        (head + good.replace("48", "148"), "record 1: latitude: 148, wanted -90 to 90 deg"),
+        (head + "1,48,11,500,0,0,45\n", "1 poses with rising time, wanted at least 2"),
+        ("when,lat,lon\n1,2,3\n", "time_s: column missing"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=wanted):
+            list(read_any(path, "csv").messages)

@@ -1,0 +1,278 @@
+"""Poses as CSV with all kinds of times and units, and of Headwall and Resonon; files that state the wrong unit."""
+
+from __future__ import annotations
+
+from datetime import date
+from math import radians
+
+import numpy as np
+import pytest
+from tracks import ns
+
+from triline.nodes.errors import UserError
+from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
+
+START = "2020-06-01T12:00:00"  # a Monday; GPS week 2108, second 129618
+N = 6
+LAT = [48.0 + 0.0009 * i for i in range(N)]  # 100 m a second to the north-east
+LON = [11.0 + 0.00135 * i for i in range(N)]
+TAIL = [f"{LAT[i]:.6f},{LON[i]:.6f},2000,1.5,-2.5,45" for i in range(N)]
+COLUMNS = "lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg"
+
+TIMES = {
+    "ISO": ("time", [f"2020-06-01T12:00:0{i}Z" for i in range(N)], None),
+    "ISO with a zone and a blank": ("timestamp", [f"2020-06-01 14:00:0{i}.000+02:00" for i in range(N)], None),
+    "day and time": ("date,time", [f"2020-06-01,12:00:0{i}.0" for i in range(N)], None),
+    "Unix": ("time_s", [f"{1591012800 + i}.0" for i in range(N)], None),
+    "Unix, with the day": ("time_s", [f"{1591012800 + i}.0" for i in range(N)], date(2020, 6, 1)),
+    "week": ("week,gps_s", [f"2108,{129618 + i}" for i in range(N)], None),
+    "day": ("gps_s", [f"{129618 + i}" for i in range(N)], date(2020, 6, 1)),
+    "since 1980": ("gps_s", [f"{2108 * 604800 + 129618 + i}" for i in range(N)], None),
+}
+
+
+def write(path, head, times, columns=COLUMNS, tail=TAIL, sep=","):
+    rows = [f"{head},{columns}", *(f"{t},{v}" for t, v in zip(times, tail, strict=True))]
+    path.write_text("\n".join(rows).replace(",", sep) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("what", TIMES)
+@pytest.mark.parametrize("sep", [",", ";"])
+def test_times_of_every_kind(tmp_path, what, sep):
+    head, times, day = TIMES[what]
+    path = write(tmp_path / "poses.csv", head, times, sep=sep)
+    assert kind_of_path(path) == "csv"
+    track = read_track(path, "csv", Options(day=day))
+    assert track.time_ns.tolist() == [ns(START) + i * 10**9 for i in range(N)] and not track.notes
+    np.testing.assert_allclose(track.geodetic, np.column_stack([LAT, LON, np.full(N, 2000.0)]), atol=1e-6)
+    np.testing.assert_allclose(np.degrees(track.rpy[2]), [1.5, -2.5, 45.0])
+
+
+def test_over_the_end_of_a_week(tmp_path):
+    times = ["2108,604798", "2108,604799", *(f"2109,{i}" for i in range(N - 2))]
+    track = read_track(write(tmp_path / "p.csv", "week,gps_s", times), "csv", Options())
+    assert np.diff(track.time_ns).tolist() == [10**9] * (N - 1)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        "lat_rad,lon_rad,height_m,roll_rad,pitch_rad,heading_rad",
+        "Latitude [rad],Longitude [rad],Altitude (m),Roll (rad),Pitch (rad),Yaw (rad)",
+    ],
+)
+def test_radians_stated_in_the_header(tmp_path, columns):
+    turn = [radians(v) for v in (1.5, -2.5, 45)]
+    tail = [
+        f"{radians(LAT[i]):.10f},{radians(LON[i]):.10f},2000," + ",".join(f"{v:.9f}" for v in turn) for i in range(N)
+    ]
+    path = write(tmp_path / "p.csv", *TIMES["Unix"][:2], columns, tail)
+    assert kind_of_path(path) == "csv"
+    track = read_track(path, "csv", Options())
+    np.testing.assert_allclose(track.geodetic[:, :2], np.column_stack([LAT, LON]), atol=1e-6)
+    np.testing.assert_allclose(np.degrees(track.rpy[2]), [1.5, -2.5, 45.0], atol=1e-6)
+
+
+def test_decimal_commas_and_sigmas_as_navigate_writes_them(tmp_path):
+    sigmas = "sigma_n_m;sigma_e_m;sigma_d_m;sigma_roll_deg;sigma_pitch_deg;sigma_heading_deg"
+    rows = [
+        f"{1591012800 + i},5;{LAT[i]:.6f};{LON[i]:.6f};2000,25;1,5;-2,5;45;0,1;0,2;0,3;0,01;0,02;0,03" for i in range(N)
+    ]
+    path = tmp_path / "p.csv"
+    text = "\n".join(["time_s;" + COLUMNS.replace(",", ";") + ";" + sigmas, *rows])
+    path.write_text(text.replace(".", ",") + "\n")
+    track = read_track(path, "csv", Options())
+    assert track.time_ns[0] == ns(START) + 500_000_000 and track.geodetic[0, 2] == 2000.25
+    np.testing.assert_allclose(track.sigma_ned_m[0], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.01, 0.02, 0.03])
+
+
+UNIX = TIMES["Unix"][1]
+BARE = COLUMNS.replace("roll_deg", "roll")
+BAD = {
+    "no unit": ("time_s", UNIX, BARE, TAIL, None, "p.csv:1: roll: the unit is not stated, wanted roll_deg or roll_rad"),
+    "feet": (
+        "time_s",
+        UNIX,
+        COLUMNS.replace("height_m", "height_ft") + ",height_rad",
+        [f"{t},1" for t in TAIL],
+        None,
+        "p.csv:1: height_rad: the unit is not stated, wanted height_m",
+    ),
+    "no heading": (
+        "time_s",
+        UNIX,
+        COLUMNS.replace("heading", "track"),
+        TAIL,
+        None,
+        "p.csv:1: heading_deg: column missing",
+    ),
+    "twice": (
+        "time_s",
+        UNIX,
+        f"{COLUMNS},yaw_deg",
+        [f"{t},1" for t in TAIL],
+        None,
+        "p.csv:1: yaw_deg: heading comes twice",
+    ),
+    "no time": ("when", UNIX, COLUMNS, TAIL, None, "p.csv:1: time_s: column missing, wanted time_s (UTC, since 1970)"),
+    "a word": (
+        "time",
+        ["noon", *TIMES["ISO"][1][1:]],
+        COLUMNS,
+        TAIL,
+        None,
+        "p.csv:2: time: 'noon', wanted an ISO 8601",
+    ),
+    "seconds without scale": (
+        "time",
+        ["5.5", *TIMES["ISO"][1][1:]],
+        COLUMNS,
+        TAIL,
+        None,
+        "p.csv:2: time: 5.5 has no scale",
+    ),
+    "ms of the week": (
+        "gps_s",
+        ["129618000"] * N,
+        COLUMNS,
+        TAIL,
+        None,
+        "p.csv:2: gps_s: 1.29618e+08, wanted seconds of",
+    ),
+    "not in the week": (
+        "week,gps_s",
+        ["2108,700000"] * N,
+        COLUMNS,
+        TAIL,
+        None,
+        "p.csv:2: gps_s: 700000, wanted seconds of",
+    ),
+    "another day, Unix": (
+        "time_s",
+        UNIX,
+        COLUMNS,
+        TAIL,
+        date(2020, 6, 9),
+        "--date 2020-06-09, but its times begin on 2020-06-01",
+    ),
+    "another day, week": (
+        *TIMES["week"][:2],
+        COLUMNS,
+        TAIL,
+        date(2020, 6, 9),
+        "--date 2020-06-09, but its times begin on",
+    ),
+    "another weekday": (*TIMES["day"][:2], COLUMNS, TAIL, date(2020, 6, 4), "say Monday, but 2020-06-04 is a Thursday"),
+    "degrees for radians": (
+        "time_s",
+        UNIX,
+        COLUMNS.replace("heading_deg", "heading_rad"),
+        TAIL,
+        None,
+        "p.csv:2: heading_rad: 45, wanted radians; are they degrees? (and 5 more like it)",
+    ),
+    "positions in radians": (
+        "time_s",
+        UNIX,
+        COLUMNS,
+        [f"{radians(LAT[i]):.9f},{radians(LON[i]):.9f},2000,0,0,45" for i in range(N)],
+        None,
+        "p.csv: lat_deg, lon_deg: radians in columns of degrees?",
+    ),
+    "headings in radians": (
+        "time_s",
+        UNIX,
+        COLUMNS,
+        [f"{LAT[i]:.6f},{11 - (LON[i] - 11):.6f},2000,0,0,-0.785" for i in range(N)],
+        None,
+        "p.csv: heading_deg: radians in a column of degrees?",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_tables(tmp_path, what):
+    head, times, columns, tail, day, wanted = BAD[what]
+    path = write(tmp_path / "p.csv", head, times, columns, tail)
+    with pytest.raises(UserError) as error:
+        list(read_any(path, "csv", Options(day=day)).messages)
+    assert wanted in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_flight_of_a_metre_a_second_is_named(tmp_path):
+    tail = [f"{48 + 0.000009 * i:.7f},11,2000,0,0,0" for i in range(N)]
+    track = read_track(write(tmp_path / "p.csv", "time_s", UNIX, tail=tail), "csv", Options())
+    assert track.notes == (
+        "p.csv: a flight of 1 m/s (median), wanted 5 to 350; are times in seconds, and positions in degrees?",
+    )
+
+
+# ---- Headwall, Resonon
+
+HEADWALL = "Roll\tPitch\tYaw\tLat\tLon\tAlt\tTimestamp\tGps_UTC_Date&Time\tStatus\tHeading"
+
+
+def headwall_rows(day="2020/06/01"):
+    return [f"1.5\t-2.5\t45\t{LAT[i]:.6f}\t{LON[i]:.6f}\t2000\t{i}\t{day} 12:00:0{i}.250000\t4\t44" for i in range(N)]
+
+
+@pytest.mark.parametrize("day", ["2020/06/01", "2020/Jun/01"])
+def test_headwall(tmp_path, day):
+    rows = headwall_rows(day)
+    path = tmp_path / "imu_gps.txt"
+    path.write_text("\n".join([HEADWALL, rows[0], *rows]) + "\n")
+    assert kind_of_path(path) == "headwall"
+    track = read_track(path, "headwall", Options(day=date(2020, 6, 1)))
+    assert track.time_ns.tolist() == [ns(START) + i * 10**9 + 250_000_000 for i in range(N)]
+    np.testing.assert_allclose(track.geodetic[3], [LAT[3], LON[3], 2000], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(track.rpy[0]), [1.5, -2.5, 45])
+    assert "1 poses repeat the time" in track.notes[-1]
+
+
+def test_headwall_damaged(tmp_path):
+    path, rows = tmp_path / "imu_gps.txt", headwall_rows()
+    good = "\n".join([HEADWALL, *rows])
+    for text, day, wanted in (
+        (good.replace("\tAlt", "\tElev"), None, r"imu_gps.txt:1: Alt: column missing, wanted Roll, Pitch"),
+        (good.replace("48.000900", "north"), None, r"imu_gps.txt:3: Lat: 'north' is not a number"),
+        (
+            good.replace("12:00:02", "25:00:02"),
+            None,
+            r"imu_gps.txt:4: Gps_UTC_Date&Time: '2020/06/01 25:00:02.250000', wan",
+        ),
+        (good, date(2020, 1, 1), r"--date 2020-01-01, but its times begin on 2020-06-01"),
+        (HEADWALL + "\n" + rows[0], None, r"imu_gps.txt: 1 poses, wanted at least 2"),
+    ):
+        path.write_text(text + "\n")
+        with pytest.raises(UserError, match=wanted):
+            read_track(path, "headwall", Options(day=day))
+
+
+def lcf_rows():
+    turn = "\t".join(f"{radians(v):.9f}" for v in (1.5, -2.5, 45))
+    return [f"{1591012800 + i}.25\t{turn}\t{LON[i]:.6f}\t{LAT[i]:.6f}\t2000.0\t0\t0" for i in range(N)]
+
+
+def test_resonon(tmp_path):
+    path = tmp_path / "flight.lcf"
+    path.write_text("\n".join(lcf_rows()) + "\n")
+    assert kind_of_path(path) == "resonon"
+    track = read_track(path, "resonon", Options())
+    assert track.time_ns[1] == ns(START) + 1_250_000_000
+    np.testing.assert_allclose(track.geodetic[3], [LAT[3], LON[3], 2000], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(track.rpy[0]), [1.5, -2.5, 45], atol=1e-6)
+    for text, day, wanted in (
+        (
+            "\n".join(lcf_rows()).replace("0.785398163", "45"),
+            None,
+            r"flight.lcf:1: yaw: 45, wanted radians; are they deg",
+        ),
+        ("\n".join(lcf_rows()).replace("48.000900", "x"), None, r"flight.lcf:2: latitude: 'x' is not a number"),
+        ("1 2 3\n4 5 6\n", None, r"flight.lcf:1: yaw|flight.lcf:1: longitude: missing"),
+        ("\n".join(lcf_rows()), date(2019, 1, 1), r"--date 2019-01-01, but its times begin on 2020-06-01"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=wanted):
+            read_track(path, "resonon", Options(day=day))

@@ -1,0 +1,263 @@
+"""The matcher among real nodes: bad imagery, several strips, a window that asks for more or less."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recording_file import write_recording
+
+from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.matcher.matcher import Matcher
+from triline.nodes.navigator.navigator import Navigator
+from triline.nodes.node import Message
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.runner import process
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.simulator.flight_settings import simulated_flight
+from triline.nodes.simulator.simulator import Simulator
+from triline.schemas import messages as m
+from triline.schemas.image_lines import LineBlock
+from triline.solver.matching.options import MatchingOptions
+from triline.solver.matching.places import Density
+
+EPOCH_NS = 1_780_000_000_000_000_000
+SETTINGS = {
+    "sensor": "ads40-small",
+    "pixels": 500,
+    "images": True,
+    "height": 600.0,
+    "seconds": 20.0,
+    "lead_in": 2.0,
+    "attitude_rate": 100.0,
+    "seed": 6,
+}
+
+
+@pytest.fixture(scope="module")
+def messages():
+    flight = simulated_flight(SETTINGS)
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
+def run(tmp_path, messages, points_per_s=4.0):
+    """Process messages with navigator, matcher and adjuster; returns summary, ties and what was told."""
+    flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    write_recording(flight, messages)
+    with RecordingWriter(out) as writer:
+        nodes = [Navigator(), Matcher(points_per_s=points_per_s), Adjuster()]
+        summary = process(RecordingReader(flight), nodes, writer.write_raw)
+    reader = RecordingReader(out)
+    ties = [m.body for m in reader.messages(["observation/tie"]) if "-M" in m.body.point]
+    told = [m.body.message for m in reader.messages(["event/log"]) if m.body.name == "matcher"]
+    return summary, ties, told
+
+
+def spoilt(messages, change):
+    """Messages whose line blocks went through ``change(ccd, first line, pixels)``; None is a lost block."""
+    for message in messages:
+        if not message.topic.startswith("sensor/lines/"):
+            yield message
+            continue
+        b = message.body
+        pixels = change(b.ccd, int(b.first_line), b.pixels.copy())
+        if pixels is not None:
+            block = LineBlock(pixels, b.ccd, b.strip, b.first_line, b.time_ns, b.line_period_ns)
+            yield replace(message, body=block)
+
+
+def lines_between(first, end, value):
+    """A change that sets lines of all CCD lines; ``value`` is a grey value or a function of the pixels."""
+
+    def change(ccd, line, pixels):
+        number = line + np.arange(len(pixels))
+        bad = (number >= first) & (number < end)
+        pixels[bad] = value(pixels[bad]) if callable(value) else value
+        return pixels
+
+    return change
+
+
+def water(pixels):
+    return np.random.default_rng(1).normal(300, 4, pixels.shape).astype(pixels.dtype)
+
+
+FROZEN = {}
+
+
+def frozen_backward(ccd, line, pixels):
+    """From line 200 to 300 the backward line repeats what it saw last."""
+    if ccd != "B" or not 200 <= line < 300:
+        FROZEN[ccd] = pixels[-1]
+        return pixels
+    pixels[:] = FROZEN[ccd]
+    return pixels
+
+
+def chain(*changes):
+    def change(ccd, line, pixels):
+        for one in changes:
+            pixels = one(ccd, line, pixels)
+            if pixels is None:
+                return None
+        return pixels
+
+    return change
+
+
+def lost_block(ccd, line, pixels):
+    return None if ccd == "N" and 100 <= line < 120 else pixels
+
+
+def short_lines(ccd, line, pixels):
+    return pixels[:, :100] if 60 <= line < 70 and ccd == "F" else pixels
+
+
+def backward_dies(ccd, line, pixels):
+    return None if ccd == "B" and line >= 150 else pixels
+
+
+def nadir_dies(ccd, line, pixels):
+    return None if ccd == "N" and line >= 150 else pixels
+
+
+FAULTS = {
+    "faults of the camera": (
+        chain(lost_block, short_lines, lines_between(150, 155, 0), frozen_backward, lines_between(330, 350, 4095)),
+        {"lines missing": 4, "malformed": 1, "lines dark": 15, "lines frozen": 90, "lines saturated": 60},
+        ("N: 20 lines are missing", "N: lines are black", "B: lines are frozen", "N: lines are saturated"),
+    ),
+    "a CCD line falls silent": (
+        backward_dies,
+        {"ties": 60},
+        ("B: nothing has come after line 149",),
+    ),
+    "the nadir line dies": (
+        nadir_dies,
+        {"ties": 60},
+        ("N: nothing has come after line 149", "N sees nothing: tie points begin in B"),
+    ),
+    "lens cap, then water": (
+        chain(lines_between(40, 100, 0), lines_between(235, 400, water)),
+        {"lines dark": 180, "cells without texture": 30},
+        ("N: lines are black (lens cap", "N: lines are good again", "poor in texture", "has texture again"),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "fault",
+    ["a CCD line falls silent", *(pytest.param(f, marks=pytest.mark.study) for f in list(FAULTS) if "silent" not in f)],
+)
+def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tmp_path, messages, fault):
+    change, counters, words = FAULTS[fault]
+    summary, ties, told = run(tmp_path, spoilt(messages, change))
+    counted = summary.counters["matcher"]
+    for name, least in counters.items():
+        assert counted.get(name, 0) >= least, name
+    assert not counted.get("failed") and not summary.counters["adjuster"].get("failed")
+    for text in words:
+        assert sum(text in line for line in told) in range(1, 4), (text, told)
+    assert all("\n" not in text for text in told)
+    assert sum(": target " not in text for text in told) < 20 and not any("no lines" in text for text in told)
+    assert len(ties) > 10 and counted["ties"] == len(ties)
+    assert summary.outputs["orientation/final"] > 300
+
+
+@pytest.mark.study
+def test_points_keep_their_names_from_strip_to_strip(tmp_path):
+    settings = {**SETTINGS, "seconds": 15.0, "height": 450.0, "strips": 1, "cross": 1, "no_turns": True}
+    flight = simulated_flight(settings)
+    messages = list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+    summary, ties, _ = run(tmp_path, messages)
+    strips = {}
+    for tie in ties:
+        strips.setdefault(tie.point, set()).update(image.strip for image in tie.images)
+    again = [point for point, seen in strips.items() if len(seen) == 2]
+    assert len(again) >= 10
+    assert all(point.startswith("S1-M") for point in again)
+    counted = summary.counters["matcher"]
+    assert counted["ties with earlier strips"] == len(again)
+    assert counted["earlier points not found"] < 0.3 * counted["earlier points tried"]
+    # the window takes them for what they are
+    rejected = summary.counters["adjuster"].get("rejected", 0)
+    assert rejected < 0.03 * sum(len(tie.images) for tie in ties)
+
+
+def test_density_follows_the_window_and_the_success_of_its_places():
+    density = Density(MatchingOptions(points_per_s=8.0, window_points=60, window_rays=600))
+    first, borders = density.cells(10.0)
+    assert first == pytest.approx(160, abs=2) and np.ptp(np.diff(borders)) < 1e-9
+    density.window_holds(points=20, rays=60)
+    assert density.cells(10.0)[0] == pytest.approx(320, abs=4)
+    density.window_holds(points=400, rays=1200)
+    assert density.cells(10.0)[0] == pytest.approx(80, abs=2)
+    density.window_holds(points=100, rays=300)
+    across = np.linspace(-0.99, 0.99, 800)
+    for _ in range(5):  # the left half fails more often
+        density.judged(across, (np.arange(800) % 2 == 0) | (across > 0))
+    n, borders = density.cells(0.1)
+    left = int(np.searchsorted(borders, 0.5))
+    assert left == pytest.approx(2 / 3 * n, abs=2)
+
+
+def test_what_the_adjuster_answers_is_no_progress():
+    """The adjuster is driven by the matcher's progress: if its reports were progress again, neither would ever end."""
+    matcher = Matcher()
+    lines = LineBlock(np.zeros((2, 10), np.uint16), "N", "S1", 0, EPOCH_NS)
+    bodies = {
+        "trajectory/filtered": m.PoseInFrame(), "sensor/lines/N": lines,
+        "adjustment/report": m.AdjustmentReport(points=50, rays=150), "orientation/live": m.PoseInFrame(),
+    }  # fmt: skip
+    told = [
+        topic
+        for i, (topic, body) in enumerate(bodies.items())
+        for x in matcher.step(Message(topic, EPOCH_NS + i * 10**9, body))
+        if x.topic == "observation/progress"
+    ]
+    assert told == ["trajectory/filtered", "sensor/lines/N"]
+
+
+# ---- ground far from the origin's height
+
+
+def raised(messages, by_m, control=True):
+    """The same flight, with the origin of the local frame so much lower: all that is local is so much higher."""
+    for message in messages:
+        if message.topic == "observation/control" and not control:
+            continue
+        if message.topic in ("configuration/project", "observation/control"):
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            if message.topic == "observation/control":
+                body.z += by_m
+            else:
+                body.origin_height -= by_m
+            message = replace(message, body=body)
+        yield message
+
+
+@pytest.fixture(scope="module")
+def short():
+    flight = simulated_flight({**SETTINGS, "seconds": 12.0})
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
+@pytest.mark.parametrize("by_m", [1000.0, *(pytest.param(by_m, marks=pytest.mark.study) for by_m in (300.0, 2500.0))])
+def test_ties_do_not_hang_on_the_height_of_the_origin(tmp_path, short, by_m):
+    (tmp_path / "as it is").mkdir()
+    _, ties, told = run(tmp_path / "as it is", short)
+    _, as_many, _ = run(tmp_path, list(raised(short, by_m)))
+    assert len(ties) > 20 and abs(len(as_many) - len(ties)) <= 0.05 * len(ties)
+    assert not [text for text in told if "ground_m" in text]
+
+
+def test_where_the_ground_is_not_known_to_be_a_line_says_what_to_give(tmp_path, messages):
+    _, ties, told = run(tmp_path, list(raised(messages, 300.0, control=False)))
+    assert not ties
+    (line,) = [text for text in told if "ground_m" in text]
+    assert "the ground is taken to be at 0 m" in line
+
+
+def test_a_ground_that_is_no_height_is_refused():
+    with pytest.raises(ValueError, match="ground_m: wanted a height"):
+        Matcher(ground_m=float("nan"))

@@ -1,0 +1,102 @@
+"""Recordings of other writers: of the MCAP library with whatever it leaves out, and of earlier versions of triline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import sample_messages as sample
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from mcap_protobuf.schema import register_schema
+from places import ROOT
+from recording_file import chunk_spans, write_recording
+
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.summary import findings
+from triline.schemas import codec, topics
+
+GOLDEN = ROOT / "recordings" / "strip.mcap"
+NO_SUMMARY = {
+    "index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
+    "use_summary_offsets": False,
+}  # fmt: skip
+
+
+def library_writes(path: Path, messages, source: str = "test", **options) -> Path:
+    """A recording by the library's writer alone; log time is a second behind publish time."""
+    with open(path, "wb") as file:
+        writer = Writer(file, **options)
+        writer.start()
+        channels: dict[str, int] = {}
+        for i, message in enumerate(messages):
+            if message.topic not in channels:
+                schema = register_schema(writer, topics.find(message.topic).type)
+                channels[message.topic] = writer.register_channel(message.topic, "protobuf", schema, {"source": source})
+            data = codec.encode(message.body)
+            writer.add_message(channels[message.topic], message.stamp_ns + 10**9, data, message.stamp_ns, i)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {}, {"chunk_size": 4096}, {"use_chunking": False}, {"enable_crcs": False}, {"enable_data_crcs": True},
+        NO_SUMMARY, {**NO_SUMMARY, "use_chunking": False},
+    ],
+    ids=["as it is", "small chunks", "no chunks", "no checksums", "checksum of all", "no summary", "neither"],
+)  # fmt: skip
+def test_what_the_library_writes_is_read(tmp_path, compression, options):
+    messages = sample.flight(lines=True)
+    path = library_writes(tmp_path / "a.mcap", messages, compression=compression, **options)
+    reader = RecordingReader(path)
+    raws = list(reader.raws(reader.select()))
+    assert [(raw.topic, raw.envelope.stamp_ns, raw.envelope.source, raw.envelope.sequence) for raw in raws] == [
+        (message.topic, message.stamp_ns, "test", i) for i, message in enumerate(messages)
+    ]
+    assert all(raw.receive_ns == raw.envelope.stamp_ns + 10**9 for raw in raws)
+    assert [bytes(raw.data) for raw in raws] == [codec.encode(message.body) for message in messages]
+    assert reader.complete and reader.damage == [] and reader.check_outside() is None
+
+
+def test_a_recording_of_an_earlier_version_is_read_like_the_library_reads_it():
+    reader = RecordingReader(GOLDEN)
+    assert findings(reader) == [] and len(reader.index) > 4000
+    ours = {
+        (raw.topic, raw.envelope.source, raw.envelope.stamp_ns, raw.receive_ns, bytes(raw.data))
+        for raw in reader.raws(reader.select())
+    }
+    with open(GOLDEN, "rb") as file:
+        theirs = {
+            (channel.topic, channel.metadata["source"], message.publish_time, message.log_time, message.data)
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+        }
+    assert ours == theirs and len(ours) == len(reader.index)
+
+
+def test_views_of_a_file_are_not_copies(tmp_path):
+    path = write_recording(tmp_path / "a.mcap", [sample.message("sensor/gnss")])
+    reader = RecordingReader(path)
+    data = reader.raw(0).data
+    assert isinstance(data, memoryview) and data.obj is reader._buffer.obj
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_a_chunk_of_the_wrong_length_costs_that_chunk_alone(tmp_path, compression):
+    """Every bit of the length that its record, its content and its data are said to have."""
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0), chunk_size=8192, compression=compression)
+    data, reader, spans = path.read_bytes(), RecordingReader(path), chunk_spans(path)
+    hit = len(spans) // 2
+    assert hit > 3
+    kept = int((reader.index.chunk != hit).sum())
+    begin = spans[hit][0]
+    of_data = begin + 9 + 28 + 4 + (0 if compression == "none" else len(compression))
+    for place in (begin + 1, begin + 9 + 16, of_data):
+        for bit in range(64):
+            broken = bytearray(data)
+            broken[place + bit // 8] ^= 1 << bit % 8
+            (tmp_path / "b.mcap").write_bytes(broken)
+            again = RecordingReader(tmp_path / "b.mcap")
+            assert len(again.index) == kept and len(again.damage) == 1, (place - begin, bit)

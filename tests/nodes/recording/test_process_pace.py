@@ -1,0 +1,137 @@
+"""Recordings through `process`: in two processes as in one, and at the pace for throughput as good as live."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from triline.nodes import convert, registry
+from triline.nodes.cli.process import at_pace
+from triline.nodes.config import build
+from triline.nodes.errors import UserError
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.runner import process
+from triline.nodes.recording.runner_apart import Apart
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.simulator.simulator import Simulator
+from triline.solver.accuracy import angle_difference
+from triline.solver.navigation.inertial_data import TACTICAL
+from triline.solver.simulation.error_models import ErrorModel
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.inertial_sensors import InertialPlan
+from triline.solver.simulation.scenario import simulate
+
+EPOCH = 1_700_000_000_000_000_000
+KINDS = ("attitude", "inertial")
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory):
+    """Recordings of a strip with its truth, by kind of navigation data."""
+    found = {}
+    for kind in KINDS:
+        inertial = InertialPlan(TACTICAL, 100.0) if kind == "inertial" else None
+        plan = FlightPlan(strip_s=30.0, lead_in_s=20.0)
+        simulation = simulate(plan, 4, ErrorModel(attitude_rate_hz=100.0, gnss_rate_hz=5.0), inertial=inertial)
+        path = tmp_path_factory.mktemp(kind) / "flight.mcap"
+        with RecordingWriter(path) as writer:
+            for message in Simulator(simulation).messages(EPOCH):
+                writer.write(message)
+        found[kind] = simulation, path
+    return found
+
+
+def processed(path, pace="load", apart=False):
+    """Bytes of what comes out."""
+    nodes = [build(registry.node_class(name), at_pace({}, pace)) for name in registry.ESTIMATING]
+    out = io.BytesIO()
+    with RecordingWriter(out) as writer:
+        summary = process(RecordingReader(path), nodes, writer.write_raw, apart=apart)
+    assert summary.nodes == ["navigator", "adjuster"]
+    assert not any("failed" in counters for counters in summary.counters.values())
+    return summary, out.getvalue()
+
+
+@pytest.mark.skipif(not Apart.possible(), reason="one processor only, or no fork")
+def test_two_processes_give_the_bytes_of_one(flights):
+    _, path = flights["attitude"]
+    (alone, expected), (apart, found) = processed(path), processed(path, apart=True)
+    assert found == expected
+    assert (apart.outputs, apart.counters, apart.states) == (alone.outputs, alone.counters, alone.states)
+
+
+@pytest.mark.skipif(not Apart.possible(), reason="one processor only, or no fork")
+def test_a_process_that_is_killed_is_told_in_one_line(flights, monkeypatch):
+    _, path = flights["attitude"]
+    send = Apart.send
+
+    def kill(self, batch):
+        self._process.kill()
+        self._process.join()
+        send(self, batch)
+
+    monkeypatch.setattr(Apart, "send", kill)
+    with pytest.raises(UserError, match="the process of the adjuster has ended"):
+        processed(path, apart=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_for_throughput_are_as_good(flights, tmp_path, kind):
+    simulation, path = flights[kind]
+    found = {}
+    for pace in ("load", "throughput"):
+        summary, content = processed(path, pace)
+        (tmp_path / pace).write_bytes(content)
+        found[pace] = summary, *errors(RecordingReader(tmp_path / pace), simulation)
+    (live, final, ratio, points), (quick, quick_final, quick_ratio, quick_points) = found["load"], found["throughput"]
+    assert quick.outputs["adjustment/report"] < 0.4 * live.outputs["adjustment/report"]
+    assert quick.outputs["trajectory/filtered"] < 0.2 * live.outputs["trajectory/filtered"]
+    assert quick.outputs["orientation/final"] == live.outputs["orientation/final"]
+    assert quick.outputs["orientation/live"] > 0.7 * live.outputs["orientation/live"]
+    # the same to a tenth of what the results differ from the truth, or better
+    assert (quick_final < 1.1 * final).all()
+    assert quick_ratio < max(1.1 * ratio, 1.5)
+    assert quick_points < 1.1 * points
+    # and once a strip is over it does not matter that answers were wanted early: X, Y, Z, omega, phi, kappa; the
+    # heading, which is learnt on the strip, to a fifth, the others as much as two solutions of one flight differ
+    whole, quick_whole = (component_errors(RecordingReader(tmp_path / p), simulation) for p in ("load", "throughput"))
+    assert len(whole) == len(quick_whole) == live.outputs["orientation/final"]
+    assert (rms(whole) < np.array([1.4] * 5 + [1.2]) * rms(quick_whole)).all()
+    # the last of it, too, of which the smoothed poses come when it is over
+    assert (rms(whole[-60:]) < 1.6 * rms(quick_whole[-60:]) + np.repeat([0.02, 2e-5], 3)).all()
+
+
+def rms(e):
+    return np.sqrt(np.mean(e**2, axis=0))
+
+
+def component_errors(reader, simulation, topic="orientation/whole"):
+    """Errors (n, 6) of orientation in the order of time; what was said last counts."""
+    last = {convert.time_ns(m.body.timestamp): m.body for m in reader.messages([topic])}
+    bodies = [last[t] for t in sorted(last)]
+    truth = simulation.flight.truth.at((np.array(sorted(last)) - EPOCH) * 1e-9)
+    position = np.array([convert.pose_sample(body).position_l for body in bodies])
+    angles = np.array([list(body.angles) for body in bodies])
+    return np.hstack([position - truth.position_l, angle_difference(angles, truth.angles)])
+
+
+def errors(reader, simulation):
+    """Root mean squares (2,) of position and attitude of final orientation, its normalised square, and of points, m."""
+    off = component_errors(reader, simulation, "orientation/final")
+    C = np.array([convert.pose_sample(m.body).covariance for m in reader.messages(["orientation/final"])])
+    ratio = np.einsum("ni,ni->n", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]).mean() / 6.0
+    true = {m.body.point: m.body for m in reader.messages(["truth/point"])}
+    last = {m.body.point: m.body for m in reader.messages(["point/object"])}
+    e = np.array([[p.x - true[n].x, p.y - true[n].y, p.z - true[n].z] for n, p in last.items()])
+    return np.sqrt([(off[:, :3] ** 2).mean(), (off[:, 3:] ** 2).mean()]), ratio, float(np.sqrt((e**2).mean()))
+
+
+def test_a_pace_that_is_not_known_and_poses_too_far_apart_are_refused():
+    with pytest.raises(UserError, match="filtered_s is 3, wanted 0 to 1 s"):
+        build(registry.node_class("navigator"), {"navigator": {"filtered_s": 3.0}})
+    with pytest.raises(UserError, match="wanted one of load, normal, throughput"):
+        build(registry.node_class("adjuster"), {"adjuster": {"pace": "fast"}})
+    # what a configuration says goes before the pace
+    assert at_pace({"adjuster": {"pace": "normal"}}, "throughput")["adjuster"]["pace"] == "normal"

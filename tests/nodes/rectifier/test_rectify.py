@@ -1,0 +1,320 @@
+"""`triline rectify` and the rectifier node: a flight with image lines to orthoimages, held against the true ground."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+from notebook import Notebook
+from rio_cogeo.cogeo import cog_validate
+from synthetic_flight import flight_messages
+
+from triline.nodes.batch import rectification as work
+from triline.nodes.cli import main
+from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
+from triline.nodes.node import Message
+from triline.nodes.recording.access import Recording
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.rectifier.rectifier import Rectifier
+from triline.nodes.simulator.flight_settings import simulated_flight
+from triline.nodes.viewer.scene import Scene
+from triline.schemas import messages as m
+from triline.solver.orthoimage.ground_grid import GroundGrid
+from triline.solver.orthoimage.surface import HeightField
+from triline.solver.simulation.imagery import ground_sample
+from triline.solver.simulation.road_check import find_roads
+
+#: A rough flight: roads are off by several pixels with the measured orientation.
+SETTINGS = {
+    "sensor": "ads40-small", "pixels": 800, "images": True, "seconds": 36.0, "ties": 12.0, "turbulence": 3.0,
+    "wander_attitude": (0.3,) * 3, "wander": (3.0,) * 3, "attitude_rate": 100.0,
+    "control": 6, "check": 4, "cars": 0.0, "seed": 5,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulated_flight(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("rectify")
+
+
+@pytest.fixture(scope="module")
+def flown(folder):
+    """The recording, with navigator, adjuster and rectifier."""
+    options = []
+    for name, value in SETTINGS.items():
+        values = value if isinstance(value, tuple) else (value,)
+        options += ["--" + name.replace("_", "-"), *(() if value is True else map(str, values))]
+    assert main(["simulate", "-o", str(folder / "raw.mcap"), "--dem", str(folder / "dem.tif"), "-q", *options]) == 0
+    out = folder / "flown.mcap"
+    assert main(["process", str(folder / "raw.mcap"), "-o", str(out), "--nodes", "navigator,adjuster,rectifier"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def dem(flown, folder):
+    """The true relief, as `triline simulate` wrote it beside the recording."""
+    return folder / "dem.tif"
+
+
+def _rectify(capsys, flown, target, *options):
+    capsys.readouterr()
+    assert main(["rectify", str(flown), "-o", str(target), "--json", *map(str, options)]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_orthoimage_shows_the_ground_where_it_is(flown, simulated, dem, folder, capsys):
+    """Grey values of cells against the reflectance of their places: direct rectification undoes what was rendered."""
+    flight, imager = simulated.simulation.flight, simulated.imager
+    target = folder / "truth.tif"
+    result = _rectify(capsys, flown, target, "--orientation", "truth", "--dem", dem, "--resampling", "cubic")
+    assert result["orientation"] == "truth" and result["crs"] == "EPSG:32632" and not result["left_out"]
+    assert result["strips"] == {"S1": flight.strips[0].lines}
+    valid, errors, warnings = cog_validate(str(target), strict=True)
+    assert valid and not errors and not warnings
+    with rasterio.open(target) as image:
+        assert image.crs.to_epsg() == 32632 and image.nodata == 0 and image.dtypes == ("uint16",)
+        assert image.overviews(1) and image.shape == (result["rows"], result["columns"])
+        assert image.transform.a == -image.transform.e == result["gsd"]
+        grey = image.read(1).astype(float)
+        rng = np.random.default_rng(1)
+        row, column = (a[rng.choice((grey > 0).sum(), 6000, replace=False)] for a in np.nonzero(grey))
+        x, y = rasterio.transform.xy(image.transform, row, column)
+    utm = replace(flight.frame, crs="EPSG:32632")
+    place = np.column_stack([x, y, np.full(len(x), flight.frame.height_m)])
+    for _ in range(4):
+        local = utm.from_crs(place)
+        local[:, 2] = flight.terrain.height(local[:, 0], local[:, 1])
+        place[:, 2] = utm.to_crs(local)[:, 2]
+    seen = imager.texture.seen_by(1.05 * imager.texture.detail_m)
+    found = np.empty((2, 3))
+    for axis in range(2):
+        for k, shift in enumerate((-1.0, 0.0, 1.0)):
+            at = local[:, :2] + shift * result["gsd"] * np.eye(2)[axis]
+            # look 1 is that of the nadir line: it decides about what stirs
+            found[axis, k] = np.corrcoef(grey[row, column], seen.reflectance(at[:, 0], at[:, 1], 0.0, 1))[0, 1]
+    assert found[:, 1].min() > 0.95  # illumination falls off to the ends of the line
+    peak = 0.5 * (found[:, 2] - found[:, 0]) / (2 * found[:, 1] - found[:, 0] - found[:, 2])
+    assert np.abs(peak).max() < 0.1, "best shift, cells"
+
+
+def test_roads_become_straight(flown, simulated):
+    """Off by more than 3 px with the measured orientation, by less than 0.3 px with the final one."""
+    flight = simulated.simulation.flight
+    recording = Recording(flown)
+    camera = recording.camera()
+    frame = work.frame_for(work.project_frame(recording), "EPSG:32632")
+    grid = GroundGrid(frame, round(ground_sample(flight), 2))
+    low, high = flight.truth.position_l.min(axis=0) - 2000, flight.truth.position_l.max(axis=0) + 2000
+    x, y = np.arange(low[0], high[0], 10.0), np.arange(low[1], high[1], 10.0)
+    field = HeightField(x[0], y[0], 10.0, flight.terrain.height(*np.meshgrid(x, y)))
+    off = {}
+    for name in ("measured", "final", "truth"):
+        _, orientation, reference_ns = work.orientation_of(recording, name)
+        job = work.Rectification(camera, 1, field, grid, "bilinear", orientation, reference_ns)
+        for block in work.line_blocks(recording, "N", None):
+            job.add(block)
+        done = job.finish()
+        assert done is not None and done.missed_rays == 0
+        roads = find_roads(done.mosaic, grid, simulated.imager.texture, flight.terrain, reach=14.0)
+        assert len(roads.road) > 150 and len(np.unique(roads.road)) >= 4
+        off[name] = roads.rms()
+    assert off["measured"] > 3.0
+    assert off["final"] < 0.3
+    assert off["truth"] < 0.2  # the noise of the measurement
+
+
+def test_choices_of_rectify(flown, folder, capsys):
+    best = _rectify(capsys, flown, folder / "best.tif", "--gsd", 8, "--dem", "points")
+    assert best["orientation"] == "whole" and best["pixels_together"] == 3 and best["gsd"] == 8
+    forward = _rectify(
+        capsys, flown, folder / "f.tif", "--ccd", "F", "--gsd", 10, "--crs", "EPSG:3035", "--height", 320
+    )
+    assert forward["ccd"] == "F" and forward["crs"] == "EPSG:3035" and "320.0 m" in forward["ground"]
+    local = _rectify(
+        capsys, flown, folder / "l.tif", "--crs", "local", "--gsd", 10, "--orientation", "live", "--strip", "S1"
+    )
+    with rasterio.open(folder / "l.tif") as image:
+        assert image.crs is None and abs(image.bounds.left) < 4000 and image.shape == (local["rows"], local["columns"])
+    assert main(["rectify", str(flown), "-o", str(folder / "q.tif"), "--gsd", "10"]) == 0
+    assert "whole orientation, height" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--ccd", "X"], "no image lines of CCD line 'X', there are: F, N, B"),
+        (["--strip", "S9"], "no strip 'S9', there are: S1"),
+        (["--gsd", "0"], "--gsd 0.0: wanted more than 0"),
+        (["--gsd", "0.0001"], "choose a larger one"),
+        (["--crs", "EPSG:4326"], "is geographic, wanted a projected CRS"),
+        (["--crs", "EPSG:0"], "PROJ does not know the CRS 'EPSG:0'"),
+        (["--dem", "no.tif"], "no.tif: no such file"),
+        (["--dem", __file__], "not a raster"),
+        (["--height", "9000"], "below the ground"),
+        (["--height", "1", "--dem", "points"], "wanted one of them"),
+    ],
+)
+def test_refusals(flown, folder, capsys, options, text):
+    target = folder / "refused.tif"
+    assert main(["rectify", str(flown), "-o", str(target), *options]) == 1
+    err = capsys.readouterr().err
+    assert text in err and err.count("\n") == 1 and not target.exists()
+
+
+def test_recordings_that_cannot_be_rectified(flown, folder, capsys):
+    reader = RecordingReader(flown)
+
+    def without(name, *gone):
+        with RecordingWriter(folder / name) as writer:
+            for message in reader.sorted_messages():
+                if not message.topic.startswith(gone) and not message.topic.startswith("orthoimage"):
+                    writer.write(message)
+        return folder / name
+
+    def refused(path, *options):
+        assert main(["rectify", str(path), "-o", str(folder / "no.tif"), *options]) == 1
+        return capsys.readouterr().err
+
+    assert "no image lines in it" in refused(without("blind.mcap", "sensor/lines"))
+    raw = folder / "raw.mcap"
+    assert "no final orientation" in refused(raw, "--orientation", "final")
+    assert "it has truth" in refused(raw, "--orientation", "measured")
+    lost = without("lost.mcap", "truth", "orientation", "trajectory", "sensor/lines/F", "sensor/lines/B")
+    assert "no orientation in it" in refused(lost)
+    assert "no such file" in refused(folder / "none.mcap")
+    assert "is a folder" in refused(folder)
+    assert "would overwrite" in (main(["rectify", str(raw), "-o", str(raw)]), capsys.readouterr().err)[1]
+    assert (
+        "no folder"
+        in (main(["rectify", str(raw), "-o", str(folder / "x" / "y.tif"), "--gsd", "20"]), capsys.readouterr().err)[1]
+    )
+
+
+def test_lost_blocks_leave_a_hole_and_are_told(flown, folder, capsys):
+    gone = 0
+    with RecordingWriter(folder / "holes.mcap") as writer:
+        for message in RecordingReader(flown).sorted_messages():
+            if message.topic == "sensor/lines/N" and 300 <= message.body.first_line < 340:
+                gone += len(message.body.pixels)
+            elif message.topic.startswith(
+                ("configuration", "sensor/lines/N", "truth/trajectory", "observation/control")
+            ):
+                writer.write(message)
+    assert gone > 20
+    result = _rectify(capsys, folder / "holes.mcap", folder / "holes.tif", "--gsd", 3)
+    assert result["left_out"] == {"missing": gone}
+    whole = _rectify(capsys, flown, folder / "whole.tif", "--orientation", "truth", "--gsd", 3)
+    with rasterio.open(folder / "holes.tif") as a, rasterio.open(folder / "whole.tif") as b:
+        share = 1 - (a.read(1) > 0).sum() / (b.read(1) > 0).sum()
+    assert 0.8 < share / (gone / sum(whole["strips"].values())) < 1.3
+
+
+def test_heights_that_cannot_be_used(folder, flown, capsys):
+    z = np.zeros((20, 20))
+    write_heights(folder / "far.tif", Heights("EPSG:32756", z, 4e5, 6.2e6, 10.0, -10.0))
+    assert main(["rectify", str(flown), "-o", str(folder / "no.tif"), "--dem", str(folder / "far.tif")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    write_heights(folder / "none.tif", Heights("EPSG:32632", np.full((20, 20), np.nan), 4e5, 5e6, 10.0, -10.0))
+    assert main(["rectify", str(flown), "-o", str(folder / "no.tif"), "--dem", str(folder / "none.tif")]) == 1
+    assert "holds no height" in capsys.readouterr().err
+    back = read_heights(folder / "far.tif")
+    assert (back.x0, back.y0, back.dx, back.dy) == (4e5, 6.2e6, 10.0, -10.0)
+
+
+# ---- the node
+
+
+def _tiles(path, version):
+    newest = {}
+    for message in RecordingReader(path).sorted_messages([f"orthoimage/{version}"]):
+        newest[message.body.row, message.body.column] = message.body
+    return newest
+
+
+def test_node_grows_two_orthoimages(flown, simulated):
+    """Tiles of both versions, and the final one shows roads where they are."""
+    flight = simulated.simulation.flight
+    live, final = _tiles(flown, "live"), _tiles(flown, "final")
+    assert len(final) >= 4 and len(set(live) ^ set(final)) <= 3
+    known = {}
+    for name, tiles in (("live", live), ("final", final)):
+        tile = next(iter(tiles.values()))
+        assert tile.size == 256 and tile.encoding == "mono8" and tile.ccd == "N" and tile.strip == "S1"
+        known[name] = sum((np.frombuffer(t.data, np.uint8) > 0).sum() for t in tiles.values()) * tile.gsd_m**2
+        for (row, column), t in tiles.items():
+            assert (t.x, t.y) == (column * 256 * t.gsd_m, -row * 256 * t.gsd_m)
+    swath = flight.strips[0].lines * ground_sample(flight) * 800 * ground_sample(flight)
+    assert 0.9 < known["final"] / swath < 1.15 and 0.9 < known["live"] / swath < 1.15
+
+
+def test_node_gives_the_same_bytes_again(flown, folder):
+    again = folder / "again.mcap"
+    assert main(["process", str(flown), "-o", str(again), "--nodes", "rectifier", "-q"]) == 0
+    for version in ("live", "final"):
+        one, other = (
+            [
+                (t.stamp_ns, t.body.SerializeToString())
+                for t in RecordingReader(p).sorted_messages([f"orthoimage/{version}"])
+            ]
+            for p in (flown, again)
+        )
+        assert one == other and len(one) > 10
+
+
+def test_node_counts_what_it_cannot_use(flown):
+    node = Rectifier()
+    assert node.state() == "waiting for configuration"
+    reader = RecordingReader(flown)
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 5e9
+    for message in reader.sorted_messages(list(node.inputs)):
+        if message.stamp_ns > end_ns:
+            break
+        list(node.step(message))
+        if message.topic == "sensor/lines/N":
+            list(node.step(message))  # twice
+            block = replace(message.body, pixels=message.body.pixels[:, :5])
+            list(node.step(Message(message.topic, message.stamp_ns, block)))
+            list(node.step(Message("sensor/lines/Q", message.stamp_ns, message.body)))
+            list(node.step(Message(message.topic, message.stamp_ns, replace(message.body, strip="S7"))))
+    assert node.state() == "running" and list(node.finish())
+    assert node.counters["lines twice or late"] > 100 and node.counters["unknown strip"] > 10
+    assert node.counters["malformed"] > 20 and not node.counters["failed"]
+    for bad in ({"samples": 2}, {"publish_s": 0.0}, {"budget_mb": -1.0}):
+        with pytest.raises(ValueError, match="wanted"):
+            Rectifier(**bad)
+
+
+def test_a_small_budget_does_not_wait_for_the_final_orientation(flown):
+    node = Rectifier(budget_mb=0.05)
+    out = [t for message in RecordingReader(flown).sorted_messages(list(node.inputs)) for t in node.step(message)]
+    assert node.counters["final lines without refined orientation"] > 100
+    assert any(t.topic == "orthoimage/final" for t in out)
+
+
+def test_scene_lays_tiles_on_the_ground():
+    canvas = Notebook()
+    scene = Scene(canvas)
+    messages = flight_messages(seconds=14.0, points=20)
+    for message in messages:
+        scene.take(message)
+    data = np.zeros((8, 8), dtype=np.uint8)
+    data[2:4, 1:6] = 100
+    tile = m.GroundTile(size=8, gsd_m=2.0, x=100.0, y=50.0, encoding="mono8", data=data.tobytes(), row=3, column=-2)
+    scene.take(Message("orthoimage/final", messages[-1].stamp_ns, tile))
+    scene.draw()
+    corners, grey = canvas.drawn["mosaic/final/3_-2"]
+    assert grey.shape == (2, 5) and (grey > 100).all()
+    wanted = np.array([(102, 46), (112, 46), (112, 42), (102, 42)]) - scene.state.origin[:2]
+    assert np.allclose(corners[:, :2], wanted) and canvas.layouts[-1].mosaic
+    tile.data = b"123"
+    with pytest.raises(ValueError, match="3 bytes"):
+        scene.take(Message("orthoimage/final", messages[-1].stamp_ns, tile))

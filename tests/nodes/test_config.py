@@ -1,0 +1,102 @@
+"""Configuration of nodes from TOML, the names of nodes, and the meeting port."""
+
+from __future__ import annotations
+
+import pytest
+
+from triline.nodes import registry
+from triline.nodes.bus.session import DEFAULT_PORT, configuration, default_port
+from triline.nodes.cli import main
+from triline.nodes.config import build, load
+from triline.nodes.errors import UserError
+from triline.nodes.node import Node
+
+
+class Gauge(Node):
+    name, inputs, outputs = "gauge", (), ()
+
+    def __init__(self, depth: int = 3, unit: str = "m") -> None:
+        super().__init__()
+        if depth < 0:
+            raise ValueError(f"depth is {depth}, wanted 0 or more")
+        self.depth, self.unit = depth, unit
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_a_table_a_node(tmp_path):
+    tables = load(write(tmp_path / "a.toml", "[gauge]\ndepth = 7\n\n[other]\nx = 1\n"))
+    gauge = build(Gauge, tables)
+    assert (gauge.depth, gauge.unit) == (7, "m")
+    assert build(Gauge, load(None)).depth == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("[gauge]\nheight = 2\n", r"configuration \[gauge\]: height is not known, wanted one of depth, unit"),
+        ("[gauge]\ndepth = -1\n", r"configuration \[gauge\]: depth is -1, wanted 0 or more"),
+        ("[gauge]\ndepth = 'x'\n", r"configuration \[gauge\]: "),
+        ("depth = 1\n", "depth stands outside a table"),
+        ("[gauge\n", "a.toml: not a TOML file"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(tmp_path, text, what):
+    with pytest.raises(UserError, match=what) as caught:
+        build(Gauge, load(write(tmp_path / "a.toml", text)))
+    assert "\n" not in str(caught.value)
+
+
+def test_tables_and_keys_that_nobody_reads_are_refused(tmp_path, capsys):
+    file = write(tmp_path / "a.toml", "[adjustor]\nmodel = 'ppm'\n")
+    assert main(["node", "monitor", "--config", str(file)]) == 1
+    assert "a.toml: table [adjustor] is not known, wanted one of simulator, " in capsys.readouterr().err
+    assert main(["node", "monitor", "--set", "foo=1"]) == 1
+    assert "configuration [monitor]: foo is not known" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("not json {", "line 1, column 1: expected array"),
+        ('{\nmode:"foo"}', "line 2: unknown variant `foo`"),
+        ("", "Empty config file"),
+    ],
+)
+def test_a_bad_bus_file_is_told_without_what_zenoh_is_made_of(tmp_path, text, what):
+    with pytest.raises(UserError) as caught:
+        configuration(file=write(tmp_path / "bus.json5", text))
+    said = str(caught.value)
+    assert f"bus.json5: not a Zenoh configuration: {what}" in said
+    assert "\n" not in said and ".rs" not in said and "cargo" not in said
+
+
+def test_every_step_node_can_be_loaded_and_keeps_to_the_topic_table():
+    from triline.schemas import topics
+
+    for name in (*registry.ESTIMATING, *registry.ONLOOKERS):
+        cls = registry.node_class(name)
+        assert cls.name == name and issubclass(cls, Node)
+        for topic in (*cls.inputs, *cls.outputs):
+            topics.find(topic)
+        truth = [t for t in cls.inputs if topics.find(t).family is topics.Family.TRUTH]
+        assert not truth or name in registry.ONLOOKERS  # no estimating node reads the truth
+    for name in registry.PROGRAMS:
+        assert callable(registry.program(name))
+    for name in ("pilot", "recorder"):
+        with pytest.raises(UserError, match=f"no node '{name}'"):
+            registry.node_class(name)
+
+
+def test_the_meeting_port(monkeypatch):
+    monkeypatch.delenv("TRILINE_PORT", raising=False)
+    assert default_port() == DEFAULT_PORT
+    monkeypatch.setenv("TRILINE_PORT", "18000")
+    assert default_port() == 18000
+    for bad in ("0", "x", "70000"):
+        monkeypatch.setenv("TRILINE_PORT", bad)
+        with pytest.raises(UserError, match="wanted a port number"):
+            default_port()

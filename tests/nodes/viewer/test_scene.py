@@ -1,0 +1,289 @@
+"""The scene: what is drawn of the messages, where, how large and in which colour."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from notebook import Notebook
+from synthetic_flight import START_NS, flight_messages
+
+from triline.nodes import convert
+from triline.nodes.cli.view import show
+from triline.nodes.node import Message
+from triline.nodes.viewer.rerun_canvas import _ASPECT, _FIELD_OF_VIEW, viewpoint
+from triline.nodes.viewer.scene_part import CHECK, CONTROL, FINAL, LIVE, REJECTED, Pieces
+from triline.nodes.viewer.scene_state import PoseHistory, round_number
+from triline.nodes.viewer.trajectories import ellipsoid
+from triline.solver.camera.sensors import preset
+from triline.solver.geometry.rotation import matrix_from_quaternion
+
+GSD_M = 1500.0 * 0.0065 / 62.7
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return flight_messages(seconds=34.0, points=150)
+
+
+@pytest.fixture(scope="module")
+def notes(messages):
+    canvas = Notebook()
+    show(messages, canvas)
+    return canvas
+
+
+def test_display_coordinates_are_near_zero(notes):
+    for entity, what in notes.drawn.items():
+        if entity.startswith(("flight/", "points/")) and isinstance(what[0], np.ndarray) and len(what[0]):
+            assert np.abs(what[0]).max() < 10_000
+    control = notes.drawn["points/control"][0]
+    assert np.abs(control[:, 2]).max() < 50
+
+
+def test_deviations_are_exaggerated_as_the_title_says(notes, messages):
+    title = notes.layouts[-1].title
+    factor = float(title.split("3 sigma x ")[1].split(",")[0])
+    assert factor == 100
+    final = [convert.pose_sample(m.body) for m in messages if m.topic == "orientation/final"]
+    origin = final[0].position_l - final[0].correction[:3] + factor * final[0].correction[:3]
+    drawn = np.vstack([strips[0] for strips in notes.pieces("flight/final")])
+    origin -= drawn[0]
+    assert np.allclose(origin, np.round(origin, -1)) and np.allclose(origin[:2], np.round(origin[:2], -2))
+    last = next(s for s in reversed(final) if np.isclose((s.time_ns - final[0].time_ns) % 200_000_000, 0))
+    expected = last.position_l + (factor - 1) * last.correction[:3] - origin
+    np.testing.assert_allclose(drawn[-1], expected, atol=1e-6)
+    # truth lies inside the three-sigma ellipsoids where it does without exaggeration
+    half = np.vstack(notes.pieces("flight/sigma", 1))
+    np.testing.assert_allclose(np.sort(half, axis=1), np.tile([24.0, 24.0, 30.0], (len(half), 1)), rtol=1e-6)
+
+
+def test_points_are_coloured_by_status(notes, messages):
+    final = {m.body.point: m.body for m in messages if m.topic == "point/object" and m.body.status == 1}
+    colors = [color for piece in notes.pieces("points/final", 1) for color in piece]
+    rejected = sum(any(r.rejected for r in p.residuals) for p in final.values())
+    assert rejected >= 2
+    assert colors.count(REJECTED) == rejected and colors.count(FINAL) == len(final) - rejected
+    assert set(notes.drawn["points/control"][1]) == {CONTROL} and set(notes.drawn["points/check"][1]) == {CHECK}
+    assert len(notes.drawn["points/live"][0]) == len(
+        {m.body.point for m in messages if m.topic == "point/object"}
+    ) - len(final)
+
+
+def test_live_points_are_shown_until_they_are_final(messages):
+    canvas = Notebook()
+    show([m for m in messages if not (m.topic == "point/object" and m.body.status == 1)], canvas)
+    assert LIVE in canvas.drawn["points/live"][1] and len(canvas.drawn["points/live"][0]) > 50
+
+
+def test_residuals_in_object_space_have_the_stated_scale(notes, messages):
+    scale = float(notes.layouts[-1].title.split("residuals x ")[1])
+    assert scale == 500
+    final = [m.body for m in messages if m.topic == "point/object" and m.body.status == 1]
+    pixels = np.array([[r.v_line, r.v_sample] for p in final for r in p.residuals if not r.rejected])
+    vectors = np.vstack(notes.pieces("points/residuals", 1))
+    assert len(vectors) == len(pixels)
+    # lines advance by speed / line rate, samples by the ground sampling distance
+    expected = scale * np.hypot(pixels[:, 0] * 70.0 / 800.0, pixels[:, 1] * GSD_M)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), expected, rtol=0.02)
+    given = {m.body.point: m.body for m in messages if m.topic == "observation/control"}
+    _, misfits, _ = notes.drawn["points/misfit"]
+    adjusted = [p for p in final if p.point in given]
+    assert len(misfits) == len(adjusted) >= 3
+    p, g = adjusted[0], given[adjusted[0].point]
+    np.testing.assert_allclose(misfits[0], scale * np.array([p.x - g.x, p.y - g.y, p.z - g.z]), rtol=1e-9)
+
+
+def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages, bar_px=1.0):
+    final = [m.body for m in messages if m.topic == "point/object" and m.body.status == 1]
+    for line in preset("ads40").lines:
+        rays = [r for p in final for r in p.residuals if r.ccd == line.id]
+        origins, vectors, _ = notes.drawn[f"image/{line.id}/residuals"]
+        bar = notes.drawn[f"image/{line.id}/scale"][1][0, 0]
+        kept = sorted((r.sample, r.v_sample, r.v_line) for r in rays if not r.rejected)
+        order = np.argsort(origins[:, 0])
+        np.testing.assert_allclose(origins[order, 0], [s for s, _, _ in kept])
+        np.testing.assert_allclose(vectors[order] / bar * bar_px, [[x, -y] for _, x, y in kept], rtol=1e-9)
+        bad = notes.drawn[f"image/{line.id}/rejected"]
+        assert len(bad[0]) == sum(r.rejected for r in rays)
+        assert not len(bad[1]) or np.linalg.norm(bad[1], axis=1).max() <= 2.001 * bar
+
+
+def test_small_residuals_get_a_smaller_bar(messages):
+    small = []
+    for m in messages:
+        body = type(m.body)()
+        body.CopyFrom(m.body)
+        if m.topic == "point/object":
+            for r in body.residuals:
+                r.v_line, r.v_sample = 0.1 * r.v_line, 0.1 * r.v_sample
+        small.append(Message(m.topic, m.stamp_ns, body, m.source, m.sequence))
+    canvas = Notebook()
+    show(small, canvas)
+    titles = canvas.layouts[-1].ccds.values()
+    assert {re.sub(".* bar = ", "", title) for title in titles} == {"0.1 px"}
+    test_residuals_in_image_space_have_the_size_of_the_bar(canvas, small, bar_px=0.1)
+
+
+def test_curves_hold_what_the_messages_say(notes, messages):
+    reports = [m.body for m in messages if m.topic == "adjustment/report"]
+    time_s, sigma0 = notes.curves["plots/sigma0/value"]
+    np.testing.assert_allclose(sigma0, [r.sigma0 for r in reports])
+    assert (np.diff(time_s) > 0).all() and time_s[0] == pytest.approx(5.0)
+    low, high = (np.array(notes.curves[f"plots/sigma0/{n}"][1]) for n in ("low", "high"))
+    inside = np.mean((np.array(sigma0) > low) & (np.array(sigma0) < high))
+    assert 0.5 < inside < 1.0 and (low < 1).all() and (high > 1).all()
+    # the correction functions approach what the truth asks for
+    t, final = (np.array(v) for v in notes.curves["plots/corrections/dX/final"])
+    true_t, true = (np.array(v) for v in notes.curves["plots/corrections/dX/truth"])
+    left = final - np.interp(t, true_t, true)
+    assert 0.03 < np.sqrt(np.mean(left**2)) < 0.15
+    assert len(notes.curves["plots/errors/position/live"][0]) > 0.9 * len(notes.curves["plots/corrections/dX/live"][0])
+    error = {n: np.mean(notes.curves[f"plots/errors/position/{n}"][1]) for n in ("filtered", "live", "final")}
+    assert error["final"] < error["live"] < error["filtered"]
+    assert notes.curves["plots/parameters/mdeg/domega"][1][-1] == pytest.approx(np.degrees(9e-5) * 1000)
+    assert {"m", "mdeg", "determined"} == set(notes.layouts[-1].units)
+    assert ("navigator: GNSS outage of 1.4 s, coasting", "WARN") in notes.events
+
+
+def test_the_map_shows_where_it_is(notes):
+    track = np.vstack(notes.pieces("map/final"))
+    assert np.abs(track - [47.0, 8.0]).max() < 0.1 and np.ptp(track[:, 0]) > 0.005
+
+
+def test_truth_is_not_shown_when_it_is_not_wanted(messages):
+    canvas = Notebook()
+    show(messages, canvas, truth=False)
+    assert not any("truth" in entity for entity in [*canvas.drawn, *canvas.curves])
+    assert not canvas.layouts[-1].truth
+
+
+def test_the_strip_is_in_view(notes):
+    layout = notes.layouts[-1]
+    eye, target = viewpoint(layout)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    view = layout.corners - eye
+    depth = view @ forward
+    assert (depth > 0).all()
+    x, y = np.abs(view @ right) / depth, np.abs(view @ up) / depth
+    half = np.tan(_FIELD_OF_VIEW / 2)
+    assert x.max() < half * _ASPECT and y.max() < half
+    assert x.max() > 0.7 * half * _ASPECT or y.max() > 0.7 * half  # and not a dot in the distance
+
+
+def test_a_scene_without_configuration_draws_what_it_can(messages):
+    canvas = Notebook()
+    counts = show([m for m in messages if not m.topic.startswith(("configuration/", "observation/"))], canvas)
+    assert counts["trajectory/filtered"] and canvas.pieces("flight/trajectory") and canvas.closed == 1
+
+
+def test_growing_entities_are_drawn_in_bounded_pieces():
+    drawn = defaultdict(list)
+    pieces = Pieces("a", size=10, joined=True)
+    for i in range(95):
+        pieces.add(i)
+        pieces.draw(lambda entity, rows: drawn[entity].append(list(rows)))
+    assert max(len(rows) for versions in drawn.values() for rows in versions) == 10
+    last = [drawn[f"a/{k}"][-1] for k in range(len(drawn))]
+    assert [row for k, rows in enumerate(last) for row in (rows if k == 0 else rows[1:])] == list(range(95))
+    assert all(a[-1] == b[0] for a, b in pairwise(last))
+    before = sum(map(len, drawn.values()))
+    pieces.draw(lambda entity, rows: drawn[entity].append(rows))
+    assert sum(map(len, drawn.values())) == before
+
+
+def test_pose_history_interpolates():
+    history = PoseHistory()
+    for t in range(5):
+        sample = convert.PoseSample(t * 100, np.array([t, 2.0 * t, 0.0]), np.array([0, 0, 0, 1.0]), None, True)
+        history.add(sample)
+    place = history.at(250)
+    assert place is not None
+    np.testing.assert_allclose(place[0], [2.5, 5.0, 0.0])
+    assert history.at(401) is None and history.at(-1) is None and history.newest_ns == 400
+
+
+def test_ellipsoid_has_the_axes_of_its_covariance():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    half, q = ellipsoid(root @ root.T, 2.0)
+    R = matrix_from_quaternion(q)
+    np.testing.assert_allclose(R @ np.diag((half / 2) ** 2) @ R.T, root @ root.T, atol=1e-12)
+
+
+@pytest.mark.parametrize(("value", "expected"), [(60, 50), (75, 100), (24, 20), (100, 100), (0.011, 0.01), (387, 500)])
+def test_scales_are_round(value, expected):
+    assert round_number(value) == pytest.approx(expected)
+
+
+def test_a_recording_with_a_smoothed_trajectory_only_is_shown(messages):
+    canvas = Notebook()
+    renamed = [
+        Message("trajectory/smoothed", m.stamp_ns, m.body, m.source, m.sequence)
+        if m.topic == "trajectory/filtered"
+        else m
+        for m in messages
+    ]
+    show(renamed, canvas)
+    assert canvas.pieces("flight/trajectory") and "Deviations from smoothed" in canvas.layouts[-1].title
+    assert canvas.curves["plots/errors/position/smoothed"][0]
+    both = Notebook()
+    show(sorted(messages + renamed, key=lambda m: m.stamp_ns), both)
+    assert "Deviations from filtered" in both.layouts[-1].title
+
+
+def test_a_simulated_flight_that_no_navigator_has_seen_is_shown(messages):
+    canvas = Notebook()
+    kept = ("configuration/", "sensor/", "observation/", "truth/")
+    show([m for m in messages if m.topic.startswith(kept)], canvas)
+    drawn = np.vstack([strips[0] for strips in canvas.pieces("flight/trajectory")])
+    assert np.ptp(drawn[:, :2], axis=0).max() > 1500
+    assert "Deviations from truth" in canvas.layouts[-1].title
+
+
+def test_who_joins_late_sees_the_whole_strip_in_its_place(messages):
+    late = START_NS + 15 * convert.SECOND_NS
+    canvas, usual = Notebook(), Notebook()
+    latched = ("configuration/", "observation/control")
+    show([m for m in messages if m.topic.startswith(latched) or m.stamp_ns > late], canvas)
+    show(messages, usual)
+    # display origins are the same (from control), so the corners can be compared; the flight weaves a little
+    np.testing.assert_allclose(canvas.layouts[-1].corners, usual.layouts[-1].corners, atol=120)
+
+
+def test_the_window_is_shown_on_the_ground_and_the_light_beside_it(messages):
+    """Outlines of the marginal and the live part meet where the window begins; residuals of live points are bright."""
+    canvas = Notebook()
+    show(messages, canvas)
+    assert not any(entity.startswith("light") for entity in canvas.drawn)  # reports that do not say: no light
+    told = []
+    for message in messages:
+        body = message.body
+        if message.topic == "adjustment/report":
+            body = type(body)()
+            body.CopyFrom(message.body)
+            body.light, body.light_reason, body.strip = (
+                "weak",
+                "no control within 40 s; height datum rests on GNSS",
+                "S1",
+            )
+            body.window_start_ns = max(body.window_end_ns - 8 * convert.SECOND_NS, 0)
+            body.protection.extend([1.0] * 6)
+        told.append(Message(message.topic, message.stamp_ns, body, message.source, message.sequence))
+    show([m for m in told if not (m.topic == "point/object" and m.body.status == 1)], canvas)
+    _, colors, labels = canvas.drawn["light/reason"]
+    assert labels[0].startswith("WEAK: no control within 40 s;") and colors[0][0] > colors[0][2]
+    assert len(canvas.drawn["light/lamp"][0]) == 1
+    marginal, live = (canvas.drawn[f"flight/window/{name}"][0][0] for name in ("marginal", "live"))
+    assert len(canvas.drawn["flight/window/border"][0]) == 1
+    assert np.abs(marginal[:, None] - live[None]).sum(axis=2).min() < 1e-6
+    lengths = [np.ptp(outline[:, :2], axis=0).max() for outline in (marginal, live)]
+    assert lengths[0] > lengths[1] > 300.0
+    assert len(canvas.drawn["points/fresh"][0]) > 20
+    assert canvas.curves["plots/integrity/position/X_protection"][1][-1] == 1.0

@@ -1,0 +1,323 @@
+"""The viewer node, and the viewers it can draw in."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_rig import wait_for
+from notebook import Notebook
+from recording_file import write_recording
+from synthetic_flight import START_NS, flight_messages, spoilt_copy
+
+from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.node import Message
+from triline.nodes.viewer import scene
+from triline.nodes.viewer.canvas import NullCanvas
+from triline.nodes.viewer.rerun_canvas import open_canvas
+from triline.nodes.viewer.rerun_process import ViewerProcess, _private_folder, viewer_binary
+from triline.nodes.viewer.viewer import Viewer
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return flight_messages(seconds=34.0, points=150)
+
+
+@pytest.fixture(scope="module")
+def recording(messages, tmp_path_factory):
+    path = tmp_path_factory.mktemp("viewer") / "flight.mcap"
+    return write_recording(path, messages)
+
+
+# ---- the node
+
+
+def _finish(viewer):
+    viewer.finish()
+    assert not viewer._thread.is_alive()
+
+
+def test_node_shows_what_it_is_given(messages):
+    canvas = Notebook()
+    viewer = Viewer(canvas=canvas)
+    for message in messages:
+        if message.topic in Viewer.inputs:
+            assert list(viewer.step(message)) == []
+    _finish(viewer)
+    assert canvas.closed == 1 and viewer.state() == "running" and not viewer.counters
+    assert canvas.pieces("flight/final") and canvas.curves["plots/sigma0/value"][0]
+
+
+class _Stuck(Notebook):
+    def __init__(self):
+        super().__init__()
+        self.released = threading.Event()
+
+    def points(self, *args, **kwargs):
+        self.released.wait()
+
+
+def test_a_stuck_viewer_drops_and_counts_and_holds_nobody_up(messages):
+    canvas = _Stuck()
+    viewer = Viewer(canvas=canvas, queue_size=300)
+    for message in messages:  # would hang here if a step waited for the picture
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
+    assert viewer.counters["view dropped"] > 500
+    canvas.released.set()
+    viewer.finish()
+
+
+class _Broken(Notebook):
+    def lines(self, *args, **kwargs):
+        raise RuntimeError("no more ink")
+
+
+def test_a_viewer_that_breaks_takes_nothing_with_it(messages):
+    viewer = Viewer(canvas=_Broken())
+    for message in messages:
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
+    _finish(viewer)
+    assert viewer.counters["view failed"] >= 1 and "no more ink" in viewer.state()
+
+
+class _BreaksOnce(Notebook):
+    def __init__(self):
+        super().__init__()
+        self.left = 1
+
+    def lines(self, *args, **kwargs):
+        if self.left:
+            self.left -= 1
+            raise RuntimeError("no more ink")
+        super().lines(*args, **kwargs)
+
+
+def test_a_viewer_that_could_not_draw_draws_again(messages):
+    canvas = _BreaksOnce()
+    viewer = Viewer(canvas=canvas)
+    for message in messages:
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
+    wait_for(lambda: viewer.counters["view failed"] == 1, 10, "the failure")
+    wait_for(lambda: viewer.state() == "running", 10, "the recovery")
+    _finish(viewer)
+    assert canvas.drawn
+
+
+def test_unusable_messages_are_counted(messages):
+    canvas = Notebook()
+    viewer = Viewer(canvas=canvas)
+    good = next(m for m in messages if m.topic == "orientation/live")
+    body = type(good.body)()
+    body.CopyFrom(good.body)
+    body.covariance.append(1.0)
+    viewer.step(Message("orientation/live", START_NS, body, "test", 0))
+    _finish(viewer)
+    assert viewer.counters["unusable"] == 1 and "covariance has 37 values" in viewer.last_problem
+
+
+def test_nothing_is_drawn_without_a_display(messages):
+    viewer = Viewer(mode="none")
+    for message in messages[:200]:
+        viewer.step(message)
+    _finish(viewer)
+    assert isinstance(viewer.canvas, NullCanvas) and viewer.url is None
+
+
+def test_viewer_takes_topics_of_the_table_only():
+    from triline.schemas import topics
+
+    for topic in Viewer.inputs:
+        assert topics.find(topic).name == topic
+    assert set(scene.TRUTH_TOPICS) <= set(Viewer.inputs) and Viewer.outputs == ()
+
+
+def test_unknown_mode_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="wanted native, web"):
+        Viewer(mode="hologram")
+    with pytest.raises(UserError, match="cannot be written"):
+        Viewer(mode=f"rrd:{tmp_path}/no/flight.rrd")
+
+
+# ---- Rerun
+
+
+def _rerun(*arguments):
+    environment = {**os.environ, "RUST_LOG": "error", "XDG_CONFIG_HOME": str(_private_folder())}
+    return subprocess.run([viewer_binary(), *arguments], capture_output=True, text=True, timeout=600, env=environment)
+
+
+def test_file_is_whole_and_holds_the_views(messages, tmp_path):
+    path = tmp_path / "flight.rrd"
+    begun = time.process_time()
+    viewer = Viewer(mode=f"rrd:{path}")
+    for message in messages:
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
+    _finish(viewer)
+    cost = time.process_time() - begun
+    assert not viewer.counters and viewer.state() == "running"
+    assert cost < 0.25 * 34, "drawing a flight takes a quarter of a core"
+    verified = _rerun("rrd", "verify", str(path))
+    assert verified.returncode == 0, verified.stderr
+    listing = _rerun("rrd", "print", str(path)).stdout
+    for entity in (
+        "/flight/trajectory/0", "/flight/live/0", "/flight/final/0", "/flight/truth/0", "/flight/sigma/0",
+        "/points/final/0",
+        "/points/control", "/points/misfit", "/image/F/residuals", "/image/N/residuals", "/image/B/residuals",
+        "/plots/sigma0/value", "/plots/latency/data", "/plots/corrections/dkappa/upper", "/map/gnss/0", "/log",
+        "/legend",
+    ):  # fmt: skip
+        assert entity in listing, entity
+
+
+def _listening_ports(pids):
+    """(address, port) of the TCP sockets that processes listen on, from the kernel's tables."""
+    inodes = set()
+    for pid in pids:
+        for fd in os.listdir(f"/proc/{pid}/fd"):
+            with contextlib.suppress(OSError):
+                inodes.add(os.readlink(f"/proc/{pid}/fd/{fd}").removeprefix("socket:[").rstrip("]"))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in inodes:
+                address, port = fields[1].split(":")
+                name = socket.inet_ntoa(bytes.fromhex(address)[::-1]) if table == "tcp" else address
+                found.add((name, int(port, 16)))
+    return found
+
+
+def _family(pid):
+    """A process and all that descend from it."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [pid, *(p for child in children for p in _family(int(child)))]
+
+
+def test_web_viewer_listens_on_loopback_only_and_goes_with_us(messages):
+    if not sys.platform.startswith("linux"):
+        pytest.skip("reads the kernel's tables")
+    viewer = Viewer(mode="web")
+    process = viewer.canvas.process
+    pids = _family(process.process.pid)
+    ports = _listening_ports(pids)
+    assert ports == {("127.0.0.1", process.grpc_port), ("127.0.0.1", process.web_port)}
+    settings = json.loads((_private_folder() / "rerun" / "analytics.json").read_text())
+    assert settings["analytics_enabled"] is False
+    assert viewer.url and viewer.url.startswith(f"http://127.0.0.1:{process.web_port}/")
+    with urllib.request.urlopen(f"http://127.0.0.1:{process.web_port}/", timeout=10) as answer:
+        assert answer.status == 200 and b"rerun" in answer.read().lower()
+    for message in messages[:3000]:
+        if message.topic in Viewer.inputs:
+            viewer.step(message)
+    _finish(viewer)
+    assert viewer.state() == "the viewer was closed" and not viewer.counters
+    assert not any(_alive(pid) for pid in pids)
+
+
+def test_two_web_viewers_take_different_ports():
+    first, second = ViewerProcess(web=True), ViewerProcess(web=True)
+    try:
+        assert len({first.grpc_port, first.web_port, second.grpc_port, second.web_port}) == 4
+    finally:
+        first.close()
+        second.close()
+    assert not first.running and not second.running
+
+
+def test_web_viewer_ends_with_a_killed_node(tmp_path):
+    if not sys.platform.startswith("linux"):
+        pytest.skip("only Linux ends a child with its parent")
+    code = (
+        "from triline.nodes.viewer.rerun_process import ViewerProcess; import time;"
+        "v = ViewerProcess(web=True); print(v.process.pid, flush=True); time.sleep(60)"
+    )
+    node = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert node.stdout is not None
+    pid = int(node.stdout.readline())
+    node.kill()
+    node.wait()
+    deadline = time.monotonic() + 5
+    while _alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not _alive(pid)
+
+
+def _alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_native_viewer_without_a_display_is_refused(monkeypatch, recording, capsys):
+    if not sys.platform.startswith("linux"):
+        pytest.skip("other systems always have a display")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(UserError, match="no display"):
+        open_canvas("native")
+    assert main(["view", str(recording)]) == 1
+    assert "--web or --rrd" in capsys.readouterr().err
+    assert main(["node", "viewer"]) == 1
+    assert "triline node viewer: --set mode=web" in capsys.readouterr().err
+
+
+def test_view_command_writes_a_file(recording, messages, tmp_path, capsys):
+    target = tmp_path / "view.rrd"
+    assert main(["view", str(recording), "--rrd", str(target), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["messages"]["orientation/final"] == sum(m.topic == "orientation/final" for m in messages)
+    assert _rerun("rrd", "verify", str(target)).returncode == 0
+    assert main(["view", str(tmp_path / "none.mcap"), "--rrd", str(target)]) == 1
+    assert main(["view", str(recording), "--rrd", str(tmp_path / "no" / "x.rrd")]) == 1
+    err = capsys.readouterr().err
+    assert "no such file" in err and "cannot be written" in err and "Traceback" not in err
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_that_are_not_finite_do_not_end_the_view(messages, seed):
+    rng = np.random.default_rng(seed)
+    canvas = Notebook()
+    viewer = Viewer(canvas=canvas)
+    for m in messages:
+        if m.topic in Viewer.inputs:
+            bad = rng.random() < 0.1
+            viewer.step(Message(m.topic, m.stamp_ns, spoilt_copy(m.body, rng), m.source, m.sequence) if bad else m)
+    _finish(viewer)
+    assert viewer.state() == "running", viewer.last_problem
+    assert not viewer.counters["view failed"] and viewer.counters["unusable"] > 20
+    for entity, what in canvas.drawn.items():
+        for values in what:
+            if isinstance(values, np.ndarray):
+                assert np.isfinite(values).all(), entity
+
+
+def test_view_command_serves_until_it_is_told_to_stop(recording):
+    if not sys.platform.startswith("linux"):
+        pytest.skip("reads the kernel's tables")
+    command = [sys.executable, "-m", "triline.nodes.cli", "view", str(recording), "--web"]
+    view = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert view.stdout is not None and view.stderr is not None
+    assert view.stdout.readline().startswith("http://127.0.0.1:")
+    family = _family(view.pid)
+    assert len(family) >= 2 and {address for address, _ in _listening_ports(family)} == {"127.0.0.1"}
+    view.terminate()
+    assert view.wait(20) == 0 and view.stderr.read() == ""
+    assert not any(_alive(pid) for pid in family)

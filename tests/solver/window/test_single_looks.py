@@ -1,0 +1,207 @@
+"""Looks that find no partner in their strip: refused, kept for the block, and used when it sees their points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from three_strips import OPTIONS, PLAN, TIES, flown
+
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
+from triline.solver.window.block import archive
+from triline.solver.window.block.points import SingleLook
+from triline.solver.window.results import TAKEN_BACK
+from triline.solver.window.state.maker import BatchMaker
+
+ALONE = "too few looks"
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return flown()
+
+
+@pytest.fixture(scope="module")
+def online(flight):
+    return adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+
+
+def looks_of(result, reason):
+    return [(r.point, r.look) for r in result.refused if r.reason == reason]
+
+
+def test_a_single_look_counts_when_another_strip_sees_its_point(flight, online):
+    alone, back = looks_of(online, ALONE), looks_of(online, TAKEN_BACK)
+    assert len(back) == len(set(back)) >= 8
+    assert set(back) <= set(alone)
+    batch = adjust_at_once(*flight, OPTIONS)
+    for name, look in back:
+        whole, wanted = online.whole_points[name], batch.final_points[name]
+        assert look in [r.look for r in whole.residuals]
+        assert {r.look for r in whole.residuals} == {r.look for r in wanted.residuals}
+        sigma = np.sqrt(np.diag(wanted.covariance))
+        assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
+        assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(sigma, rel=0.02)
+
+
+@pytest.mark.study
+def test_how_far_away_its_point_is_need_not_be_known_beforehand(flight, online, monkeypatch):
+    """Linearised 300 m from it, and not anew where it is found, looks would tell positions from attitudes."""
+    make = BatchMaker.make_single
+    monkeypatch.setattr(BatchMaker, "make_single", lambda *a: make(*a[:-1], a[-1] + [0.0, 0.0, 300.0]))
+    far = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    assert looks_of(far, TAKEN_BACK) == looks_of(online, TAKEN_BACK)
+    for one, other in zip(far.whole, online.whole, strict=True):
+        sigma = np.sqrt(np.einsum("nii->ni", other.covariance))
+        assert np.abs((one.correction - other.correction) / sigma).max() < 0.02
+        assert np.sqrt(np.einsum("nii->ni", one.covariance)) == pytest.approx(sigma, rel=0.01)
+
+
+def with_a_wrong_look(flight, wrong):
+    """The flight, a look at which is measured 60 samples aside, with data snooping."""
+    simulation, poses = flight
+    images = simulation.images
+    at = (images.line == wrong.line) & (images.sample == wrong.sample)
+    assert at.sum() == 1
+    spoilt = replace(simulation, images=replace(images, sample=np.where(at, images.sample + 60.0, images.sample)))
+    return adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+
+
+def test_a_wrong_single_look_is_left_out(flight, online):
+    simulation, _ = flight
+    name, wrong = next((n, k) for n, k in looks_of(online, TAKEN_BACK) if online.whole_points[n].rays == 4)
+    result = with_a_wrong_look(flight, wrong)
+    assert name not in [n for n, _ in looks_of(result, TAKEN_BACK)]
+    assert any("do not agree with earlier strips" in text and name in text for text in result.events)
+    truth = dict(zip(map(str, simulation.points.id), simulation.points.xyz_l, strict=True))
+    off = result.whole_points[name].xyz_l - truth[name]
+    assert off @ np.linalg.solve(result.whole_points[name].covariance, off) < 20.0
+
+
+@pytest.mark.study
+def test_two_single_looks_that_contradict_each_other_place_no_point(flight, online):
+    """Neither can be told to be the wrong one; what was left out is not taken back again and again."""
+    name, wrong = next((n, k) for n, k in looks_of(online, TAKEN_BACK) if online.whole_points[n].rays == 5)
+    result = with_a_wrong_look(flight, wrong)
+    told = [r for r in result.refused if r.point == name]
+    assert {(r.look.strip, r.reason) for r in told} == {("S1", ALONE), ("S2", "snooping")}
+    assert result.whole_points[name].rays == 3  # those of the last strip
+
+
+@pytest.mark.study
+def test_a_slightly_wrong_single_look_does_not_take_good_ones_with_it(flight, online):
+    """It passes at the door; the looks of the next strip are refused for it, come back together, and it goes."""
+    simulation, poses = flight
+    name, wrong = next((n, k) for n, k in looks_of(online, TAKEN_BACK) if n == "T00264")
+    images = simulation.images
+    at = (images.line == wrong.line) & (images.sample == wrong.sample)
+    spoilt = replace(simulation, images=replace(images, sample=np.where(at, images.sample + 2.2, images.sample)))
+    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    refused = [r.look for r in result.refused if r.point == name and r.reason == "snooping"]
+    assert len(refused) == 3 and {r.look for r in result.refused if r.reason == TAKEN_BACK} >= set(refused)
+    assert result.whole_points[name].rays == 3
+    assert any("do not agree with earlier strips" in text and name in text for text in result.events)
+
+
+def test_single_looks_of_a_strip_flown_again_leave_it_consistent():
+    """Every fourth point has one look of the same CCD line in each, 45 m apart."""
+    plan = replace(PLAN, strips=3, cross_strips=0, sidelap=0.97)
+    simulation, poses = flown(plan, replace(TIES, tie_points_per_s=8.0, control=0, check=0))
+    looks, rng = simulation.images.looks, np.random.default_rng(3)
+    keep = np.ones(len(looks.point), dtype=bool)
+    for point in np.unique(looks.point):
+        first, last = (np.flatnonzero((looks.point == point) & (looks.strip == k)) for k in (0, 2))
+        both = set(looks.ccd[first]) & set(looks.ccd[last])
+        if both and rng.random() < 0.25:
+            ccd = min(both)
+            keep[looks.point == point] = False
+            keep[[first[looks.ccd[first] == ccd][0], last[looks.ccd[last] == ccd][0]]] = True
+    simulation = replace(simulation, images=simulation.images.select(keep))
+    result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5)
+    assert len(looks_of(result, TAKEN_BACK)) > 100
+    again = orientation_errors(simulation, [o for o in result.final if o.strip == "S3"])
+    assert 0.4 < again.nees.mean() < 1.2  # 1.4 where errors they share count as independent
+    assert 0.4 < orientation_errors(simulation, result.whole).nees.mean() < 1.2
+
+
+def test_a_look_without_ground_near_it_is_given_up(flight):
+    """One point, whose looks contradict each other, and a single look at another: it is told, nothing fails."""
+    simulation, poses = flight
+    images = simulation.images
+    of_first = images.looks.strip == 0
+    seen = np.bincount(images.looks.point[of_first], minlength=len(simulation.points.id))
+    pair, other = np.flatnonzero(seen == 2)[0], np.flatnonzero(seen > 2)[0]
+    keep = of_first & (images.looks.point == pair)
+    keep[np.flatnonzero(of_first & (images.looks.point == other))[0]] = True
+    few = images.select(keep)
+    few = replace(few, sample=few.sample + 300.0 * (np.arange(len(few.sample)) == np.argmax(few.looks.point == pair)))
+    spoilt = replace(simulation, images=few)
+    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    assert [n for n, _ in looks_of(result, ALONE)] == [str(simulation.points.id[other])]
+
+
+def test_control_that_comes_late_places_a_single_look(flight, online):
+    """Nobody sees its point again; as in the batch adjustment that knows the control."""
+    simulation, poses = flight
+    name, look = looks_of(online, TAKEN_BACK)[0]
+    i = list(map(str, simulation.points.id)).index(name)
+    images = simulation.images
+    simulation = replace(simulation, images=images.select((images.looks.point != i) | (images.line == look.line)))
+    xyz = simulation.points.xyz_l[i] + 0.01
+    begin_s = simulation.flight.strips[1].first_line_time_s
+
+    def watch(now, window):
+        if now > begin_s + 10.0 and name not in window.network.intake.control:
+            window.add_control(name, xyz, np.full(3, 0.02), "control")
+
+    late = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+    assert name in late.whole_points and late.whole_points[name].role == "control"
+    role = np.where(np.arange(len(simulation.points.id)) == i, "control", simulation.points.role)
+    surveyed = simulation.surveyed_l.copy()
+    surveyed[i] = xyz
+    known = replace(simulation, surveyed_l=surveyed, points=replace(simulation.points, role=role))
+    batch = adjust_at_once(known, poses, OPTIONS)
+    sigma = np.sqrt(np.diag(batch.final_points[name].covariance))
+    assert np.abs((late.whole_points[name].xyz_l - batch.final_points[name].xyz_l) / sigma).max() < 0.1
+
+
+@pytest.mark.study
+def test_what_a_drift_does_to_a_single_look_is_known(flight, monkeypatch):
+    """By the difference that a look makes that is measured a pixel aside."""
+    made = []
+    init = SingleLook.left
+
+    def left(self, place_l=None):
+        made.append(self)
+        return init(self, place_l)
+
+    monkeypatch.setattr(SingleLook, "left", left)
+    adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    with_cell = [s for s in made if s.cell is not None]
+    assert len(with_cell) > 0.8 * len(made)
+    for single in with_cell[:5]:
+        batch, i = single.batch, single.place
+        effect = single.cell.on_rays(range(i, i + 1))
+        assert effect.shape == (2, len(single.cell.of_block)) and (single.cell.of_block < 0).all()
+        group = int(np.flatnonzero(effect.any(axis=0))[0]) // 4 * 4  # of the unknowns of its group, the first
+        before = batch.lin.residual[:, i].copy()
+        rays = batch.rays
+        batch.rays = replace(rays, xy_mm=rays.xy_mm + rays.pitch_mm)
+        batch.linearise(batch.theta, reweigh=False)
+        moved = batch.lin.residual[:, i] - before
+        batch.rays = rays
+        batch.linearise(batch.theta, reweigh=False)
+        assert effect[:, group + 1] == pytest.approx(moved, rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.study
+def test_no_more_than_so_many_are_kept(flight, monkeypatch):
+    monkeypatch.setattr(archive, "MOST_SINGLE", 3)
+    told = []
+
+    def watch(now, window):
+        told.append(sum(point.single for point in window._block.earlier.points.values()))
+
+    adjust_online(*flight, OPTIONS, live=False, update_s=0.5, watch=watch)
+    assert max(told) == 3

@@ -1,0 +1,90 @@
+"""What the window computes in a shorter way is what the long way gives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from triline.solver.adjustment.reduced_system import DenseFactor
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.state.maker import BatchMaker
+from triline.solver.window.window import Window
+
+
+def test_cofactors_of_few_unknowns() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(60, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
+    columns = np.array([3, 38, 0, 17])
+    wanted = np.linalg.inv(A.T @ A)[np.ix_(columns, columns)]
+    factor = DenseFactor(A.T @ A)
+    few = factor.few_cofactors(columns)
+    scale = np.sqrt(np.diagonal(wanted))
+    np.testing.assert_allclose(few / scale / scale[:, None], wanted / scale / scale[:, None], atol=1e-9)
+    factor.inverse()
+    np.testing.assert_allclose(factor.few_cofactors(columns), few, rtol=1e-9, atol=1e-12 * np.abs(few).max())
+
+
+def test_cofactors_of_few_unknowns_of_a_singular_matrix() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(30, 5)) @ rng.normal(size=(5, 8))
+    factor = DenseFactor(A.T @ A)
+    columns = np.array([1, 6])
+    np.testing.assert_allclose(factor.few_cofactors(columns), factor.inverse()[np.ix_(columns, columns)])
+    assert len(factor.undetermined.eigenvalues) == 3
+
+
+def test_residuals_without_cofactors() -> None:
+    """Of every batch of a window, at a solution for which it has not been judged."""
+    simulation = simulate(FlightPlan(strip_s=12.0), 1, observation_plan=ObservationPlan(tie_points_per_s=6.0))
+    compared = 0
+
+    def watch(_: float, window: Window) -> None:
+        nonlocal compared
+        for batch in window.network.batches:
+            batch.judged = None
+            alone = batch.residuals_px(window.state)
+            assert batch.judged is None
+            np.testing.assert_allclose(alone, batch.judge(window.state)[1].v_px, rtol=1e-12, atol=1e-12)
+            np.testing.assert_array_equal(batch.residuals_px(window.state), batch.judge(window.state)[1].v_px)
+            compared += 1
+
+    adjust_online(simulation, navigate(simulation), live=False, watch=watch)
+    assert compared > 20
+
+
+def test_a_joined_batch_says_what_its_parts_said() -> None:
+    """Rays that come a few at a time: batches of a time are joined, and together know what they knew."""
+    simulation = simulate(FlightPlan(strip_s=24.0), 1, observation_plan=ObservationPlan(tie_points_per_s=20.0))
+    sizes, compared = [], 0
+
+    def watch(now: float, window: Window) -> None:
+        nonlocal compared
+        sizes.append(max((len(b.rays) for b in window.network.batches if b.newest_s < now - 3.0), default=0))
+        parts = [b for b in window.network.batches if b.provisional][:3]
+        if len(parts) < 2 or compared == 20:
+            return
+        compared += 1
+        points, state = window.network.intake.points, window.state
+        known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
+        maker = BatchMaker(window.network)
+        made = [maker.make(b.names, [points[n] for n in b.names], known)[0] for b in parts]
+        joined = maker.make(list(known), [points[n] for n in known], known)[0]
+        total, rhs = np.zeros((len(state), len(state))), np.zeros(len(state))
+        for batch in made:
+            assert batch is not None
+            place = state.places(batch.columns)
+            total[np.ix_(place, place)] += batch.information.matrix
+            rhs[place] += batch.information.rhs
+        assert joined is not None
+        place = state.places(joined.columns)
+        scale = np.sqrt(np.diagonal(state.covariance(joined.columns)))
+        got = joined.information
+        wanted = total[np.ix_(place, place)] * scale * scale[:, None]
+        np.testing.assert_allclose(got.matrix * scale * scale[:, None], wanted, atol=1e-9 * np.abs(wanted).max())
+        np.testing.assert_allclose(got.rhs * scale, rhs[place] * scale, rtol=1e-7, atol=1e-6)
+        assert got.rows == sum(b.information.rows for b in made if b is not None)
+
+    adjust_online(simulation, navigate(simulation), live=False, watch=watch, update_s=0.05)
+    assert compared == 20
+    assert 12 < max(sizes) <= 160  # 3 rays an update; smoothed poses come five times a second

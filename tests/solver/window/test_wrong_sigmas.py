@@ -1,0 +1,167 @@
+"""Flights whose a-priori sigmas are wrong: the window finds out before it throws looks or control out."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, error_groups
+from triline.solver.models.slow_errors import SlowErrors
+from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
+from triline.solver.simulation.scenario import simulate
+from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.window.results import TAKEN_BACK, WindowOptions
+from triline.solver.window.screening.sigma_check import ENOUGH, RIGHT, SigmaCheck
+from triline.solver.window.state.network import LiveNetwork
+from triline.solver.window.state.strip import WindowStrip
+from triline.solver.window.state.unknowns import WindowState
+
+SLOW = SlowErrors((0.3, 0.3, 0.5), (1e-4, 1e-4, 2e-4), (5e-5,) * 3, (0.1, 0.1, 0.2), (4e-5,) * 3, 30.0)
+OPTIONS = WindowOptions(grid_hz=4.0)
+
+
+@cache
+def flown(row: str, strip_s: float = 40.0, seed: int = 4):
+    """A flight with carrier-phase GNSS in a world of the study, through the window."""
+    simulation = simulate(FlightPlan(strip_s=strip_s), seed, SETTINGS["rtk"], OBSERVED, world=ROWS[row].world)
+    return simulation, adjust_online(simulation, navigate(simulation), OPTIONS, live=False)
+
+
+def rejected(online) -> int:
+    """Looks that are left out in the end."""
+    out = set()
+    for r in online.refused:
+        if r.reason in ("snooping", TAKEN_BACK) and not r.coordinate:
+            (out.discard if r.reason == TAKEN_BACK else out.add)((r.point, r.look))
+    return len(out)
+
+
+def refused_control(online) -> set:
+    out = set()
+    for r in online.refused:
+        if r.coordinate:
+            (out.discard if r.reason == TAKEN_BACK else out.add)((r.point, r.coordinate))
+    return out
+
+
+def rmse(row: str) -> float:
+    simulation, online = flown(row)
+    return float(np.sqrt((point_errors(simulation, online.whole_points).error ** 2).sum(axis=1).mean()))
+
+
+def test_a_flight_as_stated_keeps_its_sigmas():
+    _, online = flown("stated")
+    assert not [event for event in online.events if event.startswith("sigmas:")]
+    assert online.window.network.sigmas.image == 1.0 and (online.window.network.sigmas.apriori == 1.0).all()
+
+
+@pytest.mark.parametrize("row", ["sine-slow", "boresight", "gnss-datum"])
+def test_what_nobody_stated_is_found_and_costs_little(row):
+    """Before, the first lost a third of its looks and the others all control; all of them were 0.6 to 1.5 m off."""
+    simulation, online = flown(row)
+    assert any(event.startswith("sigmas: ") for event in online.events)
+    assert rejected(online) < 0.02 * len(simulation.images) and not refused_control(online)
+    assert rmse(row) < 1.8 * rmse("stated")
+    assert 0.5 < point_errors(simulation, online.whole_points).nees.mean() < 1.8
+    assert 0.3 < orientation_errors(simulation, online.whole).nees.mean() < 2.5
+
+
+def test_a_datum_difference_is_told_with_its_sigma():
+    _, online = flown("gnss-datum")
+    lines = [event for event in online.events if "GNSS differ by" in event]
+    assert lines and all("+-" in line and "is published in the datum of control" in line for line in lines)
+    assert not [name for r in online.reports for name in r.quality.names]  # no healthy source is accused
+    assert all(r.quality.light != "good" for r in online.reports[-20:])
+
+
+@pytest.mark.study
+def test_vibration_is_told_from_image_noise():
+    _, vibrating = flown("sine-fast")
+    _, noisy = flown("noise")
+    assert any("vibrates" in event for event in vibrating.events)
+    assert not any("vibrates" in event for event in noisy.events)
+    assert noisy.window.network.sigmas.image == pytest.approx(2.0, rel=0.25)
+
+
+# ---- the mechanism
+
+
+def strip_in(state: WindowState, factor=None) -> WindowStrip:
+    strip = WindowStrip("S1", 0.0, 100.0, 2000, SLOW, OPTIONS, state, factor=factor)
+    strip.activate(9.0, state)
+    return strip
+
+
+def seen(strip: WindowStrip, state: WindowState) -> None:
+    """Observations of the corrections at some times."""
+    rng = np.random.default_rng(3)
+    for t in np.arange(0.5, 9.0, 0.7):
+        d = strip.design([t])
+        for c in range(6):
+            columns, scale = d.columns[0][None, :, c], [0.1, 3e-5][c > 2]
+            state.observe(columns, d.coefficients[0][None], rng.normal(0, scale, 1), np.full(1, scale))
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_sigmas_stated_anew_are_those_stated_from_the_start(when):
+    factor = np.array([2.0, 3.0, 1.5, 5.0])
+    from_start, anew = WindowState(), WindowState()
+    expected, strip = strip_in(from_start, factor), strip_in(anew)
+    if when == "before":
+        strip.restate_sigmas(factor, anew)
+    for s, state in ((expected, from_start), (strip, anew)):
+        seen(s, state)
+    if when == "after":
+        strip.restate_sigmas(factor, anew)
+    for s, state in ((expected, from_start), (strip, anew)):
+        s.activate(15.0, state)  # what comes later has them, too
+        state.solve()
+    assert anew.theta == pytest.approx(from_start.theta, rel=1e-7, abs=1e-12)
+    got, want = (np.diagonal(s.covariance(s.numbers)) for s in (anew, from_start))
+    assert got == pytest.approx(want, rel=1e-7)
+    assert anew.cost() == pytest.approx(from_start.cost(), rel=1e-9)
+
+
+def test_residuals_and_redundancies_of_what_was_known_beforehand():
+    """The redundancies are those of the definition, and no group has more than it has equations."""
+    state = WindowState()
+    strip = strip_in(state)
+    seen(strip, state)
+    state.solve()
+    group, square, redundancy = strip.apriori_fit(state, -np.inf)
+    total = np.trace(np.eye(len(state)) - state.covariance(state.numbers) @ sum(
+        strip.apriori_information(g, state)[0] for g in range(4)))  # fmt: skip
+    assert len(state) - total == pytest.approx(len(group) - redundancy.sum(), abs=1e-6)
+    assert (square >= 0).all() and (np.bincount(group, redundancy) <= np.bincount(group) + 1e-9).all()
+
+
+def test_groups_go_by_the_words_of_the_labels():
+    labels = ("X offset of strip shift", "kappa shift of strip S1", "phi drift of strip S1")
+    wander = ("Y wander value at border 3 of strip S1", "wander of omega over segment 2 of strip S1")
+    assert error_groups((*labels, *wander)).tolist() == [OFFSET, SHIFT, SHIFT, POSITION_WANDER, ATTITUDE_WANDER]
+
+
+def test_looks_that_disagree_make_tests_wider(camera_network):
+    rng = np.random.default_rng(1)
+    check = SigmaCheck(camera_network)
+    good = RIGHT * rng.chisquare(1, 100)
+    check.entered((s, 1) for s in good)
+    assert camera_network.sigmas.disagreement == 1.0
+    check.entered((9.0 * s, 1) for s in good)
+    assert 2.2 < camera_network.sigmas.disagreement < 4.0
+
+
+def test_a_few_points_say_nothing(camera_network):
+    check = SigmaCheck(camera_network)
+    check.entered([(100.0, 3)] * (ENOUGH - 1))
+    assert camera_network.sigmas.disagreement == 1.0
+
+
+@pytest.fixture
+def camera_network() -> LiveNetwork:
+    from triline.solver.camera.sensors import preset
+
+    return LiveNetwork(preset("ads40"))

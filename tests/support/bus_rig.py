@@ -1,0 +1,89 @@
+"""Real nodes in real processes on a bus of their own, for tests."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
+ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def triline(*arguments: object, timeout: float = 600) -> subprocess.CompletedProcess[str]:
+    """A command, run to its end."""
+    command = [*TRILINE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, env=ENVIRONMENT)
+
+
+@functools.cache
+def simulated_flight(seconds: int = 8) -> Path:
+    """A small flight: attitude, GNSS, tie points, control, truth."""
+    path = Path(tempfile.mkdtemp(prefix="triline-tests-")) / "flight.mcap"
+    done = triline("simulate", "-o", path, "--sensor", "ads40", "--strips", 1, "--seconds", seconds, "--seed", 3)
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+#: A machine that is busy with other things may take so many times as long as an idle one needs at most.
+PATIENCE = 6.0
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 10.0, what: str = "the condition") -> None:
+    until = time.monotonic() + PATIENCE * timeout_s
+    while not condition():
+        assert time.monotonic() < until, f"{what} did not come within {PATIENCE * timeout_s:g} s"
+        time.sleep(0.02)
+
+
+class Rig:
+    """Processes on one port; whatever happens, none is left when the context ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port = free_port()
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self, *arguments: object, name: str = "") -> subprocess.Popen[bytes]:
+        """A command in the background, its output in ``<name>.log``."""
+        name = name or str(arguments[1] if arguments[0] == "node" else arguments[0])
+        return self.start_program([*TRILINE, *map(str, arguments)], name)
+
+    def start_program(self, command: list[str], name: str) -> subprocess.Popen[bytes]:
+        """Any program that takes ``--port``."""
+        with open(self.folder / f"{name}.log", "ab") as log:
+            process = subprocess.Popen(
+                [*command, "--port", str(self.port)],
+                stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=ENVIRONMENT, start_new_session=True,
+            )  # fmt: skip
+        self.processes.append(process)
+        return process
+
+    def log(self, name: str) -> str:
+        return (self.folder / f"{name}.log").read_text()
+
+    def stop(self, process: subprocess.Popen[bytes], number: int = signal.SIGINT) -> int:
+        process.send_signal(number)
+        return process.wait(20)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+                process.wait()

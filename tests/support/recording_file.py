@@ -1,0 +1,35 @@
+"""Recordings of messages, for tests of what reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from triline.nodes.node import Message
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
+
+
+def write_recording(path: Path, messages: Iterable[Message], **options) -> Path:
+    """Write messages in their order; return the path."""
+    with RecordingWriter(path, **options) as writer:
+        for message in messages:
+            writer.write(message)
+    return path
+
+
+def payloads(path: Path, topic: str) -> list[tuple[int, int, bytes]]:
+    """Stamp, number and payload of the messages of a topic, in order."""
+    reader = RecordingReader(path)
+    raws = [reader.raw(int(n)) for n in reader.sort(reader.select([topic]))]
+    return [(raw.envelope.stamp_ns, raw.envelope.sequence, bytes(raw.data)) for raw in raws]
+
+
+def chunk_spans(path: Path) -> list[tuple[int, int]]:
+    """Where each chunk of a whole recording begins and ends, as the MCAP library reads it in the summary."""
+    with open(path, "rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length) for c in summary.chunk_indexes]
