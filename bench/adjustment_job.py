@@ -6,15 +6,15 @@ adjustments with elimination. Prints the median of a few runs, without simulatio
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
 
+import frame
 import numpy as np
 
-from triline.solver.adjustment.batch import Event, Job, Phase, run
+from triline.solver.adjustment.job import Event, Job, Phase, run
 from triline.solver.adjustment.network import Control, Measurements, Network, build_network
 from triline.solver.simulation.testfield_study import choose_control
 from triline.solver.simulation.testfields import TESTFIELDS
@@ -58,8 +58,8 @@ def timed(network: Network, job: Job) -> list[tuple[str, float]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=5)
+    parser = frame.parser(__doc__)
+    parser.add_argument("--runs", type=int, default=5, help="of the job; the median is printed (5)")
     args = parser.parse_args()
     field = TESTFIELDS["pavia2000"]()
     configuration = field.configurations[1]
@@ -82,7 +82,7 @@ def main() -> int:
     for name, seconds in phases.items():
         print(f"  {name:45s}{np.median(seconds) * len(seconds) / args.runs:8.3f} s")
     print(f"  {'whole job':45s}{np.median(totals):8.3f} s (wanted: less than {LIMIT_S:.0f} s)")
-    return 0 if np.median(totals) < LIMIT_S else 1
+    return frame.verdict(bool(np.median(totals) < LIMIT_S))
 
 
 if __name__ == "__main__":

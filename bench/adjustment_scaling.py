@@ -1,6 +1,6 @@
 """Time and memory of the batch adjustment against the number of rays, of strips and of segments.
 
-    python bench/adjustment_scaling.py [-o FOLDER] [--quick]
+    python bench/adjustment_scaling.py [-o FOLDER]
 
 Every case runs in a process of its own; its memory is the largest resident set, simulation of the network included.
 With -o the plot adjustment_scaling.png is written to FOLDER.
@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+import frame
 
 #: what grows: model, additional parameters, points, strips, cross strips, length in m, segments or fixes
 CASES = {
@@ -34,11 +35,11 @@ def run(case: tuple) -> dict:
 
     from triline.solver.adjustment.adjustment import pose_problem, solve
     from triline.solver.adjustment.covariance import cofactors
-    from triline.solver.camera import three_line_camera
+    from triline.solver.camera.line_camera import three_line_camera
+    from triline.solver.camera.self_calibration import tls
     from triline.solver.models.dgr import DgrOptions
     from triline.solver.models.lim import LimOptions
     from triline.solver.models.ppm import PpmOptions
-    from triline.solver.selfcalibration import tls
     from triline.solver.simulation.network import regular_block
 
     model, with_aps, points, strips, cross, length, parts = case
@@ -105,9 +106,8 @@ def plot(results: dict[str, list[tuple[float, dict]]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__)
     parser.add_argument("-o", type=Path, metavar="FOLDER", help="where the plot goes")
-    parser.add_argument("--quick", action="store_true", help="only the three smallest of every kind")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
@@ -115,10 +115,9 @@ def main() -> None:
         return
     results: dict[str, list[tuple[float, dict]]] = {}
     for name, cases in CASES.items():
-        for case in cases[:3] if given.quick else cases:
+        for case in cases:
             command = [sys.executable, __file__, "--one", json.dumps(case)]
-            environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-            done = subprocess.run(command, capture_output=True, text=True, env=environment)
+            done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode:
                 sys.exit(done.stderr.strip().splitlines()[-1])
             r = json.loads(done.stdout)

@@ -1,6 +1,6 @@
 """A-priori weights from the trajectory: squares of the errors of the refined orientation over what it says of itself.
 
-    python bench/apriori.py [--seeds 16] [--cases flight outage restart] [--quick]
+    python bench/apriori.py [--seeds 16] [--cases flight outage restart]
 
 Simulated flights with raw inertial data go through navigator and adjuster as on line, heading found in motion 18 s
 before the first strip. In the middle of a strip GNSS is out for 23 s (outage), or the navigator is killed and started
@@ -10,19 +10,18 @@ again (restart). 1 is expected; the mean over seeds must lie within three standa
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
+import frame
 import numpy as np
 from scipy.stats import t as student_t
 
 from triline.nodes import convert
-from triline.nodes.adjuster import Adjuster
-from triline.nodes.navigator import Navigator
+from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
-from triline.nodes.simulator import Simulator
+from triline.nodes.simulator.simulator import Simulator
 from triline.solver.accuracy import angle_difference
 from triline.solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from triline.solver.simulation.error_models import ErrorModel
@@ -83,14 +82,11 @@ def of_seed(grade: str, seed: int, case: str) -> dict[str, np.ndarray]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=16)
+    parser = frame.parser(__doc__, seeds=16, processes=True)
     parser.add_argument("--cases", nargs="+", default=["flight", "outage", "restart"])
     parser.add_argument("--grades", nargs="+", default=list(GRADES))
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument("--quick", action="store_true", help="three seeds")
     args = parser.parse_args()
-    seeds, good = 3 if args.quick else args.seeds, True
+    seeds, good = args.seeds, True
     with ProcessPoolExecutor(args.processes) as pool:
         done = {
             (case, name): [pool.submit(of_seed, name, seed, case) for seed in range(10, 10 + seeds)]
@@ -111,7 +107,7 @@ def main() -> int:
                     flush=True,
                 )
     print("all as wanted" if good else "not all as wanted")
-    return 0 if good else 1
+    return frame.verdict(good)
 
 
 if __name__ == "__main__":

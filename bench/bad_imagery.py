@@ -8,17 +8,17 @@ slow attitude errors. Errors are those of rays against the true place of the poi
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
+import frame
 import numpy as np
 from numpy.typing import NDArray
 
-from triline.nodes.flight_settings import simulated_flight
+from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.solver.simulation.matching_study import match_strip, tie_errors
 
 Images = list[NDArray[np.unsignedinteger]]
@@ -107,9 +107,8 @@ FAULTS: dict[str, Spoil] = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--first", type=int, default=3)
+    parser = frame.parser(__doc__, seeds=2)
+    parser.add_argument("--first", type=int, default=3, help="seed (3)")
     parser.add_argument("--seconds", type=float, default=40.0)
     parser.add_argument("--pixels", type=int, default=800)
     parser.add_argument("--only", default="", help="faults whose names hold these words")

@@ -19,20 +19,23 @@ import tempfile
 import time
 from pathlib import Path
 
+import frame
 import numpy as np
 import psutil
 
-from triline.nodes.bus import Bus
+from triline.nodes.bus.processes import ALLOCATOR
+from triline.nodes.bus.session import Bus
 from triline.nodes.convert import gnss_message
 from triline.nodes.node import Message
-from triline.nodes.processes import ALLOCATOR
-from triline.nodes.recording import RecordingReader
+from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
 
 N_SAMPLES, LINES, LINE_RATE_HZ = 12_000, 32, 800.0
 RATES_HZ = {"F": LINE_RATE_HZ / LINES, "N": LINE_RATE_HZ / LINES, "B": LINE_RATE_HZ / LINES, "imu": 500.0, "gnss": 5.0}
 START_DELAY_S = 3.0
+#: What the recorder may take of a core.
+WANTED_CORES = 0.5
 
 
 def publish(what: str, port: int, seconds: float, begin: float) -> None:
@@ -70,7 +73,7 @@ def measure(seconds: float, port: int, compression: str) -> dict:
     environment = {**os.environ, **ALLOCATOR}
     with tempfile.TemporaryDirectory(prefix="triline-bench-") as folder:
         output = Path(folder) / "load.mcap"
-        command = [sys.executable, "-m", "triline.nodes.cli", "node", "recorder", "-q", "--port", str(port)]
+        command = [*frame.TRILINE, "node", "recorder", "-q", "--port", str(port)]
         command += ["-o", str(output), "--set", f"compression={compression}"]
         recorder = subprocess.Popen(command, env=environment)
         begin = time.time() + START_DELAY_S
@@ -112,11 +115,10 @@ def _topic(reader: RecordingReader, entry: dict) -> dict:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--port", type=int, default=17547)
     parser.add_argument("--compression", default="none", choices=("none", "lz4", "zstd"))
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--publish", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.publish:
@@ -136,7 +138,7 @@ def main() -> int:
             print(
                 f"{t['topic']:<16} {t['sent']:>7} {t['lost']:>5} {times}   {100 * t['publisher_cores']:.0f} % of a core"
             )
-    return 0 if result["lost"] == 0 and result["recorder_cores"] < 1 else 1
+    return frame.verdict(result["lost"] == 0 and result["recorder_cores"] < WANTED_CORES)
 
 
 if __name__ == "__main__":

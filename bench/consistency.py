@@ -1,9 +1,8 @@
-"""Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds and a long flight.
+"""Are errors as large as the window says? Mean normalised error squared (1 expected), over seeds.
 
     python bench/consistency.py seeds [--seeds 50] [--model wander] [--rough] [--camera 0.03]
     python bench/consistency.py held [--seeds 20] [--camera 0.03]
     python bench/consistency.py control [--seeds 100]
-    python bench/consistency.py drift [--minutes 120]
 
 *seeds*: one strip of 40 s a seed; the band is 95 % of the mean of so many flights, from their scatter. With *camera*,
 the true camera has TLS-12 parameters drawn from that share of their usual a-priori sigmas, and they are estimated;
@@ -11,29 +10,26 @@ without wander (*--constant*) the errors are those that "dgr" describes. *held*:
 three ways: as it is, all parameters in the state from the start; with those that are not determined by then held at
 zero; and these held, but with what they leave open in the covariance ("considered", after Schmidt). *control*: one
 coordinate of a control point is wrong by 2 to 12 of its sigmas; how often a component is beyond its protection level
-(0.1 % allowed), and beyond 3.29 sigma. *drift*: strips one after the other, each tied to the one before by its side
-lap; the ratio in quarters of the flight, and what is kept.
-Set OPENBLAS_NUM_THREADS=1.
+(0.1 % allowed), and beyond 3.29 sigma.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 
+import frame
 import numpy as np
 from scipy.stats import norm
 
-from triline.solver.selfcalibration import tls
+from triline.solver.camera.self_calibration import tls
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
-from triline.solver.window.determinability import ESTIMATED
+from triline.solver.window.quality.determinability import ESTIMATED
 from triline.solver.window.results import WindowOptions
 from triline.solver.window.window import Window
 
@@ -62,12 +58,9 @@ def one_flight(seed: int, model: str, rough: bool, camera: float, constant: bool
 
 
 def seeds(args: argparse.Namespace) -> None:
-    with ProcessPoolExecutor(2) as pool:
-        work = partial(one_flight, model=args.model, rough=args.rough, camera=args.camera, constant=args.constant)
-        rows = np.array(list(pool.map(work, range(1, args.seeds + 1))))
-    band = 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
-    for name, mean, b in zip(KINDS, rows.mean(axis=0), band, strict=True):
-        print(f"{name:14} {mean:.3f} +- {b:.3f}  {'in the band' if abs(mean - 1.0) <= b else 'outside'}")
+    work = partial(one_flight, model=args.model, rough=args.rough, camera=args.camera, constant=args.constant)
+    for name, mean, band in zip(KINDS, *frame.mean_and_band(list(frame.over_seeds(work, args.seeds))), strict=True):
+        print(f"{name:14} {frame.banded(mean, band)}")
 
 
 def one_held(seed: int, camera: float) -> dict[str, np.ndarray]:
@@ -78,12 +71,12 @@ def one_held(seed: int, camera: float) -> dict[str, np.ndarray]:
     sums = {way: np.zeros(8) for way in WAYS}
 
     def watch(now: float, window: Window) -> None:
-        live, found = window.live(now), window._watch.last
+        live, found = window.live(now), window._quality.last
         if live is None or found is None or not found.standing:
             return
         design = window.strips[live.strip].design(live.time_s)
         columns = np.unique(design.columns[design.columns >= 0]).astype(np.int64)
-        held = window._camera_columns[[s.status != ESTIMATED for s in found.standing]]
+        held = window.network.camera_columns[[s.status != ESTIMATED for s in found.standing]]
         A = np.zeros((6, len(columns)))
         node, component = np.nonzero(design.columns[0] >= 0)
         place = np.searchsorted(columns, design.columns[0, node, component])
@@ -91,7 +84,7 @@ def one_held(seed: int, camera: float) -> dict[str, np.ndarray]:
         Q = window.state.covariance(np.concatenate([columns, held]))
         u = len(columns)
         gain = A @ np.linalg.solve(Q[u:, u:], Q[u:, :u]).T
-        open_ = gain * stated.apriori_sigma[np.isin(window._camera_columns, held)]
+        open_ = gain * stated.apriori_sigma[np.isin(window.network.camera_columns, held)]
         error = orientation_errors(simulation, [live]).error[0]
         less = error - gain @ window.state.values(held)
         known = live.covariance[0] - gain @ Q[u:, u:] @ gain.T
@@ -107,16 +100,15 @@ def one_held(seed: int, camera: float) -> dict[str, np.ndarray]:
 
 
 def held(args: argparse.Namespace) -> None:
-    with ProcessPoolExecutor(2) as pool:
-        flights = list(pool.map(partial(one_held, camera=args.camera or 0.03), range(1, args.seeds + 1)))
+    flights = list(frame.over_seeds(partial(one_held, camera=args.camera or 0.03), args.seeds))
     rmse = {}
     for way in WAYS:
         each = np.array([f[way][6] / f[way][7] for f in flights])
         rmse[way] = np.sqrt(np.sum([f[way][:6] for f in flights], axis=0) / np.sum([f[way][7] for f in flights]))
         ratio = rmse[way] / rmse[WAYS[0]]
-        band = 1.96 * each.std(ddof=1) / np.sqrt(len(each))
+        mean, band = frame.mean_and_band(each)
         print(
-            f"{way:11} NEES {each.mean():6.2f} +- {band:.2f}, largest flight {each.max():6.1f}; RMSE over that of "
+            f"{way:11} NEES {mean:6.2f} +- {band:.2f}, largest flight {each.max():6.1f}; RMSE over that of "
             f"{WAYS[0]}: mean {ratio.mean():.3f}, worst component {ratio.max():.3f}"
         )
 
@@ -145,8 +137,7 @@ def one_wrong_control(seed: int) -> dict[str, tuple[int, int, int]]:
 
 
 def control(args: argparse.Namespace) -> None:
-    with ProcessPoolExecutor(2) as pool:
-        flights = list(pool.map(one_wrong_control, range(1, args.seeds + 1)))
+    flights = list(frame.over_seeds(one_wrong_control, args.seeds))
     for name in ("live", "final"):
         beyond, far, n = np.sum([f[name] for f in flights], axis=0)
         of_flights = sum(f[name][0] > 0 for f in flights)
@@ -156,50 +147,15 @@ def control(args: argparse.Namespace) -> None:
         )
 
 
-def drift(args: argparse.Namespace) -> None:
-    strips = max(4, round(args.minutes))
-    plan = FlightPlan(strips=strips, strip_s=54.0, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0, sidelap=0.2)
-    simulation = simulate(plan, 1, ERRORS, ObservationPlan(tie_points_per_s=3.0, control=2 * strips, check=strips))
-    memory: list[float] = []
-
-    def watch(now: float, window) -> None:
-        if int(now) % 300 == 0:
-            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-
-    options = WindowOptions(grid_hz=2.0)
-    result = adjust_online(simulation, navigate(simulation), options, live=False, update_s=0.5, watch=watch)
-    print(f"{simulation.flight.covered_s[-1, 1] / 60:.0f} minutes, {strips} strips, {len(result.final_points)} points")
-    names = [s.id for s in simulation.flight.strips]
-    ms = 1e3 * np.array(result.update_s)
-    for k, part in enumerate(np.array_split(np.arange(strips), 4)):
-        mine = {names[i] for i in part}
-        ratios = [
-            orientation_errors(simulation, [o for o in run if o.strip in mine]).nees.mean()
-            for run in (result.final, result.whole)
-        ]
-        found = {n: p for n, p in result.final_points.items() if p.residuals[0].look.strip in mine}
-        ratios.append(point_errors(simulation, found).nees.mean())
-        own = ms[k * len(ms) // 4 : (k + 1) * len(ms) // 4]
-        print(
-            f"quarter {k + 1}: final {ratios[0]:.3f}  whole {ratios[1]:.3f}  points {ratios[2]:.3f}   "
-            f"update p50 {np.median(own):.1f} ms, p99 {np.percentile(own, 99):.1f} ms, longest {own.max():.0f} ms"
-        )
-    print(
-        "peak memory, MB, every five minutes (the results are kept):", np.round(memory[:: max(1, len(memory) // 12)], 0)
-    )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("seeds", "held", "control", "drift"))
-    parser.add_argument("--seeds", type=int, default=50)
+    parser = frame.parser(__doc__, seeds=50)
+    parser.add_argument("what", choices=("seeds", "held", "control"))
     parser.add_argument("--model", default="wander")
     parser.add_argument("--rough", action="store_true", help="no stabilised mount, twice the turbulence")
     parser.add_argument("--camera", type=float, default=0.0, help="share of the a-priori sigmas of TLS-12")
     parser.add_argument("--constant", action="store_true", help="no wander")
-    parser.add_argument("--minutes", type=float, default=120.0)
     args = parser.parse_args()
-    {"seeds": seeds, "held": held, "control": control, "drift": drift}[args.what](args)
+    {"seeds": seeds, "held": held, "control": control}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,14 @@ Strips one after the other, each tied to the one before by its side lap, with gr
 ten minutes, as soon as they are flown, of the strips that became final in them: the ratio of final and whole
 orientation and of points, time of updates and memory (the results are kept). At the end the ratio of the whole flight,
 and that of its second half over the first, with their 95 % bands: 1 has to lie in both. The bands are from the scatter
-of the rows, not of the strips: neighbouring strips share points and errors. Set OPENBLAS_NUM_THREADS=1.
+of the rows, not of the strips: neighbouring strips share points and errors.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 
+import frame
 import numpy as np
 from scipy.stats import t as student
 
@@ -33,12 +33,6 @@ from triline.solver.window.results import WindowOptions
 ROW_S = 600.0
 STRIP_S, GAP_S = 54.0, 6.0
 KINDS = ("final", "whole", "points")
-
-
-def resident_mb() -> float:
-    """Resident memory."""
-    with open("/proc/self/status") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
 
 
 class Ratios:
@@ -65,7 +59,8 @@ class Ratios:
         each = "  ".join(f"{kind} {ratio:.3f}" for kind, ratio in zip(KINDS, self.rows[-1], strict=True))
         print(
             f"to {now_s / 60:4.0f} min, {len(over):2d} strips: {each}   update p50 {np.median(ms):5.1f} ms, p99 "
-            f"{np.percentile(ms, 99):5.1f} ms   {resident_mb():5.0f} MB   {time.monotonic() - self._begun:5.0f} s",
+            f"{np.percentile(ms, 99):5.1f} ms   "
+            f"{frame.resident_mb():5.0f} MB   {time.monotonic() - self._begun:5.0f} s",
             flush=True,
         )
 
@@ -84,7 +79,7 @@ class Ratios:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__)
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
@@ -110,12 +105,9 @@ def main() -> int:
         drift = last[:, i].mean() / first[:, i].mean()
         each = [h[:, i].std(ddof=1) / h[:, i].mean() / np.sqrt(len(h)) for h in (first, last)]
         scatter = student.isf(0.025, len(rows) - 2) * drift * np.hypot(*each)
-        print(f"{kind:7} {_banded(rows[:, i].mean(), error)};  second half over first {_banded(drift, scatter)}")
+        print(f"{kind:7} {frame.banded(rows[:, i].mean(), error)}")
+        print(f"{'':7} second half over first {frame.banded(drift, scatter)}")
     return 0
-
-
-def _banded(value: float, error: float) -> str:
-    return f"{value:.3f} +- {error:.3f}, {'in the band' if abs(value - 1.0) <= error else 'outside'}"
 
 
 if __name__ == "__main__":

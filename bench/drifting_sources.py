@@ -4,25 +4,24 @@
 
 One strip of 70 s a seed, 8 tie points/s; from 5 s on the looks of one CCD line, of one source or of one of two, drift
 by 0.03 px/s in their samples or 0.05 px/s in their lines. Then blocks of three strips of 50 s, tied across; in one of
-them samples drift by 0.03 px/s. Then clean flights with 500 tie points/s. Set
-OPENBLAS_NUM_THREADS=1.
+them samples drift by 0.03 px/s. Then clean flights with 500 tie points/s.
 """
 
 from __future__ import annotations
 
-import argparse
 import zlib
 from dataclasses import replace
 from itertools import pairwise
 
+import frame
 import numpy as np
 
+from triline.solver.adjustment.drift_hypotheses import ALL
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, Simulation, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
 from triline.solver.window.results import Look
-from triline.solver.window.suspects import ALL
 from triline.solver.window.window import Window
 
 PLAN = FlightPlan(strip_s=70.0, lead_in_s=3.0, lead_out_s=2.0)
@@ -74,8 +73,7 @@ def drifting_in(simulation: Simulation, strip: int, ccd: str) -> Simulation:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser = frame.parser(__doc__, seeds=5)
     parser.add_argument("--dense", type=int, default=3, help="clean flights with 500 tie points/s")
     options = parser.parse_args()
     from triline.solver.simulation import window_study
@@ -93,7 +91,7 @@ def main() -> int:
         true, after, among, alone, changes, nees = (f"m{number - 1}", ccd), [], [], [], 0, []
         for flight, known in zip(flights, poses, strict=True):
             result = adjust_online(spoilt(flight, ccd, rate), known, live=False, update_s=0.5)
-            alarms = [(r.watched.time_s, r.watched.sources[0]) for r in result.reports if r.watched.sources]
+            alarms = [(r.quality.time_s, r.quality.sources[0]) for r in result.reports if r.quality.sources]
             orientation = [orientation_errors(flight, o).nees.mean() for o in (result.final, result.whole)]
             points = [point_errors(flight, p).nees.mean() for p in (result.final_points, result.whole_points)]
             nees.append([*orientation, *points])
@@ -119,7 +117,7 @@ def main() -> int:
         for seed in range(options.seeds):
             flight = simulate(BLOCK, seed, SENSORS, ObservationPlan(tie_points_per_s=8.0, control=9, check=20))
             result = adjust_online(drifting_in(flight, strip, ccd), navigate(flight), live=False, update_s=0.5)
-            named += any(r.watched.sources for r in result.reports)
+            named += any(r.quality.sources for r in result.reports)
             last = {(o.strip, float(o.time_s[0])): o for o in result.whole}  # told again when the block has grown
             runs = result.final, list(last.values())
             orientation = [orientation_errors(flight, o).nees.mean() for o in runs]
@@ -130,7 +128,7 @@ def main() -> int:
     for seed in range(options.dense):
         flight = simulate(replace(PLAN, strip_s=60.0), seed, SENSORS, many)
         result = adjust_online(flight, navigate(flight), live=False, update_s=0.2)
-        false += any(r.watched.sources for r in result.reports)
+        false += any(r.quality.sources for r in result.reports)
     print(f"clean, 500 tie points/s: {false} of {options.dense} flights with an alarm")
     return 0
 

@@ -16,7 +16,6 @@ are drawn from their a-priori sigmas; rows of DGR fly without wander, which DGR 
 These batches are the window with all data in one update. ``adjust`` compares with the other estimator instead, that of
 ``triline adjust``: another network, other normal equations, another covariance; the same models and a-priori sigmas.
 Beside the quotients of RMSE: the largest difference of two results in units of the sigma, and the quotient of sigmas.
-Set OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
+import frame
 import numpy as np
 
-from triline.solver.adjustment.batch import Job
-from triline.solver.adjustment.batch import run as run_batch
+from triline.solver.adjustment.job import Job
+from triline.solver.adjustment.job import run as run_batch
+from triline.solver.camera.self_calibration import SELF_CALIBRATIONS, SelfCalibration
+from triline.solver.camera.sensors import preset
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
-from triline.solver.selfcalibration import SELF_CALIBRATIONS, SelfCalibration
-from triline.solver.sensors import preset
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
@@ -52,7 +51,7 @@ from triline.solver.simulation.window_study import (
     slow_errors_of,
 )
 from triline.solver.window.results import AdjustedPoint, WindowOptions
-from triline.solver.window.strip import model_options
+from triline.solver.window.state.strip import model_options
 
 #: Attitude at 100 Hz: half the work, and the window interpolates either.
 ERRORS = ErrorModel(attitude_rate_hz=100.0)
@@ -201,12 +200,11 @@ def one_adjustment(seed: int, case: Case) -> dict[str, np.ndarray]:
 
 def run(case: Case, seeds: int, one_by_one: bool = False) -> dict[str, object]:
     """A row of the table; on the way, where asked for, what it is after each flight."""
-    with ProcessPoolExecutor(2) as pool:
-        flights = []
-        for flight in pool.map(partial(one_flight, case=case), range(1, seeds + 1)):
-            flights.append(flight)
-            if one_by_one:
-                show(f"  {len(flights)} flights", _row(flights))
+    flights = []
+    for flight in frame.over_seeds(partial(one_flight, case=case), seeds):
+        flights.append(flight)
+        if one_by_one:
+            show(f"  {len(flights)} flights", _row(flights))
     return _row(flights)
 
 
@@ -235,11 +233,10 @@ def show(title: str, row: dict) -> None:
 
 
 def header() -> None:
-    print(
-        f"{'(mean and worst component)':38}"
-        + " | ".join(f"{c.replace('points ', 'pts '):>13}"[:13] for c in COLUMNS)
-        + " | nees: final, points, whole, points"
-    )
+    pairs = " | ".join(f"{name:^29}" for name in ("final / causal", "whole / batch", "final / batch"))
+    cells = " | ".join(f"{what:>13}" for what in ("orientation", "points") * 3)
+    print(f"{'':38}{pairs} | NEES")
+    print(f"{'RMSE over RMSE: mean, worst':38}{cells} | final, points, whole, points", flush=True)
 
 
 def every_case(models: Sequence[str]) -> Iterator[Case]:
@@ -282,8 +279,8 @@ def block(args: argparse.Namespace) -> None:
 
 
 def adjust(args: argparse.Namespace) -> None:
-    print(f"{'':38}whole / adjusted, RMSE: mean, worst | largest difference")
-    print(f"{'':38}{'orientation':>13} | {'points':>13} | {'in sigmas: both':>15} | sigmas of points")
+    print(f"{'':38}{'RMSE over RMSE: mean, worst':^29} | {'largest, sigmas':>15} | sigma over sigma")
+    print(f"{'window / triline adjust':38}{'orientation':>13} | {'points':>13} | {'orient., points':>15} | of points")
     for model in MODELS:
         for selfcal in ("none", "tls12"):
             name = f"{model}{', ' + selfcal if selfcal != 'none' else ''}"
@@ -292,8 +289,7 @@ def adjust(args: argparse.Namespace) -> None:
                 model, False, selfcal, 6, 2, args.strip_s, height_m=1000.0
             )
             for title, case in cases.items():
-                with ProcessPoolExecutor(2) as pool:
-                    flights = list(pool.map(partial(one_adjustment, case=case), range(1, args.seeds + 1)))
+                flights = list(frame.over_seeds(partial(one_adjustment, case=case), args.seeds))
                 f = {key: np.concatenate([flight[key] for flight in flights]) for key in flights[0]}
                 cells, off = [], []
                 for part in ("", "points "):
@@ -306,9 +302,8 @@ def adjust(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, seeds=20)
     parser.add_argument("what", choices=("table", "blocks", "block", "adjust"))
-    parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="of table and blocks")
     parser.add_argument("--model", choices=MODELS, default="wander", help="of block")
     parser.add_argument("--rough", action="store_true")

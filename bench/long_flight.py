@@ -12,23 +12,22 @@ second thread sees it every 20 ms, however short the peak.
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
 
+import frame
 import numpy as np
 
 from triline.nodes import registry
 from triline.nodes.cli.process import at_pace
-from triline.nodes.collection import RareCollections
 from triline.nodes.config import build
-from triline.nodes.recording import RecordingReader, RecordingWriter
-from triline.nodes.runner import process
+from triline.nodes.garbage_collection import RareCollections
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.runner import process
+from triline.nodes.recording.writer import RecordingWriter
 from triline.schemas.envelope import RawMessage
 from triline.solver.window.window import Window
 
@@ -44,18 +43,9 @@ def simulate(folder: Path, hours: float) -> Path:
     """A block of strips, 8 tie points a second, attitude at 50 Hz."""
     path = folder / "flight.mcap"
     strips = max(2, round(hours * 3600.0 / (STRIP_S + TURN_S)))
-    subprocess.run(
-        [sys.executable, "-m", "triline.nodes.cli", "simulate", "-o", str(path), "--strips", str(strips), "--seconds",
-         str(STRIP_S), "--ties", "8", "--attitude-rate", "50", "-q"],
-        check=True,
-    )  # fmt: skip
+    plan = ("--strips", str(strips), "--seconds", str(STRIP_S), "--ties", "8", "--attitude-rate", "50")
+    frame.triline("simulate", "-o", str(path), *plan, "-q")
     return path
-
-
-def resident_mb() -> float:
-    """Resident memory without the mapped recordings."""
-    with open("/proc/self/status") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1024.0
 
 
 class Watcher:
@@ -70,7 +60,7 @@ class Watcher:
 
     def _look(self) -> None:
         while not self._over.wait(0.02):
-            self.seen.append((self.now_s, resident_mb()))
+            self.seen.append((self.now_s, frame.resident_mb()))
 
     def close(self) -> np.ndarray:
         """All that was seen (n, 2)."""
@@ -124,7 +114,7 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
             if now_s >= due:
                 due = now_s + 60.0
                 collections.if_due()
-                memory.append((now_s, resident_mb()))
+                memory.append((now_s, frame.resident_mb()))
                 if now_s >= row_due:
                     tell(np.array(memory), np.array(updates), row_due)
                     row_due += ROW_S
@@ -144,7 +134,7 @@ def tell(memory: np.ndarray, updates: np.ndarray, to_s: float) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__)
     parser.add_argument("--hours", type=float, default=4.0)
     parser.add_argument("--pace", choices=("load", "throughput"), default="load", help="as of triline process")
     parser.add_argument("--recording", type=Path, help="a recording instead of a simulated flight")
@@ -181,7 +171,7 @@ def main() -> int:
         ),
         "latency by the reference, trend an hour": round(float(slope[0] / np.polyval(slope, 0.0)), 4),
     }
-    print(json.dumps(result, indent=2))
+    frame.show(result)
     draw(memory, updates, args.output)
     return 0
 

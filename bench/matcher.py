@@ -1,34 +1,29 @@
-"""The matcher under full load, and beside OpenCV: 12 000 px x 3 CCD lines x 800 lines/s.
+"""What the matcher costs of a core at 12 000 px x 3 CCD lines x 800 lines/s, and how it compares with OpenCV.
 
-    python bench/matcher.py                # renders 20 s of a flight once (out/bench/full_rate.mcap, 1.2 GB)
-    python bench/matcher.py --points 40    # tie points a second that are wanted
+    python bench/matcher.py [--points 30] [--seeds 3]
 
-1. Over the bus, on two cores (`matcher_live.py`): rays a second, latency from a point's last look to its tie, what was
-   lost or late.
-2. The recording goes through navigator and matcher in this process: rays a second, core time of the matcher a second of
-   flight, and the latency as platform time plus the core time of the step, whatever else the machine does.
-3. The same places are measured in the same rectified images (the forward view against the nadir view) by triline, by
+1. The recording of `matcher_live.py` goes through navigator and matcher in this process: rays a second, core time of
+   the matcher a second of flight, and the latency as platform time plus the core time of the step, whatever else the
+   machine does.
+2. The same places are measured in the same rectified images (the forward view against the nadir view) by triline, by
    OpenCV's pyramid Lucas-Kanade and by ORB matches near them, against truth.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import cv2
+import frame
 import numpy as np
-from matcher_live import lines, live, met
+from matcher_live import RECORDING, render
 
-from triline.nodes.flight_settings import simulated_flight
-from triline.nodes.matcher import Matcher
-from triline.nodes.navigator import Navigator
+from triline.nodes.matcher.matcher import Matcher
+from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
-from triline.nodes.recording import RecordingReader
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.step_driver import StepDriver
 from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.line_scan import LineScan, view_of
@@ -36,22 +31,6 @@ from triline.solver.matching.line_store import LineRing
 from triline.solver.matching.looks import verdict
 from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.search import Ground, Image, find
-
-RECORDING = Path("out/bench/full_rate.mcap")
-SETTINGS = {"sensor": "ads40", "height": 1500.0, "speed": 124.4, "images": True, "seconds": 20.0, "lead_in": 2.0}
-SEED = 4
-
-
-def render() -> None:
-    """The flight of `SETTINGS` as a recording, once."""
-    if RECORDING.exists():
-        return
-    RECORDING.parent.mkdir(parents=True, exist_ok=True)
-    arguments = [
-        x for k, v in SETTINGS.items() for x in ([f"--{k.replace('_', '-')}"] + ([] if v is True else [str(v)]))
-    ]
-    command = [sys.executable, "-m", "triline.nodes.cli", "simulate", "-q", "-o", str(RECORDING), "--seed", str(SEED)]
-    subprocess.run([*command, *arguments], check=True)
 
 
 def rate(points_per_s: float, budget_mb: float) -> dict:
@@ -223,25 +202,18 @@ def _on_plane(scan: LineScan, line: np.ndarray, sample: np.ndarray) -> np.ndarra
     return scan.to_plane(line, sample, np.zeros(len(line)))[0][:, :2]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = frame.parser(__doc__, seeds=3, as_json=True)
     parser.add_argument("--points", type=float, default=30.0, help="tie points a second that are wanted (30)")
     parser.add_argument("--budget-mb", type=float, default=1024.0, help="for image lines (1024)")
-    parser.add_argument("--seeds", type=int, default=3, help="flights of the comparison (3)")
-    parser.add_argument("--cores", type=int, default=2, help="for all processes on the bus together (2)")
-    parser.add_argument("--port", type=int, default=17651)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     beside = compare(list(range(1, args.seeds + 1)))
     render()
     full = rate(args.points, args.budget_mb)
-    over_bus = live(RECORDING, args.points, args.budget_mb, args.cores, args.port)
     if args.json:
-        print(json.dumps({"live": over_bus, "rate": full, "beside": beside}, indent=2))
+        print(json.dumps({"rate": full, "beside": beside}, indent=2))
     else:
         print(f"12 000 px x 3 x 800 lines/s, {full['points_per_s']:g} tie points a second wanted")
-        print("\n".join(lines(over_bus)))
-        print("in one process, without an adjuster:")
         print(f"  {full['rays_per_s']:.0f} rays/s over {full['seconds']:.0f} s, {full['cores']:.2f} of a core")
         print(f"  last look to tie: median {full['latency_p50_s']:.3f} s, 95 % below {full['latency_p95_s']:.3f} s")
         print(f"  line store {full['store_mb']:.0f} MB, {100 * full['cover']:.0f} % of the width")
@@ -251,8 +223,7 @@ def main() -> int:
                 f"  {name:<26} {r['places']:6d} {100 * r['found']:5.0f} % {100 * r['within_03_px']:12.1f} %"
                 f" {r['median_px']:5.3f} px {100 * r['wrong_2_px']:7.1f} % {r['ms_a_place']:8.2f} ms"
             )
-    return 0 if met(over_bus) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -2,7 +2,8 @@
 
     python bench/matcher_live.py [--points 30] [--cores 2] [--json]
 
-The recording of `matcher.py` is replayed at its pace. All processes share the cores, the player and this listener
+A flight of 20 s with 12 000 px x 3 CCD lines x 800 lines/s is rendered once (out/bench/full_rate.mcap, 1.2 GB) and
+replayed at its pace. All processes share the cores, the player and this listener
 included. The latency of a tie is wall time: from the moment its last look is imaged to its reception here; the moment
 is told by the quickest message of the 200 Hz attitude sensor. What was lost or late is what the nodes' own counters say
 while ties come.
@@ -10,7 +11,6 @@ while ties come.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -19,16 +19,32 @@ import tempfile
 import time
 from pathlib import Path
 
+import frame
 import numpy as np
 import psutil
 
-from triline.nodes.bus import Bus
-from triline.nodes.processes import ALLOCATOR, NodeGroup
+from triline.nodes.bus.processes import ALLOCATOR, NodeGroup
+from triline.nodes.bus.session import Bus
 from triline.schemas import codec
 from triline.schemas.envelope import RawMessage
 
+#: The flight at full rate.
+RECORDING = Path("out/bench/full_rate.mcap")
+SETTINGS = {"sensor": "ads40", "height": 1500.0, "speed": 124.4, "images": True, "seconds": 20.0, "lead_in": 2.0}
+SEED = 4
 #: Ties of the first seconds wait for enough of them to be judged together.
 SETTLE_S = 1.0
+
+
+def render() -> None:
+    """Write `RECORDING`, unless it is there."""
+    if RECORDING.exists():
+        return
+    RECORDING.parent.mkdir(parents=True, exist_ok=True)
+    arguments = [
+        x for k, v in SETTINGS.items() for x in ([f"--{k.replace('_', '-')}"] + ([] if v is True else [str(v)]))
+    ]
+    frame.triline("simulate", "-q", "-o", str(RECORDING), "--seed", str(SEED), *arguments)
 
 
 class Ears:
@@ -104,7 +120,7 @@ def live(recording: Path, points_per_s: float, budget_mb: float, cores: int, por
         while not bus.alive() >= {"navigator", "matcher", "adjuster"}:
             time.sleep(0.1)
         time.sleep(1.0)
-        command = [sys.executable, "-m", "triline.nodes.cli", "replay", str(recording), "-q", *group.arguments]
+        command = [*frame.TRILINE, "replay", str(recording), "-q", *group.arguments]
         player = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
         watched = {n.name: psutil.Process(n.process.pid) for n in nodes} | {"player": psutil.Process(player.pid)}
         used, before = _watch(player, watched, ears)
@@ -183,19 +199,16 @@ def met(result: dict) -> bool:
 
 
 def main() -> int:
-    from matcher import RECORDING, render
-
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("--points", type=float, default=30.0, help="tie points a second that are wanted (30)")
     parser.add_argument("--budget-mb", type=float, default=1024.0, help="for image lines (1024)")
     parser.add_argument("--cores", type=int, default=2, help="for all processes together (2)")
     parser.add_argument("--port", type=int, default=17651)
-    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     render()
     result = live(RECORDING, args.points, args.budget_mb, args.cores, args.port)
     print(json.dumps(result, indent=2) if args.json else "\n".join(lines(result)))
-    return 0 if met(result) else 1
+    return frame.verdict(met(result))
 
 
 if __name__ == "__main__":

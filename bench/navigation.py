@@ -1,6 +1,6 @@
 """Inertial navigation: speed of filter and smoother, cost and latency on line, accuracy and consistency over seeds.
 
-    python bench/navigation.py [--seeds 20] [--quick]
+    python bench/navigation.py [--seeds 20]
 
 The flights are simulated: 600 s at 200 Hz, survey lines and turns, turbulence; GNSS at 1 Hz with 2/2/4 cm. Tactical:
 gyro bias 0.03 deg/h, 0.003 deg/sqrt(h), accelerometer bias 15 mGal; MEMS: 20 deg/h, 0.2 deg/sqrt(h), 2000 mGal.
@@ -9,13 +9,13 @@ Times are of one core (process time), the best of three.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 
+import frame
 import numpy as np
 
-from triline.solver.frames import LocalFrame
+from triline.solver.geometry.frames import LocalFrame
 from triline.solver.navigation.alignment import align
 from triline.solver.navigation.carried import NavigationTrajectory
 from triline.solver.navigation.error_state import NavigationSettings
@@ -162,20 +162,16 @@ def outage() -> bool:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--quick", action="store_true", help="few seeds, a short flight on line")
-    args = parser.parse_args()
-    seeds = 3 if args.quick else args.seeds
+    args = frame.parser(__doc__, seeds=20).parse_args()
     done = [
         speed(),
-        online(120.0 if args.quick else 300.0),
+        online(300.0),
         outage(),
-        accuracy(TACTICAL, "tactical", seeds, WANTED),
-        accuracy(MEMS, "MEMS", seeds),
+        accuracy(TACTICAL, "tactical", args.seeds, WANTED),
+        accuracy(MEMS, "MEMS", args.seeds),
     ]
     print("all as wanted" if all(done) else "not all as wanted")
-    return 0 if all(done) else 1
+    return frame.verdict(all(done))
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ printed), or nothing (missed); a right shift beside one that fits as well counts
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
+import frame
 import numpy as np
 
 from triline.solver.navigation.error_state import NavigationSettings
@@ -116,15 +115,12 @@ def column(kind: str, sigma: str, grade: str, seeds: int, duration_s: float, par
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser = frame.parser(__doc__, seeds=3, processes=True)
     parser.add_argument("--duration", type=float, default=300.0)
     parser.add_argument("--cases", default="", help="only cases that contain this")
     parser.add_argument("--motions", nargs="*", default=["survey", "after rest"])
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument("--quick", action="store_true", help="one seed, survey flights")
     args = parser.parse_args()
-    seeds, motions = (1, ["survey"]) if args.quick else (args.seeds, args.motions)
+    seeds, motions = args.seeds, args.motions
     columns = [(sigma, grade) for sigma in SIGMAS for grade in GRADES]
     good = True
     with ProcessPoolExecutor(args.processes) as pool:
@@ -146,7 +142,7 @@ def main() -> int:
                         print(f"      {text}")
                 print(f"  {name:32s} " + "   ".join(f"{c:^14s}" for c in row), flush=True)
     print("every cause named, no false alarm" if good else "not all as wanted")
-    return 0 if good else 1
+    return frame.verdict(good)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ noise of that measurement. Beside it the ground error of the orientation itself.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import sys
@@ -25,12 +24,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import frame
 import numpy as np
 
-from triline.nodes import rectification as work
-from triline.nodes.access import Recording
+from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main as triline
-from triline.nodes.flight_settings import simulated_flight
+from triline.nodes.recording.access import Recording
+from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.solver.orthoimage.ground_grid import GroundGrid, utm_of
 from triline.solver.orthoimage.mosaic import Mosaic
 from triline.solver.orthoimage.strip import StripRectifier, rays_of
@@ -176,9 +176,8 @@ def straightness(seed: int, folder: Path) -> dict[str, tuple[float, float, float
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, seeds=2)
     parser.add_argument("--lines", type=int, default=3000)
-    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--rate-only", action="store_true")
     args = parser.parse_args()
     good = rate(args.lines)
@@ -194,7 +193,7 @@ def main() -> int:
                 f"  {'met' if met else 'NOT MET'}, seed {seed}: roads off by {before:.2f} px before and {after:.2f} px "
                 f"after, wanted above {WANTED_BEFORE_PX:g} and below {WANTED_AFTER_PX:g}"
             )
-    return 0 if good else 1
+    return frame.verdict(good)
 
 
 if __name__ == "__main__":

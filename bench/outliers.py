@@ -5,19 +5,18 @@
 One strip of 40 s a seed; a share of the rays of tie points are blunders of so many pixels. Compared are RMSE over all
 seeds of X, Y, Z, omega, phi, kappa and of object points with three rays or more: the whole strip from the window
 (after the backward pass) against the batch adjustment with data snooping; and each against itself without the
-blunders. A figure that comes from a few bad flights is told by the worst flight beside it. Set OPENBLAS_NUM_THREADS=1.
+blunders. A figure that comes from a few bad flights is told by the worst flight beside it.
 """
 
 from __future__ import annotations
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 
+import frame
 import numpy as np
 
-from triline.solver.adjustment.batch import BatchResult, Job, run
+from triline.solver.adjustment.job import BatchResult, Job, run
 from triline.solver.models.wander import WanderOptions
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
@@ -110,14 +109,11 @@ PAIRS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
+    parser = frame.parser(__doc__, seeds=20)
     parser.add_argument("--share", type=float, default=0.2, help="of the rays of tie points that are blunders")
     parser.add_argument("--px", type=float, nargs=2, default=(5.0, 40.0), help="least and largest blunder")
     args = parser.parse_args()
-    with ProcessPoolExecutor(2) as pool:
-        work = partial(one_flight, share=args.share, px=tuple(args.px))
-        flights = list(pool.map(work, range(1, args.seeds + 1)))
+    flights = list(frame.over_seeds(partial(one_flight, share=args.share, px=tuple(args.px)), args.seeds))
     print(
         f"{100 * args.share:.0f} % blunders of {args.px[0]:g} to {args.px[1]:g} px, {args.seeds} flights: RMSE / RMSE"
     )

@@ -9,26 +9,25 @@ the strip. On the first strip the heading is still being learnt. 1 is as stated,
 
 from __future__ import annotations
 
-import argparse
-import os
 from concurrent.futures import ProcessPoolExecutor
 
+import frame
 import numpy as np
 
 from triline.nodes import convert
-from triline.nodes.adjuster_poses import PoseBuffer
-from triline.nodes.adjuster_strips import NEAR_START_S
-from triline.nodes.navigator import Navigator
+from triline.nodes.adjuster.poses import PoseBuffer
+from triline.nodes.adjuster.strips import NEAR_START_S
+from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
-from triline.nodes.simulator import Simulator
+from triline.nodes.simulator.simulator import Simulator
 from triline.solver.accuracy import angle_difference
+from triline.solver.models.gauss_markov import autocorrelation
+from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.navigation.inertial_data import MEMS, TACTICAL
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.inertial_sensors import InertialPlan
 from triline.solver.simulation.scenario import simulate
-from triline.solver.slow_errors import SlowErrors
-from triline.solver.wander import autocorrelation
 
 EPOCH = 1_700_000_000_000_000_000
 GRADES = {"tactical": TACTICAL, "MEMS": MEMS}
@@ -91,12 +90,10 @@ def stated_changes(slow: SlowErrors, strip_s: float) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=6)
+    parser = frame.parser(__doc__, seeds=6, processes=True)
     parser.add_argument("--grades", nargs="+", choices=list(GRADES), default=list(GRADES))
     parser.add_argument("--strip-s", type=float, default=60.0)
     parser.add_argument("--strips", type=int, default=2)
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
     args = parser.parse_args()
     with ProcessPoolExecutor(args.processes) as pool:
         flights = {

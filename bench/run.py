@@ -1,55 +1,432 @@
-"""All benchmarks, one after the other: ``make bench``. Each is a program of its own and can be run alone."""
+"""Run benchmarks and studies, and write what they print into ``docs/``: ``make bench``.
+
+    python bench/run.py                 # all but those that take longer than half an hour
+    python bench/run.py strips latency  # these
+    python bench/run.py --long          # all
+    python bench/run.py --list          # names, questions and commands
+
+A benchmark owns one block of a page in ``docs/``, between ``<!-- bench NAME -->`` and ``<!-- end -->``. As soon as it
+is done its commands, what they printed, the day and the machine stand there. A program that fails leaves its block as
+it is. Every program can be run alone; ``--help`` shows its options.
+"""
 
 from __future__ import annotations
 
+import argparse
+import datetime
+import os
+import platform
+import re
+import shlex
 import subprocess
 import sys
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
-FOLDER = Path(__file__).parent
-#: What is measured, and the program that measures it with its arguments.
-BENCHMARKS = {
-    "bus and recorder under the load of three full image lines": ["bus_load.py"],
-    "timing of a replay": ["replay_timing.py"],
-    "batch adjustment against Ceres": ["ceres/compare.py"],
-    "batch adjustment: time and memory against size": ["adjustment_scaling.py", "-o", "out/bench"],
-    "batch job: snooping, elimination, covariances": ["adjustment_job.py"],
-    "inertial navigation": ["navigation.py"],
-    "users' traps in inertial and GNSS data": ["navigation_traps.py", "--seeds", "2"],
-    "a-priori weights from the trajectory": ["apriori.py", "--quick"],
-    "how fast the errors of smoothed poses change": ["pose_changes.py", "--seeds", "2"],
-    "sliding window: latency of updates": ["window.py", "latency", "--selfcal", "--interval", "0.024"],
-    "sliding window beside GTSAM and Ceres": ["window_peers.py"],
-    "tie point to orientation over the bus": ["tie_latency.py"],
-    "the same with self-calibration": ["tie_latency.py", "--selfcal", "tls18"],
-    "the same from processor times": ["tie_latency.py", "--selfcal", "tls18", "--computed"],
-    "an hour through process, pace for throughput": ["process_hour.py", "--imu", "--pace", "throughput"],
-    "a tenth of it at the pace of a live flight": ["process_hour.py", "--imu", "--share", "0.1"],
-    "memory and latency over hours": ["long_flight.py", "--hours", "1"],
-    "sliding window against the batch adjustment, one strip": ["efficiency.py", "table", "--seeds", "6"],
-    "the same, a block of strips": ["efficiency.py", "block", "--seeds", "4", "--strip-s", "24"],
-    "the same against `triline adjust`": ["efficiency.py", "adjust", "--seeds", "2", "--strip-s", "24"],
-    "sliding window: normalised errors": ["consistency.py", "seeds"],
-    "the same as time goes on": ["drift.py", "--minutes", "45"],
-    "self-calibration with dense rays, batch and window": ["self_calibration.py", "--ties", "100", "--seeds", "6"],
-    "protection levels with wrong control": ["consistency.py", "control", "--seeds", "20"],
-    "data snooping against the batch adjustment's": ["outliers.py", "--seeds", "6"],
-    "tie points that drift": ["drifting_sources.py", "--seeds", "1", "--dense", "1"],
-    "orthoimage": ["orthoimage.py"],
-    "tie points of spoilt image lines": ["bad_imagery.py", "--seeds", "1"],
-    "image matching at full rate, and beside OpenCV": ["matcher.py"],
-}
+import frame
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+#: What takes longer runs only when it is asked for.
+LONG_MIN = 30.0
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A question and the commands whose output answers it.
+
+    Attributes
+    ----------
+    name : of the block in ``docs/``
+    question : that it answers
+    commands : as a reader types them, ``python bench/PROGRAM.py ...`` or ``triline ...``
+    minutes : on two idle cores, about
+    """
+
+    name: str
+    question: str
+    commands: tuple[str, ...]
+    minutes: float
+
+    @property
+    def long(self) -> bool:
+        return self.minutes > LONG_MIN
+
+
+BENCHMARKS = (
+    Benchmark(
+        "strips",
+        "How close does the on-line answer of one strip come to a batch adjustment of the same data?",
+        ("python bench/efficiency.py table --seeds 20",),
+        6,
+    ),
+    Benchmark(
+        "blocks",
+        "The same for a block of six strips and two cross strips",
+        ("python bench/efficiency.py blocks --seeds 20 --strip-s 24",),
+        100,
+    ),
+    Benchmark(
+        "adjust",
+        "Does the window agree with the estimator of `triline adjust`?",
+        ("python bench/efficiency.py adjust --seeds 3 --strip-s 24",),
+        10,
+    ),
+    Benchmark(
+        "outliers",
+        "Does data snooping in the window find as many blunders as that of the batch adjustment?",
+        ("python bench/outliers.py --seeds 20", "python bench/outliers.py --seeds 20 --px 2 8"),
+        4,
+    ),
+    Benchmark(
+        "sigmas",
+        "Are errors as large as the sigmas say?",
+        (
+            "python bench/consistency.py seeds --seeds 50",
+            "python bench/consistency.py seeds --seeds 50 --rough",
+            "python bench/consistency.py seeds --seeds 50 --camera 0.03",
+        ),
+        8,
+    ),
+    Benchmark(
+        "misspecified",
+        "What happens in a world that is not as it is stated?",
+        ("triline study misspecified --seeds 2 --settings rtk --jobs 2",),
+        12,
+    ),
+    Benchmark(
+        "hours",
+        "Do sigmas stay right over two hours?",
+        ("python bench/drift.py --minutes 120",),
+        8,
+    ),
+    Benchmark(
+        "inertial",
+        "Are sigmas right where the poses come from inertial data?",
+        ("python bench/apriori.py --seeds 6",),
+        6,
+    ),
+    Benchmark(
+        "pose-changes",
+        "Do the errors of smoothed inertial poses change as fast as the adjuster assumes?",
+        ("python bench/pose_changes.py --seeds 6",),
+        4,
+    ),
+    Benchmark(
+        "camera",
+        "What does it cost to estimate a camera parameter only once it is determined?",
+        (
+            "python bench/consistency.py held --seeds 20 --camera 0.03",
+            "python bench/consistency.py held --seeds 20 --camera 0.1",
+        ),
+        6,
+    ),
+    Benchmark(
+        "self-calibration",
+        "Are sigmas right where many rays meet additional parameters of the camera?",
+        (
+            "python bench/self_calibration.py --ties 100 --seeds 12",
+            "python bench/self_calibration.py --ties 8 --seeds 24",
+            "python bench/self_calibration.py --ties 100 --seeds 10 --seconds 60 --px 0.6 --share 1 --exact "
+            "--no-window",
+        ),
+        25,
+    ),
+    Benchmark(
+        "camera-sigmas",
+        "Are sigmas right with a calibrated camera, over many flights, and do batch and window agree?",
+        ("python bench/self_calibration.py --parameters 12 --share 0.03 --ties 5 --seeds 150",),
+        35,
+    ),
+    Benchmark(
+        "seeds",
+        "How much better than direct georeferencing is the demo's flight, over seeds?",
+        ("triline study online --seeds 20",),
+        8,
+    ),
+    Benchmark(
+        "protection",
+        "How often does a wrong control coordinate do more than the protection level allows?",
+        ("python bench/consistency.py control --seeds 100",),
+        6,
+    ),
+    Benchmark(
+        "drifting-ties",
+        "Are tie points that drift named, and what is the orientation worth then?",
+        ("python bench/drifting_sources.py",),
+        5,
+    ),
+    Benchmark(
+        "constants",
+        "What do half and double the value of a tuned constant of the window change?",
+        (
+            "python bench/constants.py effect hypotheses.CAUSE_STEADY MATTERS_PX MOVED pose_noise.NOISE_CHANGED SHARP "
+            "screening.ties.TOGETHER --processes 2",
+        ),
+        7,
+    ),
+    Benchmark(
+        "latency",
+        "How long does an update take with 20 000 rays in the window?",
+        (
+            "python bench/window.py latency --selfcal --interval 0.024",
+            "python bench/window.py latency --selfcal --interval 0.2",
+        ),
+        3,
+    ),
+    Benchmark(
+        "tie-latency",
+        "How long does it take from a tie point on the bus to the orientation that uses it?",
+        (
+            "python bench/tie_latency.py",
+            "python bench/tie_latency.py --selfcal tls18",
+            "python bench/tie_latency.py --selfcal tls18 --computed",
+        ),
+        6,
+    ),
+    Benchmark(
+        "window-peers",
+        "How fast is an update beside GTSAM's fixed-lag smoother and Ceres?",
+        ("python bench/window_peers.py",),
+        6,
+    ),
+    Benchmark(
+        "hour",
+        "How long does `triline process` take for an hour of flight?",
+        (
+            "python bench/process_hour.py --imu --pace throughput",
+            "python bench/process_hour.py --imu --share 0.1",
+        ),
+        5,
+    ),
+    Benchmark(
+        "memory",
+        "Do memory and latency stay flat over four hours?",
+        ("python bench/long_flight.py --hours 4 --pace throughput",),
+        10,
+    ),
+    Benchmark(
+        "bus-load",
+        "Do bus and recorder keep up with three full CCD lines, 57.6 MB/s?",
+        ("python bench/bus_load.py",),
+        1,
+    ),
+    Benchmark(
+        "recordings",
+        "What does own code beside the mcap library buy?",
+        ("python bench/recordings.py",),
+        2,
+    ),
+    Benchmark(
+        "rotations",
+        "Where would SciPy's rotations be as fast as own code?",
+        ("python bench/rotation.py",),
+        1,
+    ),
+    Benchmark(
+        "replay",
+        "How exactly does a replay keep the time of the recording?",
+        ("python bench/replay_timing.py",),
+        1,
+    ),
+    Benchmark(
+        "batch",
+        "How fast is the batch adjustment, and how does it grow?",
+        (
+            "python bench/adjustment_job.py",
+            "python bench/adjustment_scaling.py -o out/bench",
+            "python bench/batch_peers.py",
+        ),
+        8,
+    ),
+    Benchmark(
+        "navigation",
+        "Is the inertial navigator fast, accurate and consistent?",
+        ("python bench/navigation.py",),
+        5,
+    ),
+    Benchmark(
+        "traps",
+        "Which wrong units, axes and clocks in inertial and GNSS data are named?",
+        ("python bench/navigation_traps.py --seeds 2",),
+        10,
+    ),
+    Benchmark(
+        "matcher",
+        "What does image matching cost at 12 000 px x 3 x 800 lines/s, and how does it compare with OpenCV?",
+        ("python bench/matcher_live.py", "python bench/matcher.py"),
+        12,
+    ),
+    Benchmark(
+        "matching",
+        "How accurate are matched tie points, and are their sigmas right?",
+        ("triline study matching --seeds 3",),
+        10,
+    ),
+    Benchmark(
+        "starts",
+        "Does matching find its way from an orientation that is wrong by 30 px?",
+        ("triline study starts --seeds 2 --jobs 2",),
+        40,
+    ),
+    Benchmark(
+        "bad-imagery",
+        "What is left of tie points where image lines are spoilt?",
+        ("python bench/bad_imagery.py",),
+        12,
+    ),
+    Benchmark(
+        "matched-ties",
+        "Are matched tie points worth as much as simulated ones of the same noise?",
+        (
+            "triline study ties --kinds rough --seeds 4 --again 2 --jobs 2",
+            'triline study ties --kinds plain "no mount" --seeds 2 --again 2 --jobs 2',
+        ),
+        60,
+    ),
+    Benchmark(
+        "orthoimage",
+        "How fast is rectification beside GDAL, and how straight do roads come out?",
+        ("python bench/orthoimage.py",),
+        8,
+    ),
+    Benchmark(
+        "testfields",
+        "Does the adjustment reach the accuracy published for real testfields?",
+        ("triline study testfields --seeds 10",),
+        1,
+    ),
+    Benchmark(
+        "batch-sigmas",
+        "Are errors of adjusted blocks as large as their sigmas say?",
+        ("triline study consistency",),
+        2,
+    ),
+    Benchmark(
+        "freezes",
+        "Does a node that stood still around the lease of its links hear its sensors again?",
+        ("python bench/link_freezes.py --freezes 12 --least 4.4 --most 5.0",),
+        6,
+    ),
+    Benchmark(
+        "rectification",
+        "How fast is an image rectified beside GDAL's RPC warp, and do two looks of Ventoux lie on each other?",
+        ("python bench/rectification.py",),
+        8,
+    ),
+    Benchmark(
+        "satellites",
+        "How long does location by satellite models take, beside rasterio's?",
+        ("python bench/satellites.py",),
+        2,
+    ),
+)
 
 
 def main() -> int:
-    failed = []
-    for title, (program, *arguments) in BENCHMARKS.items():
-        print(f"\n=== {title}: bench/{program}", flush=True)
-        if subprocess.run([sys.executable, str(FOLDER / program), *arguments]).returncode:
-            failed.append(program)
+    parser = frame.parser(__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run")
+    parser.add_argument("--long", action="store_true", help=f"also those that take more than {LONG_MIN:g} minutes")
+    parser.add_argument("--list", action="store_true", help="say what there is, and run nothing")
+    args = parser.parse_args()
+    if args.list:
+        for b in BENCHMARKS:
+            print(f"{b.name} ({b.minutes:g} min): {b.question}", *b.commands, sep="\n    ")
+        return 0
+    failed = [b.name for b in chosen(parser, args) if not run(b)]
+    fill("list", overview())
     if failed:
-        print(f"\nfailed: {', '.join(failed)}")
+        print(f"\nnot as wanted, or failed: {', '.join(failed)}")
     return 1 if failed else 0
+
+
+def chosen(parser: argparse.ArgumentParser, args: argparse.Namespace) -> list[Benchmark]:
+    """Those that the command line asks for."""
+    if not args.names:
+        return [b for b in BENCHMARKS if args.long or not b.long]
+    known = {b.name: b for b in BENCHMARKS}
+    unknown = [name for name in args.names if name not in known]
+    if unknown:
+        parser.error(f"no benchmark {unknown[0]!r}; there are {', '.join(known)}")
+    return [known[name] for name in args.names]
+
+
+def run(benchmark: Benchmark) -> bool:
+    """Run the commands, print their output as it comes and put it into the page; whether all is as wanted."""
+    print(f"\n=== {benchmark.name}: {benchmark.question}", flush=True)
+    text, good, begun = [], True, time.monotonic()
+    for command in benchmark.commands:
+        print(f"$ {command}", flush=True)
+        code, said = execute(command)
+        if code not in (0, frame.NOT_MET):
+            print(f"failed with exit code {code}: {benchmark.name} stays as it was in {DOCS.name}/", flush=True)
+            return False
+        good &= code == 0
+        text += [f"$ {command}", *said]
+    minutes = (time.monotonic() - begun) / 60.0
+    fill(benchmark.name, ["```text", *text, "```", machine(minutes)])
+    return good
+
+
+def execute(command: str) -> tuple[int, list[str]]:
+    """Exit code of a command, and the lines that it printed."""
+    program, *words = shlex.split(command)
+    start = [sys.executable] if program == "python" else frame.TRILINE
+    lines: list[str] = []
+    with subprocess.Popen([*start, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            lines.append(line.rstrip())
+    return process.returncode, lines
+
+
+def machine(minutes: float) -> str:
+    """Where and when: day, processor, Python, and how long it took."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists() and (found := re.search(r"model name\s*: (.*)", cpuinfo.read_text())):
+        model = found.group(1)
+    day = datetime.date.today().isoformat()
+    return f"{day}, {os.cpu_count()} cores of {model}, Python {platform.python_version()}, {minutes:.0f} minutes."
+
+
+def overview() -> list[str]:
+    """The table of all benchmarks."""
+    rows = ["| benchmark | question | programs | minutes |", "|---|---|---|---|"]
+    for b in BENCHMARKS:
+        programs = ", ".join(dict.fromkeys(f"`{program_of(c)}`" for c in b.commands))
+        rows.append(f"| {b.name} | {b.question} | {programs} | {b.minutes:g}{' (`--long`)' if b.long else ''} |")
+    return rows
+
+
+def program_of(command: str) -> str:
+    """`efficiency.py` or `triline study ties`."""
+    words = command.split()
+    return Path(words[1]).name if words[0] == "python" else " ".join(words[:3])
+
+
+def block(name: str) -> re.Pattern[str]:
+    """The place of a block in a page."""
+    return re.compile(rf"(<!-- bench {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def fill(name: str, lines: list[str]) -> None:
+    """Put lines into the block of a name, on whichever page it stands.
+
+    Raises
+    ------
+    LookupError : no page has the block
+    """
+    text = "\n".join(lines) + "\n"
+    for page in sorted(DOCS.glob("*.md")):
+        old = page.read_text(encoding="utf-8")
+        new, count = block(name).subn(lambda found: found.group(1) + text + found.group(2), old)
+        if count:
+            page.write_text(new, encoding="utf-8")
+            return
+    raise LookupError(f"no page in {DOCS.name}/ has a block for {name}")
 
 
 if __name__ == "__main__":

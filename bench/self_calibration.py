@@ -8,21 +8,22 @@ it is as calibrated, and the sigmas say nothing of that.
 *batch* is what `triline adjust` runs, *final* and *whole* are the window's. NEES: mean normalised error squared of
 orientation on a grid of 5 Hz, object points and additional parameters (1 expected), with the 95 % band from the
 scatter of the flights. *Z*: mean error of Z over the strip in units of its mean sigma, root of the mean square over the
-flights. *batch / whole*: RMSE over RMSE, and sigma over sigma, of the same points. Set OPENBLAS_NUM_THREADS=1.
+flights. *batch / whole*: RMSE over RMSE, and sigma over sigma, of the same points.
 """
 
 from __future__ import annotations
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
+import frame
 import numpy as np
 
-from triline.solver.adjustment.batch import BatchResult, Job, run
+from triline.solver.adjustment.job import BatchResult, Job, run
 from triline.solver.adjustment.refined_orientation import correction_cofactors
+from triline.solver.camera.self_calibration import SelfCalibration, tls
+from triline.solver.geometry.trajectory import noise_between
 from triline.solver.models.wander import WanderOptions
-from triline.solver.selfcalibration import SelfCalibration, tls
 from triline.solver.simulation.camera_errors import drawn_parameters, simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
@@ -38,7 +39,6 @@ from triline.solver.simulation.window_study import (
     point_errors,
     slow_errors_of,
 )
-from triline.solver.trajectory import noise_between
 from triline.solver.window.results import WindowOptions
 
 #: Attitude at 100 Hz: half the work, and the trajectory interpolates either.
@@ -130,8 +130,7 @@ def of_window(simulation: Simulation, online: OnlineResult) -> Figures:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=12)
+    parser = frame.parser(__doc__, seeds=12)
     parser.add_argument("--ties", type=float, default=8.0, help="tie points a second")
     parser.add_argument("--parameters", type=int, default=18, choices=(12, 16, 18), help="TLS set")
     parser.add_argument("--share", type=float, default=0.1, help="of the usual a-priori sigmas")
@@ -141,16 +140,13 @@ def main() -> None:
     parser.add_argument("--exact", action="store_true", help="the camera is as calibrated")
     parser.add_argument("--no-window", dest="window", action="store_false", help="the batch adjustment alone")
     args = parser.parse_args()
-    with ProcessPoolExecutor(2) as pool:
-        flights = list(pool.map(partial(one_flight, args=args), range(1, args.seeds + 1)))
+    flights = list(frame.over_seeds(partial(one_flight, args=args), args.seeds))
     for key in flights[0]:
         values = np.array([f[key] for f in flights])
         if key.endswith(" Z") and key.split()[0] in ("batch", "final", "whole"):
             print(f"{key:20} {np.sqrt(np.mean(values**2)):.2f} sigma, mean {values.mean():+.2f}")
         elif not key.startswith(("squares", "sigma")):
-            band = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
-            say = "in the band" if abs(values.mean() - 1.0) <= band else "outside"
-            print(f"{key:20} {values.mean():.3f} +- {band:.3f}  {say}, largest {values.max():.2f}")
+            print(f"{key:20} {frame.banded(*frame.mean_and_band(values))}, largest {values.max():.2f}")
     if args.window:
         sums = {k: sum(f[k] for f in flights) for k in flights[0] if k.startswith(("squares", "sigma"))}
         rmse = [np.sqrt(sums[f"squares {c}"] / sums[f"squares {c} whole"]) for c in "XYZ"]

@@ -12,23 +12,21 @@ processor times, for machines that others use as well.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import frame
 import numpy as np
 from tie_latency_computed import computed
 
-from triline.nodes.bus import Bus
+from triline.nodes.bus.pacing import publish_paced
+from triline.nodes.bus.processes import NodeGroup
+from triline.nodes.bus.session import Bus
 from triline.nodes.node import Message
-from triline.nodes.pacing import publish_paced
-from triline.nodes.processes import NodeGroup
-from triline.nodes.recording import RecordingReader
+from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import codec
 from triline.schemas.envelope import RawMessage
 
@@ -80,16 +78,15 @@ class Ears:
 def prepare(folder: Path, args: argparse.Namespace) -> Path:
     """A recording with poses and tie points."""
     flight, navigated = folder / "flight.mcap", folder / "navigated.mcap"
-    triline = [sys.executable, "-m", "triline.nodes.cli"]
     ties = args.rays / RAYS_A_POINT
     plan = ["--seconds", str(args.seconds), "--ties", f"{ties:.1f}", "--strips", "1", "-q"]
-    subprocess.run([*triline, "simulate", "-o", str(flight), *plan], check=True)
-    subprocess.run([*triline, "process", str(flight), "-o", str(navigated), "--nodes", "navigator", "-q"], check=True)
+    frame.triline("simulate", "-o", str(flight), *plan)
+    frame.triline("process", str(flight), "-o", str(navigated), "--nodes", "navigator", "-q")
     return navigated
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("--rays", type=float, default=500.0, help="tie rays a second")
     parser.add_argument("--window", type=float, default=40.0, help="s")
     parser.add_argument("--seconds", type=float, default=75.0, help="of the strip")
@@ -105,7 +102,7 @@ def main() -> None:
             named = {"self_calibration": args.selfcal, "update_rays": args.update_rays, "window_s": args.window}
             # the strip begins 10 s after the first message; at its end everything leaves
             found = computed(recording, TOPICS, named, 11.0 + args.window, 8.0 + args.seconds)
-            print(json.dumps(found, indent=2))
+            frame.show(found, args.json)
             return
         ears = Ears()
         with NodeGroup(folder, "bench", args.port) as group, Bus("bench", source="bench", port=args.port) as bus:
@@ -128,14 +125,15 @@ def main() -> None:
     latency = 1e3 * np.array([s for then, s in ears.answers_s if then > full])
     compute = 1e3 * np.array([s for then, s in ears.compute_s if then > full])
     p50, p90, p99 = np.percentile(latency, [50, 90, 99])
-    print(json.dumps({
+    figures = {
         "tie points": len(latency), "p50_ms": round(p50, 1), "p90_ms": round(p90, 1), "p99_ms": round(p99, 1),
         "max_ms": round(latency.max(), 1),
         "update wall time p50, p99, ms": np.percentile(compute, [50, 99]).round(1).tolist(),
         "updates a second": round(len(compute) / (args.seconds - args.window - 2.0), 1),
         "live messages": ears.lives, "highest level of the pace": ears.pace,
         "publisher late at worst, ms": round(1e3 * pacer.worst_late_s, 1),
-    }, indent=2))  # fmt: skip
+    }  # fmt: skip
+    frame.show(figures, args.json)
 
 
 if __name__ == "__main__":

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from triline.nodes.adjuster import Adjuster
-from triline.nodes.collection import RareCollections
-from triline.nodes.recording import RecordingReader
+from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.garbage_collection import RareCollections
+from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import codec
 
 

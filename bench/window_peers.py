@@ -5,32 +5,30 @@
 One strip, DGR-type globals, a segment each 2 s, window 40 s, TLS-18. GTSAM (wheel ``gtsam``) gets the window's own
 linearised rows, one custom factor a point, evaluated once; so hardly any time goes into residuals. Ceres
 (libceres-dev) solves a network of the same size (LIM with 20 fixes, TLS-18), residuals in C++ with automatic
-derivatives; a warm window needs about two steps of it. All on one thread
-(set OPENBLAS_NUM_THREADS=1); our updates also test, publish and
+derivatives; a warm window needs about two steps of it. All on one thread; our updates also test, publish and
 marginalise. What is not installed is left out, and said.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import shutil
-import sys
 import tempfile
 import time
 from copy import copy
 from pathlib import Path
 from typing import Any
 
+import batch_peers
+import frame
 import numpy as np
 
-from triline.nodes.collection import RareCollections
-from triline.solver.selfcalibration import tls
+from triline.nodes.garbage_collection import RareCollections
+from triline.solver.camera.self_calibration import tls
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.results import WindowOptions
-from triline.solver.window.strip import WindowStrip
+from triline.solver.window.state.strip import WindowStrip
 from triline.solver.window.window import Window
 
 WINDOW_S = 40.0
@@ -55,7 +53,7 @@ class Recorded:
         if self.strip is None:
             (strip,) = window.strips.values() or (None,)
             self.strip = copy(strip)  # when it is over it lets go of what is needed here
-        for batch in window._batches:
+        for batch in window.network.batches:
             rays += len(batch.rays)
             if id(batch) in self._known:
                 continue
@@ -186,19 +184,16 @@ def ceres_ms(rays: int) -> tuple[float, float] | None:
     """Time of a whole solution and of one step, ms."""
     if shutil.which("cmake") is None or not Path("/usr/include/ceres").exists():
         return None
-    sys.path.insert(0, str(Path(__file__).parent / "ceres"))
-    import compare
-
     case = "window"
-    compare.CASES[case] = ("lim", 20, True, round(rays / 2.9), 1, 0, 2800.0)
+    batch_peers.CASES[case] = ("lim", 20, True, round(rays / 2.9), 1, 0, 2800.0)
     with tempfile.TemporaryDirectory() as folder:
-        row = compare.compare(case, compare.build(Path(folder)), Path(folder), 3)
+        row = batch_peers.compare(case, batch_peers.build(Path(folder)), Path(folder), 3)
     print(f"  ({row['rays']} rays in the network that Ceres solves)")
     return 1e3 * row["ceres_s"], 1e3 * row["ceres_s"] / row["ceres_iterations"]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__)
     parser.add_argument("--rays", type=int, default=20000, help="in the window")
     parser.add_argument("--seconds", type=float, default=80.0, help="of the strip")
     args = parser.parse_args()
@@ -221,7 +216,7 @@ def main() -> None:
         - 3 * result.reports[steady[0]].points, "updates": len(ours),
         "ours, p50 and p99, ms": np.percentile(ours, [50, 99]).round(1).tolist(),
     }  # fmt: skip
-    print(json.dumps(figures, indent=2), flush=True)
+    frame.show(figures)
     theirs = gtsam_ms(recorded, result.window, len(parameters.apriori_sigma), first)
     if theirs is None:
         print("GTSAM: not installed (pip install gtsam), left out")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from triline.nodes.access import Recording
+from triline.nodes.recording.access import Recording
 
 FOLDER = Path(__file__).parent
 FLIGHT = FOLDER / "strip.mcap"

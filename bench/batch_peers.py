@@ -1,6 +1,6 @@
 """Batch adjustment against Ceres (sparse Schur complement, automatic derivatives): same residuals, start and cost.
 
-    python bench/ceres/compare.py [--repeat 5] [CASE ...]
+    python bench/batch_peers.py [--repeat 5] [CASE ...]
 
 Builds bench/ceres/adjust.cpp with Debian's libceres-dev. Times are the smallest of the repetitions: ours from the
 network to the solution (layout, elimination plan, iterations, factor at the solution), Ceres' from its summary (without
@@ -9,9 +9,7 @@ building the problem), with the faster of SuiteSparse and Eigen. Both use one th
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -19,7 +17,9 @@ import tempfile
 import time
 from pathlib import Path
 
-HERE = Path(__file__).parent
+import frame
+
+HERE = Path(__file__).parent / "ceres"
 #: name: model, segments or fixes, with TLS-18, points, parallel strips, cross strips, length of the block in m
 CASES = {
     "DGR, 5 000 rays": ("dgr", 0, False, 880, 4, 1, 5000.0),
@@ -109,11 +109,11 @@ def compare(name: str, peer: Path | None, folder: Path, repeat: int) -> dict:
     import numpy as np
 
     from triline.solver.adjustment.adjustment import pose_problem, solve
-    from triline.solver.camera import three_line_camera
+    from triline.solver.camera.line_camera import three_line_camera
+    from triline.solver.camera.self_calibration import tls
     from triline.solver.models.dgr import DgrOptions
     from triline.solver.models.lim import LimOptions
     from triline.solver.models.ppm import PpmOptions
-    from triline.solver.selfcalibration import tls
     from triline.solver.simulation.network import regular_block
 
     model, parts, with_aps, points, strips, cross, length = CASES[name]
@@ -186,13 +186,10 @@ def _line(r: dict) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("cases", nargs="*", metavar="CASE", help="; ".join(CASES))
     parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    for library in ("OPENBLAS", "OMP"):  # before NumPy is imported; the peer inherits it
-        os.environ[f"{library}_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as folder:
         peer = build(Path(folder))
         rows = []
