@@ -4,13 +4,14 @@ BIN := $(VENV)/bin
 # tests and studies use processes, not BLAS threads
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint bench study schemas golden clean
+.PHONY: help demo test docs lint bench study schemas golden clean
 
 help:
 	@echo "make demo    live on-line triangulation of a simulated flight (headless where there is no display)"
 	@echo "make test    all tests"
 	@echo "make lint    ruff, type checker, import contract"
-	@echo "make bench   speed, side by side with peers"
+	@echo "make bench   benchmarks; writes their tables into docs/benchmarks.md"
+	@echo "make docs    the documentation as a site, in build/docs"
 	@echo "make study   slow statistical studies"
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
@@ -30,11 +31,19 @@ $(VENV)/.bench: $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	@touch $@
 
+$(VENV)/.docs: $(VENV)/.run
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	@touch $@
+
 demo: $(VENV)/.run
 	$(BIN)/triline demo
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -b html docs build/docs
+	@echo "build/docs/index.html"
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -48,6 +57,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python bench/run.py
 
 study: $(VENV)/.bench
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m study
 	$(BIN)/triline study all
 
 golden: $(VENV)/.dev

@@ -13,9 +13,9 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 
 def open(path):
-    """Open a recording for analysis; see `triline.nodes.access.Recording`."""
+    """Open a recording for analysis; see `triline.nodes.recording.access.Recording`."""
     # the folder of triline.nodes lies beside this one, where a type checker does not look
-    from .nodes.access import Recording  # pyright: ignore[reportMissingImports]
+    from .nodes.recording.access import Recording  # pyright: ignore[reportMissingImports]
 
     return Recording(path)
 
