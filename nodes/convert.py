@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -288,3 +289,9 @@ def role_of(ground_point: Any) -> str:
 def tie_message(point: str, images: Iterable[dict[str, Any]]) -> Any:
     """A TiePoint; each image is a dict of ImagePoint's fields."""
     return m.TiePoint(point=point, images=[m.ImagePoint(**image) for image in images])
+
+
+def iso(stamp_ns: int) -> str:
+    """A stamp as ISO time, UTC, to the microsecond."""
+    seconds, rest = divmod(stamp_ns, SECOND_NS)
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"

@@ -301,6 +301,7 @@ def test_positions_two_seconds_out_of_order(fly, clean):
 # ---- tie points
 
 
+@pytest.mark.study
 def test_a_fifth_of_the_rays_being_blunders_is_rejected_and_named(tmp_path):
     """What is compared is the same flight with those rays never measured."""
     rng = np.random.default_rng(21)

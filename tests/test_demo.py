@@ -96,6 +96,7 @@ def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path)
         assert live == again, f"{topic} differs"
 
 
+@pytest.mark.study
 def test_process_twice_is_byte_identical(demo, tmp_path):
     folder, _ = demo
     first = process(folder / "flight.mcap", tmp_path / "1.mcap")
@@ -132,6 +133,7 @@ def test_the_flight_before_is_kept(tmp_path):
     assert not list(tmp_path.glob("flight*.mcap"))
 
 
+@pytest.mark.study
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds processes in /proc")
 def test_nodes_killed_in_turn_are_started_again_and_the_flight_is_kept(tmp_path):
     from bus_rig import free_port

@@ -7,10 +7,8 @@ import json
 from pathlib import Path
 
 from ..errors import UserError
-from ..formats.flight_folder import read_flight
 from ..recording.reader import RecordingReader
 from ..recording.summary import findings
-from ..sensors.settings import read_sensors
 
 EXAMPLE = "triline check flight.mcap"
 
@@ -41,6 +39,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_folder(args: argparse.Namespace) -> int:
     """Print what a flight folder lacks, a line each; 1 where something does."""
+    # the readers of everything that a flight can hold, which the check of a recording does not need
+    from ..formats.flight_folder import read_flight
+    from ..sensors.settings import read_sensors
+
     flight = read_flight(args.recording)
     programs = read_sensors(flight)
     problems, notes = flight.problems, [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]

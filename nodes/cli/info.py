@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ..convert import iso
 from ..formats.importable import refuse_importable
-from ..player.player import iso
 from ..recording.access import Recording
 from ..recording.summary import findings, holdings
 from ..terminal import plain

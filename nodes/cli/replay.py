@@ -11,7 +11,8 @@ from pathlib import Path
 from ..bus.brake import Brake
 from ..bus.program import stop_on_signals
 from ..bus.session import Bus
-from ..player.player import first_stamp_ns, iso, play, time_argument
+from ..convert import iso
+from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
 from .bus_options import add_bus_arguments, bus_of, reporter
 from .progress import progress

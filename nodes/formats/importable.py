@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import UserError
-from .detect import KINDS, kind_of_path
 
 
 def refuse_importable(path: Path) -> None:
@@ -15,6 +14,8 @@ def refuse_importable(path: Path) -> None:
     """
     if not path.exists() or (path.is_file() and _is_mcap(path)):
         return
+    from .detect import KINDS, kind_of_path  # imports the readers of all kinds
+
     try:
         kind = kind_of_path(path)
     except UserError:

@@ -273,11 +273,3 @@ def run(options: ProgramOptions) -> int:
         options.stop.wait(0.5)  # what is still on its way
     options.report(f"played {sum(result.counts.values())} messages")
     return 0
-
-
-def iso(stamp_ns: int) -> str:
-    """A stamp as ISO time, UTC, to the microsecond."""
-    from datetime import UTC, datetime
-
-    seconds, rest = divmod(stamp_ns, SECOND_NS)
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
@@ -25,6 +24,9 @@ from ..errors import UserError
 from ..node import Message
 from .reader import RecordingReader
 from .summary import topic_summaries
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.floating]
 
@@ -76,6 +78,8 @@ class Recording:
 
     def topics(self) -> pd.DataFrame:
         """One row a topic: messages, first and last stamp, rate, sources, gaps."""
+        import pandas as pd  # takes longer to import than all the rest
+
         rows = topic_summaries(self.reader)
         table = pd.DataFrame([vars(row) for row in rows], columns=pd.Index(vars(rows[0]) if rows else ["topic"]))
         return table.set_index("topic")
@@ -93,6 +97,8 @@ class Recording:
         lists whose length differs from message to message, stay one object column. ``stamp_ns``, ``sequence`` and
         ``source`` are the envelope's; times of type Timestamp become int64 ns.
         """
+        import pandas as pd  # takes longer to import than all the rest
+
         rows = []
         for message in self.messages(topic):
             row: dict[str, Any] = {
@@ -140,6 +146,8 @@ class Recording:
 
     def strips(self) -> pd.DataFrame:
         """One row a strip: first line time, line rate, number of lines as known last."""
+        import pandas as pd  # takes longer to import than all the rest
+
         table = self.table("configuration/strip")
         if table.empty:
             return table
@@ -179,6 +187,8 @@ def _repeated(value: Any) -> bool:
 
 def _spread(table: pd.DataFrame) -> pd.DataFrame:
     """Columns of equally long number lists become one column a value."""
+    import pandas as pd  # takes longer to import than all the rest
+
     columns: dict[str, Any] = {}
     for name in table.columns:
         values = table[name]

@@ -31,6 +31,8 @@ _TOGETHER = 8192
 _NOTED = {
     Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER,
 }  # fmt: skip
+#: What the index behind a chunk begins with: channel, length of what follows; a message has its number in this place.
+_INDEX_HEAD = 6
 
 
 class RecordingReader:
@@ -129,6 +131,13 @@ class RecordingReader:
         """Note a record outside chunks."""
         record = scan.parse(found.data)
         match record:
+            case McapMessage() if self._data_end is not None:
+                raise ValueError("a message behind the end of the data")
+            case McapMessage() if (
+                self._chunks and scan.MESSAGE_HEAD.size + len(record.data) == _INDEX_HEAD + record.sequence
+            ):
+                # one flipped bit makes a message of the index behind a chunk; its length then stands for the number
+                raise ValueError("a message with the shape of an index")
             case McapMessage():
                 rows.extend((0, found.offset, record.channel_id, record.sequence, record.log_time, record.publish_time))
             case Header():

@@ -197,6 +197,45 @@ class WindowFit:
     miss: Array
 
 
+def _linearised(
+    c: Curve, r0: Array, v0: Array, R0: Array, gyro: Array, accel: Array, arm: Array
+) -> tuple[Array, Array]:
+    """The curve that the unknowns of `fit_window` predict, positions and then velocities (m or 2 m, 3), and its
+    derivatives (m or 2 m, 3, 18)."""
+    tau, eye = c.tau[:, None], np.broadcast_to(np.eye(3), (len(c.tau), 3, 3))
+    turned = c.R @ arm
+    x = (c.p + c.Jp @ gyro - c.Bp @ accel + turned) @ R0.T
+    model = r0 + tau * v0 + x
+    sensors = R0 @ (c.Jp + skew(turned) @ c.A), -(R0 @ c.Bp), R0 @ c.R
+    J = np.concatenate([eye, tau[:, None] * eye, -skew(x), *sensors], axis=-1)
+    if c.velocity is None:
+        return model, J
+    x = (c.v + c.Jv @ gyro - c.B @ accel + _apply(c.R, np.cross(c.rate, arm))) @ R0.T
+    sensors = R0 @ c.Jv, -(R0 @ c.B), R0 @ c.R @ skew(c.rate)
+    Jv = np.concatenate([0.0 * eye, eye, -skew(x), *sensors], axis=-1)
+    return np.concatenate([model, v0 + x]), np.concatenate([J, Jv])
+
+
+def _course_equation(heading: float, forward: Array, R_ne: Array) -> tuple[Array, Array]:
+    """Derivatives (1, 3) of the course by the rotation of the frame, and how far it is off (1,), in units of its sigma.
+
+    ``forward`` is the axis of the body in north-east-down, ``heading`` the course it should have, in radians.
+    """
+    miss = (heading - np.arctan2(forward[1], forward[0]) + np.pi) % (2 * np.pi) - np.pi
+    h2 = max(forward[0] ** 2 + forward[1] ** 2, 1e-3)
+    turn = (np.array([-forward[1], forward[0], 0.0]) / h2 @ -skew(forward)) @ R_ne
+    return turn[None] / COURSE_SIGMA, np.array([miss / COURSE_SIGMA])
+
+
+def _least_squares(design: Array, off: Array) -> tuple[Array, Array, float]:
+    """Covariance (18, 18) and correction (18,) of whitened equations, and the sum of squares before it."""
+    scale = np.linalg.norm(design, axis=0)
+    Q, T = np.linalg.qr(design / scale)
+    T = T + np.diag(np.where(np.abs(np.diag(T)) < 1e-9, 1e-6, 0.0))
+    inverse = np.linalg.inv(T) / scale[:, None]
+    return inverse @ inverse.T, inverse @ (Q.T @ off), float(off @ off)
+
+
 def fit_window(
     c: Curve,
     settings: NavigationSettings,
@@ -228,21 +267,9 @@ def fit_window(
     sigma = np.concatenate([sigma_b[:3], sigma_b[k : k + 3], np.full(3, arm_sigma)])
     r0, gyro, accel = c.y[0].copy(), np.zeros(3), np.zeros(3)
     v0 = (c.y[-1] - c.y[0] - R0 @ (c.p[-1] - c.p[0])) / (c.tau[-1] - c.tau[0])
-    tau, eye = c.tau[:, None], np.broadcast_to(np.eye(3), (m, 3, 3))
-    swing = skew(c.rate)
     N, cost, miss = np.eye(18), np.inf, np.zeros(m)
     for _ in range(rounds):
-        turned = c.R @ arm
-        x = (c.p + c.Jp @ gyro - c.Bp @ accel + turned) @ R0.T
-        model = r0 + tau * v0 + x
-        sensors = R0 @ (c.Jp + skew(turned) @ c.A), -(R0 @ c.Bp), R0 @ c.R
-        J = np.concatenate([eye, tau[:, None] * eye, -skew(x), *sensors], axis=-1)
-        if c.velocity is not None:
-            x = (c.v + c.Jv @ gyro - c.B @ accel + _apply(c.R, np.cross(c.rate, arm))) @ R0.T
-            model = np.concatenate([model, v0 + x])
-            sensors = R0 @ c.Jv, -(R0 @ c.B), R0 @ c.R @ swing
-            Jv = np.concatenate([0.0 * eye, eye, -skew(x), *sensors], axis=-1)
-            J = np.concatenate([J, Jv])
+        model, J = _linearised(c, r0, v0, R0, gyro, accel, arm)
         A: list[NDArray[Any]] = [solve_triangular(root, J.reshape(-1, 18), lower=True), np.eye(18)[9:] / sigma[:, None]]
         off = np.concatenate([gyro, accel, arm - arm0])
         r: list[NDArray[Any]] = [solve_triangular(root, y - model.ravel(), lower=True), -off / sigma]
@@ -251,23 +278,12 @@ def fit_window(
             A.append(W @ np.eye(18)[6:9])
             r.append(W @ vector_from_quaternion(quaternion_from_matrix(prior[0] @ R0.T)))
         if course is not None and R_ne is not None:
-            i, heading = course
-            forward = R_ne @ (R0 @ c.R[i, :, 0])
-            miss = (heading - np.arctan2(forward[1], forward[0]) + np.pi) % (2 * np.pi) - np.pi
-            h2 = max(forward[0] ** 2 + forward[1] ** 2, 1e-3)
-            turn = (np.array([-forward[1], forward[0], 0.0]) / h2 @ -skew(forward)) @ R_ne
-            A.append(turn[None] @ np.eye(18)[6:9] / COURSE_SIGMA)
-            r.append(np.asarray([miss / COURSE_SIGMA]))
+            turn, off_course = _course_equation(course[1], R_ne @ (R0 @ c.R[course[0], :, 0]), R_ne)
+            A.append(turn @ np.eye(18)[6:9])
+            r.append(off_course)
         off_m = np.linalg.norm(c.y - model[:m], axis=1)
         miss = off_m / np.sqrt(np.einsum("mii->m", c.covariance) / 3.0)
-        all_r = np.concatenate(r)
-        cost = float(all_r @ all_r)
-        design = np.vstack(A)
-        scale = np.linalg.norm(design, axis=0)
-        Q, T = np.linalg.qr(design / scale)
-        T = T + np.diag(np.where(np.abs(np.diag(T)) < 1e-9, 1e-6, 0.0))
-        inverse = np.linalg.inv(T) / scale[:, None]
-        N, dx = inverse @ inverse.T, inverse @ (Q.T @ all_r)
+        N, dx, cost = _least_squares(np.vstack(A), np.concatenate(r))
         angle = float(np.linalg.norm(dx[6:9]))
         if angle > 0.5:  # far from the solution: turn only so far
             dx *= 0.5 / angle

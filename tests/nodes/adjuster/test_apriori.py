@@ -131,6 +131,7 @@ def test_a_heading_found_in_motion_is_weighted_by_its_covariance():
     assert by_project > max(3.0, 2.0 * by_poses)
 
 
+@pytest.mark.study
 def test_an_outage_in_the_middle_of_a_strip_is_weighted_by_what_it_leaves():
     """The refined orientation knows the larger error (two-sided, many seeds in bench)."""
     simulation, adjuster = fly(1, 38.0), adjuster_of()

@@ -38,6 +38,7 @@ sys.exit(main())
 """
 
 
+@pytest.mark.study
 def test_an_overloaded_adjuster_keeps_up_says_how_and_recovers(tmp_path):
     flight, live, again = tmp_path / "flight.mcap", tmp_path / "live.mcap", tmp_path / "again.mcap"
     plan = ("--seconds", 34, "--ties", 20, "--attitude-rate", 100, "--seed", 5)

@@ -35,6 +35,7 @@ def rig(tmp_path):
 # ---- the same live and from a recording
 
 
+@pytest.mark.study
 def test_live_and_process_give_the_same_messages(rig, tmp_path):
     flight, live, processed = simulated_flight(), tmp_path / "live.mcap", tmp_path / "processed.mcap"
     recorder = rig.start("node", "recorder", "-o", live)

@@ -293,6 +293,7 @@ def test_what_is_not_signalised_is_left_alone():
         desk.ground_point(m.GroundPoint(point="P", target_radius=-1.0, covariance=[0.0] * 9))
 
 
+@pytest.mark.study
 def test_rejected_coordinates_do_not_count_until_they_are_confirmed():
     flown = simulated_flight({"seconds": 20.0, "seed": 4, "lead_in": 3.0, "attitude_rate": 50.0, "check": 0})
     messages = list(Simulator(flown.simulation).messages(10**18))

@@ -160,6 +160,7 @@ class Platform:
         assert self.group.processes["recorder"].stop() == 0
 
 
+@pytest.mark.study
 def test_over_the_bus_it_is_the_same_trajectory_and_a_killed_navigator_aligns_anew(
     flight: Path, processed: Path, tmp_path: Path
 ):

@@ -77,6 +77,7 @@ def test_a_process_that_is_killed_is_told_in_one_line(flights, monkeypatch):
         processed(path, apart=True)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
 def test_results_for_throughput_are_as_good(flights, tmp_path, kind):
     simulation, path = flights[kind]

@@ -243,6 +243,7 @@ def test_report_is_one_page_that_fetches_nothing(recording, tmp_path, capsys):
     assert len(printed["rejected_observations"]) == printed["rejected"]
 
 
+@pytest.mark.study
 def test_the_same_recording_gives_the_same_report(recording, tmp_path):
     pages = []
     for name in ("a.html", "b.html"):

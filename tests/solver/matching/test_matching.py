@@ -139,6 +139,7 @@ def test_ties_lie_where_the_truth_says_with_the_covariance_they_claim(flown, cle
     assert 0.6 < ((error / sigma)[length < 2] ** 2).mean() < 1.4
 
 
+@pytest.mark.study
 def test_views_are_looked_for_as_they_come_and_ties_follow_soon(flown, images, monkeypatch):
     looked = []
     look = LookMatcher.look

@@ -119,6 +119,7 @@ def test_replay_is_identical(usual):
         assert (a.angles == b.angles).all()
 
 
+@pytest.mark.study
 def test_late_and_disordered_fixes_change_next_to_nothing(usual):
     f = flight()
     poses, nav = run(f, stream(f, latency=lambda i: 0.1 + (1.7 if i % 4 == 1 else 0.0)))

@@ -141,6 +141,7 @@ def test_a_look_without_ground_near_it_is_given_up(flight):
     assert [n for n, _ in looks_of(result, ALONE)] == [str(simulation.points.id[other])]
 
 
+@pytest.mark.study
 def test_control_that_comes_late_places_a_single_look(flight, online):
     """Nobody sees its point again; as in the batch adjustment that knows the control."""
     simulation, poses = flight

@@ -238,6 +238,7 @@ def test_a_control_point_seen_again_in_one_look_ties_and_is_not_weighted_again(f
         assert point.rays > 1 and np.sqrt(np.diag(point.covariance)).min() > 0.02 / np.sqrt(2)
 
 
+@pytest.mark.study
 def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
     """With single looks alone a later strip is better than without; one that is wrong is not used."""
     simulation, poses = flight

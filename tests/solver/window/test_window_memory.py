@@ -51,6 +51,7 @@ def flight():
     return simulation, list(navigate(simulation))
 
 
+@pytest.mark.study
 def test_what_the_window_keeps_does_not_grow_with_the_flight(flight, monkeypatch):
     """Measured in the turns, when the window is empty and the block holds as much as it may."""
     monkeypatch.setattr(window_archive, "BLOCK_UNKNOWNS", 200)

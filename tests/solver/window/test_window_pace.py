@@ -46,6 +46,7 @@ def test_other_work_puts_it_off_but_not_for_long() -> None:
         assert np.diff(always[part]).max() < 2.0 * every_s + 0.1
 
 
+@pytest.mark.study
 def test_what_is_old_leaves_a_little_at_a_time() -> None:
     """Points that are completed together were seen first at different times: at the border of a segment many batches
     are old at once."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
@@ -53,6 +54,7 @@ def test_residuals_without_cofactors() -> None:
     assert compared > 20
 
 
+@pytest.mark.study
 def test_a_joined_batch_says_what_its_parts_said() -> None:
     """Rays that come a few at a time: batches of a time are joined, and together know what they knew."""
     simulation = simulate(FlightPlan(strip_s=24.0), 1, observation_plan=ObservationPlan(tie_points_per_s=20.0))

@@ -232,6 +232,7 @@ def test_errors_stay_within_their_protection_levels(flight, online):
         assert (level > 3.29 * sigma).all() and np.median(level / sigma) < 25.0
 
 
+@pytest.mark.study
 def test_an_undetected_error_stays_within_the_protection_level():
     """Half a pixel to two in one ray, as much as escapes the tests, in three rays of each of four flights."""
     beyond = []
