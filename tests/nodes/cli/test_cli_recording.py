@@ -19,9 +19,10 @@ from recording_file import write_recording
 import triline
 from triline.nodes.bus.session import Bus
 from triline.nodes.cli import main
+from triline.nodes.convert import iso
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message, Node
-from triline.nodes.player.player import iso, play, time_argument
+from triline.nodes.player.player import play, time_argument
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.runner import active_nodes, process
 from triline.nodes.recording.writer import RecordingWriter
