@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ from ...solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest
 from ...solver.adjustment.surface_control import SurfaceFit
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
+from .json_values import plain
 
 Array = NDArray[np.floating]
 
@@ -153,7 +153,7 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
             {"model": s.problem.model.name, "sigma0": s.sigma0, "strips": strips_of(adjustment, s)}
             for s in result.stages[:-1]
         ]
-    return _plain(content)
+    return plain(content)
 
 
 def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
@@ -410,20 +410,3 @@ def _correlations(solution: Solution) -> list[dict[str, Any]]:
         return []
     pairs = strongest_correlations(solution.factor.cofactors(np.arange(len(names))), names)
     return [{"between": [p.first, p.second], "r": p.correlation} for p in pairs[:MOST_LISTED]]
-
-
-def _plain(value: Any) -> Any:
-    """The same with Python numbers; NaN and infinity, which JSON does not have, as None."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value

@@ -36,6 +36,7 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
+from .json_values import plain
 
 Array = NDArray[np.floating]
 
@@ -304,7 +305,7 @@ def scene_result(a: SceneAdjustment) -> dict[str, Any]:
         "undetermined": [{"words": words, "share": 0.0, "unknowns": [words]} for words in s.undetermined],
         "notes": _notes(a),
     }
-    return _plain(content)
+    return plain(content)
 
 
 def _unique(name: str, lens: str, taken: Mapping[str, Any]) -> str:
@@ -448,22 +449,6 @@ def _notes(a: SceneAdjustment) -> list[str]:
         notes.append("corrections: X along the track, Y across it to the right, Z up; omega about forward, phi about "
                      "right, kappa about down")  # fmt: skip
     return notes
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value
 
 
 # tables

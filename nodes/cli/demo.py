@@ -10,7 +10,7 @@ from typing import Any
 from ..bus.processes import NodeGroup
 from ..bus.session import port_is_held
 from ..errors import UserError
-from .live_flight import ESTIMATORS, LiveFlight, add_view_arguments
+from .live_flight import ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
 
 EXAMPLE = "triline demo --headless --seconds 60 --seed 7"
 
@@ -32,7 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the flight waits for nobody: nodes that cannot keep up leave work out, as in a real flight",
     )
-    parser.add_argument("--seconds", type=_seconds, default=60.0, metavar="N", help="length of the strip (default 60)")
+    parser.add_argument(
+        "--seconds",
+        type=seconds_between(10.0, 7200.0),
+        default=60.0,
+        metavar="N",
+        help="length of the strip (default 60)",
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated flight (default 1)")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder of results (out/demo)"
@@ -117,13 +123,3 @@ class Demo(LiveFlight):
         if not result["waited_s"]:
             return []
         return [f"the flight waited {result['waited_s']:.1f} s for nodes that were behind (not with --real-time)"]
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 10.0 <= value <= 7200.0:
-        raise argparse.ArgumentTypeError(f"{text!r}, wanted 10 to 7200 seconds")
-    return value

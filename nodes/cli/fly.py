@@ -15,7 +15,7 @@ from ...schemas.envelope import RawMessage
 from ..bus.processes import NodeGroup
 from ..errors import UserError
 from ..monitor.sensor_watch import SensorWatch
-from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments
+from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
 
 if TYPE_CHECKING:
     from ..bus.session import Bus
@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--nodes", type=_nodes, default=ESTIMATORS, metavar="NAMES",
         help=f"comma-separated, of {', '.join(ESTIMATORS)} (default: all)",
     )  # fmt: skip
-    parser.add_argument("--seconds", type=_seconds, metavar="N", help="end after so long (default: Ctrl-C)")
+    parser.add_argument(
+        "--seconds", type=seconds_between(1.0, 1e6), metavar="N", help="end after so long (default: Ctrl-C)"
+    )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder of results (default: DIR/live/ and the time)"
     )
@@ -256,13 +258,3 @@ def _nodes(text: str) -> tuple[str, ...]:
     if not all(name in ESTIMATORS for name in names):
         raise argparse.ArgumentTypeError(f"{text!r}, wanted some of {','.join(ESTIMATORS)}")
     return tuple(name for name in ESTIMATORS if name in names)
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 1.0 <= value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r}, wanted 1 second or more")
-    return value

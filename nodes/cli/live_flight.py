@@ -357,3 +357,18 @@ def free_port() -> int:
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
+
+
+def seconds_between(least: float, most: float) -> Callable[[str], float]:
+    """What argparse takes for a time in seconds within these bounds."""
+
+    def seconds(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text!r}, wanted {least:g} to {most:g} seconds")
+        return value
+
+    return seconds

@@ -7,6 +7,7 @@ import csv
 import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ...solver.simulation.misspecified_study import (
     fly,
     through_window,
 )
+from ..batch.json_values import plain
 from ..errors import UserError
 from ..formats.new_file import new_file
 from ..simulator.world_settings import world_text
@@ -81,8 +83,8 @@ def document(
     return {
         "seeds": args.seeds, "first": args.first, "strips": args.strips, "seconds": args.seconds, "online": args.online,
         "cells": [
-            {**cell.plain(), "true": world_text(ROWS[cell.row].world),
-             "each": [f.plain() for f in flights[cell.setting, cell.row]]}
+            {**plain(asdict(cell)), "true": world_text(ROWS[cell.row].world),
+             "each": [plain(asdict(f)) for f in flights[cell.setting, cell.row]]}
             for cell in cells
         ],
     }  # fmt: skip
@@ -92,10 +94,10 @@ def write_csv(cells: Sequence[Cell], path: Path) -> None:
     """One line a row and setting; a column a figure, `limit ...` 1 where it holds."""
     table = []
     for cell in cells:
-        plain = cell.plain()
-        limits, lights = plain.pop("limits"), plain.pop("lights")
+        row = plain(asdict(cell))
+        limits, lights = row.pop("limits"), row.pop("lights")
         table.append(
-            {**plain, **{name: lights.get(name, 0) for name in ("good", "weak", "failed")}}
+            {**row, **{name: lights.get(name, 0) for name in ("good", "weak", "failed")}}
             | {f"limit {name}": int(held) for name, held in limits.items()}
         )
     with new_file(path) as part, part.open("w", newline="") as out:

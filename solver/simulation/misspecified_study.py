@@ -8,9 +8,8 @@ told what `ErrorModel` and `ObservationPlan` state and nothing of the `World`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from time import process_time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,10 +199,6 @@ class FlightFigures:
     good_share: float
     events: list[str] = field(default_factory=list)
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
-        return _plain(asdict(self))
-
 
 def through_window(simulation: Simulation, poses: list[TimedPose]) -> OnlineAnswer:
     """The window without nodes. Its updates come at fixed times alone, so that it is not all that `process` does."""
@@ -369,10 +364,6 @@ class Cell:
     seconds: float
     limits: dict[str, bool]
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
-        return _plain(asdict(self))
-
 
 def cell_of(setting: str, row: str, flights: Sequence[FlightFigures], stated_m: float) -> Cell:
     """Flights of a row together.
@@ -438,14 +429,3 @@ def named(source: str, ccd: str) -> str:
 def _spatial(error: Array) -> float:
     """Root mean square of the length of errors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) if len(error) else np.nan
-
-
-def _plain(value: Any) -> Any:
-    """The same without NaN and infinity, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return bool(value) if isinstance(value, np.bool_) else value
