@@ -363,6 +363,7 @@ def test_a_fifth_of_the_rays_being_blunders_is_rejected_and_named(tmp_path):
 # ---- frozen nodes, full disks
 
 
+@pytest.mark.study
 def test_others_go_on_while_recorder_and_adjuster_are_frozen(tmp_path):
     """Both stand still for seconds and catch up; nobody who publishes waits for them."""
     with Rig(tmp_path) as rig, Bus(port=rig.port, source="listener") as bus:

@@ -1,16 +1,20 @@
 """``triline study sensitivity``: which parameter a location owes its error to, by four methods.
 
-A pixel of a satellite scene, of a simulated one, or of an ADS40 strip is located with errors in orbit, attitude, time,
-image and height. The table has, for each parameter and for east and north, what its sigma moves the point by (from the
-derivative), its share of the variance by covariance propagation, and its first-order and total index by FAST and
-Sobol. Below stands the sigma by covariance propagation and by Monte Carlo, with its standard error and percentiles; a
-note says where the two differ, because the function is not linear within the sigmas.
+A pixel of a satellite scene, of a simulated one, of a frame image like BILSAT's or of an ADS40 strip is located with
+errors in orbit, attitude, time, image and height. The table has, for each parameter and for east and north, what its
+sigma moves the point by (from the derivative), its share of the variance by covariance propagation, and its
+first-order and total index by FAST and Sobol. Below stands the sigma by covariance propagation and by Monte Carlo,
+with its standard error and percentiles; a note says where the two differ, because the function is not linear within
+the sigmas. A last line tells how the sigma varies over the scene, and which parameter dominates where; ``--page``
+draws the maps.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,27 +26,31 @@ from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import Refraction
 from ...solver.location.uncertainty import Sigmas
+from ...solver.rectification.comparison import bilsat_camera
 from ...solver.sensitivity.inputs import Function, Normal
 from ...solver.sensitivity.located_pixel import (
     AIRCRAFT,
+    FRAME,
     RESULTS,
     SATELLITE,
     AircraftPixel,
+    FramePixel,
     SatellitePixel,
-    aircraft_inputs,
+    camera_inputs,
     satellite_inputs,
 )
 from ...solver.sensitivity.monte_carlo import PERCENTILES
+from ...solver.sensitivity.scene_map import SceneMap, scene_map
 from ...solver.sensitivity.study import Study, study
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ..errors import UserError
-from ..formats.new_file import new_file
+from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
 
 EXAMPLE = "triline study sensitivity aster-vnir ads40 --attitude-sigma 0.001 0.001 0.001 --csv shares.csv"
 #: Scenes of the study without arguments.
-_SCENES = ("aster-vnir", "ads40")
+_SCENES = ("bilsat", "aster-vnir", "ads40")
 #: The strip of the worked example: flown north, so high, m, over ground so high; CCD line.
 _FLOWN_M, _GROUND_M, _AIR_CCD = 3000.0, 300.0, "N"
 #: Place below the satellite of simulated scenes, degrees.
@@ -51,19 +59,42 @@ _PLACE_DEG = (36.0, 139.6)
 #: a satellite with receiver and star tracker; an aircraft with GNSS and inertial measurement after processing.
 _SATELLITE = ((2.0, 2.0, 2.0), (5e-4, 5e-4, 1e-3), 1e-4, 0.3, 10.0)
 _AIR = ((0.05, 0.05, 0.1), (0.003, 0.003, 0.006), 0.0, 0.3, 0.5)
-#: Of the focal length of the aircraft's camera, mm; the usual one of a laboratory calibration.
-_FOCAL_MM = 0.002
+#: A small satellite with GPS and star trackers whose frame camera is not calibrated in flight.
+_FRAME = ((50.0, 50.0, 50.0), (0.01, 0.01, 0.02), 0.0, 0.3, 15.0)
+#: Of the focal length, mm: usual of a laboratory calibration of an aerial camera; of a small satellite after launch.
+_FOCAL_MM, _FRAME_FOCAL_MM = 0.002, 0.02
+#: Height of the ground of the frame image above the ellipsoid, m.
+_FRAME_GROUND_M = 1000.0
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """A pixel to be looked at: its name, where it is, the function and what its parameters scatter by."""
+    """A scene and the pixel in it to be looked at, as functions of parameters that scatter.
+
+    Attributes
+    ----------
+    name, where : of the scene; of the pixel
+    function : of the pixel
+    inputs, units : the parameters
+    pixel : column and row to the function of any pixel; ValueError where it sees no ground
+    rows : (lowest, highest) row of the image, or the names of its lines of detectors where a row is such a line
+    samples : columns
+    """
 
     name: str
     where: dict[str, float | str]
     function: Function
     inputs: Normal
     units: dict[str, str]
+    pixel: Callable[[float, float], Function]
+    rows: tuple[float, float] | Sequence[str]
+    samples: int
+
+    def map(self, n: int) -> SceneMap:
+        """Errors on a grid of n columns and n rows, or as many rows as there are lines of detectors."""
+        named = isinstance(self.rows[0], str)
+        rows = np.arange(len(self.rows)) if named else np.linspace(*map(float, self.rows), n)
+        return scene_map(self.pixel, self.inputs, np.linspace(0.0, self.samples - 1.0, n), rows)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,7 +103,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenes",
         nargs="*",
         metavar="SCENE",
-        help=f"metadata of a satellite scene, a simulated sensor ({simulated}), or ads40 (aster-vnir ads40)",
+        help=f"metadata of a satellite scene, a simulated sensor ({simulated}), bilsat (a frame image) or ads40 "
+        f"({' '.join(_SCENES)})",
     )
     parser.add_argument("--pixel", type=float, nargs=2, metavar=("COLUMN", "ROW"), help="0-based (middle of the image)")
     parser.add_argument("--height", type=float, metavar="M", help="of the ground above the ellipsoid (300)")
@@ -88,20 +120,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=int, default=20_000, metavar="N", help="of Monte Carlo (20000)")
     parser.add_argument("--samples", type=int, default=2048, metavar="N", help="for indices, a power of 2 (2048)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the draws (1)")
+    parser.add_argument("--grid", type=int, default=9, metavar="N", help="columns and rows of the map (9)")
     parser.add_argument("--csv", metavar="FILE", help="write one row a scene, result and parameter")
+    parser.add_argument("--map-csv", metavar="FILE", help="write one row a scene and place of the map")
+    parser.add_argument("--page", metavar="FILE", help="write tables, maps and convergence as a page (HTML)")
 
 
 def run(args: argparse.Namespace) -> int:
-    results = []
+    if not 2 <= args.grid <= 200:
+        raise UserError(f"--grid {args.grid}: wanted 2 to 200 columns and rows")
+    for name in (args.csv, args.map_csv, args.page):
+        if name:
+            refuse_unless_file(Path(name))
+    makers = {"ads40": _aircraft, "bilsat": _frame}
+    results, maps = [], []
     for name in args.scenes or _SCENES:
-        scene = _aircraft(args) if name == "ads40" else _satellite(args, name)
+        scene = makers[name](args) if name in makers else _satellite(args, name)
         try:
             found = study(scene.function, scene.inputs, args.runs, args.samples, args.seed)
         except ValueError as error:
             raise UserError(f"{name}: {error}") from None
-        results.append(_as_table(scene, found))
+        maps.append(scene.map(args.grid))
+        results.append({**_as_table(scene, found), "map": _as_map(scene, maps[-1])})
     if args.csv:
         _write_csv(Path(args.csv), results)
+    if args.map_csv:
+        _write_map_csv(Path(args.map_csv), results)
+    if args.page:
+        from ..report.sensitivity_page import write_page  # draws with matplotlib
+
+        with new_file(Path(args.page)) as part:
+            write_page(part, results, maps)
     if args.json:
         print(json.dumps({"scenes": results}, indent=2))
     else:
@@ -161,7 +210,29 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
     except ValueError as error:
         raise UserError(f"{name}: {error}") from None
     where = {"column": column, "row": row, "height_m": height}
-    return _Scene(name, where, function, satellite_inputs(_sigmas(args, _SATELLITE, stated)), SATELLITE)
+    return _Scene(
+        name, where, function, satellite_inputs(_sigmas(args, _SATELLITE, stated)), SATELLITE,
+        lambda column, row: SatellitePixel(sensor, row, column, height), (0.0, sensor.lines - 1.0), sensor.samples,
+    )  # fmt: skip
+
+
+def _frame(args: argparse.Namespace) -> _Scene:
+    if args.ccd is not None:
+        raise UserError(f"bilsat: --ccd {args.ccd}, but a frame image has no lines of detectors")
+    camera = bilsat_camera()
+    if args.refraction:
+        camera = camera.with_refraction(Refraction())
+    column, row = _pixel(args, "bilsat", camera.samples, camera.lines)
+    height = _FRAME_GROUND_M if args.height is None else args.height
+    try:
+        function = FramePixel(camera, row, column, height)
+    except ValueError as error:
+        raise UserError(f"bilsat: {error}") from None
+    return _Scene(
+        "bilsat", {"column": column, "row": row, "height_m": height}, function,
+        camera_inputs(FRAME, _sigmas(args, _FRAME), _FRAME_FOCAL_MM), FRAME,
+        lambda column, row: FramePixel(camera, row, column, height), (0.0, camera.lines - 1.0), camera.samples,
+    )  # fmt: skip
 
 
 def _aircraft(args: argparse.Namespace) -> _Scene:
@@ -169,20 +240,25 @@ def _aircraft(args: argparse.Namespace) -> _Scene:
     ccd = args.ccd or _AIR_CCD
     if ccd not in camera.line_index:
         raise UserError(f"ads40: line of detectors {ccd!r}, wanted one of {', '.join(camera.line_index)}")
-    k = camera.line_index[ccd]
-    column, _ = _pixel(args, "ads40", camera.lines[k].pixels, 1)
-    xy, pitch = camera.image_coordinates(np.array([k]), [column])
+    column, _ = _pixel(args, "ads40", camera.lines[camera.line_index[ccd]].pixels, 1)
     height = _GROUND_M if args.height is None else args.height
     if not height < _FLOWN_M:
         raise UserError(f"ads40: --height {height:g}, wanted ground below the aircraft at {_FLOWN_M:g} m")
-    function = AircraftPixel(
-        (0.0, 0.0, _FLOWN_M), (0.0, 0.0, np.pi / 2), (float(xy[0, 0]), float(xy[0, 1])),
-        float(camera.focal_length_mm[k]), float(np.hypot(*pitch[0])), height,
-    )  # fmt: skip
-    s = _sigmas(args, _AIR)
-    inputs = aircraft_inputs(s.position_m, s.attitude_rad, _FOCAL_MM, s.pixel, s.height_m)
+
+    def pixel(column: float, line: float) -> AircraftPixel:
+        k = round(line)
+        xy, pitch = camera.image_coordinates(np.array([k]), [column])
+        return AircraftPixel(
+            (0.0, 0.0, _FLOWN_M), (0.0, 0.0, np.pi / 2), (float(xy[0, 0]), float(xy[0, 1])),
+            float(camera.focal_length_mm[k]), float(np.hypot(*pitch[0])), height,
+        )  # fmt: skip
+
     where = {"ccd": ccd, "column": column, "height_m": height, "flying_height_m": _FLOWN_M}
-    return _Scene("ads40", where, function, inputs, AIRCRAFT)
+    return _Scene(
+        "ads40", where, pixel(column, camera.line_index[ccd]),
+        camera_inputs(AIRCRAFT, _sigmas(args, _AIR), _FOCAL_MM), AIRCRAFT, pixel, tuple(camera.line_index),
+        min(line.pixels for line in camera.lines),
+    )  # fmt: skip
 
 
 def _pixel(args: argparse.Namespace, name: str, samples: int, lines: int) -> tuple[float, float]:
@@ -235,6 +311,24 @@ def _as_table(scene: _Scene, found: Study) -> dict[str, Any]:
     }
 
 
+def _as_map(scene: _Scene, found: SceneMap) -> list[dict[str, Any]]:
+    """One entry a pixel of the grid that sees the ground."""
+    larger, smaller, azimuth = found.ellipses
+    out = []
+    for i, j in np.argwhere(found.dominating >= 0):
+        k = int(found.dominating[i, j])
+        row = scene.rows[i] if isinstance(scene.rows[0], str) else float(found.rows[i])
+        out.append({
+            "column": float(found.columns[j]), "row": row,
+            "sigma_east_m": float(np.sqrt(found.covariance[i, j, 0, 0])),
+            "sigma_north_m": float(np.sqrt(found.covariance[i, j, 1, 1])),
+            "semi_major_m": float(larger[i, j]), "semi_minor_m": float(smaller[i, j]),
+            "azimuth_deg": float(np.degrees(azimuth[i, j])),
+            "dominating": found.names[k], "share": float(found.share[i, j, k]),
+        })  # fmt: skip
+    return out
+
+
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
@@ -266,6 +360,14 @@ def _as_text(table: dict[str, Any]) -> str:
         )
         if not of["nearly_linear"]:
             lines.append("  note: not linear within the sigmas; Monte Carlo is right, covariance propagation is not")
+    sigmas = [float(np.hypot(place["sigma_east_m"], place["sigma_north_m"])) for place in table["map"]]
+    if sigmas:
+        led = Counter(place["dominating"] for place in table["map"])
+        by = ", ".join(f"{name} at {n}" for name, n in led.most_common())
+        lines.append(
+            f"  over the scene: planimetric sigma {min(sigmas):.4f} to {max(sigmas):.4f} m; "
+            f"of {len(sigmas)} places dominates {by}"
+        )
     if not table["converged"]:
         lines.append("  note: Monte Carlo has not converged to 2 %; take more --runs")
     if table["missed"]:
@@ -287,3 +389,13 @@ def _write_csv(path: Path, results: list[dict[str, Any]]) -> None:
                     columns[key].append(float("nan") if p[key] is None else p[key])
     with new_file(path) as part:
         write_table(part, columns, dict.fromkeys(keys[1:], ".8g"))
+
+
+def _write_map_csv(path: Path, results: list[dict[str, Any]]) -> None:
+    rows = [{"scene": table["scene"], **place} for table in results for place in table["map"]]
+    names = list(rows[0]) if rows else ["scene"]
+    lengths = dict.fromkeys(
+        (name for name in names if name.endswith(("_m", "_deg")) or name in ("column", "share")), ".8g"
+    )
+    with new_file(path) as part:
+        write_table(part, {name: [row[name] for row in rows] for name in names}, lengths)

@@ -1,18 +1,20 @@
-"""A located pixel as a function of what its location is computed from: pushbroom satellites and airborne strips.
+"""A located pixel as a function of what its location is computed from: pushbroom satellites, frames, airborne strips.
 
 Results are metres east, north and up from where the pixel is located without errors.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..geometry.earth import R_en
 from ..geometry.rotation import R_ENU_NED, matrix_from_angles
+from ..location.frame_camera import FrameCamera
 from ..location.pushbroom import PushbroomSensor, Rays, without_aberration
 from ..location.uncertainty import Sigmas
 from .inputs import Normal
@@ -30,6 +32,12 @@ SATELLITE = {
 AIRCRAFT = {
     "X0": "m", "Y0": "m", "Z0": "m", "omega": "rad", "phi": "rad", "kappa": "rad", "c": "mm", "x": "px", "y": "px",
     "height": "m",
+}  # fmt: skip
+
+#: Parameters of a frame image, and their units: position and turns about east, north and up, camera constant, pixel.
+FRAME = {
+    "east": "m", "north": "m", "up": "m", "omega": "rad", "phi": "rad", "kappa": "rad", "c": "mm", "line": "px",
+    "sample": "px", "height": "m",
 }  # fmt: skip
 
 
@@ -85,6 +93,44 @@ class SatellitePixel:
         return np.where(inside[:, None], (P - self._ground) @ self._R_ne.T, np.nan)
 
 
+class FramePixel:
+    """One pixel of a frame image.
+
+    Parameters
+    ----------
+    camera : with its orientation, with refraction or without
+    line, sample, height_m : the pixel and the height of the ground above the ellipsoid
+
+    Raises
+    ------
+    ValueError : a pixel whose ray misses the ground
+    """
+
+    def __init__(self, camera: FrameCamera, line: float, sample: float, height_m: float):
+        self._camera, self._line, self._sample, self._height = camera, line, sample, height_m
+        self._ground = camera.ground(line, sample, height_m)[0]
+        if not np.isfinite(self._ground).all():
+            raise ValueError(f"line {line:g}, sample {sample:g}: the ray misses the ground at {height_m:g} m")
+        lat, lon, _ = camera.ellipsoid.geodetic(self._ground)
+        self._R_ne = R_ENU_NED @ R_en(lat, lon).T
+        lat, lon, _ = camera.ellipsoid.geodetic(camera.position_e)
+        self._R_ce = R_ENU_NED @ R_en(lat, lon).T  # Earth-fixed to east, north, up below the camera
+
+    def __call__(self, errors: Array) -> Array:
+        """Metres east, north, up (n, 3) by errors (n, 10) of the parameters `FRAME`; NaN where a ray misses."""
+        errors = np.asarray(errors, dtype=float)
+        camera, R = self._camera, self._R_ce
+        xy = camera.image_mm(self._line + errors[:, 7], self._sample + errors[:, 8])
+        d = np.column_stack([xy, -(camera.focal_length_mm + errors[:, 6])]) @ camera.R_ec.T
+        d = np.einsum("nij,nj->ni", R.T @ Rotation.from_rotvec(errors[:, 3:6]).as_matrix() @ R, d)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        C = camera.position_e + errors[:, :3] @ R
+        P = C + camera.ellipsoid.intersect(C, d, self._height + errors[:, 9])[:, None] * d
+        if camera.refraction is not None:
+            P = camera.refraction.true_ground(P, C)
+        return (P - self._ground) @ self._R_ne.T
+
+
 @dataclass(frozen=True)
 class AircraftPixel:
     """One pixel of a line camera on an aircraft, over ground of constant height in a local frame.
@@ -122,9 +168,7 @@ class AircraftPixel:
         return C + np.where(scale > 0, scale, np.nan)[:, None] * d
 
 
-def aircraft_inputs(
-    position_m: ArrayLike, attitude_rad: ArrayLike, focal_length_mm: float, pixel_px: ArrayLike, height_m: float
-) -> Normal:
-    """Errors of an airborne strip, independent and normal about zero; three, three, one, two and one sigmas."""
-    parts = [*np.broadcast_to(position_m, 3), *np.broadcast_to(attitude_rad, 3), focal_length_mm]
-    return Normal(np.zeros(10), [*parts, *np.broadcast_to(pixel_px, 2), height_m], tuple(AIRCRAFT))
+def camera_inputs(names: Iterable[str], sigmas: Sigmas, focal_length_mm: float) -> Normal:
+    """Errors of a frame image (`FRAME`) or of an airborne strip (`AIRCRAFT`), independent and normal about zero."""
+    parts = [*sigmas.position_m, *sigmas.attitude_rad, focal_length_mm, *sigmas.pixel, sigmas.height_m]
+    return Normal(np.zeros(10), parts, tuple(names))

@@ -137,7 +137,7 @@ def jittered(messages, seed):
     return [message for *_, message in sorted(timed, key=lambda t: t[:2])]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.study)])
 def test_jitter_of_arrival_does_not_change_a_result(tmp_path, seed):
     messages = [m for m in sample.flight(3.0) if m.topic in Chain.inputs]
     write_recording(tmp_path / "a.mcap", messages)

@@ -17,7 +17,7 @@ def test_worked_examples(tmp_path, capsys):
     file = tmp_path / "shares.csv"
     assert main(["study", "sensitivity", *FEW, "--csv", str(file), "--json"]) == 0
     scenes = json.loads(capsys.readouterr().out)["scenes"]
-    assert [s["scene"] for s in scenes] == ["aster-vnir", "ads40"]
+    assert [s["scene"] for s in scenes] == ["bilsat", "aster-vnir", "ads40"]
     for scene in scenes:
         assert scene["converged"] and scene["missed"] == 0
         for result in scene["results"].values():
@@ -28,7 +28,7 @@ def test_worked_examples(tmp_path, capsys):
                     assert parameter["sobol_total"] == pytest.approx(parameter["share"], abs=0.03)
                     assert parameter["fast_first"] == pytest.approx(parameter["share"], abs=0.03)
     table = pd.read_csv(file)
-    assert len(table) == 2 * 2 * 10
+    assert len(table) == 3 * 2 * 10
     sums = table.groupby(["scene", "result"])["share"].sum()
     assert sums.to_numpy() == pytest.approx(1.0, abs=1e-6)
 
@@ -39,6 +39,27 @@ def test_better_attitude_buys_something(capsys):
         return json.loads(capsys.readouterr().out)["scenes"][0]["results"]["north"]["sigma_m"]
 
     assert sigma("--attitude-sigma", "0.001", "0.001", "0.002") < 0.7 * sigma()
+
+
+def test_maps_of_the_scene(tmp_path, capsys):
+    page, file = tmp_path / "page.html", tmp_path / "map.csv"
+    options = ["--grid", "5", "--page", str(page), "--map-csv", str(file), "--json"]
+    assert main(["study", "sensitivity", "aster-vnir", "ads40", *FEW, *options]) == 0
+    satellite, aircraft = json.loads(capsys.readouterr().out)["scenes"]
+    assert len(satellite["map"]) == 25 and len(aircraft["map"]) == 5 * 3
+    for place in satellite["map"] + aircraft["map"]:
+        squares = place["sigma_east_m"] ** 2 + place["sigma_north_m"] ** 2
+        assert place["semi_major_m"] ** 2 + place["semi_minor_m"] ** 2 == pytest.approx(squares)
+    # the heights move the points that are seen at a slant: at the edge of the nadir line, and everywhere forward
+    by = {(place["row"], place["column"]): place["dominating"] for place in aircraft["map"]}
+    middle, edge = sorted({column for _, column in by})[2], 0.0
+    assert by["N", middle] != "height" == by["N", edge] == by["F", middle]
+    assert {"F", "N", "B"} == {row for row, _ in by}
+    table = pd.read_csv(file)
+    assert len(table) == 25 + 15 and set(table["scene"]) == {"aster-vnir", "ads40"}
+    text = page.read_text()
+    assert text.count("<svg") == 2 * 3 and "src=" not in text and "<script" not in text
+    assert "line of detectors N" in text
 
 
 def test_a_scene_from_a_file(tmp_path, capsys):
@@ -56,6 +77,9 @@ def test_a_scene_from_a_file(tmp_path, capsys):
         (["ads40", "--samples", "1000"], "ads40: 1000 samples of a Sobol sequence, wanted a power of 2"),
         (["ads40", "--runs", "3"], "ads40: 3 runs, wanted at least 100"),
         (["ads40", "--pixel", "99999", "0"], "--pixel 99999 0, wanted one of the image of 12000 columns"),
+        (["ads40", "--grid", "1"], "--grid 1: wanted 2 to 200 columns and rows"),
+        (["ads40", "--page", "nowhere/page.html"], "nowhere/page.html: no folder nowhere"),
+        (["bilsat", "--ccd", "N"], "bilsat: --ccd N, but a frame image has no lines of detectors"),
         (["ads40", "--height", "4000"], "wanted ground below the aircraft at 3000 m"),
         (["aster-vnir", "--ccd", "Q"], "aster-vnir: line of detectors 'Q', wanted one of"),
         (["aster-vnir", "--time-sigma", "-1"], "wanted numbers of at least 0"),

@@ -54,6 +54,7 @@ def processed(path, pace="load", apart=False):
     return summary, out.getvalue()
 
 
+@pytest.mark.study
 @pytest.mark.skipif(not Apart.possible(), reason="one processor only, or no fork")
 def test_two_processes_give_the_bytes_of_one(flights):
     _, path = flights["attitude"]

@@ -109,8 +109,7 @@ def spoilt_pixels(images, kind):
     "fault",
     [
         "lost",
-        "black",
-        *(pytest.param(fault, marks=pytest.mark.study) for fault in ("frozen", "dead columns", "saturated")),
+        *(pytest.param(fault, marks=pytest.mark.study) for fault in ("black", "frozen", "dead columns", "saturated")),
     ],
 )
 def test_a_few_pixels_that_were_not_measured_cost_few_ties_and_no_honesty(flown, images, clean, fault):

@@ -109,6 +109,7 @@ def test_smoothed_poses_agree_with_the_recordings_smoother(usual):
     assert (np.abs(ratio - 1.0) < 0.15).all()
 
 
+@pytest.mark.study
 def test_replay_is_identical(usual):
     f = flight()
     again, _ = run(f, stream(f))
@@ -166,6 +167,7 @@ def test_integrals_to_several_ends_are_those_of_each():
             assert np.allclose(getattr(run_to, name), getattr(one, name), rtol=1e-12, atol=1e-15), name
 
 
+@pytest.mark.study
 def test_fixes_that_are_too_late_or_come_twice_are_counted():
     f = flight()
     events = stream(f, latency=lambda i: 4.0 if i == 60 else 0.1)

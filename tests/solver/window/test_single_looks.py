@@ -104,6 +104,7 @@ def test_a_slightly_wrong_single_look_does_not_take_good_ones_with_it(flight, on
     assert any("do not agree with earlier strips" in text and name in text for text in result.events)
 
 
+@pytest.mark.study
 def test_single_looks_of_a_strip_flown_again_leave_it_consistent():
     """Every fourth point has one look of the same CCD line in each, 45 m apart."""
     plan = replace(PLAN, strips=3, cross_strips=0, sidelap=0.97)

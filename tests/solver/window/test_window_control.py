@@ -253,7 +253,8 @@ def test_one_wrong_coordinate_is_named_and_good_control_is_not(flight):
     assert whole[0] < 1.3 * whole[1] + 0.02
 
 
-@pytest.mark.parametrize("datum", ["control", pytest.param("gnss", marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("datum", ["control", "gnss"])
 def test_control_in_another_height_system_moves_no_strip_of_a_block(datum):
     plan = FlightPlan(
         strips=2, cross_strips=1, strip_s=24.0, sidelap=0.4, turns=False, gap_s=6.0, lead_in_s=3.0, lead_out_s=2.0

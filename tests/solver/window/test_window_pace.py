@@ -72,6 +72,7 @@ def test_what_is_old_leaves_a_little_at_a_time() -> None:
     assert max(late_s) < LEAVING_S
 
 
+@pytest.mark.study
 def test_results_do_not_hang_on_the_size_of_batches() -> None:
     """Two points an update, or forty: the same final orientation, where both know the same when it becomes final."""
     simulation = simulate(FlightPlan(strip_s=26.0, lead_in_s=4.0), 3, observation_plan=ObservationPlan(40.0))

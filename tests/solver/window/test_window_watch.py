@@ -266,6 +266,7 @@ def _with_sources(monkeypatch):
     monkeypatch.setattr(Window, "add_look", add)
 
 
+@pytest.mark.study
 def test_a_source_that_drifts_is_named_and_no_other(monkeypatch):
     _with_sources(monkeypatch)
     simulation = simulate(replace(PLAN, strip_s=55.0), 0, SENSORS, TIES)
