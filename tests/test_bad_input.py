@@ -263,6 +263,7 @@ def test_repeated_messages_change_nothing(fly, clean):
             np.testing.assert_array_equal(one, two)
 
 
+@pytest.mark.study
 def test_positions_two_seconds_out_of_order(fly, clean):
     """Late by what the filter looks back they are filtered in; later, or against the order of stamps, they are left."""
 

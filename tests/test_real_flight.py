@@ -54,6 +54,7 @@ def test_on_line_orientation_removes_the_injected_errors(processed: Path):
     assert (after < before).all() and np.linalg.norm(after) < np.linalg.norm(before) / 2.5
 
 
+@pytest.mark.study
 def test_replay_over_the_bus_gives_the_same_orientation(flight: Path, processed: Path, tmp_path: Path):
     live = tmp_path / "live.mcap"
     port = free_port()

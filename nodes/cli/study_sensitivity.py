@@ -92,8 +92,9 @@ class _Scene:
 
     def map(self, n: int) -> SceneMap:
         """Errors on a grid of n columns and n rows, or as many rows as there are lines of detectors."""
-        named = isinstance(self.rows[0], str)
-        rows = np.arange(len(self.rows)) if named else np.linspace(*map(float, self.rows), n)
+        first, last = self.rows[0], self.rows[-1]
+        named = isinstance(first, str)
+        rows = np.arange(len(self.rows)) if named else np.linspace(first, float(last), n)
         return scene_map(self.pixel, self.inputs, np.linspace(0.0, self.samples - 1.0, n), rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -56,8 +57,8 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
         return None
     fig = figure(4.6 if row_names is None else 3.2)
     left, right = fig.subplots(1, 2)
-    across = np.ptp(found.columns) / max(len(found.columns) - 1, 1)
-    down = np.ptp(found.rows) / max(len(found.rows) - 1, 1)
+    across = float(np.ptp(found.columns)) / max(len(found.columns) - 1, 1) or 1.0
+    down = float(np.ptp(found.rows)) / max(len(found.rows) - 1, 1) or 1.0
     larger, smaller, azimuth = found.ellipses
     unit = 0.42 / float(np.nanmax(larger))  # the largest ellipse nearly reaches its neighbours
     names = sorted({int(k) for k in found.dominating.ravel() if k >= 0})
@@ -66,8 +67,9 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
         # drawn in steps of the grid, so that ellipses keep their shape; azimuth is clockwise from north
         left.add_patch(
             Ellipse(
-                (found.columns[j] / (across or 1.0), -found.rows[i] / (down or 1.0)),
-                2 * unit * larger[i, j], 2 * unit * smaller[i, j], angle=90.0 - np.degrees(azimuth[i, j]),
+                (float(found.columns[j]) / across, -float(found.rows[i]) / down),
+                2 * unit * float(larger[i, j]), 2 * unit * float(smaller[i, j]),
+                angle=90.0 - math.degrees(azimuth[i, j]),
                 facecolor=color, alpha=0.35, edgecolor=color,
             )
         )  # fmt: skip
@@ -107,13 +109,13 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
 
 def _ticks(ax: Axes, found: SceneMap, across: float, down: float, row_names: list[str] | None) -> None:
     some = np.unique(np.linspace(0, len(found.columns) - 1, 5).round().astype(int))
-    ax.set_xticks(found.columns[some] / (across or 1.0), [f"{found.columns[k]:.0f}" for k in some])
+    ax.set_xticks(found.columns[some] / across, [f"{found.columns[k]:.0f}" for k in some])
     rows = (
         np.arange(len(found.rows))
         if row_names
         else np.unique(np.linspace(0, len(found.rows) - 1, 5).round().astype(int))
     )
-    ax.set_yticks(-found.rows[rows] / (down or 1.0), row_names or [f"{found.rows[k]:.0f}" for k in rows])
+    ax.set_yticks(-found.rows[rows] / down, row_names or [f"{found.rows[k]:.0f}" for k in rows])
     ax.set_xlabel("column")
     ax.set_ylabel("line of detectors" if row_names else "row")
 

@@ -47,7 +47,7 @@ class SceneMap:
     def ellipses(self) -> tuple[Array, Array, Array]:
         """Semi-axes of the error ellipses (r, c), m, the larger first, and the azimuth of the larger, radians
         clockwise from north in (-pi/2, pi/2]."""
-        seen = np.isfinite(self.covariance).all(axis=(2, 3))
+        seen = self.dominating >= 0
         values, vectors = np.linalg.eigh(np.where(seen[..., None, None], self.covariance, 0.0))
         axes = np.where(seen[..., None], np.sqrt(np.maximum(values, 0.0)), np.nan)
         east, north = vectors[..., 0, 1], vectors[..., 1, 1]

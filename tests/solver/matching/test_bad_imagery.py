@@ -34,11 +34,12 @@ def test_points_of_two_views_do_without_the_third(flown, images):
     assert found.matcher.counters["looks never came"] == 0
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     "dead_s",
     [
-        pytest.param((0.0, 99.0), id="from the start", marks=pytest.mark.study),
-        pytest.param((8.0, 99.0), id="dies", marks=pytest.mark.study),
+        pytest.param((0.0, 99.0), id="from the start"),
+        pytest.param((8.0, 99.0), id="dies"),
         pytest.param((8.0, 14.0), id="a while"),
     ],
 )

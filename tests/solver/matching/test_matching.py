@@ -177,6 +177,7 @@ def test_lanes_of_a_small_budget_give_ties_too():
     assert len(found.ties) > 8 and (np.hypot(*error.T) < 0.3).mean() > 0.95
 
 
+@pytest.mark.study
 def test_a_wrong_orientation_does_not_hinder(flown, images):
     found = match_strip(flown.simulation.flight, images, wrong_rad=30 * 0.0065 * 12000 / PIXELS / 62.7)  # 30 px
     error, _ = tie_errors(flown.simulation.flight, found.ties)

@@ -172,14 +172,8 @@ def test_the_orientation_and_its_covariance_are_without_a_drift_that_is_named(fl
         assert point_errors(simulation, points).nees.mean() < 5.0  # likewise
 
 
-@pytest.mark.parametrize(
-    ("strip", "ccd", "bounded"),
-    [
-        pytest.param(0, "F", False, marks=pytest.mark.study),
-        pytest.param(1, "N", False, marks=pytest.mark.study),
-        (0, "N", True),
-    ],
-)
+@pytest.mark.study
+@pytest.mark.parametrize(("strip", "ccd", "bounded"), [(0, "F", False), (1, "N", False), (0, "N", True)])
 def test_in_a_block_neither_strip_is_bent_by_a_drift_that_is_named(strip, ccd, bounded, monkeypatch):
     """Points that tie strips carry the drift of their looks in one of them, also of one that is refined no more."""
     if bounded:

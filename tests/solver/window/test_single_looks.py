@@ -68,6 +68,7 @@ def with_a_wrong_look(flight, wrong):
     return adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
 
 
+@pytest.mark.study
 def test_a_wrong_single_look_is_left_out(flight, online):
     simulation, _ = flight
     name, wrong = next((n, k) for n, k in looks_of(online, TAKEN_BACK) if online.whole_points[n].rays == 4)

@@ -122,6 +122,7 @@ def test_control_counts_once_although_it_is_seen_from_two_strips(flight, online)
     assert max(seen) > 3 and min(sigma) > 0.02 / np.sqrt(2)
 
 
+@pytest.mark.study
 def test_control_that_comes_after_its_strip_is_over_counts_as_in_the_batch(flight, batch):
     simulation, poses = flight
     role = simulation.points.role

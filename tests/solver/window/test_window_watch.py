@@ -190,6 +190,7 @@ def test_the_exposure_is_the_largest_effect_of_all_observations(flight):
     assert of_control.any() and not of_control.all() and has_left.any() and not has_left.all()
 
 
+@pytest.mark.study
 @pytest.mark.filterwarnings("error")
 def test_what_has_been_rejected_exposes_nothing_any_more(flight):
     simulation, poses = flight
@@ -289,6 +290,7 @@ def test_a_source_that_drifts_is_named_and_no_other(monkeypatch):
 # ---- determinability
 
 
+@pytest.mark.study
 def test_parameters_count_as_determined_when_the_network_sees_them(flight):
     """Their status changes; what is estimated does not depend on it."""
     simulation, poses = flight
