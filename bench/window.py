@@ -91,13 +91,15 @@ def latency(args: argparse.Namespace) -> dict[str, object]:
     p50, p90, p99 = np.percentile(ms, [50, 90, 99])
     spent = [u for u, counts in zip(watch.updates, full, strict=False) if counts]
     phases = {f"  {title}, ms": 1e3 * float(np.mean([u[title] for u in spent])) for title, *_ in PHASES}
+    slowest = [u for u, took in zip(spent, ms, strict=True) if took > p99]
+    slow = {f"  {title}, slowest 1 %, ms": 1e3 * float(np.mean([u[title] for u in slowest])) for title, *_ in PHASES}
     unknowns = max(r.unknowns - 3 * r.points for r in result.reports)
     return {
         "interval_s": interval_s,
         "rays in window": [int(rays.min()), int(rays.max())], "unknowns without points": unknowns,
         "updates": int(full.sum()),
         "p50_ms": p50, "p90_ms": p90, "p99_ms": p99, "max_ms": ms.max(),
-        "share of a core": ms.mean() / 1e3 / interval_s, "mean_ms": ms.mean(), **phases,
+        "share of a core": ms.mean() / 1e3 / interval_s, "mean_ms": ms.mean(), **phases, **slow,
         "max_ms at the end of the strip": all_ms[now_s > end_s].max(),
     }  # fmt: skip
 

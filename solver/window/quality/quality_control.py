@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..datum.control import ControlTests
 from ..results import RefinedOrientation, WindowOptions
+from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
 from .determinability import Determinability
@@ -87,7 +90,9 @@ class QualityControl:
         if self._parameters is not None:
             gsd_m = 1.0 if ground is None else ground.gsd_m
             events = self._parameters.step(now_s, network.state, batches, fit.sigma0_total, fit.redundancy_total, gsd_m)
-        rays = np.concatenate([np.empty(0, np.int64), *(b.points_left for b in batches)])
+        left = [b.points_left for b in batches]
+        rays = np.concatenate([np.empty(0, np.int64), *left])
+        tied = int((rays >= 2).sum())
         known = np.concatenate([np.empty((0, 3)), *(b.control.weight for b in batches)]) > 0
         found = QualityFindings(
             strip="" if strip is None else strip.id,
@@ -96,13 +101,8 @@ class QualityControl:
             fit=fit,
             points=len(rays),
             refused=int((rays == 0).sum()),
-            tied=int((rays >= 2).sum()),
-            free=sum(
-                name not in network.intake.control
-                for batch in batches
-                for name, left in zip(batch.names, batch.points_left.tolist(), strict=True)
-                if left >= 2
-            ),
+            tied=tied,
+            free=tied - sum(map(partial(_tied_control, control=network.intake.control.keys()), batches, left)),
             control=known[rays > 0].sum(axis=0),
             control_refused=sum(b.control_refused for b in batches),
             control_doubt=self._control.doubt,
@@ -142,3 +142,9 @@ class QualityControl:
         ground = self._below.ground
         on_ground = np.empty(0) if ground is None else ground.sigma_m(noise + C) ** 2
         return np.sqrt(exposure.sigma**2 + np.concatenate([np.diagonal(C), on_ground]))
+
+
+def _tied_control(batch: Batch, left: NDArray[np.int64], control: Set[str]) -> int:
+    """How many points of a batch are control, by name, and have two looks left."""
+    known = control & set(batch.names)
+    return sum(int(left[batch.names.index(name)]) >= 2 for name in known)

@@ -62,13 +62,18 @@ class ConsensusSchedule:
         if not fresh:
             return []
         strip = max(batch.strips[-1] for batch in fresh)
-        mine = sorted((b for b in batches if strip in b.strips), key=lambda b: -b.newest_s)
-        count, asked = sum(b.n_points for b in mine), self.asked.get(strip, 0)
+        mine = [b for b in batches if strip in b.strips]
+        count, asked = sum([b.n_points for b in mine]), self.asked.get(strip, 0)
         step = next((n for n in YOUNG if n > asked), np.inf)
         if step == np.inf and count < asked:  # points that were counted have left
             asked = max(count, YOUNG[-1])
-        refused, before = sum(b.control_refused for b in mine), self.refused.get(strip, 0)
-        due = count >= step or refused > before or (count >= asked + RECENT and _mostly_refused(mine))
+        refused, before = sum([b.control_refused for b in mine if b.active_control]), self.refused.get(strip, 0)
+        due = count >= step or refused > before
+        if not due and count < asked + RECENT:
+            self.asked[strip], self.refused[strip] = asked, refused
+            return []
+        mine.sort(key=lambda b: -b.newest_s)
+        due = due or _mostly_refused(mine)
         self.asked[strip], self.refused[strip] = max(count, asked) if due else asked, refused
         chosen: list[Batch] = []
         points = 0

@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,8 @@ APART_S, LASTING, RAISED = (0.4, 0.8), 0.15, 1.5
 TOLD_AGAIN = 1.5
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
+COUNTS = 20.0
 #: No factor becomes larger.
 LARGEST = 1000.0
 #: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
@@ -99,7 +102,7 @@ class SigmaCheck:
 
     def entered(self, squares: Iterable[tuple[float, int]]) -> None:
         """Points have come: weighted squares of each against what was known without it, and their redundancy."""
-        self._ratios.extend(square / chi2.median(n) for square, n in squares if n > 0)
+        self._ratios.extend(square / _median_square(n) for square, n in squares if n > 0)
         ratio = float(np.median(self._ratios)) if len(self._ratios) >= ENOUGH else 1.0
         self._suspect = ratio > SUSPECT
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
@@ -148,7 +151,7 @@ class SigmaCheck:
         for pair in self._pairs:
             if not asked[list(pair)].any():
                 continue
-            for g, wanted in zip(pair, _likely(strip, state, pair), strict=True):
+            for g, wanted in zip(pair, _likely(strip, state, pair, (before[pair[0]], before[pair[1]])), strict=True):
                 factor[g] = _changed(float(factor[g]), wanted / float(factor[g]))
             if (factor != before).any():
                 break  # what wanders is looked at first; the rest when that is settled
@@ -164,7 +167,7 @@ class SigmaCheck:
         if len(w) < LEAST_LOOKS:
             return None
         stated = sigmas.image == 1.0 and noise.vibration == 0.0
-        if stated and np.median(w**2) / chi2.median(1) < 1.0 + IMAGE_QUESTIONED * np.sqrt(2.0 / len(w)):
+        if stated and np.median(w**2) / _median_square(1) < 1.0 + IMAGE_QUESTIONED * np.sqrt(2.0 / len(w)):
             return None
         judged = [(b, b.judge(state)[1]) for b in list(self._network.batches)[-MOST_JUDGED:]]
         rays = [b.rays for b, _ in judged]
@@ -226,36 +229,58 @@ class SigmaCheck:
         return lines
 
 
-def _likely(strip: WindowStrip, state: WindowState, pair: tuple[int, int]) -> tuple[float, float]:
+def _likely(
+    strip: WindowStrip, state: WindowState, pair: tuple[int, int], present: tuple[float, float]
+) -> tuple[float, float]:
     """Factors of errors of position and attitude of one kind, by the likelihood of the data under a bank of them.
 
     Whether a position is off or an attitude shows in the images by little. So each pair of factors is weighed by its
     restricted likelihood, and variances are averaged: where the data cannot tell, both are larger, and no sigma is too
     small. Minus twice the logarithm of the likelihood is ``log det N + sum 2 m log f - n' N^-1 n``, with m equations of
-    a group.
+    a group. Each pair costs a factorisation, and most of the bank is far from likely: the search goes from the factors
+    in force to neighbours as long as they count.
 
     Parameters
     ----------
     pair : groups of position and attitude
+    present : factors in force
     """
     (A, a, now_a), (B, b, now_b) = (strip.apriori_information(g, state) for g in pair)
     N, rhs = state.normal()
     rest = N - A / now_a**2 - B / now_b**2
+
+    def cost_of(f: float, g: float) -> float:
+        try:
+            root = np.linalg.cholesky(rest + A / f**2 + B / g**2)
+        except np.linalg.LinAlgError:
+            return np.inf
+        y = solve_triangular(root, rhs, lower=True, check_finite=False)
+        far = (np.log(f) ** 2 + np.log(g) ** 2) / USUAL_LOG**2
+        return float(2.0 * np.log(np.diagonal(root)).sum() + 2.0 * (a * np.log(f) + b * np.log(g)) - y @ y + far)
+
     cost = np.full((len(BANK), len(BANK)), np.inf)
-    for i, f in enumerate(BANK):
-        for j, g in enumerate(BANK):
-            try:
-                root = np.linalg.cholesky(rest + A / f**2 + B / g**2)
-            except np.linalg.LinAlgError:
-                continue
-            y = solve_triangular(root, rhs, lower=True, check_finite=False)
-            far = (np.log(f) ** 2 + np.log(g) ** 2) / USUAL_LOG**2
-            logarithms = 2.0 * np.log(np.diagonal(root)).sum() + 2.0 * (a * np.log(f) + b * np.log(g))
-            cost[i, j] = logarithms - y @ y + far
-    weight = np.exp(-0.5 * (cost - cost.min()))
+    first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
+    seen, waiting, least = {first}, [first], np.inf
+    while waiting:
+        i, j = waiting.pop()
+        cost[i, j] = cost_of(BANK[i], BANK[j])
+        least = min(least, cost[i, j])
+        if cost[i, j] > least + COUNTS and np.isfinite(least):
+            continue
+        beside = {(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)} - seen
+        near = sorted(c for c in beside if min(c) >= 0 and max(c) < len(BANK))
+        seen.update(near)
+        waiting.extend(near)
+    weight = np.exp(-0.5 * (cost - least))
     weight /= weight.sum()
     square = np.square(BANK)
     return float(np.sqrt(weight.sum(axis=1) @ square)), float(np.sqrt(weight.sum(axis=0) @ square))
+
+
+@lru_cache
+def _median_square(redundancy: int) -> float:
+    """Median of the chi-square distribution."""
+    return float(chi2.median(redundancy))
 
 
 @dataclass(frozen=True)
@@ -279,7 +304,7 @@ class _Residuals:
     @property
     def ratio(self) -> float:
         """Median of the squares over that of right sigmas."""
-        return float(np.median(self.w[self.redundancy > LEAST_CONTROLLED] ** 2) / chi2.median(1))
+        return float(np.median(self.w[self.redundancy > LEAST_CONTROLLED] ** 2) / _median_square(1))
 
     def last(self) -> bool:
         """Whether what looks have in common lasts longer than a vibration: then it is a wander of the trajectory."""
