@@ -33,6 +33,8 @@ MOST_AT_ONCE = 64
 LAG_PERIOD_S = 0.1
 #: A steady input that says nothing for so long while the flight goes on is an alarm, s; ties may be rare for a while.
 QUIET_S, LONG_QUIET_S = 4.0, 15.0
+#: What comes while a strip is flown, and not between strips.
+IN_STRIPS = ("sensor/lines/", "orientation/", "orthoimage/")
 #: Between the last message and the end of the session, for what is still on its way.
 LAST_WORDS_S = 0.2
 
@@ -197,7 +199,7 @@ class BusRunner:
         missed = []
         for topic, heard in self._heard_s.items():
             row = topics.find(topic)
-            in_strips = topic == "observation/tie" or topic.startswith("sensor/lines/")
+            in_strips = topic == "observation/tie" or topic.startswith(IN_STRIPS)
             steady = row.rate_hz > 0 and not row.in_bursts and row.family is not Family.DECISION
             quiet_s = LONG_QUIET_S if row.family is Family.OBSERVATION else QUIET_S
             if steady and now - heard > quiet_s and (self._open_strip if in_strips else flying):

@@ -96,7 +96,7 @@ class Overview:
         parts += [f"ALARM: {text}" for text in self.alarms()]
         lost = {kind: n for kind, n in self.losses().items() if n}
         if lost:
-            parts.append(", ".join(f"{n} {kind}" for kind, n in lost.items()))
+            parts.append(", ".join(_counted(n, kind) for kind, n in lost.items()))
         return plain(" | ".join(parts))
 
 
@@ -150,7 +150,7 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
     for name in sorted(overview.nodes):
         s = overview.nodes[name]
         bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
-        text = ", ".join(f"{n} {k}" for k, n in bad.items() if n)
+        text = ", ".join(_counted(n, kind) for kind, n in bad.items() if n)
         nodes.add_row(
             Text(plain(name, LONGEST_NAME)), Text(plain(s.state, LONGEST_TEXT)), f"{s.lag_s:.2f} s", str(s.queued),
             Text(text or "-", style="yellow" if text else "dim"),
@@ -262,3 +262,8 @@ def run(options: ProgramOptions) -> int:
         while not options.stop.wait(0.25):
             show()
     return 0
+
+
+def _counted(n: int, kind: str) -> str:
+    """One gap, two gaps."""
+    return f"{n} {kind.removesuffix('s') if n == 1 else kind}"
