@@ -20,8 +20,11 @@ from ...solver.adjustment.job import Event, Job, NotAdjustableError, Phase
 from ...solver.adjustment.job import run as run_job
 from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
+from ...solver.adjustment.straightened import straightened
 from ...solver.adjustment.surface_control import run_with_surface
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, SelfCalibration
+from ...solver.geometry.ellipsoid import WGS84
+from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
 from ...solver.orthoimage.surface import HeightField
@@ -42,6 +45,7 @@ from ..recording.reader import RecordingReader
 from ..recording.summary import damage_lines
 from ..terminal import drawing, plain
 from .adjust_scenes import run_scenes
+from .locate import refraction_of
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result
@@ -89,6 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dem-crs", metavar="CRS",
         help="of the raster: 'ellipsoid', a vertical CRS (EPSG:5773), or the whole, where it does not say",
     )  # fmt: skip
+    group.add_argument(
+        "--refraction", nargs="*", type=float, metavar="VALUE", help="take the bending of rays in the air off: as in "
+        "'triline locate'; behind the input",
+    )  # fmt: skip
     group.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
     parser.add_argument(
         "--per-line", action="store_true", help="refined orientation of every image line: orientation_lines.csv (-o)"
@@ -121,7 +129,11 @@ def run(args: argparse.Namespace) -> int:
     surface = None
     if args.dem is not None:
         surface = dem_in_frame(args.dem, block.frame, args.dem_crs), float(args.dem_sigma or 0.0)
-    adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface)
+    air = None
+    if args.refraction is not None:
+        air = refraction_of(args.refraction, WGS84, str(args.input))
+        block = replace(block, notes=(*block.notes, "refraction taken off the image points"))
+    adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface, air)
     content = result_of(adjustment)
     if args.output:
         write_result(adjustment, content, Path(args.output), plots=args.plots, per_line=args.per_line)
@@ -220,9 +232,19 @@ def _self_calibration(args: argparse.Namespace, block: BlockData) -> SelfCalibra
 
 
 def adjust_block(
-    block: BlockData, job: Job, tell: Any = None, surface: tuple[HeightField, float] | None = None
+    block: BlockData,
+    job: Job,
+    tell: Any = None,
+    surface: tuple[HeightField, float] | None = None,
+    refraction: Refraction | None = None,
 ) -> Adjustment:
-    """Adjust a block as a job asks; ``surface``: ground on which tie points lie, and the sigma of its heights, m.
+    """Adjust a block as a job asks.
+
+    Parameters
+    ----------
+    tell : is called with what happens
+    surface : ground on which tie points lie, and the sigma of its heights, m
+    refraction : is taken off the image points
 
     Raises
     ------
@@ -232,6 +254,8 @@ def adjust_block(
     try:
         with np.errstate(all="ignore"):  # results that are not finite are refused below
             network, fit = network_from_block(block), None
+            if refraction is not None:
+                network = straightened(network, block.frame, refraction)
             if surface is None:
                 result = run_job(network, job, tell)
             else:

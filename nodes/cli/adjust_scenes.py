@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
+from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.refraction import Refraction
 from ..batch.adjustment_summary import summary_lines
 from ..batch.scene_adjustment import (
     SCENE_CALIBRATIONS,
@@ -19,6 +22,7 @@ from ..batch.scene_adjustment import (
 )
 from ..errors import UserError
 from ..formats.scene_block import SceneBlockData, read_scene_block
+from .locate import refraction_of
 
 #: More unknowns of correction functions a lens than this want more memory than they are worth.
 MOST_PIECES = 60
@@ -27,6 +31,8 @@ MOST_PIECES = 60
 def run_scenes(args: argparse.Namespace) -> int:
     """Adjust a folder, print and write the result."""
     data = read_scene_block(Path(args.input))
+    if args.refraction is not None:
+        data = _in_air(data, refraction_of(args.refraction, data.ellipsoid, str(args.input)))
     adjustment = run_scene_job(data, scene_job(args, data))
     content = scene_result(adjustment)
     if args.output:
@@ -39,6 +45,25 @@ def run_scenes(args: argparse.Namespace) -> int:
         if args.output and not args.quiet:
             print(f"written to {args.output}")
     return 0
+
+
+def _in_air(data: SceneBlockData, refraction: Refraction) -> SceneBlockData:
+    """The block with rigorous models that bend their rays.
+
+    Raises
+    ------
+    UserError : no image has a rigorous model
+    """
+    rigorous = [image for image in data.images if isinstance(image.location, PushbroomSensor)]
+    if not rigorous:
+        raise UserError(f"{data.name}: --refraction goes with rigorous models, and no image of the block has one")
+    images = tuple(
+        replace(image, location=image.location.with_refraction(refraction))
+        if isinstance(image.location, PushbroomSensor)
+        else image
+        for image in data.images
+    )
+    return replace(data, images=images, notes=(*data.notes, f"refraction in the models of {len(rigorous)} images"))
 
 
 def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:

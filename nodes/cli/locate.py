@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.geometry.ellipsoid import WGS84
+from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
 from ...solver.location.rpc import Rpc
@@ -109,18 +110,27 @@ def with_refraction(args: argparse.Namespace, model: Any) -> Any:
         return model
     if isinstance(model, Rpc):
         raise UserError(f"{args.sensor}: --refraction goes with a rigorous model, this is an RPC")
-    if abs(model.ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
-        raise UserError(f"{args.sensor}: --refraction knows the air of the Earth only, this is another planet")
-    if len(args.refraction) not in (0, 3):
+    return model.with_refraction(refraction_of(args.refraction, model.ellipsoid, args.sensor))
+
+
+def refraction_of(values: Sequence[float], ellipsoid: Ellipsoid, what: str) -> Refraction:
+    """The air that ``--refraction`` asks for, over the ellipsoid of what is located.
+
+    Raises
+    ------
+    UserError : another planet, another number of values than none and three, values that no air has
+    """
+    if abs(ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
+        raise UserError(f"{what}: --refraction knows the air of the Earth only, this is another planet")
+    if len(values) not in (0, 3):
         raise UserError(
-            f"--refraction: {len(args.refraction)} values, wanted none, or temperature (K), pressure (hPa) and vapour "
+            f"--refraction: {len(values)} values, wanted none, or temperature (K), pressure (hPa) and vapour "
             "pressure (hPa)"
         )
     try:
-        air = Atmosphere(*args.refraction) if args.refraction else STANDARD
+        return Refraction(Atmosphere(*values) if values else STANDARD, ellipsoid)
     except ValueError as error:
         raise UserError(f"--refraction: {error}") from None
-    return model.with_refraction(Refraction(air, model.ellipsoid))
 
 
 def stated_sigmas(args: argparse.Namespace, stated: Sigmas) -> Sigmas:

@@ -1,5 +1,6 @@
 """``triline adjust``: block folders and recordings in, result files and one-line refusals out."""
 
+import csv
 import json
 import os
 import shutil
@@ -338,6 +339,20 @@ def refusal(capsys, *words):
     return lines[0]
 
 
+def test_refraction_is_taken_off(folder, tmp_path):
+    """Seen through air, ground beside the flight line looks further away than it is; heights follow from that."""
+    heights = []
+    for words in ((), ("--refraction",), ("--refraction", "288.15", "1013.25", "0")):
+        out = tmp_path / str(len(heights))
+        assert adjust(folder, *words, "-q", "-o", out) == 0
+        assert ("refraction taken off the image points" in result_in(out)["notes"]) == bool(words)
+        with open(out / "points.csv", newline="") as file:
+            heights.append(np.array([float(row["Z_m"]) for row in csv.DictReader(file)]))
+    change = np.abs(heights[1] - heights[0])
+    assert 1e-4 < change.max() < 0.3
+    np.testing.assert_allclose(heights[2], heights[1], atol=1e-4)
+
+
 def test_refusals_are_one_line(folder, tmp_path, capsys):
     assert "no such file" in refusal(capsys, tmp_path / "nowhere")
     empty = tmp_path / "empty"
@@ -351,6 +366,7 @@ def test_refusals_are_one_line(folder, tmp_path, capsys):
     assert "fixes" in refusal(capsys, folder, "--model", "lim", "--fixes", "2")
     assert "segments" in refusal(capsys, folder, "--model", "ppm", "--segments", "0")
     assert "--critical" in refusal(capsys, folder, "--critical", "0")
+    assert "--refraction: atmosphere: pressure_hpa 5" in refusal(capsys, folder, "--refraction", "288", "5", "0")
     occupied = tmp_path / "file"
     occupied.write_text("")
     assert "is a file" in refusal(capsys, folder, "-q", "-o", occupied)

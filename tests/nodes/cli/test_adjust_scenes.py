@@ -17,6 +17,7 @@ from triline.nodes.cli import main
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
 from triline.nodes.formats.scene_block import write_scene_block
+from triline.solver.location.refraction import Refraction
 from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
 
@@ -166,6 +167,42 @@ BAD = {
     ),
     "no ephemeris": ("spot5-hrs/ephemeris.csv", None, r"ephemeris.csv: no such file"),
 }  # fmt: skip
+
+
+def test_images_taken_through_the_air(block, tmp_path, capsys):
+    """Image points are moved by what the air does; with --refraction everything is as it was."""
+    image, truth = rows(block / "image_points.csv"), {row["point"]: row for row in rows(block / "truth.csv")}
+    sensors = read_scene(block / "spot5-hrs").sensors
+    bent = block.with_name("bent")
+    shutil.copytree(block, bent)
+    for row in image:
+        place = [float(truth[row["point"]][k]) for k in ("X_m", "Y_m", "Z_m")]
+        at = np.radians(place[1]), np.radians(place[0]), place[2]
+        sensor = sensors[row["ccd"]]
+        moved = (sensor.with_refraction(Refraction()).inverse(*at) - sensor.inverse(*at))[0]
+        assert 0.01 < np.linalg.norm(moved) < 1.0
+        row["line"], row["sample"] = (
+            repr(float(row[k]) + float(d)) for k, d in zip(("line", "sample"), moved, strict=True)
+        )
+    with open(bent / "image_points.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(image[0]))
+        writer.writeheader()
+        writer.writerows(image)
+    shifts, points = [], []
+    for folder, words in ((block, ()), (bent, ("--refraction",)), (bent, ())):
+        out = tmp_path / f"result{len(shifts)}"
+        assert main(["adjust", str(folder), "-q", "--snoop", "-o", str(out), *words]) == 0
+        result = json.loads((out / "result.json").read_text())
+        assert ("refraction in the models of 2 images" in result["notes"]) == bool(words)
+        shifts.append(np.array([result["strips"][f"scene/{ccd}"]["shift_deg"] for ccd in "FB"]))
+        known = [[float(row[k] or "nan") for k in ("X_m", "Y_m", "Z_m")] for row in rows(out / "points.csv")]
+        points.append(np.array(known) * [91e3, 111e3, 1.0])
+    # a hundredth of the turn that the correction has to make for the air where nobody takes it off
+    wrong = np.abs(shifts[2] - shifts[0]).max()
+    assert wrong > 1e-5 and np.abs(shifts[1] - shifts[0]).max() < 0.01 * wrong
+    np.testing.assert_allclose(points[1], points[0], atol=0.01)
+    assert main(["adjust", str(block), "--refraction", "1", "2"]) == 1
+    assert "--refraction: 2 values, wanted none, or temperature (K)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", BAD)
