@@ -1,9 +1,9 @@
 """``triline study regularisation``: the source's nine control pixels, with its published condition numbers beside ours.
 
-First table: condition number (Frobenius norm) of the normal equations without and with fictitious observations, and how
-many parameters the pixels determine. Second table: error on the ground over the whole image, of parameters estimated
-from the nine pixels in several ways; bias and noise are what is expected of it. ``--plot`` draws the L-curve and the
-cross-validation of the narrow set.
+First table: condition number (Frobenius norm) of the normal equations without and with fictitious observations, and
+how many parameters the pixels determine, with the steps of Gauss-Newton's method that the camera itself takes. Second
+table: error on the ground over the whole image, of parameters estimated from the nine pixels in several ways; bias
+and noise are what is expected of it. ``--plot`` draws the L-curve and the cross-validation of the narrow set.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, outcomes
+from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, iterations, outcomes
 from ..errors import UserError
 from ..formats.new_file import new_file, refuse_unless_file
 
@@ -36,10 +36,12 @@ def run(args: argparse.Namespace) -> int:
     for (parameters, where), (before, after) in PUBLISHED.items():
         got = conditions(parameters, where)
         rng = np.random.default_rng(args.seed)
+        steps = iterations(parameters, where, np.random.default_rng(args.seed))
         ways = outcomes(parameters, where, args.draws, rng)
         rows.append(
             {
                 "parameters": parameters, "pixels": where, "published_before": before, "published_after": after,
+                "iterations_before": steps[0], "iterations_after": steps[1],
                 "before": got.before, "after": got.after, "determined": got.rank,
                 "ways": {name: vars(found) for name, found in ways.items()},
             }
@@ -52,13 +54,16 @@ def run(args: argparse.Namespace) -> int:
     print(
         "condition numbers, Frobenius norm, parameters in units of what is known beforehand (the source's are unknown)"
     )
-    print(f"{'':12s}{'':8s}{'without':>21s}{'with fictitious obs.':>24s}{'determined':>12s}")
+    print(
+        f"{'':12s}{'':8s}{'without':>21s}{'with fictitious obs.':>24s}{'determined':>12s}{'steps without, with':>21s}"
+    )
     print(f"{'parameters':12s}{'pixels':8s}{'published':>11s}{'here':>10s}{'published':>14s}{'here':>10s}")
     for row in rows:
         here = f"{row['before']:.1e}" if row["before"] < ROUNDING else "rounding"
         print(
             f"{row['parameters']:<12d}{row['pixels']:8s}{row['published_before']:11.1e}{here:>10s}"
             f"{row['published_after']:14.1e}{row['after']:10.1e}{row['determined']:12d}"
+            f"{_steps(row['iterations_before']):>12s}{_steps(row['iterations_after']):>9s}"
         )
     print("\nerror on the ground over the whole image, m")
     head = "".join(f"{word:>10s}" for word in ("error", "1 in 20", "bias", "noise"))
@@ -71,6 +76,10 @@ def run(args: argparse.Namespace) -> int:
                 f"{_metres(way['bias_m'])}{_metres(way['noise_m'])}{way['effective']:11.1f}{alpha:>8s}{way['condition']:11.1e}"
             )
     return 0
+
+
+def _steps(n: int | None) -> str:
+    return "diverges" if n is None else str(n)
 
 
 def _metres(value: float) -> str:

@@ -231,6 +231,7 @@ def iterate(
     solve: Callable[[Regularisation], Regularised],
     sigma: ArrayLike = 1.0,
     weight: ArrayLike | None = None,
+    last_step: float = _CONVERGED * 1e3,
 ) -> Regularised:
     """Gauss-Newton's method with regularisation, for a model that is not linear; ``start`` is the prior too.
 
@@ -241,6 +242,7 @@ def iterate(
     y : (n,) observations
     solve : of each step, for example ``lambda equations: equations.tikhonov(0.1)``
     sigma, weight : as of `Regularisation`
+    last_step : a step in which no parameter changes by more, in its sigmas, is the last
 
     Raises
     ------
@@ -254,7 +256,7 @@ def iterate(
         step = solve(Regularisation(J, np.asarray(y) - computed + J @ x, sigma, prior, weight))
         change = np.abs(step.x - x) / np.maximum(step.sigma, np.finfo(float).tiny)
         x = step.x
-        if change.max() < _CONVERGED * 1e3:
+        if change.max() < last_step:
             return Regularised(**{**step.__dict__, "iterations": k + 1})
     raise ValueError(f"no convergence in {_MOST_STEPS} steps")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimation.regularisation import Regularisation, Regularised
+from ..estimation.regularisation import Regularisation, Regularised, iterate
 from ..geometry.ellipsoid import WGS84
 from ..geometry.frames import LocalFrame
 from ..geometry.rotation import angles_from_matrix, matrix_from_angles
@@ -44,6 +44,8 @@ GROUND_SIGMA_M = 15.0
 HEIGHT_M = 1000.0
 #: Derivatives are good to so much of the largest one: differences over a sigma.
 DIGITS = 1e-9
+#: Last step of the iteration, in sigmas. Derived: derivatives by the distortion have fewer digits where it is small.
+_LAST_STEP = 1e-3
 #: Condition numbers of normal equations beyond this are rounding.
 ROUNDING = 1.0 / DIGITS**2
 
@@ -219,6 +221,46 @@ def _ways(equations: Regularisation) -> dict[str, Regularised]:
         "Tikhonov, L-curve": equations.tikhonov("l-curve"),
         "truncated, cross-validation": equations.truncated("gcv"),
     }
+
+
+def iterations(parameters: int, where: str, rng: np.random.Generator) -> tuple[int | None, int | None]:
+    """Steps of Gauss-Newton's method with the camera itself, without and with fictitious observations.
+
+    True parameters are drawn as in `outcomes`; the start is what is known beforehand. None: no convergence, or
+    parameters with which the pixels miss the Earth.
+    """
+    line, sample = nine_pixels(where)
+    base = bilsat_camera().direct(line, sample, np.full(len(line), HEIGHT_M))
+    east, north = metres_a_radian(base[:, 0], base[:, 2], WGS84)
+    prior = prior_sigmas(parameters)
+    names = names_of(parameters)
+
+    def ground(values: Array) -> Array:
+        camera = bilsat_camera()
+        for name, value in zip(names, values, strict=True):
+            camera = _changed(camera, name, float(value))
+        located = camera.direct(line, sample, np.full(len(line), HEIGHT_M))
+        return np.concatenate([(located[:, 1] - base[:, 1]) * east, (located[:, 0] - base[:, 0]) * north])
+
+    def model(values: Array) -> tuple[Array, Array]:
+        J = np.stack([(ground(values + h) - ground(values - h)) / (2.0 * h.sum()) for h in np.diag(prior)], axis=1)
+        return ground(values), J
+
+    def plain(equations: Regularisation) -> Regularised:
+        s = equations.singular_values
+        return equations.truncated(int(np.count_nonzero(s > DIGITS * s[0])))
+
+    truth = prior * rng.normal(size=len(prior))
+    y = ground(truth) + GROUND_SIGMA_M * rng.normal(size=2 * len(line))
+    taken: list[int | None] = []
+    for solve in (plain, Regularisation.fictitious):
+        try:
+            with np.errstate(all="ignore"):
+                found = iterate(model, np.zeros(len(prior)), y, solve, GROUND_SIGMA_M, 1.0 / prior**2, _LAST_STEP)
+            taken.append(found.iterations)
+        except (ValueError, np.linalg.LinAlgError):
+            taken.append(None)
+    return taken[0], taken[1]
 
 
 def curve(parameters: int, where: str, rng: np.random.Generator) -> dict[str, Array]:

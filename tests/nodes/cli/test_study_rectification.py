@@ -16,7 +16,7 @@ from triline.solver.rectification.comparison import (
     resection,
     scene_points,
 )
-from triline.solver.rectification.nine_pixels import conditions, design, outcomes, prior_sigmas
+from triline.solver.rectification.nine_pixels import conditions, design, iterations, outcomes, prior_sigmas
 
 FAST = ("affine", "projective", "polynomial 2", "differential")
 
@@ -103,6 +103,12 @@ def test_with_knowledge_beforehand_the_error_is_smaller():
     total = np.hypot(fictitious.bias_m, fictitious.noise_m)
     assert 0.5 * total < fictitious.error_m < 1.5 * total  # as large as it is expected to be
     assert fictitious.effective < 5.0
+
+
+def test_with_knowledge_beforehand_the_camera_is_found_in_few_steps():
+    for parameters, where in ((14, "narrow"), (12, "wide")):
+        before, after = iterations(parameters, where, np.random.default_rng(1))
+        assert after is not None and after <= 6 and (before is None or before > after)
 
 
 def test_study_of_regularisation_prints_the_published_table(tmp_path, capsys):
