@@ -19,6 +19,7 @@ from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, pixel_covariance
+from ...solver.rectification.frame_parameters import TWELVE, FrameControl, FrameFit, fit_frame, prior_sigmas
 from ...solver.rectification.grid import MapGrid, default_crs
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
@@ -34,6 +35,8 @@ from .progress import progress
 
 Array = NDArray[np.floating]
 
+#: Sigma of heights and places of control, m, where ``--height-sigma`` states none: a hand-held receiver.
+GROUND_SIGMA_M = 15.0
 _CONTROL = (
     Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0), Column("height_m"), Column("column"), Column("row"),
 )  # fmt: skip
@@ -60,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--refraction", nargs="*", type=float, metavar="VALUE", help="as in 'triline locate'")
     group.add_argument("--control", metavar="CSV", help="lon_deg,lat_deg,height_m,column,row: corrects the model")
     group.add_argument(
-        "--correction", choices=("shift", "affine"), default="affine", help="of the image, by control (default: affine)"
+        "--correction",
+        choices=("shift", "affine", "camera"),
+        default="affine",
+        help="by control: of the image, or of the parameters of a frame camera (default: affine)",
     )
     group.add_argument("--dem-crs", metavar="CRS", help="of the heights; of a recording: ellipsoid, EPSG:5773 ..")
     group.add_argument("--dem-datum", metavar="DATUM", help=f"what heights are above: {DATUMS}")
@@ -101,6 +107,7 @@ class _Sensor:
     offset : line and sample of the image's first pixel in the scene
     sigmas : of the sensor
     fit : of the correction, None without control
+    camera : parameters of a frame camera, where control was to correct these
     """
 
     model: Any
@@ -111,6 +118,7 @@ class _Sensor:
     fit: BiasFit | None
     ellipsoid: Ellipsoid
     notes: list[str]
+    camera: FrameFit | None = None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -202,6 +210,9 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     if (line, sample) != (0, 0) or (bare.lines, bare.samples) != (image.lines, image.samples):
         model = CroppedModel(bare, line, sample, image.lines, image.samples)
     fit = None
+    if args.control is not None and args.correction == "camera":
+        found = _camera_by_control(args, Path(args.control), model, image)
+        return _Sensor(found.camera, found.camera, kind, (line, sample), sigmas, None, ellipsoid, notes, found)
     if args.control is not None:
         fit = _correction(args, Path(args.control), model, image, sigmas)
         model = CorrectedModel(model, fit.bias)
@@ -240,13 +251,39 @@ def _first_pixel(
     return line, sample
 
 
-def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas) -> BiasFit:
+def _control(path: Path, image: SourceImage) -> Any:
     table = read_table(path, _CONTROL, [])
     u, v = table["row"], table["column"]
     size = f"the image has {image.samples} columns and {image.lines} rows"
     outside = (u < -0.5) | (u > image.lines - 0.5)
     table.refuse(outside, "row", lambda k: f"{u[k]:g}: outside, {size}")
     table.refuse((v < -0.5) | (v > image.samples - 0.5), "column", lambda k: f"{v[k]:g}: outside, {size}")
+    return table
+
+
+def _camera_by_control(args: argparse.Namespace, path: Path, model: Any, image: SourceImage) -> FrameFit:
+    """The frame camera with the parameters of `TWELVE`, by control with errors in pixel and height."""
+    if not isinstance(model, FrameCamera):
+        raise UserError("--correction camera: goes with the whole image of a frame camera, wanted shift or affine")
+    if args.sigma:
+        raise UserError("--sigma: goes with --correction shift or affine, not with camera")
+    table = _control(path, image)
+    control = FrameControl(
+        table["row"], table["column"], np.radians(table["lat_deg"]), np.radians(table["lon_deg"]), table["height_m"]
+    )
+    height_m = args.height_sigma or GROUND_SIGMA_M
+    try:
+        return fit_frame(
+            model, control, TWELVE, pixel_sigma=args.pixel_sigma or 0.5, height_sigma_m=height_m,
+            ground_sigma_m=height_m, prior_sigma=prior_sigmas(len(TWELVE)),
+        )  # fmt: skip
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None
+
+
+def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas) -> BiasFit:
+    table = _control(path, image)
+    u, v = table["row"], table["column"]
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
     sigma = args.pixel_sigma or 0.5
     try:
@@ -465,6 +502,24 @@ def _tell(
             "shift_px": fit.bias.coefficients[:, 0].tolist(),
             "rms_px": np.sqrt(np.mean(fit.residual_px[used] ** 2, axis=0)).tolist(),
         }  # fmt: skip
+    if sensor.camera is not None:
+        found = sensor.camera.found
+        result["control"] = {
+            "points": len(found.rejected), "rejected": int(found.rejected.sum()), "sigma0": found.sigma0,
+            "redundancy": found.redundancy, "correction": args.correction,
+            "parameters": {
+                name: {"change": float(x), "sigma": float(s)}
+                for name, x, s in zip(sensor.camera.names, found.parameters, found.sigma, strict=True)
+            },
+            "corrections": [
+                {"point": k + 1, **{
+                    name: {"correction": float(v[c]), "sigma": float(s[c])}
+                    for c, name in enumerate(("row_px", "column_px", "height_m", "east_m", "north_m"))
+                }}
+                for k, (v, s) in enumerate(zip(found.corrections, found.correction_sigma, strict=True))
+                if not found.rejected[k]
+            ],
+        }  # fmt: skip
     if args.json:
         print(json.dumps(result, indent=2))
         return
@@ -479,6 +534,12 @@ def _tell(
         print(
             f"  control: {len(fit.rejected)} points, {int(fit.rejected.sum())} rejected, sigma0 {fit.sigma0:.2f}, "
             f"shift of lines {line:+.2f} px, of samples {sample:+.2f} px"
+        )
+    if sensor.camera is not None:
+        found, n = sensor.camera.found, len(sensor.camera.names)
+        out = int(found.rejected.sum())
+        print(
+            f"  control: {len(found.rejected)} points, {out} rejected, sigma0 {found.sigma0:.2f}, {n} camera parameters"
         )
     if not args.quiet:
         for note in sensor.notes:

@@ -23,6 +23,7 @@ import numpy as np
 
 from ...solver.camera.sensors import preset
 from ...solver.geometry.ellipsoid import WGS84
+from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import Refraction
 from ...solver.location.uncertainty import Sigmas
@@ -44,6 +45,7 @@ from ...solver.sensitivity.scene_map import SceneMap, scene_map
 from ...solver.sensitivity.study import Study, study
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ..errors import UserError
+from ..formats.frame_json import is_frame_json, read_frame
 from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
@@ -104,8 +106,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenes",
         nargs="*",
         metavar="SCENE",
-        help=f"metadata of a satellite scene, a simulated sensor ({simulated}), bilsat (a frame image) or ads40 "
-        f"({' '.join(_SCENES)})",
+        help=f"metadata of a satellite scene, JSON of a frame camera, a simulated sensor ({simulated}), bilsat (a frame "
+        f"image) or ads40 ({' '.join(_SCENES)})",
     )
     parser.add_argument("--pixel", type=float, nargs=2, metavar=("COLUMN", "ROW"), help="0-based (middle of the image)")
     parser.add_argument("--height", type=float, metavar="M", help="of the ground above the ellipsoid (300)")
@@ -133,10 +135,9 @@ def run(args: argparse.Namespace) -> int:
     for name in (args.csv, args.map_csv, args.page):
         if name:
             refuse_unless_file(Path(name))
-    makers = {"ads40": _aircraft, "bilsat": _frame}
     results, maps = [], []
     for name in args.scenes or _SCENES:
-        scene = makers[name](args) if name in makers else _satellite(args, name)
+        scene = _scene(args, name)
         try:
             found = study(scene.function, scene.inputs, args.runs, args.samples, args.seed)
         except ValueError as error:
@@ -157,6 +158,18 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n\n".join(_as_text(result) for result in results))
     return 0
+
+
+def _scene(args: argparse.Namespace, name: str) -> _Scene:
+    if name == "ads40":
+        return _aircraft(args)
+    path = Path(name)
+    if name == "bilsat":
+        return _frame(args, name, bilsat_camera(), _FRAME_GROUND_M)
+    if path.is_file() and is_frame_json(path):
+        camera, stated = read_frame(path, [])
+        return _frame(args, name, camera, _GROUND_M, Sigmas(stated["position_m"], stated["attitude_rad"]))
+    return _satellite(args, name)
 
 
 def _sigmas(args: argparse.Namespace, usual: tuple[Any, ...], stated: Sigmas | None = None) -> Sigmas:
@@ -217,21 +230,22 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
     )  # fmt: skip
 
 
-def _frame(args: argparse.Namespace) -> _Scene:
+def _frame(
+    args: argparse.Namespace, name: str, camera: FrameCamera, ground_m: float, stated: Sigmas | None = None
+) -> _Scene:
     if args.ccd is not None:
-        raise UserError(f"bilsat: --ccd {args.ccd}, but a frame image has no lines of detectors")
-    camera = bilsat_camera()
+        raise UserError(f"{name}: --ccd {args.ccd}, but a frame image has no lines of detectors")
     if args.refraction:
         camera = camera.with_refraction(Refraction())
-    column, row = _pixel(args, "bilsat", camera.samples, camera.lines)
-    height = _FRAME_GROUND_M if args.height is None else args.height
+    column, row = _pixel(args, name, camera.samples, camera.lines)
+    height = ground_m if args.height is None else args.height
     try:
         function = FramePixel(camera, row, column, height)
     except ValueError as error:
-        raise UserError(f"bilsat: {error}") from None
+        raise UserError(f"{name}: {error}") from None
     return _Scene(
-        "bilsat", {"column": column, "row": row, "height_m": height}, function,
-        camera_inputs(FRAME, _sigmas(args, _FRAME), _FRAME_FOCAL_MM), FRAME,
+        name, {"column": column, "row": row, "height_m": height}, function,
+        camera_inputs(FRAME, _sigmas(args, _FRAME, stated), _FRAME_FOCAL_MM), FRAME,
         lambda column, row: FramePixel(camera, row, column, height), (0.0, camera.lines - 1.0), camera.samples,
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ Array = NDArray[np.floating]
 #: Parameters (d,) and observations (m, p) to conditions (m, c).
 Conditions = Callable[[Array, Array], Array]
 
-#: Iterations end when parameters and corrections change by less than this share of their sigmas.
+#: Last step where nothing else is asked for.
 _CONVERGED = 1e-9
 #: The same for parameters that are held, as a share of their size. Rounding.
 _ROUNDING = 1e-12
@@ -52,6 +52,8 @@ class MixedModel:
     scale : (d,) size of a change of each parameter, for numerical derivatives; None for that of ``start``, or 1
     constraint, value : (q, d) and (q,): ``constraint @ beta = value``
     prior, prior_sigma : (d,) values known beforehand and their sigmas, infinite where nothing is known
+    last_step : iterations end when parameters and corrections change by less than this share of their sigmas; larger
+        where the conditions are computed from numbers with many digits in front, as places on the Earth are
     """
 
     conditions: Conditions
@@ -63,6 +65,7 @@ class MixedModel:
     value: ArrayLike | None = None
     prior: ArrayLike | None = None
     prior_sigma: ArrayLike | None = None
+    last_step: float = _CONVERGED
 
 
 @dataclass(frozen=True)
@@ -193,6 +196,7 @@ class _Checked:
             raise ValueError("sigmas of the prior values, wanted numbers above 0")
         self.prior_weight = np.broadcast_to(1.0 / np.square(spread), d)
         self.prior = self.start if model.prior is None else np.asarray(model.prior, dtype=float)
+        self.last_step = model.last_step
         self.c = self._conditions(self.start, self.l).shape[1]
 
     def _conditions(self, beta: Array, values: Array) -> Array:
@@ -243,10 +247,10 @@ class _Checked:
             C, change = self._normal(N, n, self.value - self.H @ beta)
             k = np.einsum("mce,me->mc", inverse, A @ change + w)
             new_v = -Q * np.einsum("mcp,mc->mp", B, k)
-            moved = np.abs(change) <= _CONVERGED * np.sqrt(np.maximum(np.diag(C), 0.0)) + _ROUNDING * self.scale
+            moved = np.abs(change) <= self.last_step * np.sqrt(np.maximum(np.diag(C), 0.0)) + _ROUNDING * self.scale
             turned = np.abs(new_v - v) / np.where(sigma > 0, sigma, 1.0)
             beta, v = beta + change, new_v
-            if moved.all() and turned.max() < _CONVERGED * 10.0:
+            if moved.all() and turned.max() < self.last_step * 10.0:
                 break
             if not np.isfinite(beta).all():
                 raise ValueError(f"the solution diverged in step {iteration}")

@@ -16,22 +16,12 @@ from numpy.typing import NDArray
 
 from ..estimation.regularisation import Regularisation, Regularised, iterate
 from ..geometry.ellipsoid import WGS84
-from ..geometry.frames import LocalFrame
-from ..geometry.rotation import angles_from_matrix, matrix_from_angles
-from ..location.frame_camera import FrameCamera
 from .comparison import bilsat_camera
+from .frame_parameters import changed, names_of, prior_sigmas
 from .sampled import metres_a_radian
 
 Array = NDArray[np.floating]
 
-#: Parameter -> sigma of what is known of it beforehand: mm, mm^-2 .. mm^-1, rad, m.
-PRIOR = {
-    "f": 0.1, "dx": 0.05, "dy": 0.05, "c": 1e-5, "k1": 1e-5, "k2": 1e-7, "p1": 1e-5, "p2": 1e-5, "omega": 3.5e-4,
-    "phi": 3.5e-4, "kappa": 3.5e-4, "X": 100.0, "Y": 100.0, "Z": 100.0,
-}  # fmt: skip
-#: Those of the second set; latitude and longitude stand for X and Y, in radians.
-TWELVE = ("f", "dx", "dy", "k1", "k2", "p1", "p2", "omega", "phi", "kappa", "lat", "lon")
-_PRIOR_12 = {"lat": 100.0 / 6.37e6, "lon": 100.0 / 6.37e6}
 #: Pixels of the source, counted from 1.
 PIXELS = {"narrow": (950.0, 1000.0, 1050.0), "wide": (1.0, 1024.0, 2048.0)}
 #: Condition numbers that the source gives: without and with fictitious observations.
@@ -50,23 +40,6 @@ _LAST_STEP = 1e-3
 ROUNDING = 1.0 / DIGITS**2
 
 
-def names_of(parameters: int) -> tuple[str, ...]:
-    """Names of 14 or 12 parameters.
-
-    Raises
-    ------
-    ValueError : another number
-    """
-    if parameters not in (14, 12):
-        raise ValueError(f"{parameters} parameters, wanted 14 or 12")
-    return tuple(PRIOR) if parameters == 14 else TWELVE
-
-
-def prior_sigmas(parameters: int) -> Array:
-    """(d,) of the parameters."""
-    return np.array([(PRIOR | _PRIOR_12)[name] for name in names_of(parameters)])
-
-
 def design(parameters: int, line: Array, sample: Array) -> Array:
     """Derivatives (2 n, d) of east and north, metres, of pixels (n,) by the parameters (central differences)."""
     camera = bilsat_camera()
@@ -74,36 +47,10 @@ def design(parameters: int, line: Array, sample: Array) -> Array:
     east, north = metres_a_radian(base[:, 0], base[:, 2], WGS84)
     columns = []
     for name, sigma in zip(names_of(parameters), prior_sigmas(parameters), strict=True):
-        ends = [_changed(camera, name, s * sigma).direct(line, sample, np.full(len(line), HEIGHT_M)) for s in (1, -1)]
+        ends = [changed(camera, name, s * sigma).direct(line, sample, np.full(len(line), HEIGHT_M)) for s in (1, -1)]
         d = (ends[0] - ends[1]) / (2.0 * sigma)
         columns.append(np.concatenate([d[:, 1] * east, d[:, 0] * north]))
     return np.stack(columns, axis=1)
-
-
-def _changed(camera: FrameCamera, name: str, by: float) -> FrameCamera:
-    """The camera with one parameter changed."""
-    C, R = camera.position_e, camera.R_ec
-    lat, lon, h = WGS84.geodetic(C)
-    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
-    f, pixel, principal = camera.focal_length_mm, camera.pixel_mm.copy(), camera.principal_point_mm.copy()
-    lens = camera.distortion.copy()
-    if name in ("omega", "phi", "kappa"):
-        angles = angles_from_matrix(R_el.T @ R)
-        angles[("omega", "phi", "kappa").index(name)] += by
-        R = R_el @ matrix_from_angles(*angles)
-    elif name in ("X", "Y", "Z"):
-        C = C + by * np.eye(3)["XYZ".index(name)]
-    elif name in ("lat", "lon"):
-        C = WGS84.cartesian(lat + by * (name == "lat"), lon + by * (name == "lon"), h)
-    elif name == "f":
-        f += by
-    elif name == "c":
-        pixel = pixel + by
-    elif name in ("dx", "dy"):
-        principal[("dx", "dy").index(name)] += by
-    else:
-        lens[("k1", "k2", "k3", "p1", "p2").index(name)] += by
-    return FrameCamera(C, R, f, pixel, camera.lines, camera.samples, principal_point_mm=principal, distortion=lens)
 
 
 def nine_pixels(where: str) -> tuple[Array, Array]:
@@ -238,7 +185,7 @@ def iterations(parameters: int, where: str, rng: np.random.Generator) -> tuple[i
     def ground(values: Array) -> Array:
         camera = bilsat_camera()
         for name, value in zip(names, values, strict=True):
-            camera = _changed(camera, name, float(value))
+            camera = changed(camera, name, float(value))
         located = camera.direct(line, sample, np.full(len(line), HEIGHT_M))
         return np.concatenate([(located[:, 1] - base[:, 1]) * east, (located[:, 0] - base[:, 0]) * north])
 

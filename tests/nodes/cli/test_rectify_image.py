@@ -240,6 +240,56 @@ def test_a_frame_camera_and_its_sigmas(tmp_path):
     assert np.nanmin(planimetric) > 15.0 and np.nanmax(planimetric) < 30.0 and np.nanmax(np.abs(up - 5.0)) < 1e-3
 
 
+def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
+    """The metadata are off by 0.02 degrees, the control by what is stated, one point by 60 pixels."""
+    truth, meta, rng = tmp_path / "truth.json", tmp_path / "frame.json", np.random.default_rng(2)
+    turned = json.loads(json.dumps(FRAME))
+    turned["exterior"]["omega_phi_kappa_deg"][0] += 0.02
+    truth.write_text(json.dumps(FRAME))
+    meta.write_text(json.dumps(turned))
+    camera, _ = read_frame(truth, [])
+    image = write_image(tmp_path / "frame.tif", np.ones((1, camera.lines, camera.samples), np.float32), nodata=-1.0)
+    line, sample, height = rng.uniform(0, 299, 16), rng.uniform(0, 399, 16), rng.uniform(700, 1100, 16)
+    lat, lon, _ = np.degrees(camera.direct(line, sample, height)).T
+    sample[4] += 60.0
+    noisy = (
+        lon,
+        lat,
+        height + 5.0 * rng.standard_normal(16),
+        sample.clip(0, 399),
+        line + 0.2 * rng.standard_normal(16),
+    )
+    control = tmp_path / "control.csv"
+    control.write_text(
+        "lon_deg,lat_deg,height_m,column,row\n"
+        + "\n".join(",".join(map(repr, map(float, r))) for r in zip(*noisy, strict=True))
+    )
+    args = [
+        "rectify",
+        str(image),
+        "--sensor",
+        str(meta),
+        "--height",
+        "900",
+        "--control",
+        str(control),
+        "--correction",
+        "camera",
+    ]
+    args += ["--pixel-sigma", "0.2", "--height-sigma", "5", "-o", str(tmp_path / "o.tif")]
+    assert main([*args, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["control"]
+    assert found["points"] == 16 and found["rejected"] == 1 and 0.5 < found["sigma0"] < 1.6
+    omega = found["parameters"]["omega"]
+    assert abs(np.degrees(omega["change"]) + 0.02) < 3.5 * np.degrees(omega["sigma"])
+    assert [p["point"] for p in found["corrections"]] == [k for k in range(1, 17) if k != 5]
+    assert all(0 < p["row_px"]["sigma"] < 0.2 for p in found["corrections"])
+    assert main([*args, "--sigma", str(tmp_path / "s.tif")]) == 1
+    assert "--sigma: goes with --correction shift or affine" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main([*args, "-q"]) == 0 and "12 camera parameters" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("way", ["crs", "orbital", "quaternion", "navigation"])
 def test_the_ways_to_state_an_orientation_agree(tmp_path, way):
     from pyproj import Transformer

@@ -70,6 +70,19 @@ def test_a_scene_from_a_file(tmp_path, capsys):
     assert "column 250, row 2000, height 100 m" in text and "by covariance" in text and "across" in text
 
 
+def test_a_frame_camera_of_ones_own(tmp_path, capsys):
+    file = tmp_path / "photo.json"
+    exterior = {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 3300.0, "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
+    interior = {"focal_length_mm": 100.0, "pixel_size_mm": 0.005, "lines": 3000, "samples": 4000}
+    sigma = {"position_m": [0.1, 0.1, 0.2], "attitude_deg": [0.01, 0.01, 0.01]}
+    file.write_text(json.dumps({"interior": interior, "exterior": exterior, "sigma": sigma}))
+    assert main(["study", "sensitivity", str(file), *FEW, "--pixel", "1999.5", "1499.5", "--json"]) == 0
+    scene = json.loads(capsys.readouterr().out)["scenes"][0]
+    parameters = scene["results"]["east"]["parameters"]
+    assert parameters["phi"]["moves_m"] == pytest.approx(3000.0 * 0.01 * 3.14159 / 180.0, rel=1e-3)
+    assert parameters["east"]["moves_m"] == pytest.approx(0.1, rel=1e-3) and len(scene["map"]) == 81
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

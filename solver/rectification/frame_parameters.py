@@ -1,0 +1,176 @@
+"""Parameters of a frame image, interior and exterior, and their estimation from control by the mixed model.
+
+The ground coordinates of a control point are a function of its pixel, its height and the parameters [D 5.20]. Pixel and
+height are observed with random errors, so every condition holds observations and parameters (Gauss-Helmert).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..estimation.mixed_model import MixedModel, MixedSolution, estimate
+from ..geometry.ellipsoid import WGS84
+from ..geometry.frames import LocalFrame
+from ..geometry.rotation import angles_from_matrix, matrix_from_angles
+from ..location.frame_camera import FrameCamera
+from .sampled import metres_a_radian
+
+Array = NDArray[np.floating]
+
+#: Parameter -> sigma of what is known of it beforehand: mm, mm^-2 .. mm^-1, rad, m.
+PRIOR = {
+    "f": 0.1, "dx": 0.05, "dy": 0.05, "c": 1e-5, "k1": 1e-5, "k2": 1e-7, "p1": 1e-5, "p2": 1e-5, "omega": 3.5e-4,
+    "phi": 3.5e-4, "kappa": 3.5e-4, "X": 100.0, "Y": 100.0, "Z": 100.0,
+}  # fmt: skip
+#: Those of the second set; latitude and longitude stand for X and Y, in radians.
+TWELVE = ("f", "dx", "dy", "k1", "k2", "p1", "p2", "omega", "phi", "kappa", "lat", "lon")
+_PRIOR_12 = {"lat": 100.0 / 6.37e6, "lon": 100.0 / 6.37e6}
+#: Size of a change of a parameter, in its sigmas, from which the steps of derivatives follow. Derived: 1e-5 of it moves
+#: the ground by much more than rounding, and by much less than it bends.
+_SCALE = 1e3
+#: Derived: places are known to a nanometre beside the radius of the Earth, which leaves 3e-8 of a sigma.
+_LAST_STEP = 1e-6
+
+
+def names_of(parameters: int) -> tuple[str, ...]:
+    """Names of 14 or 12 parameters.
+
+    Raises
+    ------
+    ValueError : another number
+    """
+    if parameters not in (14, 12):
+        raise ValueError(f"{parameters} parameters, wanted 14 or 12")
+    return tuple(PRIOR) if parameters == 14 else TWELVE
+
+
+def prior_sigmas(parameters: int) -> Array:
+    """(d,) of the parameters."""
+    return np.array([(PRIOR | _PRIOR_12)[name] for name in names_of(parameters)])
+
+
+def changed(camera: FrameCamera, name: str, by: float) -> FrameCamera:
+    """The camera with one parameter changed: a name of `PRIOR` or `TWELVE`, or ``k3``."""
+    C, R = camera.position_e, camera.R_ec
+    lat, lon, h = WGS84.geodetic(C)
+    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+    f, pixel, principal = camera.focal_length_mm, camera.pixel_mm.copy(), camera.principal_point_mm.copy()
+    lens = camera.distortion.copy()
+    if name in ("omega", "phi", "kappa"):
+        angles = angles_from_matrix(R_el.T @ R)
+        angles[("omega", "phi", "kappa").index(name)] += by
+        R = R_el @ matrix_from_angles(*angles)
+    elif name in ("X", "Y", "Z"):
+        C = C + by * np.eye(3)["XYZ".index(name)]
+    elif name in ("lat", "lon"):
+        C = WGS84.cartesian(lat + by * (name == "lat"), lon + by * (name == "lon"), h)
+    elif name == "f":
+        f += by
+    elif name == "c":
+        pixel = pixel + by
+    elif name in ("dx", "dy"):
+        principal[("dx", "dy").index(name)] += by
+    else:
+        lens[("k1", "k2", "k3", "p1", "p2").index(name)] += by
+    return FrameCamera(C, R, f, pixel, camera.lines, camera.samples, principal_point_mm=principal, distortion=lens)
+
+
+@dataclass(frozen=True)
+class FrameFit:
+    """A frame camera as control has it.
+
+    Attributes
+    ----------
+    camera : with the estimated parameters
+    names : of the parameters
+    found : parameters (changes against the start); corrections of line, sample (pixels), height, east and north
+        (metres) with their sigmas, and two columns of zeros; points that the outlier test left out
+    """
+
+    camera: FrameCamera
+    names: tuple[str, ...]
+    found: MixedSolution
+
+
+@dataclass(frozen=True)
+class FrameControl:
+    """Control points of a frame image; m of them.
+
+    Attributes
+    ----------
+    line, sample : (m,) as measured, pixels
+    lat, lon : (m,) radians
+    height_m : (m,) above the ellipsoid
+    """
+
+    line: Array
+    sample: Array
+    lat: Array
+    lon: Array
+    height_m: Array
+
+
+def fit_frame(
+    camera: FrameCamera,
+    control: FrameControl,
+    names: tuple[str, ...],
+    *,
+    pixel_sigma: float,
+    height_sigma_m: float,
+    ground_sigma_m: float,
+    prior_sigma: ArrayLike,
+    constraints: Mapping[str, float] | None = None,
+    snoop: bool = True,
+) -> FrameFit:
+    """Estimate parameters of a frame camera from control with errors in pixel, height and ground coordinates.
+
+    Parameters
+    ----------
+    camera : to start from; its values are what is known beforehand
+    names : of the parameters, see `names_of`
+    pixel_sigma, height_sigma_m, ground_sigma_m : of the observations
+    prior_sigma : (d,) of what is known beforehand, infinite where nothing is
+    constraints : parameter -> change that it has to have
+    snoop : leave out points with corrections that are too large
+
+    Raises
+    ------
+    ValueError : too few points, parameters that are not determined, no convergence, a point without ground
+    """
+    seen = np.isfinite(camera.direct(control.line, control.sample, control.height_m)).all(axis=1)
+    if not seen.all():
+        raise ValueError(f"control point {int(np.argmin(seen))} (counted from 0): its pixel sees no ground")
+    prior = np.asarray(prior_sigma, dtype=float)
+
+    def conditions(beta: Array, observed: Array) -> Array:
+        other = camera
+        for name, value in zip(names, beta, strict=True):
+            other = changed(other, name, float(value))
+        line, sample, height, e, n, lat, lon = observed.T
+        located = other.direct(line, sample, height)
+        east, north = metres_a_radian(lat, height, other.ellipsoid)
+        return np.column_stack([(located[:, 1] - lon) * east - e, (located[:, 0] - lat) * north - n])
+
+    held = constraints or {}
+    matrix = np.array([[float(name == wanted) for name in names] for wanted in held])
+    zero = np.zeros(len(control.line))
+    model = MixedModel(
+        conditions,
+        np.column_stack([control.line, control.sample, control.height_m, zero, zero, control.lat, control.lon]),
+        [pixel_sigma, pixel_sigma, height_sigma_m, ground_sigma_m, ground_sigma_m, 0.0, 0.0],
+        np.zeros(len(names)),
+        np.where(np.isfinite(prior), _SCALE * prior, 1.0),
+        matrix if held else None,
+        list(held.values()) if held else None,
+        np.zeros(len(names)),
+        prior,
+        _LAST_STEP,
+    )
+    found = estimate(model, snoop)
+    for name, value in zip(names, found.parameters, strict=True):
+        camera = changed(camera, name, float(value))
+    return FrameFit(camera, names, found)
