@@ -106,8 +106,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenes",
         nargs="*",
         metavar="SCENE",
-        help=f"metadata of a satellite scene, JSON of a frame camera, a simulated sensor ({simulated}), bilsat (a frame "
-        f"image) or ads40 ({' '.join(_SCENES)})",
+        help=f"metadata of a satellite scene, JSON of a frame camera, a simulated sensor ({simulated}), bilsat (a "
+        f"frame image) or ads40 ({' '.join(_SCENES)})",
     )
     parser.add_argument("--pixel", type=float, nargs=2, metavar=("COLUMN", "ROW"), help="0-based (middle of the image)")
     parser.add_argument("--height", type=float, metavar="M", help="of the ground above the ellipsoid (300)")
