@@ -13,7 +13,7 @@ from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control
-from ...solver.adjustment.reliability import reliability
+from ...solver.adjustment.reliability import Reliability, reliability
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest_correlations
 from ...solver.adjustment.surface_control import SurfaceFit
@@ -388,7 +388,11 @@ def _reliability(result: BatchResult) -> dict[str, Any]:
     """Summary over the image points that take part, line and sample."""
     used = result.solution.ray_weight > 0
     rays = result.rays
-    r = reliability(rays.redundancy[used], rays.sigma_px[used])
+    return reliability_summary(reliability(rays.redundancy[used], rays.sigma_px[used]))
+
+
+def reliability_summary(r: Reliability) -> dict[str, Any]:
+    """Of image points: redundancy numbers and detectable errors, line and sample."""
     found: dict[str, Any] = {}
     for k, name in enumerate(("line", "sample")):
         number, detectable = r.redundancy[:, k], r.detectable[:, k]

@@ -36,6 +36,7 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
+from .adjustment_result import reliability_summary
 from .json_values import plain
 
 Array = NDArray[np.floating]
@@ -394,19 +395,7 @@ def _rejected(a: SceneAdjustment) -> list[dict[str, Any]]:
 def _reliability(a: SceneAdjustment) -> dict[str, Any]:
     """Summary over the image points that take part, line and sample."""
     used = a.solution.ray_weight
-    r = reliability(a.solution.redundancy_numbers[used], a.data.rays.sigma_px[used, None])
-    found: dict[str, Any] = {}
-    for k, name in enumerate(("line", "sample")):
-        number, detectable = r.redundancy[:, k], r.detectable[:, k]
-        finite = detectable[np.isfinite(detectable)]
-        found[name] = {
-            "redundancy_mean": float(number.mean()) if len(number) else None,
-            "redundancy_min": float(number.min()) if len(number) else None,
-            "detectable_px_median": float(np.median(finite)) if len(finite) else None,
-            "detectable_px_max": float(finite.max()) if len(finite) else None,
-            "uncontrolled": int((~np.isfinite(detectable)).sum()),
-        }
-    return found
+    return reliability_summary(reliability(a.solution.redundancy_numbers[used], a.data.rays.sigma_px[used, None]))
 
 
 def _given_w(a: SceneAdjustment, p: int, axis: int) -> float:
