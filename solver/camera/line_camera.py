@@ -123,6 +123,15 @@ class LineCamera:
         return xy - self.principal_point_mm[line], pitch
 
 
+def finest_pixel(camera: LineCamera) -> float:
+    """Angle of the smallest pixel of a camera, radians."""
+    sizes = [
+        float(np.linalg.norm(np.diff(line.xy_mm, axis=0), axis=1).min(initial=np.inf)) / focal
+        for line, focal in zip(camera.lines, camera.focal_length_mm.tolist(), strict=True)
+    ]
+    return min(sizes)
+
+
 def straight_line(
     id: str,
     lens: str,

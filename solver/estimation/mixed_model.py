@@ -17,7 +17,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+
+from ..quantiles import norm
 
 Array = NDArray[np.floating]
 #: Parameters (d,) and observations (m, p) to conditions (m, c).

@@ -230,6 +230,10 @@ class MeasuredTrajectory:
             open_end[mine] = source.open_end(t[mine])
         return MeasuredPoses(Poses(t, *values), covariance, by_smoothed, open_end)
 
+    def angles_at(self, time_s: ArrayLike) -> Array:
+        """Omega, phi, kappa (n, 3) at times (n,) that are covered."""
+        return self.at(time_s).poses.angles
+
     def forget(self, before_s: float) -> None:
         """Drop what is older."""
         for trajectory in (self._filtered, self._smoothed):

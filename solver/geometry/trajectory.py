@@ -40,6 +40,10 @@ class Poses:
     velocity_l: Array
     angle_rate: Array
 
+    def part(self, which: slice) -> Poses:
+        """Some of them."""
+        return Poses(*(value[which] for value in vars(self).values()))
+
     @property
     def R_lc(self) -> Array:
         from .rotation import matrix_from_angles
@@ -97,6 +101,10 @@ class Trajectory:
         """Which times lie inside the trajectory."""
         t = np.asarray(time_s, dtype=float)
         return (t >= self.time_s[0]) & (t <= self.time_s[-1])
+
+    def angles_at(self, time_s: ArrayLike) -> Array:
+        """Omega, phi, kappa (m, 3) at times (m,) inside."""
+        return self.at(time_s).angles
 
     def at(self, time_s: ArrayLike) -> Poses:
         """Pose at times (m,).

@@ -11,12 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from ..geometry.ellipsoid import WGS84, Ellipsoid
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
 
 Array = NDArray[np.floating]
 
@@ -130,6 +134,8 @@ class Refraction:
     @cached_property
     def _content(self) -> CubicHermiteSpline:
         """Integral of the refractivity from the lowest height to a height, m."""
+        from scipy.interpolate import CubicHermiteSpline
+
         h = np.arange(_LOWEST_M, TOP_M + 0.5 * _STEP_M, _STEP_M)
         N = self.atmosphere.refractivity(h)
         between = self.atmosphere.refractivity(0.5 * (h[1:] + h[:-1]))

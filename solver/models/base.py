@@ -68,6 +68,12 @@ class Design:
         padded = np.append(np.asarray(theta, dtype=float), 0.0)  # column -1 reads the zero
         return np.einsum("nk,nkc->nc", self.coefficients, padded[self.columns])
 
+    def joined(self, other: Design, numbers: NDArray[np.int64]) -> Design:
+        """With the corrections of another one of the same rays, whose columns are places in ``numbers``."""
+        own = np.where(other.columns >= 0, numbers[other.columns], -1).astype(np.int32)
+        columns = np.concatenate([self.columns, own], axis=1)
+        return Design(columns, np.concatenate([self.coefficients, other.coefficients], axis=1))
+
     def unknowns(self) -> NDArray[np.int64]:
         """The unknowns (u,) that the corrections depend on, ascending."""
         numbers = np.unique(self.columns)
@@ -203,6 +209,11 @@ class ModelOptions(ABC):
 
     @abstractmethod
     def build(self, extent: Extent) -> CorrectionModel: ...
+
+
+def same(value: float) -> tuple[float, float, float]:
+    """One number for three axes."""
+    return (value, value, value)
 
 
 def three(settings: Mapping[str, object], key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -7,7 +7,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from ..geometry.rotation import matrix_from_quaternion
 from .ephemeris import check_covered, check_nodes
@@ -52,6 +51,8 @@ class SplineAttitude:
     """
 
     def __init__(self, time_s: ArrayLike, quaternion: ArrayLike, *, margin_s: float = 0.0):
+        from scipy.spatial.transform import Rotation, RotationSpline
+
         t, q = np.asarray(time_s, dtype=float), unit_quaternions(quaternion)
         check_nodes(t, q, "attitude", 4)
         self.start_s, self.end_s = float(t[0] - margin_s), float(t[-1] + margin_s)
@@ -67,6 +68,8 @@ class SplineAttitude:
         ------
         ValueError : a time outside
         """
+        from scipy.spatial.transform import Rotation
+
         t = np.asarray(time_s, dtype=float)
         check_covered(t, self.start_s, self.end_s, "the attitude")
         inside = np.clip(t, self._first, self._last)
@@ -106,6 +109,8 @@ class TableAttitude:
     """
 
     def __init__(self, time_s: ArrayLike, quaternion: ArrayLike, *, margin_s: float = 0.0):
+        from scipy.spatial.transform import Rotation, Slerp
+
         t, q = np.asarray(time_s, dtype=float), unit_quaternions(quaternion)
         check_nodes(t, q, "attitude", 4)
         self.start_s, self.end_s = float(t[0] - margin_s), float(t[-1] + margin_s)
@@ -162,6 +167,8 @@ class AnglesAttitude:
         ------
         ValueError : a time outside
         """
+        from scipy.spatial.transform import Rotation
+
         t = np.asarray(time_s, dtype=float)
         check_covered(t, self.start_s, self.end_s, "the attitude")
         k = np.clip(np.searchsorted(self._time, t, side="right") - 1, 0, len(self._time) - 2)

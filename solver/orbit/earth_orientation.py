@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import erfa
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_interp_spline
 
 from .time_scales import iso_utc, julian_dates, tai_from_day
 
@@ -145,6 +144,8 @@ def R_bias() -> Array:
 
 def _celestial_pole(day: float | Array, tt: Array) -> tuple[Array, Array, Array]:
     """X, Y and s of the celestial intermediate pole at Julian dates ``day + tt`` of TT; many by a spline."""
+    from scipy.interpolate import make_interp_spline
+
     if not len(tt):
         return tt, tt, tt
     first = float(np.min(day))

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ..estimation.plane_transforms import fit_transform
 from ..geometry.ellipsoid import WGS84
@@ -269,6 +268,8 @@ def _residuals(
 
 def _moved(camera: FrameCamera, axes: Array, x: Array) -> FrameCamera:
     """The camera shifted by ``x[:3]`` along axes (columns) and turned by ``x[3:]`` about them."""
+    from scipy.spatial.transform import Rotation
+
     R = Rotation.from_rotvec(axes @ x[3:]).as_matrix() @ camera.R_ec
     return camera.with_orientation(camera.position_e + axes @ x[:3], R)
 

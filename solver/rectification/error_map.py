@@ -1,11 +1,7 @@
 """How well an orthoimage's cells are placed: planimetric and height sigma of what is read from them.
 
-A feature appears in the image with an error ``e`` (orientation and measurement), and the height of the terrain model is
-wrong by ``d``. Its ray, moved by ``J e`` over level ground, meets the terrain of slope ``s`` where
-
-    dEN = J e + g dh        dh = s' dEN + d        so that        dh = (s' J e + d) / (1 - s' g)
-
-with ``g`` the way of the ray a metre of height. Where the slope is as steep as the ray, both grow beyond limits.
+A feature appears in the image with an error (orientation and measurement), which moves its ray over level ground; the
+terrain model may be wrong, too. Where the moved ray meets the terrain says `..orthoimage.error_band.on_slope`.
 """
 
 from __future__ import annotations
@@ -17,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipsoid import Ellipsoid
+from ..orthoimage.error_band import on_slope
 from .cell_to_pixel import HeightsOfTile
 from .occlusion import place_slopes
 from .sampled import SomeCells, ground_steps, over_cells
@@ -27,8 +24,6 @@ Array = NDArray[np.floating]
 #: Covariance (n, 2, 2), pixels2, of where points appear, and (n,) variance of their place on the ground, m2 each way,
 #: by lines, samples and heights (n,).
 ImageErrors = Callable[[Array, Array, Array], tuple[Array, Array]]
-#: Smallest 1 - s'g that counts; below it the ray touches the slope.
-LEAST_ANGLE = 0.02
 
 
 def sigmas_of_tile(
@@ -51,18 +46,14 @@ def sigmas_of_tile(
     E[:, 1, 1] += level
     dense = over_cells(cells, np.column_stack([E[:, 0, 0], E[:, 0, 1], E[:, 1, 1], by_height]), shape)
     e00, e01, e11, g0, g1 = np.moveaxis(dense, -1, 0)
-    variance = np.float32(height_sigma_m**2)
+    variance = height_sigma_m**2
     if heights is None or terrain is None:
         planimetric = e00 + e11 + (g0 * g0 + g1 * g1) * variance
         return _root(planimetric), np.full(shape, height_sigma_m, dtype=np.float32)
     M = np.mean(place_slopes(terrain, lat, lon, cells.height_m, ellipsoid), axis=0).astype(np.float32)
     by_row, by_column = slopes(heights.values, heights.row, heights.column)
     s0, s1 = by_row * M[0, 0] + by_column * M[1, 0], by_row * M[0, 1] + by_column * M[1, 1]
-    angle = 1.0 - s0 * g0 - s1 * g1
-    angle = np.where(np.abs(angle) < LEAST_ANGLE, np.float32(np.nan), angle)
-    es0, es1 = e00 * s0 + e01 * s1, e01 * s0 + e11 * s1
-    height = (s0 * es0 + s1 * es1 + variance) / (angle * angle)
-    planimetric = e00 + e11 + 2.0 * (g0 * es0 + g1 * es1) / angle + (g0 * g0 + g1 * g1) * height
+    planimetric, height = on_slope(e00, e01, e11, g0, g1, s0, s1, variance)
     return _root(planimetric), _root(height)
 
 
