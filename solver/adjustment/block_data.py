@@ -87,10 +87,12 @@ class Apriori:
     image_sigma_px : of a line or a sample where the measurement gives none
     trajectory : the ``[trajectory]`` table as written (sigmas of the corrections), what a trajectory model's
         ``from_settings`` takes; a key that is absent gets the model's default
+    then : the ``[trajectory.then]`` table: what the second of two models has of its own
     """
 
     image_sigma_px: float = 0.3
     trajectory: Mapping[str, object] = field(default_factory=dict)
+    then: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+
+from ..quantiles import chi2
 
 Array = NDArray[np.floating]
 #: Source of image measurements (its publisher, may be empty) and CCD line.

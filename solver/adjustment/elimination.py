@@ -97,6 +97,8 @@ def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ra
         used = np.unique(cell[rays])
         columns = np.unique(np.concatenate([cells[k].columns for k in used])) if len(used) else np.empty(0, dtype=int)
         columns = columns[columns >= 0]
+        if layout.n_surface:
+            columns = np.append(columns, layout.shift_column)
         width = len(columns) + 1
         local = np.full(layout.n_unknowns + 1, width - 1)
         local[columns] = np.arange(width - 1)
@@ -105,7 +107,7 @@ def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ra
         place = table[cell[rays]].T + (point[rays] - low) * width
         clusters.append(Cluster(slice(low, high), rays, columns, np.ascontiguousarray(place)))
     cliques = [c.columns for c in clusters if len(c.columns)]
-    structure = find_structure(layout.n_model, layout.n_unknowns, cliques, prior)
+    structure = find_structure(layout.n_of_sets, layout.n_unknowns, cliques, prior)
     return Elimination(
         point, len(first_ray) - 1, by_cell, cell, tuple(cells), tuple(clusters), layout.n_unknowns, structure
     )

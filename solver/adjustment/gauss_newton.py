@@ -159,6 +159,7 @@ class Descent:
             self.converged = converged
         points = self.normals.points
         n = 2 * int((self.weight > 0).sum()) + p.prior.n_observations + p.control.n_observations
+        n += 0 if p.control.surface is None else p.control.surface.n_observations
         u = self.layout.n_unknowns - len(self.factor.undetermined) + int(points.rank.sum())
         return Solution(
             replace(p, layout=self.layout),

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
+from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .adjustment import AdjustmentOptions, Iteration, Problem, Solution, continue_problem, pose_problem, solve
 from .covariance import Cofactors, cofactors
 from .determinability import Limits, Removal
 from .direct_georeferencing import Georeferenced, georeference
 from .network import Control, Network
 from .network_weakness import Combination, undetermined
-from .normal_equations import reduce_normals
+from .normal_equations import Prior, reduce_normals, whiten_prior
 from .normal_matrix import DenseMatrix
 from .parameter_elimination import eliminate, own_information
 from .point_consensus import Doubt, doubts
@@ -26,6 +27,7 @@ from .reliability import CRITICAL_W
 from .robust import WeightFunction, huber
 from .snooping import Rejected, Round, Snooping, image_scale, joint_limit, snoop
 from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
+from .surface_control import SurfaceFit, SurfaceRows, SurfaceShift
 from .variance_components import LEAST_REDUNDANCY, Component, Scales, estimate_components, group_sums, scaled
 
 Array = NDArray[np.floating]
@@ -41,6 +43,10 @@ WARM_TOLERANCE = 1e-9
 
 #: Times that what is left of the noise of poses is looked at.
 NOISE_ROUNDS = 3
+
+#: Readings of a surface at most, and change of a weight, and of a height in sigmas of the surface, from which on it is
+#: read again. Tuned: it is a matter of rounding.
+SURFACE_ROUNDS, SURFACE_STILL = 12, 0.02
 
 #: Re-estimations of the image sigma, each followed by a new search for outliers.
 REWEIGHTINGS = 3
@@ -76,6 +82,7 @@ class Job:
     reweight : re-estimate the image sigma
     components : estimate the sigmas of image, control, position and attitude
     weights, max_iterations : see `AdjustmentOptions`
+    platform : constant errors of the platform that are unknowns
     """
 
     model: ModelOptions
@@ -90,6 +97,7 @@ class Job:
     components: bool = False
     weights: str = "motion"
     max_iterations: int = 30
+    platform: PlatformErrors = NO_PLATFORM_ERRORS
 
     @property
     def options(self) -> AdjustmentOptions:
@@ -120,6 +128,7 @@ class BatchResult:
     groups : number, ``v^T P v`` and redundancy of image, control, position and attitude
     iterations : steps of all adjustments
     doubtful : object points that the rays they kept do not confirm; comparisons leave them out
+    surface : what came of the heights of the surface that points lie on; None without one
     """
 
     stages: tuple[Solution, ...]
@@ -137,6 +146,7 @@ class BatchResult:
     groups: dict[str, tuple[int, float, float]]
     iterations: int
     doubtful: tuple[Doubt, ...] = ()
+    surface: SurfaceFit | None = None
 
     @property
     def solution(self) -> Solution:
@@ -193,7 +203,8 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
 
     Raises
     ------
-    NotAdjustableError : no point is seen twice and nothing is known of any; values beyond all bounds
+    NotAdjustableError : no point is seen twice and nothing is known of any; values beyond all bounds; a surface that
+        has no height below any point
     """
     tell = progress or (lambda event: None)
     _refuse_hopeless(network)
@@ -228,6 +239,7 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
         group_sums(solution, Q),
         outcome.steps,
         doubts(solution, lost, joint_limit(job.critical)),
+        outcome.surface_fit(),
     )
 
 
@@ -242,19 +254,21 @@ class _Stage:
         self.kept: dict[str, str] = {}
         self.components: tuple[Component, ...] = ()
         self.steps = before.steps if before else 0
+        self.free_shift = before.free_shift if before else False
         tell(Phase(f"adjustment, {model.name}"))
         weight, points = None, None
         if before:
             weight, points = before.solution.ray_weight, before.solution.state.points_l
             self.snooping = before.snooping
             problem = continue_problem(before.solution, model)
-            problem = replace(self._adapt(problem), control=before.solution.problem.control)
+            problem = self._adapt(replace(problem, control=before.solution.problem.control), control=False)
         else:
-            problem = pose_problem(network, model, job.self_calibration)
+            problem = pose_problem(network, model, job.self_calibration, job.platform)
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
             start = solve(problem, points, weight, replace(job.options, robust=huber()), tell)
         self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
+        self._read_surface()
         if not before:
             self._state_noise(network, model)
         if self.scales.factor["image"] != 1.0:
@@ -266,7 +280,8 @@ class _Stage:
             left = with_noise_left(network, self.solution)
             if left is None:
                 return
-            problem = pose_problem(left, model, self.job.self_calibration)
+            problem = pose_problem(left, model, self.job.self_calibration, self.job.platform)
+            problem = self._adapt(replace(problem, control=self.solution.problem.control), control=False)
             options = replace(self.job.options, robust=self.job.robust)
             self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
 
@@ -293,6 +308,88 @@ class _Stage:
             if job.snoop:
                 self._snoop()
         self._keep(solve(self.solution.problem, self.solution, self.solution.ray_weight, job.options))
+        self._read_surface()
+
+    def _read_surface(self) -> None:
+        """Put points onto the surface as it is where they are now, until they stay, and see whether its shift agrees.
+
+        Heights of points that stand above it, on trees and houses, lose their weight.
+        """
+        surface = self.solution.network.surface
+        if surface is None:
+            return
+        for _ in range(SURFACE_ROUNDS):
+            before = self.solution
+            points, shift_m = np.where((before.points.rank == 3)[:, None], before.state.points_l, np.nan), self._shift_m
+            rows, known = surface.rows(points, self._on_surface), before.problem.control.surface
+            used = rows.weight > 0
+            if not used.any():
+                raise NotAdjustableError("the surface has no height below any tie point")
+            off = rows.off(points, shift_m)[used]
+            if known is None:  # as a whole it may be anywhere
+                off = off - np.median(off)
+            factor = surface.weights(off, surface.scale_m(off))
+            weight = rows.weight.copy()
+            weight[used] *= factor
+            if known is not None:
+                changed = np.abs(weight - known.weight).max() / surface.sigma_m**-2.0
+                both = used & (known.weight > 0)
+                moved = np.abs(rows.off(points, 0.0) - known.off(points, 0.0))[both].max(initial=0.0)
+                if changed < SURFACE_STILL and moved < SURFACE_STILL * surface.sigma_m:
+                    break
+            self._with_surface(rows.weighed(weight))
+            free = self._surface_shift().free
+            if free != self.free_shift:
+                self.free_shift = free
+                self._with_surface(rows.weighed(weight))
+
+    def _with_surface(self, rows: SurfaceRows) -> None:
+        """Adjust with equations of the surface."""
+        problem = self.solution.problem
+        prior = problem.prior
+        if self.free_shift:
+            prior = prior.without(problem.layout.shift_column)
+        elif problem.prior.n_observations < self._stated_prior.n_observations:
+            prior = self._adapt(replace(problem, prior=self._stated_prior), control=False).prior
+        problem = replace(problem, prior=prior, control=replace(problem.control, surface=rows))
+        self._keep(solve(problem, self.solution, self.solution.ray_weight, self.job.options))
+
+    @property
+    def _stated_prior(self) -> Prior:
+        """A-priori equations as they were stated."""
+        layout = self.solution.layout
+        return whiten_prior(layout.prior, layout.n_unknowns)
+
+    @property
+    def _on_surface(self) -> NDArray[np.bool_]:
+        """Points (p,) that a height of the surface is wanted for: seen twice, without coordinates of their own."""
+        network = self.solution.network
+        wanted = network.rays_per_point >= 2
+        wanted[network.control.point] = wanted[network.check.point] = False
+        return wanted
+
+    @property
+    def _shift_m(self) -> float:
+        return self.solution.layout.shift_of(self.solution.state.theta)
+
+    def _surface_shift(self) -> SurfaceShift:
+        solution, surface = self.solution, self.solution.network.surface
+        assert surface is not None
+        unit = np.zeros(solution.layout.n_unknowns)
+        unit[solution.layout.shift_column] = 1.0
+        variance = float(unit @ solution.factor.solve(unit))
+        return SurfaceShift.of(self._shift_m, variance, surface.shift_sigma_m, self.free_shift)
+
+    def surface_fit(self) -> SurfaceFit | None:
+        """What came of the surface; None without one."""
+        surface, rows = self.solution.network.surface, self.solution.problem.control.surface
+        if surface is None or rows is None:
+            return None
+        points = self.solution.state.points_l
+        known = surface.rows(points, self._on_surface & (self.solution.points.rank == 3))
+        off = np.where(known.weight > 0, known.off(points, self._shift_m), np.nan)
+        weight = rows.weight * surface.sigma_m**2
+        return SurfaceFit(surface.sigma_m, surface.shift_sigma_m, off, weight, self._surface_shift())
 
     def _keep(self, solution: Solution) -> None:
         if not (np.isfinite(solution.cost) and np.isfinite(solution.state.theta).all()):
@@ -300,8 +397,12 @@ class _Stage:
         self.solution = solution
         self.steps += solution.iterations
 
-    def _adapt(self, problem: Problem) -> Problem:
-        return self.scales.apply(problem)
+    def _adapt(self, problem: Problem, control: bool = True) -> Problem:
+        """A problem posed anew with what was found of its a-priori weights, of those of control where wanted."""
+        scaled = self.scales.apply(problem)
+        if self.free_shift:
+            scaled = replace(scaled, prior=scaled.prior.without(problem.layout.shift_column))
+        return scaled if control else replace(scaled, control=problem.control)
 
     def _snoop_with_start(self) -> None:
         """Search from a robust start where one was asked for: what it left out may return."""

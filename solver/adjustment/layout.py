@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.self_calibration import CameraDesign, SelfCalibration
-from ..models.base import CorrectionModel, Extent, ModelOptions, PseudoObservations, join_observations
-from .network import Network
+from ..models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, join_observations
+from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
+from .network import Network, Strip
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
+
+#: The shift of a surface that points lie on, as an unknown in words.
+SURFACE_SHIFT = "shift of the surface"
 
 #: Up to so many rays all terms of the corrections are formed at once.
 FEW_RAYS = 512
@@ -71,11 +75,13 @@ class Layout:
     coefficients : (K, n)
     camera : effect of the additional parameters, where they act on the rays (`linearisation.fit_rays`; before there is
         a solution, at the measured coordinates); columns counted from `n_model`; None without self-calibration
-    n_model, n_camera : numbers of unknowns
-    names : (n_model + n_camera,) in words
+    n_model, n_camera : numbers of unknowns; those of the model count the platform's, which come last of these
+    names : (n_unknowns,) in words
     prior : a-priori knowledge of all unknowns
     heading : kappa's correction is one of heading, about the vertical: it turns the measured omega and phi as well
     shift : of the rays to where they are linearised; None if that is where they were measured
+    n_surface : 1 where points lie on a surface, whose shift is the last unknown; else 0
+    platform : constant errors of the platform among the unknowns; their terms come last
     """
 
     sets: tuple[CorrectionSet, ...]
@@ -91,10 +97,31 @@ class Layout:
     prior: PseudoObservations
     heading: bool = False
     shift: RayShift | None = None
+    n_surface: int = 0
+    platform: PlatformErrors = NO_PLATFORM_ERRORS
+
+    @property
+    def n_of_sets(self) -> int:
+        """Number of unknowns of the correction sets."""
+        return self.n_model - self.platform.n_unknowns
+
+    @property
+    def platform_columns(self) -> IntArray:
+        """(m,) of the platform's unknowns."""
+        return np.arange(self.n_of_sets, self.n_model)
 
     @property
     def n_unknowns(self) -> int:
+        return self.n_model + self.n_camera + self.n_surface
+
+    @property
+    def shift_column(self) -> int:
+        """Column of the shift of the surface that points lie on."""
         return self.n_model + self.n_camera
+
+    def shift_of(self, theta: Array) -> float:
+        """Shift of the surface, m; 0 without one."""
+        return float(theta[self.shift_column]) if self.n_surface else 0.0
 
     def corrections(self, theta: Array, rays: slice = slice(None)) -> Array:
         """Orientation corrections (6, n) of the rays, or of a range of them."""
@@ -120,8 +147,13 @@ class Layout:
         return replace(self, camera=replace(self.camera, coefficients=coefficients), shift=shift)
 
 
-def build_layout(network: Network, options: ModelOptions, self_calibration: SelfCalibration | None = None) -> Layout:
-    """Correction sets for all strips (and lenses) that have rays, additional parameters behind them."""
+def build_layout(
+    network: Network,
+    options: ModelOptions,
+    self_calibration: SelfCalibration | None = None,
+    platform: PlatformErrors = NO_PLATFORM_ERRORS,
+) -> Layout:
+    """Correction sets for all strips (and lenses) that have rays, then the platform, then additional parameters."""
     rays = network.rays
     lens = network.camera.lens_of_line[rays.ccd]
     separate = len(network.camera.lenses) > 1
@@ -149,10 +181,23 @@ def build_layout(network: Network, options: ModelOptions, self_calibration: Self
         model = options.build(extent)
         sets.append(CorrectionSet(strip_index, lens_index, model, first))
         first += model.n_unknowns
-    node, component, columns, coefficients = _terms(sets, set_of_ray, rays.time_s)
+    designs = [(np.flatnonzero(set_of_ray == s), item) for s, item in enumerate(sets)]
+    parts = [(mine, item.first_column, item.model.design(rays.time_s[mine])) for mine, item in designs]
+    node, component, columns, coefficients = _terms(parts, len(rays))
     camera = None
     names = [name for s in sets for name in s.model.unknown_names]
     prior = [_shifted(s.model.pseudo_observations(), s.first_column) for s in sets]
+    if platform.n_unknowns:
+        own = [
+            (mine, first, platform_design(network.strips[item.strip], rays.time_s[mine], platform, network.heading))
+            for mine, item in designs
+        ]
+        more = _terms(own, len(rays))
+        node, component = np.append(node, len(coefficients) + more[0]), np.append(component, more[1])
+        columns, coefficients = np.concatenate([columns, more[2]]), np.concatenate([coefficients, more[3]])
+        names += platform.unknown_names
+        prior.append(_shifted(platform.pseudo_observations(), first))
+        first += platform.n_unknowns
     if self_calibration is not None and self_calibration.n_unknowns:
         camera = self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
         names += self_calibration.unknown_names
@@ -166,6 +211,12 @@ def build_layout(network: Network, options: ModelOptions, self_calibration: Self
                 self_calibration.unknown_names,
             )
         )
+    n_camera = len(names) - first
+    if network.surface is not None:
+        names.append(SURFACE_SHIFT)
+        sigma = np.array([network.surface.shift_sigma_m])
+        column = np.array([[first + n_camera]], dtype=np.int32)
+        prior.append(PseudoObservations(column, np.ones((1, 1)), np.zeros(1), sigma, (SURFACE_SHIFT,)))
     return Layout(
         tuple(sets),
         set_of_ray.astype(np.int64),
@@ -175,20 +226,29 @@ def build_layout(network: Network, options: ModelOptions, self_calibration: Self
         coefficients,
         camera,
         first,
-        len(names) - first,
+        n_camera,
         tuple(names),
         join_observations(prior),
         network.heading,
+        n_surface=int(network.surface is not None),
+        platform=platform,
     )
 
 
-def _terms(sets: Sequence[CorrectionSet], set_of_ray: IntArray, time_s: Array):
-    """Terms (node, component) that any ray has, their columns (T, n) and the coefficients (K, n)."""
-    n = len(time_s)
-    designs = []
-    for s, item in enumerate(sets):
-        mine = np.flatnonzero(set_of_ray == s)
-        designs.append((mine, item.first_column, item.model.design(time_s[mine])))
+def platform_design(strip: Strip, time_s: Array, platform: PlatformErrors, heading: bool) -> Design:
+    """Corrections of a strip at times (n,) by constant errors of the platform, columns counted from 0."""
+    return platform.design(strip.trajectory.at(time_s), strip.trajectory, heading)
+
+
+def _terms(
+    designs: Sequence[tuple[IntArray, int, Design]], n: int
+) -> tuple[IntArray, IntArray, NDArray[np.int32], Array]:
+    """Terms (node, component) that any of n rays has, their columns (T, n) and the coefficients (K, n).
+
+    Parameters
+    ----------
+    designs : places of rays, first of their columns, and their design
+    """
     nodes = max(d.coefficients.shape[1] for _, _, d in designs)
     present = np.zeros((nodes, 6), dtype=bool)
     for _, _, d in designs:

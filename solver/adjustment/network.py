@@ -13,6 +13,7 @@ from ..camera.line_camera import LineCamera
 from ..geometry.ray_intersection import intersect_rays
 from ..geometry.rotation import matrix_from_angles
 from ..geometry.trajectory import Trajectory, noise_between
+from .surface_control import SurfaceControl
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -163,6 +164,7 @@ class Network:
     check : coordinates to compare with; their rays take part as those of tie points
     refused : rays left out when the network was built: (place in the caller's arrays, reason)
     heading : the attitude comes from an inertial system, so that an error of kappa is one of heading (`Layout.heading`)
+    surface : on which points without given coordinates lie; None for none
     """
 
     camera: LineCamera
@@ -175,6 +177,7 @@ class Network:
     check: Control
     refused: tuple[tuple[int, str], ...] = ()
     heading: bool = False
+    surface: SurfaceControl | None = None
 
     @property
     def n_points(self) -> int:

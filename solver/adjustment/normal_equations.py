@@ -20,6 +20,7 @@ from .linearisation import Linearisation
 from .network import Control
 from .normal_matrix import NormalMatrix
 from .reliability import normalised_residuals
+from .surface_control import SurfaceRows
 
 Array = NDArray[np.floating]
 
@@ -49,6 +50,12 @@ class Prior:
         """Whitened residuals (m,)."""
         return self.value - self.matrix @ theta
 
+    def without(self, column: int) -> Prior:
+        """Without the equations of an unknown, which is free then."""
+        keep = np.flatnonzero(np.asarray(abs(self.matrix[:, [column]]).sum(axis=1)).ravel() == 0.0)
+        matrix = csr_array(self.matrix[keep])
+        return Prior(matrix, self.value[keep], csr_array(matrix.T @ matrix))
+
 
 def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
     """Sparse matrix and right-hand side of the pseudo-observations that carry weight."""
@@ -63,11 +70,15 @@ def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
 
 @dataclass(frozen=True)
 class ControlWeights:
-    """Weights (p, 3) and target coordinates (p, 3) of all points; weight 0 where nothing is given."""
+    """Weights (p, 3) and target coordinates (p, 3) of all points; weight 0 where nothing is given.
+
+    ``surface``: equations of points that lie on a surface, None if there is none.
+    """
 
     weight: Array
     xyz_l: Array
     n_observations: int
+    surface: SurfaceRows | None = None
 
     def residual(self, points_l: Array) -> Array:
         """Whitened (p, 3): given minus estimated."""
@@ -99,11 +110,13 @@ class PointNormals:
     inverse_factor : (6, p) lower triangle 00, 10, 11, 20, 21, 22; rows of undetermined directions are zero
     y : (3, p)
     rank : (p,) number of determined directions
+    surface : (3, p) coupling of each point to the shift of the surface it lies on, times the inverse factor
     """
 
     inverse_factor: Array
     y: Array
     rank: NDArray[np.int64]
+    surface: Array | None = None
 
     def back(self, t: Array) -> Array:
         """``L^-T t`` for (3, p)."""
@@ -142,9 +155,15 @@ class Reduced:
 
 
 def point_normals(
-    lin: Linearisation, index: NDArray[np.int64], p: int, control: ControlWeights, points_l: Array, damping: float = 0.0
+    lin: Linearisation,
+    index: NDArray[np.int64],
+    p: int,
+    control: ControlWeights,
+    points_l: Array,
+    damping: float = 0.0,
+    shift_m: float = 0.0,
 ) -> PointNormals:
-    """Normal matrices of p points, factorised; ``index`` (n,) is the point of each ray."""
+    """Normal matrices of p points, factorised; ``index`` (n,) is the point of each ray, ``shift_m`` of the surface."""
     j, r = lin.point, lin.residual
 
     def total(values: Array) -> Array:
@@ -154,6 +173,11 @@ def point_normals(
     v = [total(j[0, a] * j[0, b] + j[1, a] * j[1, b]) for a, b in pairs]
     g = np.stack([total(j[0, a] * r[0] + j[1, a] * r[1]) for a in range(3)])
     g += (control.weight * (control.xyz_l - points_l)).T
+    surface, m = control.surface, np.empty((3, 0))
+    if surface is not None:
+        m = surface.normal.T * surface.weight
+        v = [own + m[a] * surface.normal[:, b] for own, (a, b) in zip(v, pairs, strict=True)]
+        g += m * np.where(surface.weight > 0, surface.off(points_l, shift_m), 0.0)
     for axis, diagonal in enumerate((0, 2, 5)):
         v[diagonal] = (v[diagonal] + control.weight[:, axis]) * (1.0 + damping)
 
@@ -171,7 +195,10 @@ def point_normals(
     d = -(l20 * a + l21 * b) * f
     y = np.stack([a * g[0], b * g[0] + c * g[1], d * g[0] + e * g[1] + f * g[2]])
     rank = good_a.astype(np.int64) + good_c + good_f
-    return PointNormals(np.stack([a, b, c, d, e, f]), y, rank)
+    of_shift = None
+    if surface is not None:
+        of_shift = np.stack([a * m[0], b * m[0] + c * m[1], d * m[0] + e * m[1] + f * m[2]])
+    return PointNormals(np.stack([a, b, c, d, e, f]), y, rank, of_shift)
 
 
 def reduce_normals(
@@ -192,10 +219,15 @@ def reduce_normals(
     matrix.add_sparse(prior.normal)
     rhs = prior.matrix.T @ prior.residual(theta)
     add_cells(matrix, rhs, lin, layout, elimination)
+    surface, shift_m = control.surface, layout.shift_of(theta)
+    if surface is not None:
+        place = np.array([layout.shift_column])
+        matrix.add(place, np.array([[surface.weight.sum()]]))
+        rhs[place] += np.sqrt(surface.weight) @ surface.residual(points_l, shift_m)
     if damping:
         matrix.damp(damping)
     matrix.keep_scale()
-    points = point_normals(lin, elimination.point, elimination.n_points, control, points_l, damping)
+    points = point_normals(lin, elimination.point, elimination.n_points, control, points_l, damping, shift_m)
     for cluster, D in couplings(lin, layout, elimination, points):
         rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
         block = D.T @ D
@@ -235,13 +267,20 @@ def _add_batch(
         np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
     J[:, T:-1] = lin.camera.take(rays, axis=2)
     J[:, -1] = lin.residual.take(rays, axis=1)
+    m, first = layout.platform.n_unknowns, T
+    if m:  # an unknown of the platform acts on several components: its terms, one after the other, are one
+        first = T - int(np.isin(layout.columns[:, 0], layout.platform_columns).sum())
+        ends = np.searchsorted(layout.columns[first:, 0], layout.platform_columns)
+        sums = np.add.reduceat(J[:, first:T], ends, axis=1)
+        J = np.concatenate([J[:, :first], sums, J[:, T:]], axis=1)
     for cell in batch:
         x, y = J[:, :, cell.low - low : cell.high - low]
         block = x @ x.T + y @ y.T
-        used = np.flatnonzero(cell.columns >= 0)
-        columns = cell.columns[used]
+        of_terms = np.concatenate([cell.columns[:first], layout.platform_columns, cell.columns[T:]])
+        used = np.flatnonzero(of_terms >= 0)
+        columns = of_terms[used]
         rhs[columns] += block[used, -1]
-        matrix.add(columns, block[np.ix_(used, used)] if len(used) < T + slots else block[:-1, :-1])
+        matrix.add(columns, block[np.ix_(used, used)] if len(used) < len(of_terms) else block[:-1, :-1])
 
 
 def couplings(
@@ -258,7 +297,11 @@ def couplings(
         terms = _coupling_terms(lin, layout, points, elimination.point, rays)
         for cluster in clusters[first:last]:
             own = terms[:, :, cluster.rays.start - rays.start : cluster.rays.stop - rays.start]
-            yield cluster, _coupling(own, cluster)
+            D = _coupling(own, cluster)
+            if points.surface is not None:
+                place = int(np.searchsorted(cluster.columns, layout.shift_column))
+                D.reshape(3, cluster.n_points, -1)[:, :, place] += points.surface[:, cluster.points]
+            yield cluster, D
         first = last
 
 
@@ -311,4 +354,6 @@ def back_substitute(
     t = [np.bincount(index, lin.point[0, a] * change[0] + lin.point[1, a] * change[1], p) for a in range(3)]
     a, b, c, d, e, f = points.inverse_factor
     rest = points.y - np.stack([a * t[0], b * t[0] + c * t[1], d * t[0] + e * t[1] + f * t[2]])
+    if points.surface is not None:
+        rest -= points.surface * layout.shift_of(d_theta)
     return points.back(rest).T

@@ -49,8 +49,9 @@ def gather_evidence(solution: Solution) -> Evidence:
     cross = np.concatenate([Q[:first], to_points.reshape(-1, m)])
     strongest, r = strongest_correlations(cross, np.concatenate([solution.factor.variances()[:first], of_points]), q)
     sigma0 = solution.sigma0 if solution.redundancy > 0 else 1.0
+    names = layout.names[first : first + m]
     return Evidence(
-        layout.names[first:],
+        names,
         solution.camera_parameters,
         Q[columns],
         _pivots(solution, q),
@@ -60,7 +61,7 @@ def gather_evidence(solution: Solution) -> Evidence:
         sigma0,
         max(solution.redundancy, 0),
         ground_sample_distance(solution.network),
-        ranks(layout.names[first:], solution.network.camera),
+        ranks(names, solution.network.camera),
     )
 
 
@@ -99,9 +100,9 @@ def without(solution: Solution, name: str, options: AdjustmentOptions, adapt: Ca
     old = solution.problem
     assert old.self_calibration is not None
     smaller = old.self_calibration.without([name])
-    problem = adapt(pose_problem(old.network, old.model, smaller if smaller.n_unknowns else None))
+    problem = adapt(pose_problem(old.network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
     problem = replace(problem, control=old.control, earlier=old.earlier)
-    place = old.layout.n_model + old.layout.names[old.layout.n_model :].index(name)
+    place = old.layout.names.index(name, old.layout.n_model)
     start = State(np.delete(solution.state.theta, place), solution.state.points_l)
     return solve(problem, start, solution.ray_weight, options)
 
@@ -119,16 +120,20 @@ def own_information(solution: Solution) -> Array:
         of_ray = layout.camera.columns[layout.camera.pattern]
         squares = np.einsum("csn,csn->sn", lin.camera, lin.camera) * weight
         for s in range(of_ray.shape[1]):
-            own[layout.n_model :] += np.bincount(of_ray[:, s] + 1, squares[s], layout.n_camera + 1)[1:]
+            of_camera = own[layout.n_model : layout.n_model + layout.n_camera]
+            of_camera += np.bincount(of_ray[:, s] + 1, squares[s], layout.n_camera + 1)[1:]
+    if layout.n_surface and solution.problem.control.surface is not None:
+        own[layout.shift_column] = solution.problem.control.surface.weight.sum()
     return own
 
 
 def _pivots(solution: Solution, q: Array) -> Array:
     """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where singular."""
-    own = own_information(solution)[solution.layout.n_model :]
+    parameters = slice(solution.layout.n_model, solution.layout.n_model + len(q))
+    own = own_information(solution)[parameters]
     pivot = np.divide(1.0, own * q, out=np.ones_like(q), where=(own > 0) & (q > 0))
     pivot[own == 0] = 0.0
-    null = np.abs(solution.factor.undetermined.vectors[solution.layout.n_model :])
+    null = np.abs(solution.factor.undetermined.vectors[parameters])
     pivot[(null > 0.3).any(axis=1)] = 0.0
     return np.minimum(pivot, 1.0)
 
@@ -143,10 +148,10 @@ def _partners(solution: Solution, strongest: NDArray[np.int64]) -> tuple[str, ..
     ]
     null = solution.factor.undetermined.vectors
     for i in range(m):  # where the system is singular, what the parameter cannot be told from
-        own = np.abs(null[len(names) - m + i])
+        own = np.abs(null[first + i])
         if own.max(initial=0.0) > 0.3:
             part = np.abs(null[:, int(np.argmax(own))])
-            part[len(names) - m + i] = 0.0
+            part[first + i] = 0.0
             members = [k for k in np.argsort(-part, kind="stable")[:3] if part[k] > PART]
             partner[i] = describe(tuple(names[k] for k in members), 0) if members else "nothing"
     return tuple(partner)

@@ -13,8 +13,8 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from ..quantiles import chi2
 from .adjustment import Solution
 from .linearisation import linearise
 
@@ -84,7 +84,7 @@ def consensus(residual: Array, design: Array, limit: float) -> Consensus | None:
         return None
     best = min(found, key=lambda rays: (-len(rays), found[rays][0]))
     _, shift, Q = found[best]
-    apart = float(stats.chi2.isf(stats.chi2.sf(limit, 2), 3))
+    apart = float(chi2.isf(chi2.sf(limit, 2), 3))
     rival = any(
         len(rays) == len(best) and _distance(other[1] - shift, Q + other[2]) > apart
         for rays, other in found.items()

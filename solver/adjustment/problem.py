@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
+from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .elimination import Elimination, plan_elimination
 from .layout import Layout, build_layout
 from .linearisation import Linearisation, Whitening, corrected
@@ -140,12 +141,18 @@ class Solution:
     @property
     def camera_parameters(self) -> Array:
         """(n_camera,) estimated additional parameters."""
-        return self.state.theta[self.layout.n_model :]
+        first = self.layout.n_model
+        return self.state.theta[first : first + self.layout.n_camera]
 
 
-def pose_problem(network: Network, model: ModelOptions, self_calibration: SelfCalibration | None = None) -> Problem:
+def pose_problem(
+    network: Network,
+    model: ModelOptions,
+    self_calibration: SelfCalibration | None = None,
+    platform: PlatformErrors = NO_PLATFORM_ERRORS,
+) -> Problem:
     """Unknowns, priors and elimination plan of a network."""
-    layout = build_layout(network, model, self_calibration)
+    layout = build_layout(network, model, self_calibration, platform)
     network = _with_left_out(network, layout)
     prior = whiten_prior(layout.prior, layout.n_unknowns)
     return Problem(
@@ -187,11 +194,16 @@ def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
     refined = _with_left_out(old.network, old.layout, -1.0)
     position, angles = corrected(rays, old.layout, correction)
     refined = refined.with_orientation(position.T, angles.T)
-    return replace(pose_problem(refined, model, old.self_calibration), earlier=(*old.earlier, solution))
+    problem = pose_problem(refined, model, old.self_calibration, old.layout.platform)
+    return replace(problem, earlier=(*old.earlier, solution))
 
 
 def cost_of(problem: Problem, state: State, lin: Linearisation) -> float:
     """Sum of squared whitened residuals of rays, control and a-priori observations."""
     prior = problem.prior.residual(state.theta)
     control = problem.control.residual(state.points_l)
-    return float(np.vdot(lin.residual, lin.residual) + prior @ prior + np.vdot(control, control))
+    cost = float(np.vdot(lin.residual, lin.residual) + prior @ prior + np.vdot(control, control))
+    if problem.control.surface is not None:
+        surface = problem.control.surface.residual(state.points_l, problem.layout.shift_of(state.theta))
+        cost += float(surface @ surface)
+    return cost

@@ -13,8 +13,8 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
+from ..quantiles import norm
 from .reliability import noncentrality
 
 Array = NDArray[np.floating]

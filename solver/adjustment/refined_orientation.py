@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..models.base import Design
 from .adjustment import Solution
-from .layout import CorrectionSet
+from .layout import CorrectionSet, platform_design
 
 Array = NDArray[np.floating]
 
@@ -28,28 +29,33 @@ def corrections_at(solution: Solution, strip: int, time_s: ArrayLike, lens: int 
     total = np.zeros((len(np.asarray(time_s)), 6))
     for stage in (*solution.problem.earlier, solution):
         found = find_set(stage, strip, lens)
-        total += found.model.evaluate(stage.state.theta[found.columns], time_s)
+        total += design_at(stage, found, time_s).evaluate(stage.state.theta)
     return total
 
 
 def correction_cofactors(solution: Solution, strip: int, time_s: ArrayLike, lens: int | None = None) -> Array:
     """Cofactors (n, 6, 6) of the corrections at times (n,), of the last model; m and rad, for sigma0 = 1."""
     found = find_set(solution, strip, lens)
-    design = found.model.design(time_s)
-    n, nodes = design.coefficients.shape
-    result = np.zeros((n, 6, 6))
-    _, group = np.unique(design.columns.reshape(n, -1), axis=0, return_inverse=True)
+    design = design_at(solution, found, time_s)
+    columns, coefficients = design.columns, design.coefficients
+    result = np.zeros((len(columns), 6, 6))
+    _, group = np.unique(columns.reshape(len(columns), -1), axis=0, return_inverse=True)
     for g in range(int(group.max(initial=-1)) + 1):
         mine = np.flatnonzero(group == g)
-        columns = design.columns[mine[0]].astype(np.int64)
-        present = np.flatnonzero(columns.ravel() >= 0)
-        own = columns.ravel()[present]
-        Q = np.zeros((nodes * 6, nodes * 6))
-        Q[np.ix_(present, present)] = solution.factor.cofactors(own + found.first_column)
-        by_node = Q.reshape(nodes, 6, nodes, 6)
-        a = design.coefficients[mine]
-        result[mine] = np.einsum("nk,kcld,nl->ncd", a, by_node, a, optimize=True)
+        numbers, A = Design(columns[mine], coefficients[mine]).functions()
+        result[mine] = (A @ solution.factor.cofactors(numbers)) @ np.swapaxes(A, 1, 2)
     return result
+
+
+def design_at(solution: Solution, of: CorrectionSet, time_s: ArrayLike) -> Design:
+    """Corrections of a set at times (n,) with those of the platform, by the columns of all unknowns."""
+    design, layout = of.model.design(time_s), solution.layout
+    design = Design(np.where(design.columns >= 0, design.columns + of.first_column, -1), design.coefficients)
+    if layout.platform.n_unknowns:
+        strip = solution.network.strips[of.strip]
+        own = platform_design(strip, np.asarray(time_s, dtype=float), layout.platform, layout.heading)
+        design = design.joined(own, layout.platform_columns)
+    return design
 
 
 def find_set(solution: Solution, strip: int, lens: int | None = None) -> CorrectionSet:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+
+from ..quantiles import norm
 
 Array = NDArray[np.floating]
 
@@ -22,7 +23,7 @@ UNCONTROLLED = 1e-6
 
 def noncentrality(critical: float = CRITICAL_W, power: float = POWER) -> float:
     """``delta_0``: shift of a normalised residual that a test with this critical value finds with this power (4.13)."""
-    return critical + float(stats.norm.ppf(power))
+    return critical + float(norm.ppf(power))
 
 
 def normalised_residuals(v: ArrayLike, redundancy_numbers: ArrayLike) -> Array:

@@ -17,8 +17,8 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from ..quantiles import chi2, norm
 from .adjustment import AdjustmentOptions, Solution, solve
 from .covariance import Cofactors, cofactors
 from .normal_equations import weigh_control
@@ -93,7 +93,7 @@ class Snooping:
 @cache
 def joint_limit(critical: float) -> float:
     """Limit of the joint test value of line and sample with the same error probability as one |w| (13.8 for 3.29)."""
-    return float(stats.chi2.isf(2.0 * stats.norm.sf(critical), 2))
+    return float(chi2.isf(2.0 * norm.sf(critical), 2))
 
 
 def failing_w(largest_w: Array, joint: Array, critical: float) -> Array:

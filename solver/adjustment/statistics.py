@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+
+from ..quantiles import chi2, fisher, student
 
 Array = NDArray[np.floating]
 
@@ -47,7 +48,7 @@ def global_test(weighted_squares: float, redundancy: int, alpha: float = ALPHA) 
         raise ValueError(f"v^T P v and redundancy cannot be negative, got {weighted_squares} and {redundancy}")
     if redundancy == 0:
         return GlobalTest(1.0, 0, 0.0, np.inf)
-    low, high = np.sqrt(stats.chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy) / redundancy)
+    low, high = np.sqrt(chi2.ppf([alpha / 2, 1 - alpha / 2], redundancy) / redundancy)
     return GlobalTest(float(np.sqrt(weighted_squares / redundancy)), redundancy, float(low), float(high))
 
 
@@ -128,7 +129,7 @@ def mean_sigma(sigma_m: ArrayLike) -> Array:
 
 def student_limit(redundancy: int, alpha: float = ALPHA) -> float:
     """Two-sided critical value of Student's t."""
-    return float(stats.t.ppf(1 - alpha / 2, max(redundancy, 1)))
+    return float(student.ppf(1 - alpha / 2, max(redundancy, 1)))
 
 
 def fisher_value(values: ArrayLike, cofactors: ArrayLike, sigma0: float) -> float:
@@ -147,7 +148,7 @@ def fisher_value(values: ArrayLike, cofactors: ArrayLike, sigma0: float) -> floa
 
 def fisher_limit(k: int, redundancy: int, alpha: float = ALPHA) -> float:
     """Critical value of F(k, redundancy)."""
-    return float(stats.f.ppf(1 - alpha, k, max(redundancy, 1)))
+    return float(fisher.ppf(1 - alpha, k, max(redundancy, 1)))
 
 
 def correlations(covariance: ArrayLike) -> Array:

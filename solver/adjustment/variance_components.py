@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.stats import chi2
 
 from ..models.base import ERROR_GROUPS, error_groups
+from ..quantiles import chi2
 from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
-from .covariance import Cofactors, cofactors
+from .covariance import Cofactors, cofactors, point_unknown_cofactors
 from .linearisation import Whitening
 from .normal_equations import Prior
 
@@ -96,13 +96,13 @@ def prior_groups(problem: Problem) -> dict[str, NDArray[np.int64]]:
     """Rows of the a-priori equations that belong to each group of slow errors, by the words of their labels."""
     given = problem.layout.prior
     labels = [label for label, s in zip(given.labels, given.sigma, strict=True) if np.isfinite(s)]
-    of_model = given.columns[np.isfinite(given.sigma)].max(axis=1) < problem.layout.n_model
+    of_model = given.columns[np.isfinite(given.sigma)].max(axis=1) < problem.layout.n_of_sets
     group = error_groups(labels)
     return {name: np.flatnonzero(of_model & (group == g)) for g, name in enumerate(ERROR_GROUPS)}
 
 
 def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float, float]]:
-    """Number, ``v^T P v`` and redundancy of each group in a solution."""
+    """Number, ``v^T P v`` and redundancy of each group in a solution, and of the surface that points lie on, if any."""
     problem, weight = solution.problem, solution.ray_weight
     v = solution.linearisation.residual
     trace = np.einsum("nii->n", of.observed)
@@ -122,6 +122,14 @@ def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float,
     r = 1.0 - _row_variances(solution)
     for group, rows in prior_groups(problem).items():
         result[group] = (len(rows), float(e[rows] @ e[rows]), float(r[rows].sum()))
+    if (surface := control.surface) is not None:
+        shift = solution.layout.shift_column
+        v = surface.residual(solution.state.points_l, float(solution.state.theta[shift]))
+        across = point_unknown_cofactors(solution, np.array([shift]))[:, :, 0]
+        adjusted = np.einsum("pi,pij,pj->p", surface.normal, of.points, surface.normal) + of.unknowns[shift]
+        adjusted += 2.0 * np.einsum("pi,pi->p", surface.normal, across)
+        left = np.where(surface.weight > 0, 1.0 - surface.weight * adjusted, 0.0)
+        result["surface"] = (surface.n_observations, float(v @ v), float(left.sum()))
     return result
 
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ..camera.line_camera import CcdLine, Lens, LineCamera
 from ..camera.self_calibration import SelfCalibration
@@ -340,6 +339,8 @@ def camera_effect(calibration: Calibration, look_b: Array, sample: Array) -> Arr
 
 def _corrected(pose: FixedPoses, six: Array, track_e: Array, axes_b: Array) -> FixedPoses:
     """Poses with corrections (n, 6) of position and attitude."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_rotvec(six[:, 3:] @ axes_b.T).as_matrix()
     position = pose.position_e + np.einsum("nij,nj->ni", track_e, six[:, :3])
     return replace(pose, position_e=position, R_eb=pose.R_eb @ turn)

@@ -107,7 +107,7 @@ def test_direct_georeferencing_with_continuity_constraints():
 
 @pytest.mark.parametrize("self_calibration", [False, True])
 def test_errors_of_points_and_sigma0_fit_what_is_stated(self_calibration):
-    """RMSE over theoretical sigma near 1, sigma0 inside its chi-square band; the long version is `study testfields`."""
+    """RMSE over theoretical sigma near 1, sigma0 in its chi-square band; the long version is `study consistency`."""
     squares, stated, outside = np.zeros(3), np.zeros(3), 0
     true = {"k1": 2e-6, "xp_F": 0.004, "yp_B": -0.003, "sy_F": 1e-4} if self_calibration else {}
     parameters = tls(CAMERA) if self_calibration else None
