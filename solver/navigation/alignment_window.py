@@ -216,6 +216,31 @@ def _linearised(
     return np.concatenate([model, v0 + x]), np.concatenate([J, Jv])
 
 
+def offset_equations(c: Curve, settings: NavigationSettings, fit: WindowFit, force: Array) -> tuple[Array, Array]:
+    """Equations of a fit with one more unknown: how far the clock of the fixes is behind, s.
+
+    What gravitation and the turning Earth add to its column is a constant and a straight line, which the unknown
+    position and velocity take up.
+
+    Parameters
+    ----------
+    force : (m, 3) specific force at the fixes, body axes, m/s^2
+
+    Returns
+    -------
+    design, off : (k, 16) derivatives by the unknowns of the fit (without lever arm) and the offset; (k,) residuals
+    """
+    arm = np.asarray(settings.lever_arm_b, dtype=float)
+    model, J = _linearised(c, fit.r0, fit.v0, fit.R0, fit.gyro, fit.accel, arm)
+    x = c.v + c.Jv @ fit.gyro - c.B @ fit.accel + _apply(c.R, np.cross(c.rate, arm))
+    column, y = fit.v0 + x @ fit.R0.T, c.y
+    if c.velocity is not None:
+        column = np.concatenate([column, _apply(c.R, force) @ fit.R0.T])
+        y = np.concatenate([y, c.velocity])
+    design = np.concatenate([J[..., :15], column[..., None]], axis=-1)
+    return design.reshape(-1, 16), (y - model).ravel()
+
+
 def _course_equation(heading: float, forward: Array, R_ne: Array) -> tuple[Array, Array]:
     """Derivatives (1, 3) of the course by the rotation of the frame, and how far it is off (1,), in units of its sigma.
 

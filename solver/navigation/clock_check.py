@@ -54,9 +54,13 @@ class ClockCheck:
         self._delays: deque[float] = deque(maxlen=DECIDING)
         self._usual: deque[float] = deque(maxlen=25)
         self._right = 0
+        self._newest_s = float("-inf")
 
     def fix(self, time_s: float, newest_s: float) -> bool:
         """Take a fix of a time that came when the newest other sample was of another; whether it can be used."""
+        if newest_s <= self._newest_s:  # nothing else has come: who is silent tells no time
+            return self.offset_s is None
+        self._newest_s = newest_s
         delay = newest_s - time_s
         self._delays.append(delay)
         usual = median(self._usual) if self._usual else 0.0

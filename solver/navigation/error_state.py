@@ -14,12 +14,11 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..geometry import earth
 from ..models.gauss_markov import damping_rate, second_order_gauss_markov
+from ..quantiles import chi2
 from .inertial_data import TACTICAL, InertialGrade
 from .strapdown import IncrementBlock, State, process_noise, propagate, rotation_matrix, transition
 
@@ -224,6 +223,8 @@ class ErrorStateFilter:
     """
 
     def __init__(self, settings: NavigationSettings, start: Start):
+        from filterpy.kalman import KalmanFilter
+
         self.settings = settings
         self.layout = settings.layout
         n = self.layout.n

@@ -24,6 +24,7 @@ from .inertial_data import GAP_FACTOR, GnssData, InertialData
 from .online_alignment import Aligned, AlignmentBuffer, GnssWatch
 from .online_poses import OnlineOptions, PoseMaker
 from .pose import NavigationEvent, NavigationPose
+from .refused_positions import RefusedPositions
 from .strapdown import State
 
 Array = NDArray[np.floating]
@@ -76,6 +77,7 @@ class InertialNavigator:
         self._next_pose = self._next_answer = -np.inf
         self._next_smooth = -np.inf
         self._restored: list[float] = []
+        self._refused = RefusedPositions()
         self._pose_due = False
         self._ahead: tuple[NavigationStates, Array] | None = None  # what the last smoothing said of later times
 
@@ -86,6 +88,11 @@ class InertialNavigator:
     @property
     def aligned(self) -> bool:
         return self._chain is not None
+
+    @property
+    def alarm(self) -> str:
+        """What is wrong with GNSS at present; "" if nothing is."""
+        return self._refused.alarm
 
     @property
     def innovations(self) -> list[Innovation]:
@@ -205,7 +212,10 @@ class InertialNavigator:
         ready = [w for w in self._waiting if w[0] <= reach]
         self._waiting = [w for w in self._waiting if w[0] > reach]
         for time_s, fix in ready:
-            self._insert(time_s, fix)
+            if self._chain is None:  # the fix before it made the navigator align anew
+                self._alignment.add_fix(time_s, fix)
+            else:
+                self._insert(time_s, fix)
         self._pose_due = False
         if self._chain is None or self._replaying or not answer:
             return []
@@ -266,6 +276,12 @@ class InertialNavigator:
             self.counters[f"gnss {wrong}"] += 1
             return False
         self._watch()
+        if self._chain is None or self._replaying:
+            return True
+        of_fix = [i for i in self.innovations if i.kind == "position" and abs(i.time_s - time_s) < 1e-6]
+        for text in filter(None, map(self._refused.take, of_fix)):
+            self.counters["gnss contradicts inertial data"] += 1
+            self._event(time_s, text)
         return True
 
     def _watch(self) -> None:

@@ -15,7 +15,6 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
@@ -59,6 +58,8 @@ class KinematicFilter:
     """
 
     def __init__(self, frame: LocalFrame, options: KinematicOptions):
+        from filterpy.kalman import KalmanFilter
+
         self.options = options
         self.frame = frame
         self.counters: Counter[str] = Counter()
@@ -246,7 +247,8 @@ class KinematicFilter:
 
     def _restart(self, time_s: float, z: Array, R: Array, size: float) -> None:
         self.counters["position jump"] += 1
-        self._event(time_s, f"position jump of {size:.1f} m: filter started again")
+        text = f"GNSS position jumped by {size:.1f} m: wrong is what was before or what follows; filter started again"
+        self._event(time_s, text)
         old = self._epochs[-1]
         self._start(time_s, z, R)
         start = self._epochs[0]

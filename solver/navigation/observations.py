@@ -1,4 +1,10 @@
-"""What can be observed of a navigator's state: each observation gives its innovation, its derivative and its noise."""
+"""What can be observed of a navigator's state: each observation gives its innovation, its derivative and its noise.
+
+Derivatives are with respect to the errors of `StateLayout`: position (m), velocity (m/s), attitude (a small rotation
+vector ``psi`` in Earth-fixed axes, ``true = exp([psi]) estimated``), then parameters of the sensors. All have ``kind``
+(the name in statistics), ``gated`` (whether a too large innovation is weighted down or refused) and ``axes`` (3, 3) in
+which innovations are shown, None for the Earth-fixed ones.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..geometry import earth
 from ..geometry.rotation import skew
-from .error_state import Estimate, StateLayout
+from .error_state import ATTITUDE, POSITION, VELOCITY, Estimate, StateLayout
 from .inertial_data import _cross
 from .strapdown import OMEGA_IE
 
@@ -23,7 +29,7 @@ class AntennaPosition:
     Attributes
     ----------
     position_e : (3,) metres
-    covariance_e : (3, 3)
+    covariance_e : (3, 3) m2
     axes : (3, 3) Earth-fixed to north-east-down
     """
 
@@ -37,8 +43,8 @@ class AntennaPosition:
         s = estimate.state
         arm = s.R_eb @ estimate.lever_arm_b
         H = np.zeros((3, layout.n))
-        H[0, 0] = H[1, 1] = H[2, 2] = 1.0
-        H[:, 6:9] = -skew(arm)
+        H[:, POSITION] = np.eye(3)
+        H[:, ATTITUDE] = -skew(arm)
         if layout.with_lever_arm:
             H[:, layout.lever_arm] = s.R_eb
         innovation = self.position_e - s.r_e - arm
@@ -55,7 +61,7 @@ class AntennaVelocity:
     Attributes
     ----------
     velocity_e : (3,) m/s, Earth-fixed axes
-    covariance_e : (3, 3)
+    covariance_e : (3, 3) (m/s)2
     rate_ib : (3,) angular rate as measured, body axes, rad/s
     axes : (3, 3) Earth-fixed to north-east-down
     """
@@ -76,10 +82,11 @@ class AntennaVelocity:
         turning = rate - s.R_eb.T @ OMEGA_IE
         swing = s.R_eb @ _cross(turning, arm)
         H = np.zeros((3, layout.n))
-        H[0, 3] = H[1, 4] = H[2, 5] = 1.0
-        H[:, 6:9] = -skew(swing)
-        gyro = s.R_eb @ skew(arm)
-        H[:, layout.gyro] = gyro if layout.k == 3 else np.hstack([gyro, gyro * rate])
+        H[:, VELOCITY] = np.eye(3)
+        H[:, ATTITUDE] = -skew(swing)
+        by_bias = s.R_eb @ skew(arm)
+        # three parameters of the gyroscopes are biases, six are biases and scale factors
+        H[:, layout.gyro] = by_bias if layout.k == 3 else np.hstack([by_bias, by_bias * rate])
         if layout.with_lever_arm:
             H[:, layout.lever_arm] = s.R_eb @ skew(turning)
         innovation = self.velocity_e - s.v_e - swing
@@ -100,13 +107,21 @@ class ZeroVelocity:
 
     def linearise(self, estimate: Estimate, layout: StateLayout) -> tuple[Array, Array, Array]:
         H = np.zeros((3, layout.n))
-        H[0, 3] = H[1, 4] = H[2, 5] = 1.0
+        H[:, VELOCITY] = np.eye(3)
         return -estimate.state.v_e, H, np.eye(3) * self.sigma_m_s**2
 
 
 @dataclass(frozen=True)
 class Heading:
-    """Heading of the body, radians, from a compass, two antennas or an attitude unit."""
+    """Heading of the body from two antennas, an attitude unit, or a compass less its declination.
+
+    It has no meaning where the body's forward axis is vertical.
+
+    Attributes
+    ----------
+    heading : radians, clockwise from true north
+    sigma : radians
+    """
 
     heading: float
     sigma: float
@@ -124,5 +139,5 @@ class Heading:
         # d forward = psi_n x forward; d heading = (f_n df_e - f_e df_n) / horizontal2
         d_heading = np.array([-forward[1], forward[0], 0.0]) / horizontal2 @ -skew(forward)
         H = np.zeros((1, layout.n))
-        H[0, 6:9] = d_heading @ R_ne
+        H[0, ATTITUDE] = d_heading @ R_ne
         return np.array([innovation]), H, np.array([[self.sigma**2]])

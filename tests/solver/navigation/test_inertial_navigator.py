@@ -204,6 +204,7 @@ def test_restarted_in_flight_it_aligns_again():
     assert (np.abs(error / sigma) < 5.5).all()
 
 
+@pytest.mark.study
 def test_a_wrong_initial_heading_is_found_out():
     f = flight()
     true = f.motion.at(0.5).angles[0]
@@ -259,6 +260,7 @@ def test_bad_calls_are_refused_in_words():
     assert nav.finish() == []
 
 
+@pytest.mark.study
 def test_a_filter_that_keeps_being_wrong_is_aligned_anew():
     f = flight("mems")
     d = f.inertial

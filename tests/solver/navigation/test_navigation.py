@@ -59,6 +59,7 @@ def statistics(results, smoothed: bool):
     return np.sqrt(np.mean(square, axis=0)), np.sqrt(np.mean(ratio, axis=0))
 
 
+@pytest.mark.study
 def test_tactical_grade_accuracy(tactical):
     forward, _ = statistics(tactical, False)
     smoothed, _ = statistics(tactical, True)
@@ -177,6 +178,7 @@ def test_slow_errors_of_gnss_are_estimated():
     assert (known < 0.45).all()
 
 
+@pytest.mark.study
 def test_outliers_are_rejected_and_do_no_harm():
     f = sim.flight(duration_s=200.0, seed=8)
     rng = np.random.default_rng(8)

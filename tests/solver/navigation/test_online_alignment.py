@@ -2,6 +2,7 @@
 
 import inertial_flights as sim
 import numpy as np
+import pytest
 
 from triline.solver.geometry.frames import LocalFrame
 from triline.solver.navigation.inertial_navigator import InertialNavigator
@@ -35,6 +36,7 @@ def test_an_outage_while_aligning_is_counted_and_told():
     assert "GNSS is back after 11.0 s" in events and navigator.aligned
 
 
+@pytest.mark.study
 def test_forward_left_up_data_are_told_when_aligning_and_good_data_are_not():
     f = sim.flight("mems", duration_s=60.0, seed=25, rate_hz=100)
     navigator, events = fed(f.inertial, f.gnss, f.settings)
