@@ -22,15 +22,36 @@ class HeightGuess:
     Attributes
     ----------
     prior_m, prior_sigma_m : of heights of which nothing is known
+    lowest_m : the lowest ground that is looked for
+    unknown : nobody has said how high the ground is, and it has not been found yet
     """
 
     prior_m: float
     prior_sigma_m: float
+    lowest_m: float = 0.0
+    unknown: bool = False
     _points: Array = field(default_factory=lambda: np.empty((0, 3)))
 
-    def forget(self) -> None:
-        """A new strip begins."""
+    @property
+    def some(self) -> bool:
+        """Whether the heights of enough points are known to guess others from."""
+        return len(self._points) >= 3
+
+    def say(self, height_m: float) -> None:
+        """The ground is about so high."""
+        self.prior_m, self.unknown = height_m, False
+
+    def lose(self, lowest_m: float) -> None:
+        """The ground has to be looked for, from a lowest height on: it is not where it is thought to be."""
+        if len(self._points):
+            self.prior_m = float(np.median(self._points[-KEPT:, 2]))
         self._points = np.empty((0, 3))
+        self.lowest_m, self.unknown = min(lowest_m, self.prior_m), True
+
+    def found(self, xyz_l: Array) -> None:
+        """Points (n, 3) show where the ground is."""
+        self.say(float(np.median(xyz_l[:, 2])))
+        self.add(xyz_l)
 
     def add(self, xyz_l: Array) -> None:
         """Points (n, 3) that were found."""
@@ -38,7 +59,7 @@ class HeightGuess:
 
     def at(self, xy: Array) -> tuple[Array, Array]:
         """Heights (n,) and their sigma (n,) at places (n, 2)."""
-        if len(self._points) < 3:
+        if not self.some:
             return np.full(len(xy), self.prior_m), np.full(len(xy), self.prior_sigma_m)
         distance = np.hypot(*(xy[:, None, :] - self._points[None, :, :2]).transpose(2, 0, 1))
         n = min(NEIGHBOURS, len(self._points))

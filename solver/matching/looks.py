@@ -206,6 +206,26 @@ class LookMatcher:
         new = good & ~known
         p.heights.add((g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[new])
 
+    def try_height(self, tracks: Sequence[Track], view: int, height_m: float) -> Array | None:
+        """Points (n, 3) of the places that are found in a view with a wide search about a height; nothing is noted.
+
+        None where the orientation of the lines is not known.
+        """
+        p = self.prediction
+        line, _ = _at(tracks)
+        scan = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
+        if scan is None:
+            return None
+        g = self._geometry(tracks, scan, np.full(len(tracks), height_m))
+        done = self._search_view(view, g, p.options.largest_reach_px)
+        if done is None:
+            return None
+        found, _, _, parallax = done
+        base = np.maximum(np.sum(parallax**2, axis=1), 1e-12)
+        dz = np.sum(parallax * (found.shift - g.expected[:, view]), axis=1) / base
+        good = verdict(found, p.options) == ""
+        return (g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[good]
+
     def finish(self, tracks: Sequence[Track]) -> Looked | None:
         """Places that have been looked for in all views become points; None if none was found often enough."""
         p = self.prediction
@@ -267,6 +287,25 @@ class LookMatcher:
 
     def _match_view(self, view: int, g: _Geometry, sigma_height: Array) -> tuple[Found, Array, Array] | None:
         """Matches in one view: what was found; line and sample there (k, 2), NaN unless good; parallax (k, 2)."""
+        p, index = self.prediction, self.prediction.others[view]
+        done = self._search_view(view, g, sigma_height)
+        if done is None:
+            return None
+        found, wide, base_line, parallax = done
+        good = self._accept(found)
+        p.searched(index, float((found.reason == "beyond search").mean()))
+        place = g.ground.moved(np.where(good[:, None], found.shift, 0.0)).centre_l
+        u, v, inside = wide.locate(place, base_line + found.shift[:, 0] * g.ground.spacing_m / g.travel)
+        good &= inside & np.isfinite(u)
+        return found, np.where(good[:, None], np.column_stack([u, v]), np.nan), parallax
+
+    def _search_view(
+        self, view: int, g: _Geometry, around: Array | float
+    ) -> tuple[Found, LineScan, Array, Array] | None:
+        """What was found in one view, its lines, the line (k,) of each place without its shift, and parallax (k, 2).
+
+        ``around`` is how far is searched, px, or the sigma (k,) of the heights that tells it.
+        """
         p = self.prediction
         index = p.others[view]
         expected, ground = g.expected[:, view], g.ground
@@ -282,16 +321,10 @@ class LookMatcher:
         other_slope = (moved.centre_l[:, :2] - camera[:, :2]) / (moved.centre_l[:, 2:] - camera[:, 2:])
         axes = np.stack([ground.along, ground.across]) / ground.spacing_m
         parallax = (g.slope - other_slope) @ axes.T
-        reach = p.reach(index, ground, sigma_height, parallax)
+        reach = p.reach(index, ground, around, parallax) if isinstance(around, np.ndarray) else float(around)
         master, other = self._image(p.master, g.scan, g.travel), self._image(index, wide, g.travel)
         base_line = other_line - expected[:, 0] * ground.spacing_m / g.travel
-        found = find(master, g.line, ground, other, expected, base_line, reach)
-        good = self._accept(found)
-        p.searched(index, float((found.reason == "beyond search").mean()))
-        place = ground.moved(np.where(good[:, None], found.shift, 0.0)).centre_l
-        u, v, inside = wide.locate(place, base_line + found.shift[:, 0] * ground.spacing_m / g.travel)
-        good &= inside & np.isfinite(u)
-        return found, np.where(good[:, None], np.column_stack([u, v]), np.nan), parallax
+        return find(master, g.line, ground, other, expected, base_line, reach), wide, base_line, parallax
 
     def _accept(self, found: Found) -> NDArray[np.bool_]:
         reason = verdict(found, self.prediction.options)

@@ -9,6 +9,7 @@ import numpy as np
 
 from .chips import CHIP_HALF, ChipStore
 from .consistency import Disagreement
+from .ground_search import GroundSearch
 from .line_intake import LineIntake
 from .line_scan import LineScan
 from .line_store import LineStore
@@ -18,7 +19,10 @@ from .places import PlaceChooser
 from .prediction import Prediction
 from .search import LEAST_SQUARES_HALF, Image
 from .seen_again import SeenAgain
-from .waiting import WaitingRoom
+from .waiting import PATIENCE_S, WaitingRoom
+
+#: So many places in a row that are found in no other view: the ground is somewhere else. Tuned.
+LOST = 40
 
 
 class MasterView:
@@ -54,6 +58,8 @@ class MasterView:
         self.until = np.inf
         self._looks, self._chips, self._new_name = looks, chips, new_name
         self._again = SeenAgain(prediction, image, chips)
+        self._ground = GroundSearch(prediction, looks)
+        self._in_vain = 0
         self._strip, self._first = "", 0
         self._unjudged: list[Looked] = []
 
@@ -74,6 +80,8 @@ class MasterView:
         self.waiting.clear()
         self.chooser.begin_strip()
         self._again.begin_strip(strip)
+        self._ground.begin_strip()
+        self._in_vain = 0
         self.resume(first_line)
 
     def resume(self, first_line: int) -> None:
@@ -105,13 +113,29 @@ class MasterView:
             out += self._settle(self.waiting.give_up(seeing))
         ring = store.rings[self.ccd]
         if ring.end < self.until and len(seeing) >= 2:
-            first = max(self.waiting.first_useful_line(store, seeing), self._first)
+            begin = ring.start if self.prediction.heights.unknown else self.waiting.first_useful_line(store, seeing)
+            first = max(begin, self._first)
             self.waiting.add(self.chooser.choose(ring, self.prediction.rate, first, lines.saturated))
+        if self.prediction.heights.unknown and not self._find_ground(store, seeing):
+            return out
         if np.isinf(self.until):
             self.waiting.add(self._new(self._again.find(max(ring.start, self._first), ring.end), named))
         for view, tracks in self.waiting.due(store):
             out += self._look(tracks, view)
         return out
+
+    def _find_ground(self, store: LineStore, seeing: frozenset[str]) -> bool:
+        """Look for the ground with the places that wait; whether it is known now."""
+        waiting, p = self.waiting, self.prediction
+        if len(seeing) < 2 or not self._ground.search(waiting.tracks, waiting.order, store):
+            ring = store.rings[self.ccd]
+            looked_for = ring.end - self._ground.lines_to_last_look(waiting.order) - PATIENCE_S * p.rate
+            self.counters["ground not found"] += waiting.forget_before(max(looked_for, ring.start))
+            return False
+        p.heights_changed()
+        waiting.forget_before(waiting.first_useful_line(store, seeing))
+        self._in_vain = 0
+        return True
 
     def take_counters(self) -> Counter[str]:
         """What was counted since the last call."""
@@ -135,6 +159,10 @@ class MasterView:
     def _look(self, tracks: list[Track], view: int) -> list[MatchedTie]:
         """Look for places in a view; the ties among those that are through with all views."""
         self._looks.look(tracks, view)
+        self._in_vain = 0 if any(track.found.any() for track in tracks) else self._in_vain + len(tracks)
+        if self._in_vain >= LOST:
+            self.prediction.heights.lose(self.prediction.heights.lowest_m)
+            self._in_vain = 0
         over, lost = self.waiting.settle(tracks)
         gone = set(map(id, lost))
         chosen = [track for track in tracks if not track.place.name]

@@ -54,7 +54,7 @@ class MatchingOptions:
 
     def __post_init__(self) -> None:
         positive = "points_per_s", "window_rays", "largest_sigma_px", "least_reach_px", "budget_mb", "relief_sigma_m"
-        check_ranges(self, positive, ("window_points", "chips_mb"))
+        check_ranges(self, positive, ("window_points", "chips_mb", "image_sigma_px"))
         if not self.least_reach_px <= self.largest_reach_px <= 80:
             raise ValueError(f"largest_reach_px: wanted {self.least_reach_px:g} to 80, got {self.largest_reach_px}")
         if not 0 <= self.least_score < 1:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from .consistency import SlowDisagreement
 from .current_orientation import CurrentOrientation
-from .height_guess import HeightGuess
 from .line_scan import LineScan, View
 from .options import MatchingOptions
+from .round_earth import ORBIT_M, RoundHeights, above_sphere, way_of_platform
 from .search import CORRELATION_HALF, REACH_PX, Ground, coarsest_factor
 
 Array = NDArray[np.floating]
@@ -42,7 +42,7 @@ class Prediction:
         self.others = [i for i in range(len(views)) if i != master]
         self.options = options
         self.orientation = CurrentOrientation()
-        self.heights = HeightGuess(0.0, options.relief_sigma_m)
+        self.heights = RoundHeights(0.0, options.relief_sigma_m)
         self.slow = SlowDisagreement(len(self.others))
         self.first_s = self.rate = 0.0
         self._axes: tuple[Array, Array] | None = None
@@ -71,14 +71,32 @@ class Prediction:
         if t == self._told[0]:
             return self._told[1]
         position, _ = self.orientation.at([t - 1.0 / self.rate * 20, t])
-        self.nadir_m = float(self.heights.at(position[1:, :2])[0][0])
+        above = above_sphere(position[1])
+        self.heights.in_orbit = above > ORBIT_M
+        if self.heights.in_orbit:  # the relief is small against it
+            self.nadir_m = float(position[1, 2]) - above
+        else:
+            self.nadir_m = float(self.heights.at(position[1:, :2])[0][0])
         height = float(position[1, 2]) - self.nadir_m
         self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6))
         return self._told[1]
 
+    @property
+    def platform_m(self) -> float:
+        """Height of the platform now, local frame."""
+        above, _ = self.height_and_travel()
+        return above + self.nadir_m
+
+    def heights_changed(self) -> None:
+        """What was taken for the height of the ground holds no more."""
+        self._told = (-np.inf, self._told[1])
+
     def lines_later(self, index: int, height_m: Array) -> Array:
         """How many lines after the master a view sees ground at heights (k,), about; local frame, m."""
         above, travel = self.height_and_travel()
+        if self.heights.in_orbit:
+            ways = [way_of_platform(self.views[i].forward, above) for i in (self.master, index)]
+            return np.full(len(height_m), (ways[0] - ways[1]) / travel)
         forward = self.views[self.master].forward - self.views[index].forward
         return forward * (above + self.nadir_m - height_m) / travel
 

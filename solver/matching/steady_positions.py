@@ -69,6 +69,14 @@ class SteadyPositions:
         if np.ptp(steps) <= 0.05 * steps.mean():
             self._fourth.append(FOURTH @ self._position[n - 4 : n + 1])
         assert self._next is not None
+        last_s = float(self._time[n - 1])
+        if time_s - last_s > 2.0 * REACH_S:  # no knot between them has positions about it
+            while self._next * POSITION_KNOT_S <= last_s + REACH_S:
+                self._settle(self._next)
+                self._next += 1
+            self._next = max(self._next, int(np.floor((time_s - REACH_S) / POSITION_KNOT_S)))
+            oldest = self._next - round(KEPT_S / POSITION_KNOT_S)
+            self._knots = {number: knot for number, knot in self._knots.items() if number > oldest}
         while self._next * POSITION_KNOT_S + REACH_S <= time_s:
             self._settle(self._next)
             self._next += 1

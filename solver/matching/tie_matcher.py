@@ -101,7 +101,22 @@ class TieMatcher:
 
     def set_mean_height(self, height_m: float) -> None:
         """What the ground's height is taken for before anything is known, local frame."""
-        self.prediction.heights.prior_m = height_m
+        self.prediction.heights.say(height_m)
+
+    def search_ground(self, lowest_m: float) -> None:
+        """The ground's height is not known: it is looked for, from a lowest height on; local frame."""
+        self.prediction.heights.lose(lowest_m)
+
+    @property
+    def ground_found(self) -> bool:
+        """Whether heights of the ground have been measured."""
+        return self.prediction.heights.some
+
+    @property
+    def ground_m(self) -> float | None:
+        """Height of the ground in the local frame as far as it is known or taken to be; None while it is looked for."""
+        heights = self.prediction.heights
+        return None if heights.unknown else heights.prior_m
 
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds, to give it more or less."""
@@ -146,8 +161,13 @@ class TieMatcher:
         out: list[MatchedTie] = []
         if store is not None and np.isfinite(self.orientation.end_s):
             self._choose_master(store, self._lines.seeing)
+            heights = self.prediction.heights
+            thought_m, looked_for = heights.prior_m, heights.unknown
             for view in self._at_work:
                 out += view.match(self._lines, store, self._named)
+            if looked_for and not heights.unknown and abs(heights.prior_m - thought_m) > 3 * heights.prior_sigma_m:
+                found = f"the ground was found at about {heights.prior_m:.0f} m in the local frame"
+                self._lines.tell(f"{found}, not at {thought_m:.0f} m")
             news = self._master.chooser.news()
             if news:
                 self._lines.tell(news)
@@ -204,7 +224,24 @@ class TieMatcher:
         if not np.isfinite(self.orientation.end_s):
             return None
         p = self.prediction
-        height, travel = p.height_and_travel()
+        if p.heights.unknown:
+            # room for ground lower than it is thought to be, where there is any
+            store = self._sized(dtype, p.platform_m - p.heights.lowest_m)
+            if store.share == 1 and store.cover == 1:
+                return store
+        store = self._sized(dtype, p.height_and_travel()[0])
+        if store.share < 1:
+            share = f"{100 * store.share:.0f} %"
+            self._lines.tell(f"{self.options.budget_mb:g} MB hold {share} of the lines that matching wants")
+        elif store.cover < 1:
+            lanes = f"{len(store.lanes)} lanes, {100 * store.cover:.0f} % of the width"
+            self._lines.tell(f"{self.options.budget_mb:g} MB: lines are kept in {lanes}")
+        return store
+
+    def _sized(self, dtype: np.dtype, height: float) -> LineStore:
+        """A store for looks at ground so far below."""
+        p = self.prediction
+        _, travel = p.height_and_travel()
         earliest = min(view.forward for view in self.views)
         margin = 2 * (CORRELATION_HALF + REACH_PX + 2) * COARSEST + 4 * PAD
         master = self.views[p.master]
@@ -213,17 +250,10 @@ class TieMatcher:
             view.ccd: int((view.forward - earliest) * 1.1 * height / travel + STORE_MARGIN_S * p.rate + margin)
             for view in ordered
         }
-        store = LineStore(
+        return LineStore(
             {v.ccd: v.pixels for v in ordered}, lines, int(self.options.budget_mb * 1e6), dtype,
             {v.ccd: self._counterpart(v.ccd, height, travel) for v in ordered},
         )  # fmt: skip
-        if store.share < 1:
-            share = f"{100 * store.share:.0f} %"
-            self._lines.tell(f"{self.options.budget_mb:g} MB hold {share} of the lines that matching wants")
-        elif store.cover < 1:
-            lanes = f"{len(store.lanes)} lanes, {100 * store.cover:.0f} % of the width"
-            self._lines.tell(f"{self.options.budget_mb:g} MB: lines are kept in {lanes}")
-        return store
 
     def _counterpart(self, ccd: str, height: float, travel: float) -> Array:
         """Sample of a CCD line that sees what each sample of the master sees, as the platform flies now (crab)."""

@@ -83,6 +83,13 @@ class WaitingRoom:
             first.append(ring.start - later if later < 0 else -np.inf)
         return sorted(first)[max(self._looks.least_rays - 2, 0)] if first else np.inf
 
+    def forget_before(self, line: float) -> int:
+        """Give up places of earlier lines in which nothing was looked for yet; how many there were."""
+        kept = [track for track in self.tracks if track.place.line >= line or track.tried.any() or track.place.name]
+        gone = len(self.tracks) - len(kept)
+        self.tracks = kept
+        return gone
+
     def due(self, store: LineStore) -> list[tuple[int, list[Track]]]:
         """Places whose next look is in store, with the view; they do not wait any more."""
         p = self.prediction

@@ -186,6 +186,7 @@ def test_a_wrong_orientation_does_not_hinder(flown, images):
     assert (length < 0.3).mean() > 0.93 and (length > 2.0).mean() < 0.01
 
 
+@pytest.mark.study
 def test_from_image_lines_to_refined_orientation(tmp_path, capsys):
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     arguments = ["--sensor", "ads40-small", "--pixels", "600", "--images", "--seconds", "18", "--height", "600"]
