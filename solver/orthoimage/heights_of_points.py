@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.spatial import KDTree, QhullError
 
 from .surface import HeightField
 
@@ -28,6 +26,9 @@ def heights_of_points(point_l: Array, spacing_m: float = 0.0) -> HeightField:
     ------
     ValueError : fewer than three points, or all on a line
     """
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+    from scipy.spatial import QhullError
+
     point_l = np.asarray(point_l, dtype=float).reshape(-1, 3)
     if len(point_l) < 3:
         raise ValueError(f"{len(point_l)} points with a height, wanted at least 3")
@@ -51,6 +52,8 @@ def heights_of_points(point_l: Array, spacing_m: float = 0.0) -> HeightField:
 
 def _trusted(point_l: Array) -> NDArray[np.bool_]:
     """Points whose height is like that of the points around; all of them where there are few."""
+    from scipy.spatial import KDTree
+
     if len(point_l) <= NEIGHBOURS:
         return np.ones(len(point_l), dtype=bool)
     around = np.asarray(KDTree(point_l[:, :2]).query(point_l[:, :2], k=NEIGHBOURS)[1])

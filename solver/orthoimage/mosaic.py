@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +34,7 @@ class Mosaic:
         self.tiles: dict[tuple[int, int], NDArray[np.unsignedinteger]] = {}
         self.changed: set[tuple[int, int]] = set()
         self._steepness: dict[tuple[int, int], NDArray[np.uint8]] = {}
+        self._sigma: dict[tuple[int, int], NDArray[np.float32]] = {}
 
     @property
     def nbytes(self) -> int:
@@ -52,6 +56,9 @@ class Mosaic:
                 better = new > old
                 np.copyto(pixels[r, c : c + n], patch.values[at : at + n], where=better)
                 np.copyto(old, new, where=better)
+                if patch.sigma_m is not None:
+                    mine = self._sigma_tile((i, j))[:, r, c : c + n]
+                    np.copyto(mine, patch.sigma_m[at : at + n].T, where=better)
                 at += n
                 column += n
 
@@ -62,6 +69,11 @@ class Mosaic:
             found = self.tiles[key] = np.zeros((self.tile, self.tile), dtype=self.dtype)
             self._steepness[key] = np.zeros((self.tile, self.tile), dtype=np.uint8)
         return found, self._steepness[key]
+
+    def _sigma_tile(self, key: tuple[int, int]) -> NDArray[np.float32]:
+        if key not in self._sigma:
+            self._sigma[key] = np.full((2, self.tile, self.tile), np.nan, dtype=np.float32)
+        return self._sigma[key]
 
     def extent(self) -> tuple[int, int, int, int]:
         """First and last-plus-one row, first and last-plus-one column of cells with something in them.
@@ -85,15 +97,26 @@ class Mosaic:
     def read(self, row0: int, row1: int, column0: int, column1: int) -> NDArray[np.unsignedinteger]:
         """Cells of a window (rows, columns), 0 where nothing is known."""
         out = np.zeros((row1 - row0, column1 - column0), dtype=self.dtype)
+        self._fill(out, self.tiles, row0, column0)
+        return out
+
+    def read_sigma(self, row0: int, row1: int, column0: int, column1: int) -> NDArray[np.float32]:
+        """Sigmas of a window (2, rows, columns), m: in the plane, of the height; NaN where nothing is known."""
+        out = np.full((2, row1 - row0, column1 - column0), np.nan, dtype=np.float32)
+        self._fill(out, self._sigma, row0, column0)
+        return out
+
+    def _fill(self, out: NDArray[Any], tiles: Mapping[tuple[int, int], NDArray[Any]], row0: int, column0: int) -> None:
+        """Copy what tiles (..., tile, tile) hold of a window (..., rows, columns) into it."""
         tile = self.tile
+        row1, column1 = row0 + out.shape[-2], column0 + out.shape[-1]
         for i in range(row0 // tile, -(-row1 // tile)):
             for j in range(column0 // tile, -(-column1 // tile)):
-                found = self.tiles.get((i, j))
+                found = tiles.get((i, j))
                 if found is None:
                     continue
                 r0, r1 = max(row0, i * tile), min(row1, (i + 1) * tile)
                 c0, c1 = max(column0, j * tile), min(column1, (j + 1) * tile)
-                out[r0 - row0 : r1 - row0, c0 - column0 : c1 - column0] = found[
-                    r0 - i * tile : r1 - i * tile, c0 - j * tile : c1 - j * tile
+                out[..., r0 - row0 : r1 - row0, c0 - column0 : c1 - column0] = found[
+                    ..., r0 - i * tile : r1 - i * tile, c0 - j * tile : c1 - j * tile
                 ]
-        return out

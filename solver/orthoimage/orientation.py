@@ -35,6 +35,43 @@ class LineOrientation:
         self.measured = Trajectory(time_s, position_l, quaternion)
         self._gap_s = gap_s
         self._knots: tuple[Array, Array] | None = None
+        self._covariance: tuple[Array, Array] | None = None
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether covariances are stated."""
+        return self._covariance is not None
+
+    def state_covariance(self, time_s: ArrayLike, covariance: ArrayLike) -> None:
+        """Covariances (m, 6, 6) of X, Y, Z, omega, phi, kappa at times (m,), m and rad; unknown ones are left out.
+
+        Raises
+        ------
+        ValueError : none is known
+        """
+        t, Q = np.asarray(time_s, dtype=float), np.asarray(covariance, dtype=float)
+        known = np.flatnonzero(np.isfinite(Q).all(axis=(1, 2)))
+        if not len(known):
+            raise ValueError("no pose has a covariance")
+        t, first = np.unique(t[known], return_index=True)
+        self._covariance = t, Q[known[first]]
+
+    def covariance_at(self, time_s: ArrayLike) -> Array:
+        """Covariances (n, 6, 6) at times (n,): between those that are stated, element by element.
+
+        Raises
+        ------
+        ValueError : none is stated
+        """
+        if self._covariance is None:
+            raise ValueError("no covariance is stated")
+        stamps, Q = self._covariance
+        t = np.asarray(time_s, dtype=float)
+        after = np.clip(np.searchsorted(stamps, t), 1, max(len(stamps) - 1, 1)) % len(stamps)
+        before = np.maximum(after - 1, 0)
+        span = np.where(after > before, stamps[after] - stamps[before], 1.0)
+        share = np.clip((t - stamps[before]) / span, 0.0, 1.0)[:, None, None]
+        return (1.0 - share) * Q[before] + share * Q[after]
 
     def refine(self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike) -> None:
         """Refined poses (n,); those at times without measured pose are left out.

@@ -14,11 +14,13 @@ gap or overlap.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.line_camera import LineCamera
+from .error_band import GroundErrors, sigmas_of_lines
 from .ground_grid import GroundGrid
 from .resampling import TAPS, resample
 from .surface import Surface
@@ -51,6 +53,7 @@ class Patch:
     length : (n,) cells in it
     values : (sum of length,) grey values, rounded; 0 = nothing known
     steepness : (sum of length,) 1 for a ray at the end of the CCD line to 255 for its middle, 0 = nothing known
+    sigma_m : (sum of length, 2) in the plane and of the height, NaN where not known; None if nobody asked
     """
 
     row: IntArray
@@ -58,6 +61,7 @@ class Patch:
     length: IntArray
     values: NDArray[np.unsignedinteger]
     steepness: NDArray[np.uint8]
+    sigma_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return int(self.length.sum())
@@ -112,6 +116,7 @@ class StripRectifier:
     grid : cells
     resampling : of `resampling.TAPS`
     band : lines that are rectified at once
+    errors : besides those of the orientation; then patches have sigmas
 
     Attributes
     ----------
@@ -123,11 +128,13 @@ class StripRectifier:
     """
 
     def __init__(
-        self, rays: Rays, surface: Surface, grid: GroundGrid, resampling: str = "bilinear", band: int = BAND
-    ) -> None:
+        self, rays: Rays, surface: Surface, grid: GroundGrid, resampling: str = "bilinear", band: int = BAND,
+        errors: GroundErrors | None = None,
+    ) -> None:  # fmt: skip
         if resampling not in TAPS:
             raise ValueError(f"resampling {resampling!r}, wanted one of {', '.join(TAPS)}")
         self.rays, self.surface, self.grid, self.resampling, self.band = rays, surface, grid, resampling, band
+        self.errors = errors
         self.missed = 0
         self._axes: _Axes | None = None
         self._first = 0  # number of the first line at hand
@@ -135,11 +142,13 @@ class StripRectifier:
         self._usable = np.empty(0, dtype=bool)
         self._cells = np.empty((0, len(rays.sample), 2))
         self._place = np.empty((0, len(rays.sample), 2))
+        self._sigma = np.empty((0, len(rays.sample), 2), dtype=np.float32)
         self._done = 0  # places p below are rectified
 
     def add(
-        self, first_line: int, pixels: NDArray[np.unsignedinteger], usable: Mask | None, position_l: Array, R_lc: Array
-    ) -> list[Patch]:
+        self, first_line: int, pixels: NDArray[np.unsignedinteger], usable: Mask | None, position_l: Array, R_lc: Array,
+        covariance: Array | None = None,
+    ) -> list[Patch]:  # fmt: skip
         """Add lines; returns what can be rectified now.
 
         Parameters
@@ -148,6 +157,7 @@ class StripRectifier:
         pixels : (n, samples)
         usable : (n,) which of them are fit for use, None for all
         position_l, R_lc : (n, 3), (n, 3, 3) orientation of each line
+        covariance : (n, 6, 6) of X, Y, Z, omega, phi, kappa of each line, m, rad; wanted where patches have sigmas
 
         Raises
         ------
@@ -167,7 +177,12 @@ class StripRectifier:
         if not len(self._usable):
             self._first = first_line
             self._pixels = self._pixels.astype(pixels.dtype)
-        cells = self._to_ground(position_l, R_lc)
+        point, cells = self._to_ground(position_l, R_lc)
+        if self.errors is not None:
+            assert covariance is not None
+            slope = self.surface.slope(point)
+            sigma = sigmas_of_lines(position_l, R_lc, covariance, self.rays.ray_c, point, slope, self.errors)
+            self._sigma = np.concatenate([self._sigma, sigma.astype(np.float32)])
         if not len(self._usable) and self._axes is not None and np.isfinite(cells).any():
             self._done = int(np.floor(np.nanmin(self._axes.place(cells)[..., 0])))
         self._pixels = np.concatenate([self._pixels, pixels])
@@ -185,14 +200,14 @@ class StripRectifier:
         self._forget(len(self._usable))
         return out
 
-    def _to_ground(self, position_l: Array, R_lc: Array) -> Array:
-        """Cells (n, k, 2) that the rays of lines meet."""
+    def _to_ground(self, position_l: Array, R_lc: Array) -> tuple[Array, Array]:
+        """Points (n, k, 3) and cells (n, k, 2) that the rays of lines meet."""
         direction = self.rays.ray_c @ np.swapaxes(R_lc, 1, 2)
         point, met = self.surface.meet(np.asarray(position_l)[:, None, :], direction)
         self.missed += int((~met).sum())
         if not met.any():
-            return np.full((*met.shape, 2), np.nan)
-        return self.grid.cells_of_many(point)
+            return point, np.full((*met.shape, 2), np.nan)
+        return point, self.grid.cells_of_many(point)
 
     def _begin(self, least: int = 8) -> list[Patch]:
         """Lay the axes through the lines at hand."""
@@ -231,6 +246,7 @@ class StripRectifier:
         self._first += lines
         self._pixels, self._usable = self._pixels[lines:], self._usable[lines:]
         self._cells, self._place = self._cells[lines:], self._place[lines:]
+        self._sigma = self._sigma[lines:]
 
     def _band(self, begin: int, end: int) -> Patch | None:
         """Cells with p from ``begin`` to below ``end``."""
@@ -255,6 +271,7 @@ class StripRectifier:
         dtype = self._pixels.dtype
         values = np.zeros(starts[-1], dtype=dtype)
         steepness = np.zeros(starts[-1], dtype=np.uint8)
+        sigma = None if self.errors is None else np.full((starts[-1], 2), np.nan, dtype=np.float32)
         largest = np.float32(np.iinfo(dtype).max)
         middle = np.float32(0.5 * (self.rays.pixels - 1))
         usable = None if self._usable.all() else self._usable
@@ -267,7 +284,7 @@ class StripRectifier:
             p = np.repeat(p_start[run:stop], n) + dp * along
             q = np.repeat(q_start[run:stop], n) + dq * along
             place = _bilinear(source, p, q)
-            line, sample = place.real, place.imag
+            line, sample = np.real(place), np.imag(place)
             with np.errstate(invalid="ignore"):
                 grey, known = resample(self._pixels, usable, line, sample, self.resampling)
                 np.rint(grey, out=grey)
@@ -275,8 +292,11 @@ class StripRectifier:
                 steep = 255.0 - np.float32(254.0) / middle * np.abs(sample - middle)
             values[part] = np.where(known, grey, 0)
             steepness[part] = np.where(known, steep, 0)
+            if sigma is not None:
+                node = np.interp(sample[known], self.rays.sample, np.arange(len(self.rays.sample)))
+                sigma[part][known] = _bilinear(self._sigma, line[known], node.astype(np.float32))
             run = stop
-        return Patch(row, column, length, values, steepness)
+        return Patch(row, column, length, values, steepness, sigma)
 
     def _inverse(self, begin: int, end: int) -> tuple[int, NDArray[np.complexfloating]] | None:
         """Line (of those at hand) and sample, as real and imaginary part, at p = begin .. end and q every so often.
@@ -372,21 +392,23 @@ class _Axes:
         return rows[some], left[some], (right - left)[some]
 
 
-def _bilinear(table: NDArray[np.complexfloating], p: Array, q: Array) -> NDArray[np.complexfloating]:
-    """Between the nodes of a table (rows, columns); p and q lie inside."""
-    rows, columns = table.shape
+def _bilinear(table: NDArray[Any], p: Array, q: Array) -> NDArray[Any]:
+    """Between the nodes of a table (rows, columns, ...); p and q (n,) lie inside."""
+    rows, columns = table.shape[:2]
     i, j = p.astype(np.intp), q.astype(np.intp)
     np.clip(i, 0, rows - 2, out=i)
     np.clip(j, 0, columns - 2, out=j)
     a, b = p - i.astype(np.float32), q - j.astype(np.float32)
     i *= columns
     i += j
-    flat = table.ravel()
-    low = flat.take(i)
-    low += b * (flat.take(i + 1) - low)
+    flat = table.reshape(rows * columns, *table.shape[2:])
+    if table.ndim > 2:
+        a, b = a[:, None], b[:, None]
+    low = flat.take(i, axis=0)
+    low += b * (flat.take(i + 1, axis=0) - low)
     i += columns
-    high = flat.take(i)
-    high += b * (flat.take(i + 1) - high)
+    high = flat.take(i, axis=0)
+    high += b * (flat.take(i + 1, axis=0) - high)
     high -= low
     high *= a
     low += high

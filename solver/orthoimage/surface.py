@@ -1,4 +1,4 @@
-"""Where rays meet the ground: a plane, the ellipsoid, or heights on a grid [D]."""
+"""Where rays meet the ground: a plane, the ellipsoid, or heights on a grid [D]; also those that the air bends."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry import earth
 from ..geometry.frames import LocalFrame
+from ..location.refraction import Refraction
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -18,6 +19,9 @@ Mask = NDArray[np.bool_]
 TOLERANCE_M, ROUNDS = 1e-3, 12
 #: Steps a cell of the search along a ray that the relief correction could not follow, and the most of them.
 STEPS_A_CELL, MOST_STEPS = 2.0, 4096
+#: Rounds of a bent ray with the ground. Derived: the shift changes by 1e-4 of a change in height, which is itself the
+#: shift times the slope of the ground, so the second round leaves less than a millimetre.
+_AIR_ROUNDS = 2
 
 
 class Surface(Protocol):
@@ -35,6 +39,10 @@ class Surface(Protocol):
         point_l : (..., 3), NaN where there is none
         met : (...) whether there is one
         """
+        ...
+
+    def slope(self, point_l: Array) -> Array:
+        """dZ/dX and dZ/dY (..., 2) at points (..., 3) on it; NaN where it is not known."""
         ...
 
 
@@ -55,6 +63,10 @@ class Plane:
         down = np.where(met, direction_l[..., 2], np.nan)
         point = position_l + direction_l * ((self.height_m - position_l[..., 2]) / down)[..., None]
         return point, met
+
+    def slope(self, point_l: Array) -> Array:
+        """See `Surface.slope`."""
+        return np.zeros((*point_l.shape[:-1], 2))
 
 
 @dataclass(frozen=True)
@@ -87,6 +99,14 @@ class Ellipsoid:
         root = np.sqrt(np.where(met, discriminant, np.nan))
         share = C / (root - B)  # the nearer root, in the form that does not cancel
         return position_l + direction_l * share[..., None], met
+
+    def slope(self, point_l: Array) -> Array:
+        """See `Surface.slope`; of the tangent plane in the local frame."""
+        a = earth.SEMI_MAJOR_M + self.height_m
+        b = earth.SEMI_MAJOR_M * (1.0 - earth.FLATTENING) + self.height_m
+        point_e = point_l @ self.frame.R_el.T + self.frame.origin_e
+        normal = (point_e / np.array([a * a, a * a, b * b])) @ self.frame.R_el
+        return -normal[..., :2] / normal[..., 2:]
 
 
 @dataclass(frozen=True)
@@ -133,6 +153,18 @@ class HeightField:
         low = z[at] + b * (z[at + 1] - z[at])
         high = z[at + columns] + b * (z[at + columns + 1] - z[at + columns])
         return np.where(inside, low + a * (high - low), np.nan)
+
+    def slope(self, point_l: Array) -> Array:
+        """See `Surface.slope`; over one step of the grid, on one side where the other one has no height."""
+        x, y, half = point_l[..., 0], point_l[..., 1], 0.5 * self.step_m
+        here = self.height(x, y)
+        out = []
+        for dx, dy in ((half, 0.0), (0.0, half)):
+            before, after = self.height(x - dx, y - dy), self.height(x + dx, y + dy)
+            both = (after - before) / self.step_m
+            one = np.where(np.isfinite(after), after - here, here - before) / half
+            out.append(np.where(np.isfinite(both), both, one))
+        return np.stack(out, axis=-1)
 
     def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
         """See `Surface.meet`.
@@ -194,3 +226,46 @@ class HeightField:
             low, high = np.where(under, middle, low), np.where(under, high, middle)
         z = 0.5 * (low + high)
         return np.where(np.abs(self._above(origin, slope, z)) < 10 * TOLERANCE_M, z, np.nan)
+
+
+@dataclass(frozen=True)
+class UnderAir:
+    """A ground that rays reach through air, which bends them towards the vertical.
+
+    The place of a bent ray at a height is that of the straight one there, less the shift of `Refraction`. The ray meets
+    the ground where the line from the perspective centre through this place does, once the place is as high.
+
+    Attributes
+    ----------
+    surface : the ground
+    frame : the local frame
+    refraction : what the air does; heights are above its ellipsoid
+    """
+
+    surface: Surface
+    frame: LocalFrame
+    refraction: Refraction
+
+    def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
+        """See `Surface.meet`."""
+        shape = np.broadcast_shapes(position_l.shape, direction_l.shape)
+        centre = np.broadcast_to(position_l, shape)
+        straight, met = self.surface.meet(centre, np.broadcast_to(direction_l, shape))
+        bent = straight
+        for _ in range(_AIR_ROUNDS):
+            if not met.any():
+                break
+            bent, met = self.surface.meet(centre, self._bent(centre, direction_l, bent) - centre)
+        return bent, met
+
+    def _bent(self, centre: Array, direction_l: Array, near: Array) -> Array:
+        """Where the bent rays are at the heights of points near their ends."""
+        along = (near[..., 2] - centre[..., 2]) / direction_l[..., 2]
+        straight = centre + direction_l * along[..., None]
+        e = [(a @ self.frame.R_el.T + self.frame.origin_e).reshape(-1, 3) for a in (straight, centre)]
+        true = (self.refraction.true_ground(*e) - self.frame.origin_e) @ self.frame.R_el
+        return true.reshape(near.shape)
+
+    def slope(self, point_l: Array) -> Array:
+        """See `Surface.slope`."""
+        return self.surface.slope(point_l)
