@@ -19,6 +19,7 @@ from .results import AdjustedPoint, RefinedOrientation, Refusal, WholeStrips, Wi
 from .screening.snooping import snoop
 from .screening.ties import snoop_ties
 from .state.batch import Batch
+from .state.lens_sets import stays_to
 from .state.maker import BatchMaker
 from .state.network import LiveNetwork
 from .state.strip import WindowStrip
@@ -164,6 +165,9 @@ class Leaving:
         """Whether a strip is over and nothing is waited for: late tie points, and smoothed poses under its rays."""
         late_s = now_s - strip.end_s - self.options.settle_s
         if not strip.ended or late_s < 0.0:
+            return False
+        network = self._network
+        if now_s < stays_to(strip, network.strips.values(), network.camera, now_s) + self.options.settle_s:
             return False
         smoothed_s = self._network.trajectory.smoothed_to_s
         if np.isinf(smoothed_s) or late_s >= SMOOTHED_LATE_S:

@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..adjustment.layout import SURFACE_SHIFT
 from ..camera.self_calibration import unit_of
 from ..geometry.rotation import corrected_angles
+from ..geometry.trajectory import Poses
 from ..models.base import COMPONENTS
 from .datum.drift_monitor import DriftMonitor
 from .datum.drifts import Compensation
@@ -108,9 +110,10 @@ class OrientationOutput:
 
     def at(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
         """Orientation at times (n,) that have a measured one."""
-        parts = [self._chunk(strip, times[i : i + CHUNK]) for i in range(0, len(times), CHUNK)]
-        correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         measured = self._network.trajectory.at(times)
+        chunks = [slice(i, i + CHUNK) for i in range(0, len(times), CHUNK)]
+        parts = [self._chunk(strip, times[chunk], measured.poses.part(chunk)) for chunk in chunks]
+        correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
         covariance = covariance + self._network.pose_noise.at(measured, strip.followed) + self._network.sigmas.doubt
@@ -124,9 +127,9 @@ class OrientationOutput:
         noise = self._network.pose_noise.at(self._network.trajectory.at(times), strip.followed)
         return noise + strip.left_out_variance(times)[:, :, None] * np.eye(6)
 
-    def _chunk(self, strip: WindowStrip, times: Array) -> tuple[Array, Array]:
+    def _chunk(self, strip: WindowStrip, times: Array, poses: Poses) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""
-        columns, A = strip.design(times).functions()
+        columns, A = strip.design(times, poses).functions()
         if self._cofactors is None or not np.array_equal(columns, self._columns):
             self._cofactors, self._columns = self._network.state.covariance(columns), columns
         through = (A.reshape(-1, len(columns)) @ self._cofactors).reshape(A.shape)
@@ -203,10 +206,11 @@ class CostHistory:
 
 
 def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Standing] = ()) -> tuple[Parameter, ...]:
-    """Offset, shift and drift of a strip where its model has them, and the additional parameters.
+    """Offset, shift and drift of a strip where its model has them, errors of the platform, shift of the surface,
+    additional parameters.
 
-    Those of the strip are in the state from the start, with what is known of them beforehand: "estimated" says that the
-    observations know them better.
+    Those of the strip, the platform and the surface are in the state from the start, with what is known beforehand:
+    "estimated" says that the observations know them better.
     """
     state, self_calibration, camera_columns = network.state, network.self_calibration, network.camera_columns
     slow, strip_globals = strip.slow, strip.numbers[:9]
@@ -215,6 +219,11 @@ def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Stan
     if len(strip_globals):
         kinds = [f"d{c}" for c in COMPONENTS] + [f"{c} drift" for c in COMPONENTS[3:]]
         names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, strip_globals.tolist(), strict=True))
+    platform = network.platform
+    apriori = np.concatenate([apriori[: len(names)], platform.sigma, network.surface.sigma])
+    for name, number in zip(platform.errors.unknown_names, platform.numbers.tolist(), strict=True):
+        names.append((name, platform.errors.UNITS[name], number))
+    names += [(SURFACE_SHIFT, "m", number) for number in network.surface.numbers.tolist()]
     if self_calibration is not None:
         for name, number in zip(self_calibration.unknown_names, camera_columns.tolist(), strict=True):
             names.append((name, unit_of(name), number))

@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..adjustment.pose_noise import ray_information
+from ..adjustment.surface_control import SurfaceControl
 from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import SelfCalibration
+from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from ..models.slow_errors import SlowErrors
 from .block.block import Block
 from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
+from .datum.surface import SurfaceTests
 from .leaving import Leaving, grid
 from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, adjusted_points, parameters
 from .quality.light import Fit
@@ -32,6 +35,7 @@ from .screening.consensus import ConsensusSchedule, consensus_weights
 from .screening.sigma_check import SigmaCheck
 from .screening.snooping import reweigh, snoop
 from .state.batch import Batch
+from .state.lens_sets import lens_of
 from .state.network import LiveNetwork
 from .state.points import ControlPoint
 from .state.relinearisation import Relinearisation
@@ -97,6 +101,8 @@ class Window:
     slow : a-priori slow errors of the measured trajectory
     options : settings
     self_calibration : additional parameters to estimate all along
+    platform : constant errors of the platform that are unknowns, with what is known of them beforehand
+    surface : on which tie points lie, for example a digital elevation model; None for none
 
     Attributes
     ----------
@@ -109,9 +115,11 @@ class Window:
         slow: SlowErrors,
         options: WindowOptions = WindowOptions(),  # noqa: B008  (frozen)
         self_calibration: SelfCalibration | None = None,
+        platform: PlatformErrors = NO_PLATFORM_ERRORS,
+        surface: SurfaceControl | None = None,
     ):
         self.camera, self.slow, self.options = camera, slow, options
-        network = self.network = LiveNetwork(camera, self_calibration)
+        network = self.network = LiveNetwork(camera, self_calibration, platform, surface)
         self.trajectory, self.state, self.strips = network.trajectory, network.state, network.strips
         self._block = Block(network)
         step_s = segment_length(slow, options)
@@ -121,7 +129,8 @@ class Window:
         self._consensus = ConsensusSchedule()
         self._sources = DriftMonitor(network, follows=options.follows_wander)
         self._control = ControlTests(network, self._sources, options.critical, options.datum)
-        self._quality = QualityControl(network, self._control, options)
+        self._surface = SurfaceTests(network, options.critical)
+        self._quality = QualityControl(network, self._control, options, self._surface)
         self._orientation = OrientationOutput(network, self._sources)
         self._leaving = Leaving(options, network, self._block, self._control, self._quality, self._orientation)
         self._history = CostHistory()
@@ -146,9 +155,16 @@ class Window:
         slow: SlowErrors | None = None,
         joined_s: float = -np.inf,
     ) -> None:
-        """A strip begins; ``slow`` are its slow errors if they are not those of the window.
+        """A strip begins.
 
-        What was flown of it before ``joined_s`` is not adjusted: there is no orientation for it.
+        Parameters
+        ----------
+        id : its name
+        first_line_time_s : platform time of its first line, s
+        line_rate_hz : lines a second
+        lines : how many there are; 0 while that is not known
+        slow : its slow errors, if they are not those of the window
+        joined_s : what was flown of it before this platform time is not adjusted: there is no orientation for it
 
         Raises
         ------
@@ -160,7 +176,7 @@ class Window:
             return
         self.strips[id] = WindowStrip(
             id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s,
-            self.network.sigmas.apriori,
+            self.network.sigmas.apriori, self.network.platform,
         )  # fmt: skip
         self._block.begin(self.strips[id])
 
@@ -170,7 +186,12 @@ class Window:
             self.strips[id].end(lines)
 
     def add_control(self, name: str, xyz_l: ArrayLike, sigma_m: ArrayLike, role: str) -> None:
-        """Known coordinates (3,); sigma infinite where a coordinate is not given.
+        """Known coordinates of a point.
+
+        Parameters
+        ----------
+        xyz_l, sigma_m : (3,) local frame, m; infinite sigma where a coordinate is not given
+        role : as in the messages; "check" for a point that is compared only
 
         They may come before or after the point's looks, and after it has become final: then they count in the backward
         pass, and as soon as the strips that saw it are over also for the strip that is flown.
@@ -187,7 +208,12 @@ class Window:
     # -- update --------------------------------------------------------------------------------------------------------
 
     def update(self, now_s: float) -> WindowUpdate:
-        """Work in what has arrived, let go what is older than the window."""
+        """Work in what has arrived, let go what is older than the window.
+
+        Parameters
+        ----------
+        now_s : platform time, s; one that lies before the last counts as the last
+        """
         self._now_s = max(self._now_s, now_s)
         self._serial += 1
         result = WindowUpdate()
@@ -197,11 +223,12 @@ class Window:
         duties = self._duties.take(self._now_s, busy=bool(joined))
         if LOOK_AFTER in duties:
             self._relinearisation.look_after(self._now_s)
-        iterations = self._solve(fresh)
+        iterations = self._solve(fresh) + self._weigh_surface(fresh + joined, RETEST in duties, result)
         if self.options.snoop:
             iterations += self._question_sigmas(result)
             due = joined or (self._due_for_test() if RETEST in duties else [])
-            iterations += self._screen(fresh, fresh + due, result) + self._weigh_control(fresh, result)
+            iterations += self._screen(fresh, fresh + due, result)
+            iterations += self._weigh_control(fresh, result)
         self._judge(joined)
         self._learn_noise()
         self._publish(fresh, result)
@@ -210,11 +237,15 @@ class Window:
         return result
 
     def finish(self) -> WindowUpdate:
-        """Everything that is left becomes final."""
+        """Everything that is left becomes final.
+
+        The phases of `update` but those that only matter while the flight goes on: no sigma is questioned, no noise is
+        learnt, and what leaves is final at once.
+        """
         result = WindowUpdate()
         fresh = self._arrive(result)
         joined = self._follow_trajectory(all_at_once=True)
-        iterations = self._solve(fresh)
+        iterations = self._solve(fresh) + self._weigh_surface(fresh, True, result)
         if self.options.snoop:
             due = joined or self._due_for_test()
             iterations += self._screen(fresh, fresh + due, result) + self._weigh_control(fresh, result)
@@ -241,7 +272,7 @@ class Window:
         result.tell_alone(arrived.alone)
         for batch in arrived.fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-        if not self._length_s and arrived.fresh:
+        if not self._length_s and arrived.fresh and not any(lens_of(self.camera, id) for id in self.strips):
             self._length_s = self.options.window_looks * look_time(self.camera, arrived.fresh[0])
         return arrived.fresh
 
@@ -261,6 +292,16 @@ class Window:
         # a third solution has shown no gain, even where control turns the orientation
         self.state.solve()
         return 2
+
+    def _weigh_surface(self, fresh: list[Batch], everything: bool, result: WindowUpdate) -> int:
+        """Heights of the surface that points lie on: which count, and whether it agrees; number of solutions
+        computed."""
+        solutions, change = self._surface.weigh(fresh, everything)
+        self._block.reweigh_surface(change)
+        result.warnings += self._surface.take_warnings()
+        if solutions:
+            self._orientation.forget()
+        return solutions
 
     def _question_sigmas(self, result: WindowUpdate) -> int:
         """Variance components, before any look is thrown out; number of solutions computed."""

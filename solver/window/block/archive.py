@@ -70,8 +70,8 @@ class Archive:
 
     Parameters
     ----------
-    camera_columns : (m,) numbers of the additional parameters, which all strips share
-    camera_sigma : (m,) a priori
+    shared_columns : (m,) numbers of the unknowns that all strips share
+    shared_sigma : (m,) a priori
 
     Attributes
     ----------
@@ -79,17 +79,17 @@ class Archive:
     changed : whether information was added since the last solution
     """
 
-    def __init__(self, camera_columns: IntArray, camera_sigma: Array):
+    def __init__(self, shared_columns: IntArray, shared_sigma: Array):
         self.strips: dict[str, KeptStrip] = {}
         self.points: dict[str, KeptPoint] = {}
-        self._camera = camera_columns
+        self._shared = shared_columns
         self._normals = BlockNormals()
-        self.add(camera_columns, np.diag(camera_sigma**-2.0), np.zeros(len(camera_columns)))
+        self.add(shared_columns, np.diag(shared_sigma**-2.0), np.zeros(len(shared_columns)))
         self.changed = False
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept; drifts (negative numbers) are."""
-        kept = np.concatenate([self._camera, *(strip.numbers for strip in self.strips.values())])
+        kept = np.concatenate([self._shared, *(strip.numbers for strip in self.strips.values())])
         return bool((np.isin(columns, kept) | (columns < 0)).all())
 
     @property
@@ -251,7 +251,7 @@ class Archive:
         named : drifts of tie points that are unknowns too, so that the others are free of them
         """
         self.changed = False
-        numbers, weight = self._unknowns(self.strips.values(), named, self._camera)
+        numbers, weight = self._unknowns(self.strips.values(), named, self._shared)
         values, cofactors = yield from self._normals.solving(numbers, weight)
         return BlockSolution(numbers, values, cofactors)
 
@@ -289,7 +289,7 @@ class Archive:
         """The strips that must be closed so that the block keeps its bounds, oldest first."""
         left, found = list(self.strips), []
         while len(left) > 1:
-            unknowns = len(self._camera) + sum(len(self.strips[id].entered) for id in left)
+            unknowns = len(self._shared) + sum(len(self.strips[id].entered) for id in left)
             points = sum(p.single is None and p.strips.isdisjoint(found) for p in self.points.values())
             if unknowns <= BLOCK_UNKNOWNS and points <= MOST_POINTS:
                 break

@@ -49,13 +49,11 @@ class Block:
     """
 
     def __init__(self, network: LiveNetwork) -> None:
-        set_ = network.self_calibration
-        sigma = set_.apriori_sigma if set_ is not None else np.empty(0)
         self._network = network
-        self.earlier = EarlierStrips(network.state, network.camera_columns)
+        self.earlier = EarlierStrips(network.state, network.shared_columns)
         self.events: list[str] = []
         self.drifts: Sequence[Named] = ()
-        self._archive = Archive(network.camera_columns, sigma)
+        self._archive = Archive(network.shared_columns, network.shared_sigma)
         self._touched: set[str] = set()
         self._new: list[str] = []
         self._full = 0
@@ -117,6 +115,12 @@ class Block:
         for c in changes:
             self.conclude()
             self._archive.weigh_control(c.point, c.axis, c.weight, c.value)
+
+    def reweigh_surface(self, change: Array) -> None:
+        """What is known beforehand of the shift of the surface has another weight, by (m, m) more."""
+        if change.any():
+            self.conclude()
+            self._archive.add(self._network.surface.numbers, change, np.zeros(len(change)))
 
     def take_events(self) -> list[str]:
         """Lines for the operator since the last call."""

@@ -105,11 +105,16 @@ class SingleLook:
 
 
 def rows_of(batch: Batch, point: int, cell: Cell | None) -> tuple[Rows, Array]:
-    """Equations of a point's rays, with the drifts of their strip, without earlier strips; the origin (3,)."""
+    """Equations of a point's rays, and of the surface it lies on, with the drifts of their strip, without earlier
+    strips; the origin (3,)."""
     A, J, residual, origin = batch.equations(point)
+    rays = len(A)
+    if (of_surface := batch.surface_equation(point)) is not None:
+        A, J, residual = (np.concatenate(pair) for pair in zip((A, J, residual), of_surface, strict=True))
     columns = batch.columns[: len(batch.columns) - batch.n_tied]
     A = A[:, : len(columns)]
     if cell is not None:
-        A = np.column_stack([A, cell.on_rays(range(batch.first_ray[point], batch.first_ray[point + 1]))])
+        drifts = cell.on_rays(range(batch.first_ray[point], batch.first_ray[point + 1]))
+        A = np.column_stack([A, np.pad(drifts, ((0, len(A) - rays), (0, 0)))])
         columns = np.concatenate([columns, cell.of_block])
     return (columns, A, J, residual), origin

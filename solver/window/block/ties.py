@@ -90,13 +90,13 @@ class EarlierStrips:
     full : how often a point could not tie because there were too many modes in the window
     """
 
-    def __init__(self, state: WindowState, camera_columns: IntArray) -> None:
+    def __init__(self, state: WindowState, shared_columns: IntArray) -> None:
         self.points: dict[str, EarlierPoint] = {}
         self.full = 0
-        self._state, self._camera = state, camera_columns
+        self._state, self._shared = state, shared_columns
         self._patches: list[Patch] = []
         self._covariance: list[Array] = []  # of the modes of each patch with those up to it, then of the parameters
-        self._camera_values = np.zeros(len(camera_columns))
+        self._shared_values = np.zeros(len(shared_columns))
 
     @property
     def present(self) -> bool:
@@ -127,7 +127,7 @@ class EarlierStrips:
             points |= zip(names, found, strict=True)
             functions.append(modes)
             yield PATCH_COST * len(names)
-        functions.append((solution.places(self._camera), np.eye(len(self._camera))))
+        functions.append((solution.places(self._shared), np.eye(len(self._shared))))
         rows: list[Array] = []
         for i, (places, M) in enumerate(functions):
             half = M @ solution.cofactors[places]
@@ -135,7 +135,7 @@ class EarlierStrips:
             yield 2.0 * rows[-1].size * len(solution.numbers)
         self.points, self._covariance = points, rows
         self._patches = [Patch(i, np.empty(0, dtype=np.int64)) for i in range(len(members))]
-        self._camera_values = solution.of(self._camera)[0]
+        self._shared_values = solution.of(self._shared)[0]
 
     # -- in the window -------------------------------------------------------------------------------------------------
 
@@ -173,8 +173,8 @@ class EarlierStrips:
         V = S[np.ix_(own, own)] - K @ S[np.ix_(given, own)]
         root = np.linalg.inv(np.linalg.cholesky(V + FLOOR * np.eye(m)))
         rows = np.concatenate([root, -root @ K], axis=1)
-        value = -root @ K[:, len(given) - len(self._camera) :] @ self._camera_values
-        columns = np.concatenate([patch.numbers, *(p.numbers for p in here), self._camera])
+        value = -root @ K[:, len(given) - len(self._shared) :] @ self._shared_values
+        columns = np.concatenate([patch.numbers, *(p.numbers for p in here), self._shared])
         self._state.observe(np.tile(columns, (m, 1)).astype(np.int32), rows, value, np.ones(m))
 
     def _joint(self, groups: Sequence[int]) -> Array:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...adjustment.bias_search import Verdict, biases
+from ...quantiles import chi2
 from ..results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
@@ -39,6 +39,10 @@ LOOK_S, WEIGH_S = 2.0, 10.0
 LOOKED_INTO = 1e-3
 #: Control and GNSS are known to contradict each other, and no sigma can be relied on, beyond so many critical values.
 FAR = 2.0
+#: A difference to the GNSS that lies across the flight by less than this share of what lies along it may be one of
+#: clocks, slower flight than this, m/s, shows none; two strips say the same if their clocks agree within that share,
+#: and their directions differ by more than the angle of this cosine. Flight is averaged over so long, s. Tuned.
+ALONG, SLOWEST_M_S, OTHER_WAY, AVERAGED_S = 0.3, 5.0, 0.5, 4.0
 #: Hypotheses named in a line for the operator at most.
 NAMED = 3
 
@@ -82,6 +86,8 @@ class ControlTests:
         self._weighed: Weighed | None = None  # last
         self._told: set[tuple[int, int]] = set()  # axes and strips whose contradiction with the GNSS has been told
         self._contradiction = ""
+        self._along: dict[int, tuple[float, Array]] = {}  # by strip: clock that would explain it, s; direction (2,)
+        self._clock_told = False
         self.warnings: list[str] = []
 
     # -- what leaves ---------------------------------------------------------------------------------------------------
@@ -287,6 +293,7 @@ class ControlTests:
         """
         if self._of_gnss:
             self._differ.clear()
+        off: dict[int, float] = {}
         for a in range(3):
             mine = d.axis == a
             n = int(mine.sum())
@@ -297,6 +304,7 @@ class ControlTests:
             U = np.column_stack([mine, np.eye(len(mine))[:, verdict.out & ~mine]])
             every = np.ones(U.shape[1], dtype=bool)
             by, sigma = (float(x[0]) for x in biases(U.T @ d.C @ U, U.T @ d.v, every))
+            off[a] = by
             points = f"all of {n} points" if n > 1 else d.coordinates[int(np.flatnonzero(mine)[0])].point
             system = "height system (geoid)?" if a == 2 else "datum?"
             text = f"control and GNSS differ by {abs(by):.2f} +- {sigma:.2f} m in {AXES[a]} ({points}): {system}"
@@ -311,6 +319,36 @@ class ControlTests:
                 )
                 other = "control" if self._of_gnss else "gnss"
                 self.warnings.append(f"{text} {rests}; set datum = {other} to turn it")
+
+        if off.keys() & {0, 1}:
+            self._name_clock(off, max(c.strip for c in d.coordinates))
+
+    def _name_clock(self, off: Mapping[int, float], strip: int) -> None:
+        """Name the clock where control and GNSS differ along the flight alone: one strip hints, two say it."""
+        end_s = self._network.trajectory.smoothed_to_s
+        times = np.array([end_s - AVERAGED_S, end_s])
+        if not self._network.trajectory.covers(times).all():
+            return
+        velocity = np.diff(self._network.trajectory.at(times).poses.position_l[:, :2], axis=0)[0] / AVERAGED_S
+        speed = float(np.linalg.norm(velocity))
+        if speed < SLOWEST_M_S:
+            return
+        direction = velocity / speed
+        by = np.array([off.get(0, 0.0), off.get(1, 0.0)])
+        along, across = float(by @ direction), float(by[1] * direction[0] - by[0] * direction[1])
+        if abs(across) > ALONG * abs(along):
+            self._along.pop(strip, None)
+            return
+        ahead_s = along / speed
+        self._along[strip] = ahead_s, direction
+        words = f"GNSS clock {abs(ahead_s):.3f} s {'ahead of' if ahead_s > 0 else 'behind'} the image lines"
+        for a in off.keys() & {0, 1}:
+            text, metres, far = self._differ[a]
+            self._differ[a] = text.replace("datum?", f"datum, or {words}?"), metres, far
+        others = [(s, w) for i, (s, w) in self._along.items() if i != strip and float(w @ direction) < OTHER_WAY]
+        if others and not self._clock_told and all(abs(s - ahead_s) < ALONG * abs(ahead_s) for s, _ in others):
+            self._clock_told = True
+            self.warnings.append(f"{words}: control of strips that were flown in other directions agrees on it")
 
     def take_warnings(self) -> list[str]:
         """Lines for the operator since the last call."""

@@ -10,7 +10,8 @@ more: the protection level is exceeded, with any one error, no more often than t
 By Cauchy and Schwarz no function moves by more than ``delta_0 sqrt(lambda)`` of its sigmas, ``lambda`` the largest
 eigenvalue of ``C^-1 A_r Q A_r^T``. So the effects of the few observations of largest lambda are computed exactly, and
 the bound stands for all others, those that have left the window included: their lambda can only have become smaller.
-One error is assumed at a time, in an image ray or in a coordinate of a control point.
+One error is assumed at a time, in an image ray, in a coordinate of a control point, or in the height of the surface
+that tie points lie on.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ...adjustment.protection import protection_factor
 from ...adjustment.reliability import CRITICAL_W, noncentrality
 from ..results import RefinedOrientation
 from ..state.batch import Batch, Information, inverse_factors
+from ..state.surface import LiveSurface
 from ..state.unknowns import Border, Marginal, WindowState
 
 Array = NDArray[np.floating]
@@ -48,6 +50,8 @@ CANCELS = 3.0
 #: Cofactors of whitened residuals that are smaller count as this (rounding). Of two rays to a point, no other
 #: observation checks the direction along the base; but the orientation does not depend on it either.
 UNCHECKED = 1e-6
+#: The observation that the shift of a surface is about zero, in words.
+SURFACE = "height of the elevation model as a whole"
 #: Control points are named together with the worst one if an error in them does this share of its effect (tuned).
 ALIKE = 0.6
 
@@ -225,7 +229,8 @@ class Integrity:
     most_exposed : batch of the observation that the newest position was most exposed to
     """
 
-    def __init__(self, critical: float) -> None:
+    def __init__(self, critical: float, surface: LiveSurface | None = None) -> None:
+        self._surface = surface
         self._critical, self._delta = critical, noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
         self._left = LeftObservations()
@@ -313,16 +318,18 @@ class Integrity:
         h = np.concatenate([*h, border.G.T @ Qg[state.places(border.numbers)]]).reshape(-1, 2, k)
         inverse = np.array([e.inverse for e in observations]).reshape(-1, 2, 2)
         squares = np.maximum(np.einsum("nik,nij,njk->nk", h, inverse, h), 0.0)  # rounding
-        effect = np.vstack([bound, self._delta * np.sqrt(squares)])
+        shifted = np.zeros((0, k)) if self._surface is None else self._surface.hidden(Qg, self._delta)
+        effect = np.vstack([bound, self._delta * np.sqrt(squares), shifted])
         size = effect[:, 6:].max(axis=1) if k > 6 else np.linalg.norm(effect[:, :3], axis=1)
-        worst = observations[size.argmax() - 1] if size.argmax() else None
+        of_surface = bool(size.argmax() > len(observations))
+        worst = observations[size.argmax() - 1] if size.argmax() and not of_surface else None
         if renew:
             self._left.thin(state)
             self.most_exposed = worst.batch if worst is not None else None
         bias = effect.max(axis=0)
         if worst is None:
-            return Exposure(bias, sigma, "", critical=self._critical)
-        alike = [e for e, s in zip(observations, size[1:], strict=True) if s > ALIKE * size.max()]
+            return Exposure(bias, sigma, SURFACE if of_surface else "", critical=self._critical)
+        alike = [e for e, s in zip(observations, size[1:], strict=False) if s > ALIKE * size.max()]
         names = sorted({e.name for e in alike if e.axis >= 0}) if worst.axis >= 0 else []
         detectable_m = self._delta * worst.sigma_m * float(worst.inverse[0, 0]) ** 0.5
         return Exposure(bias, sigma, worst.in_words, tuple(names), detectable_m, self._critical)

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...adjustment.drift_hypotheses import BiasedSource, Group
 from ...adjustment.reliability import CRITICAL_W
 from ...models.base import ERROR_GROUPS
+from ...quantiles import chi2
 from .determinability import Standing
 from .exposure import Exposure
 from .ground import WHERE
@@ -70,8 +70,8 @@ class QualityFindings:
     points, refused, tied : object points in the window, those without a ray left, and those with two or more
     free : of the latter those that are no ground points with given coordinates; None: not known
     control, control_refused : (3,) X, Y and Z coordinates of control in use; control points without a ray left
-    control_doubt, control_failed : what control contradicts, itself or the GNSS, in words, "" where it does not; and
-        whether by so much that no sigma can be relied on
+    control_doubt, control_failed : what control contradicts, itself or the GNSS, and what the surface that points lie
+        on does, in words, "" where they do not; and whether control does by so much that no sigma can be relied on
     apriori_m : (3,) sigma of X, Y and Z before any observation
     sources : of tie points, those that drift
     time_s, exposure : newest time, and what could be wrong unseen there; None without tie points
@@ -82,6 +82,7 @@ class QualityFindings:
     disagreement, constants : see `SigmaFactors`; the latter of offset, and of shift and drift
     light, reason : that are shown, see `LightDisplay`
     events : for the operator
+    held_by : what holds the datum where no control is in the window
     """
 
     strip: str
@@ -111,6 +112,7 @@ class QualityFindings:
     reason: str = ""
     events: tuple[str, ...] = ()
     free: int | None = None
+    held_by: str = "earlier control"
 
     @property
     def names(self) -> frozenset[Group]:
@@ -190,7 +192,7 @@ def _datum(s: QualityFindings) -> tuple[str, str]:
         return WEAK, on_gnss
     if not (len(s.ground_protection_m) and (s.ground_protection_m <= s.alert_limit_m).all()):
         return WEAK, _exposed(s)
-    return GOOD, "" if (s.control > 0).any() else f"no control {_within(s)}; earlier control holds the datum"
+    return GOOD, "" if (s.control > 0).any() else f"no control {_within(s)}; {s.held_by} holds the datum"
 
 
 def _exposed(s: QualityFindings) -> str:

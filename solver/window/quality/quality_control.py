@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datum.control import ControlTests
+from ..datum.surface import SurfaceTests
 from ..results import RefinedOrientation, WindowOptions
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
@@ -28,6 +29,7 @@ class QualityControl:
     Parameters
     ----------
     control : judges control, and knows of tie points that drift
+    surface : judges the surface that tie points lie on
 
     Attributes
     ----------
@@ -35,13 +37,16 @@ class QualityControl:
     last : what the last look found, without its events
     """
 
-    def __init__(self, network: LiveNetwork, control: ControlTests, options: WindowOptions) -> None:
+    def __init__(
+        self, network: LiveNetwork, control: ControlTests, options: WindowOptions, surface: SurfaceTests
+    ) -> None:
+        self._surface = surface
         self._network, self._control, self._sources = network, control, control.sources
         self._limit_m, self._below, self._display = options.alert_limit_m, GroundBelow(network.camera), LightDisplay()
         self._parameters: Determinability | None = None
         if network.self_calibration is not None and options.determine:
             self._parameters = Determinability(network.self_calibration, network.camera_columns, network.camera)
-        self.integrity = Integrity(options.critical)
+        self.integrity = Integrity(options.critical, network.surface)
         self.last: QualityFindings | None = None
 
     def protected(self, strip: WindowStrip, orientation: RefinedOrientation, final: bool = False) -> RefinedOrientation:
@@ -105,7 +110,8 @@ class QualityControl:
             free=tied - sum(map(partial(_tied_control, control=network.intake.control.keys()), batches, left)),
             control=known[rays > 0].sum(axis=0),
             control_refused=sum(b.control_refused for b in batches),
-            control_doubt=self._control.doubt,
+            control_doubt="; ".join(filter(None, (self._control.doubt, self._surface.doubt))),
+            held_by="the elevation model" if self._surface.holds else "earlier control",
             control_failed=self._control.fails(self._alert_limit_m),
             apriori_m=np.ones(3) if strip is None else strip.slow.position_sigma,
             sources=self._sources.biased,

@@ -17,10 +17,10 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import largest_of_group
+from ...quantiles import chi2
 from ..state.batch import Batch
 from ..state.unknowns import WindowState
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...adjustment.reliability import normalised_residuals
+from ...quantiles import chi2
 from ..state.batch import Batch
 from ..state.unknowns import WindowState
 

@@ -31,9 +31,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
 
 from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT
+from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
 from ..state.unknowns import WindowState
@@ -73,11 +73,14 @@ TOLD_AGAIN = 1.5
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
+#: An error of the platform contradicts what was known of it beforehand if its normalised residual is larger (a
+#: probability of 1 %); it is told when it is so many times its sigma, and so many times the a-priori one. Tuned.
+PLATFORM_QUESTIONED, CERTAIN, SURPRISING = 2.6, 5.0, 2.0
 #: No factor becomes larger.
 LARGEST = 1000.0
 #: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
 #: median of chi-square values of one degree of freedom that are the least of three), that from which it counts, and
-#: from which a wander is questioned. Tuned.
+#: from which a wander of attitude is questioned; that of position may show at control alone. Tuned.
 REMEMBERED, ENOUGH, RIGHT, CLEARLY, SUSPECT = 60, 15, 0.3, 1.5, 0.8
 
 
@@ -98,6 +101,7 @@ class SigmaCheck:
         self._vibration = 0.0
         self._steady = 0
         self._suspect = False
+        self._told_platform: set[str] = set()
         self.events: list[str] = []
 
     def entered(self, squares: Iterable[tuple[float, int]]) -> None:
@@ -118,6 +122,8 @@ class SigmaCheck:
             return False, False
         self._looked_s = now_s
         network.state.solve()
+        if network.platform.question(PLATFORM_QUESTIONED):
+            network.state.solve()
         factor = self._slow_errors(strip, now_s)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
@@ -136,6 +142,7 @@ class SigmaCheck:
                 flown.restate_sigmas(sigmas.apriori, network.state)
             network.state.solve()
         self._tell()
+        self._tell_platform()
         return of_slow, of_image
 
     def _slow_errors(self, strip: WindowStrip, now_s: float) -> Array:
@@ -146,8 +153,8 @@ class SigmaCheck:
         squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
         factor = before.copy()
         asked = (redundancies >= LEAST_REDUNDANCY) & ((factor > 1.0) | (squares > chi2.isf(QUESTIONED, redundancies)))
-        if not self._suspect:  # gross errors that have not been found yet bend the wander as well
-            asked[[POSITION_WANDER, ATTITUDE_WANDER]] &= factor[[POSITION_WANDER, ATTITUDE_WANDER]] > 1.0
+        if not self._suspect:  # a gross error that has not been found yet bends the attitude, control the position
+            asked[ATTITUDE_WANDER] &= factor[ATTITUDE_WANDER] > 1.0
         for pair in self._pairs:
             if not asked[list(pair)].any():
                 continue
@@ -222,6 +229,16 @@ class SigmaCheck:
                 if now[i] > 1.0
                 else f"sigmas: {name} is as stated"
             )
+
+    def _tell_platform(self) -> None:
+        """Say once which errors of the platform are certain, and more than was expected."""
+        platform, state = self._network.platform, self._network.state
+        value, sigma = state.values(platform.numbers), np.sqrt(np.diagonal(state.covariance(platform.numbers)))
+        for i, name in enumerate(platform.errors.unknown_names):
+            certain = abs(value[i]) > max(CERTAIN * sigma[i], SURPRISING * platform.errors.sigma[i])
+            if certain and name not in self._told_platform:
+                self._told_platform.add(name)
+                self.events.append(platform.errors.words(name, float(value[i]), float(sigma[i])))
 
     def take_events(self) -> list[str]:
         """Lines for the operator since the last call."""

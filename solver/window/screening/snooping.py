@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...adjustment.snooping import TOGETHER, failing_w, largest_of_group
+from ...quantiles import chi2
 from ..datum.biases import Coordinate
 from ..datum.control import ControlTests
 from ..results import TAKEN_BACK, Refusal

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from ...adjustment.normal_equations import ControlWeights, without_point
+from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import TOGETHER
+from ...quantiles import chi2
 from ..state.batch import Batch, PointTies, inverse_factors
 from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
@@ -111,6 +111,6 @@ def drop_ties(batch: Batch, fails: Bools) -> list[str]:
         return []
     batch.ties = replace(batch.ties, active=batch.ties.active & ~fails)
     weight = np.where(fails[:, None], batch.ties.control, batch.control.weight)
-    batch.control = ControlWeights(weight, batch.control.xyz_l, int((weight > 0).sum()))
+    batch.control = replace(batch.control, weight=weight, n_observations=int((weight > 0).sum()))
     batch.eliminate()
     return [batch.names[i] for i in np.flatnonzero(fails)]

@@ -17,6 +17,7 @@ from ...adjustment.linearisation import Linearisation, Whitening, linearise, lin
 from ...adjustment.network import Rays
 from ...adjustment.normal_equations import ControlWeights, PointNormals, inverse_factors, point_normals
 from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
+from ...adjustment.surface_control import SurfaceControl, SurfaceRows
 from .unknowns import Information, WindowState
 
 Array = NDArray[np.floating]
@@ -112,6 +113,9 @@ class Batch:
     points_l : (p, 3)
     provisional : whether a ray leans on a filtered pose that a smoothed one will replace
     ties : what earlier strips say of the points
+    surface, on_surface : that points lie on, None for none, and which of them (p,) do
+    surface_factor : (p,) on the weights of its heights
+    surface_rows : its equations, at full weight
     noise_version : of the noise of poses and images that the weights are for, see `LiveNetwork.noise_version`
     image_factor : what the sigmas of its lines and samples have been multiplied by
     counted : whether its rays are counted there
@@ -131,6 +135,8 @@ class Batch:
     points_l: Array
     provisional: bool
     ties: PointTies | None = None
+    surface: SurfaceControl | None = None
+    on_surface: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
     noise_version: int = 0
     image_factor: float = 1.0
     counted: bool = False
@@ -149,7 +155,10 @@ class Batch:
     _places: tuple[IntArray, IntArray] = field(init=False, repr=False)
     _coefficients: Array = field(init=False, repr=False)
     _incomplete: bool = field(init=False, repr=False)
+    _first_terms: IntArray | None = field(init=False, repr=False)
     coupling: Array = field(init=False, repr=False)
+    surface_factor: Array = field(init=False, repr=False)
+    surface_rows: SurfaceRows = field(init=False, repr=False)
 
     @property
     def n_points(self) -> int:
@@ -160,6 +169,7 @@ class Batch:
         self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
         self.height_m = abs(float(np.median(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])))
         self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
+        self.surface_factor = np.ones(self.n_points)
         self._template()
 
     def linearise(self, theta: Array, reweigh: bool) -> None:
@@ -170,7 +180,28 @@ class Batch:
             self.whitening, self.lin, self.layout = linearise_and_weigh(rays, self.layout, theta, self.points_l)
         else:
             self.lin = linearise(self.rays, self.layout, self.whitening, theta, self.points_l)
+        if self.surface is not None:
+            self.surface_rows = self.surface.rows(self.points_l, self.on_surface)
+            self.weigh_surface(self.surface_factor)
         self.eliminate()
+
+    def weigh_surface(self, factor: Array) -> None:
+        """Give the heights of the surface other weights (p,) between 0 and 1; `eliminate` makes them count."""
+        self.surface_factor = factor
+        rows = self.surface_rows.weighed(self.surface_rows.weight * factor)
+        self.control = replace(self.control, surface=rows)
+
+    def surface_equation(self, point: int) -> tuple[Array, Array, Array] | None:
+        """Rows (1, u) and (1, 3) and the right-hand side (1,) of a point on the surface, as `equations`; None if it is
+        not on it."""
+        rows = self.control.surface
+        if rows is None or not rows.weight[point] > 0:
+            return None
+        root = np.sqrt(rows.weight[point])
+        design = np.zeros((1, len(self.columns)))
+        design[0, self.layout.shift_column] = root
+        off = rows.residual(self.origin_l, 0.0)[point : point + 1]
+        return design, root * rows.normal[point : point + 1], off
 
     def eliminate(self) -> None:
         """Information about the orientation, with the points eliminated, at the present linearisation and weights."""
@@ -192,6 +223,9 @@ class Batch:
         D = np.add.reduceat(w @ A, self.first_ray[:-1], axis=0)  # (p, 3, u)
         if tied is not None:
             D += inverse_factors(normals) @ np.swapaxes(tied.point, 1, 2) @ tied.design
+        surface, place = self.control.surface, self.layout.shift_column
+        if surface is not None and normals.surface is not None:
+            D[:, :, place] += normals.surface.T
         of_points = D.reshape(3 * p, u)
         y = normals.y.T.ravel()
         matrix = flat.T @ flat - of_points.T @ of_points
@@ -202,6 +236,12 @@ class Batch:
         self.active_control = int(self.control.weight.any(axis=1).sum())
         self.determined = int(normals.rank.sum())
         rows = 2 * self.active_rays + self.control.n_observations - self.determined
+        if surface is not None:
+            above = surface.residual(self.origin_l, 0.0)
+            matrix[place, place] += surface.weight.sum()
+            rhs[place] += np.sqrt(surface.weight) @ above
+            square += float(above @ above)
+            rows += surface.n_observations
         if tied is not None and self.ties is not None:
             matrix += np.einsum("pku,pkv->uv", tied.design, tied.design)
             rhs += np.einsum("pku,pk->u", tied.design, tied.residual)
@@ -256,7 +296,7 @@ class Batch:
         weights[point, axis] = weight
         if self.ties is not None:
             self.ties.control[point, axis] = weight
-        self.control = ControlWeights(weights, self.control.xyz_l, int((weights > 0).sum()))
+        self.control = replace(self.control, weight=weights, n_observations=int((weights > 0).sum()))
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
@@ -286,7 +326,8 @@ class Batch:
         rows = np.zeros(2 * n * u + 1)  # the last one takes what a ray does not have
         for axis in range(2):
             step = np.where(place < 2 * n * u, place + axis * u, place) if self._incomplete else place + axis * u
-            rows[step] = self._coefficients * lin.orientation[axis].take(self.layout.component, axis=0)
+            terms = self._coefficients * lin.orientation[axis].take(self.layout.component, axis=0)
+            rows[step] = terms if self._first_terms is None else np.add.reduceat(terms, self._first_terms, axis=0)
             if self.layout.camera is not None:
                 end = of_camera >= 2 * n * u
                 rows[np.where(end, of_camera, of_camera + axis * u)] = lin.camera[axis]
@@ -298,7 +339,11 @@ class Batch:
         first = 2 * u * np.arange(n)
         nowhere = 2 * n * u
         self._incomplete = bool((layout.columns < 0).any())
-        place = np.where(layout.columns >= 0, first + layout.columns, nowhere)
+        # terms of one unknown that acts on several components stand one after the other
+        new = np.append(True, (layout.columns[1:] != layout.columns[:-1]).any(axis=1))
+        self._first_terms = None if new.all() else np.flatnonzero(new)
+        columns = layout.columns[new]
+        place = np.where(columns >= 0, first + columns, nowhere)
         of_camera = np.empty((0, n), dtype=np.int64)
         if layout.camera is not None:
             column = layout.camera.columns[layout.camera.pattern].T

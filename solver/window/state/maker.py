@@ -14,10 +14,12 @@ from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredPoses
 from ...geometry.ray_intersection import intersect_rays
 from ...geometry.rotation import corrected_angles, matrix_from_angles
+from ...geometry.trajectory import Poses
 from ...models.base import Design, PseudoObservations
 from .batch import Batch, PointTies
 from .network import LiveNetwork
 from .points import PointLooks
+from .strip import WindowStrip
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -125,7 +127,9 @@ class BatchMaker:
         rays, covariance, weight, smoothed = self.rays([point for draft in drafts for point in draft.points])
         ids = list(self.network.strips)
         groups = [np.flatnonzero(rays.strip == i) for i in np.unique(rays.strip)]
-        parts = [(mine, self.network.strips[ids[rays.strip[mine[0]]]].design(rays.time_s[mine])) for mine in groups]
+        parts = [
+            (mine, self._design(self.network.strips[ids[rays.strip[mine[0]]]], rays.part(mine))) for mine in groups
+        ]
         design = join_designs(parts, len(rays))
         made, point = [], 0
         for draft in drafts:
@@ -138,6 +142,11 @@ class BatchMaker:
             made.append(self._batch(draft, known, own, columns, covariance[part], weight[part], provisional))
             point += len(draft.names)
         return made
+
+    def _design(self, strip: WindowStrip, rays: Rays) -> Design:
+        """Of rays of a strip."""
+        poses = Poses(rays.time_s, rays.position_l, rays.angles, rays.velocity_l, rays.angle_rate)
+        return strip.design(rays.time_s, poses)
 
     def _batch(
         self,
@@ -152,8 +161,9 @@ class BatchMaker:
         """One of `make_each`."""
         names, points, ties = draft.names, draft.points, draft.ties
         columns, layout = local_layout(
-            design, rays.strip, self.network.self_calibration, self.network.camera_columns, rays
-        )
+            design, rays.strip, self.network.self_calibration, self.network.camera_columns, rays,
+            self.network.surface.numbers,
+        )  # fmt: skip
         used = np.array([p.spent for p in points])
         if ties is not None:
             columns, used = np.concatenate([columns, ties.columns]), ties.used
@@ -176,11 +186,21 @@ class BatchMaker:
             rest = Draft([names[i] for i in good], [points[i] for i in good], part)
             return self.make_each([rest], known)[0][0], lost
         batch = Batch(
-            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties
+            list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties,
+            self.network.surface.control, self._on_surface(names, points, ties),
         )  # fmt: skip
         batch.noise_version, batch.image_factor = self.network.noise_version, self.network.sigmas.image
         batch.linearise(theta, reweigh=True)
         return batch, []
+
+    def _on_surface(self, names: list[str], points: list[PointLooks], ties: PointTies | None) -> NDArray[np.bool_]:
+        """Points (p,) that a height of the surface is wanted for: seen twice, without coordinates of their own, and
+        without what an earlier strip says of them, which has it."""
+        control = self.network.intake.control
+        new = np.array([name not in control and not p.spent for name, p in zip(names, points, strict=True)])
+        if ties is not None:
+            return new & ties.single
+        return new & np.array([len(p.looks) >= 2 for p in points])
 
     def _place(
         self,
@@ -228,7 +248,12 @@ class BatchMaker:
 
 
 def local_layout(
-    design: Design, strip: IntArray, self_calibration: SelfCalibration | None, camera_columns: IntArray, rays: Rays
+    design: Design,
+    strip: IntArray,
+    self_calibration: SelfCalibration | None,
+    camera_columns: IntArray,
+    rays: Rays,
+    surface_columns: IntArray,
 ) -> tuple[IntArray, Layout]:
     """The unknowns that rays touch, by their number in the window, and a layout that counts them from 0.
 
@@ -238,6 +263,7 @@ def local_layout(
     strip : (n,) set of each ray
     self_calibration : additional parameters, all of which count as touched
     camera_columns : (m,) their numbers
+    surface_columns : (1,) number of the shift of the surface, or (0,)
     """
     touched = np.unique(design.columns)
     touched = touched[touched >= 0].astype(np.int64)
@@ -259,8 +285,10 @@ def local_layout(
         (),
         _NO_PRIOR,
         heading=True,
+        n_surface=len(surface_columns),
     )
-    return np.concatenate([touched, camera_columns if camera is not None else camera_columns[:0]]), layout
+    of_camera = camera_columns if camera is not None else camera_columns[:0]
+    return np.concatenate([touched, of_camera, surface_columns]), layout
 
 
 def join_designs(parts: Sequence[tuple[IntArray, Design]], n: int) -> Design:

@@ -8,13 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...adjustment.pose_noise import PoseNoise
+from ...adjustment.surface_control import SurfaceControl
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredTrajectory
+from ...models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .batch import Batch
+from .platform import LivePlatform
 from .points import Intake
 from .sigma_factors import SigmaFactors
 from .strip import WindowStrip
+from .surface import LiveSurface
 from .unknowns import WindowState
 
 Array = NDArray[np.floating]
@@ -80,6 +84,8 @@ class LiveNetwork:
     ----------
     camera : line camera
     self_calibration : additional parameters that are estimated all along
+    platform : constant errors of the platform that are
+    surface : on which tie points lie; None for none
 
     Attributes
     ----------
@@ -90,10 +96,18 @@ class LiveNetwork:
     batches : points with their equations
     pose_noise : what the corrections leave of the noise of poses
     sigmas : what a-priori sigmas are multiplied by
+    platform : constant errors of the platform
     camera_columns : (m,) numbers of the additional parameters
+    surface : on which tie points lie
     """
 
-    def __init__(self, camera: LineCamera, self_calibration: SelfCalibration | None = None) -> None:
+    def __init__(
+        self,
+        camera: LineCamera,
+        self_calibration: SelfCalibration | None = None,
+        platform: PlatformErrors = NO_PLATFORM_ERRORS,
+        surface: SurfaceControl | None = None,
+    ) -> None:
         self.camera, self.self_calibration = camera, self_calibration
         self.trajectory = MeasuredTrajectory()
         self.state = WindowState()
@@ -102,6 +116,7 @@ class LiveNetwork:
         self.batches = Batches(self.state)
         self.pose_noise = PoseNoise(self.trajectory)
         self.sigmas = SigmaFactors()
+        self.platform = LivePlatform(platform, self.trajectory, self.state)
         self.camera_columns: IntArray = np.empty(0, dtype=np.int64)
         if self_calibration is not None:
             m = self_calibration.n_unknowns
@@ -109,6 +124,18 @@ class LiveNetwork:
             columns = self.camera_columns[:, None].astype(np.int32)
             self.state.enter(self.camera_columns)
             self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+        self.surface = LiveSurface(surface, self.state)
+
+    @property
+    def shared_columns(self) -> IntArray:
+        """Numbers of the unknowns that all strips share: of the platform, of the camera, of the surface."""
+        return np.concatenate([self.platform.numbers, self.camera_columns, self.surface.numbers])
+
+    @property
+    def shared_sigma(self) -> Array:
+        """What is known of these beforehand."""
+        camera = self.self_calibration.apriori_sigma if self.self_calibration is not None else np.empty(0)
+        return np.concatenate([self.platform.errors.sigma, camera, self.surface.sigma])
 
     @property
     def noise_version(self) -> int:

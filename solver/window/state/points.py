@@ -203,7 +203,11 @@ class Intake:
                 reason = "too few looks" if over[first + i] else "no orientation"
                 self._refused.append(Refusal(name, point.looks[i], reason))
                 del point.looks[i], point.time_s[i], point.weight[i]
-        return ready
+        # a batch is taken apart whole, so its points wait for each other
+        waits = {id(batch) for name in self._arrived if (batch := self.points[name].batch) is not None}
+        held = [name for name in ready if id(self.points[name].batch) in waits]
+        self._arrived.update(dict.fromkeys(held))
+        return [name for name in ready if id(self.points[name].batch) not in waits] if held else ready
 
     def place(self, name: str, batch: Batch | None) -> None:
         """A point is in a batch now, or in none."""

@@ -9,6 +9,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from ...camera.line_camera import finest_pixel
 from .batch import Batch
 from .maker import BatchMaker
 from .network import LiveNetwork
@@ -20,6 +21,8 @@ IntArray = NDArray[np.int64]
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
 #: the linear equations then miss goes with its square: two hundredths of a pixel.
 MOVED = 1.5e-3
+#: For finer pixels, from orbit, it is less: no more of a pixel is missed. Derived from the usual ones of 1e-4 rad.
+MISSED_PX = 0.022
 #: Every so many turns it is looked whether a batch has moved, if new data did not move far.
 LOOKED_AFTER = 16
 #: So many batches at most are linearised again in one turn. Where new data moved far, or weights have changed, so many
@@ -52,6 +55,7 @@ class Relinearisation:
 
     def __init__(self, network: LiveNetwork, step_s: float) -> None:
         self._network, self._maker, self._step_s = network, BatchMaker(network), step_s
+        self._moved = min(MOVED, float(np.sqrt(MISSED_PX * finest_pixel(network.camera))))
         self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
         self._following = False  # whether they are what was left when new data moved far
         self._reweighing = False  # whether they are what was left when weights changed
@@ -148,8 +152,8 @@ class Relinearisation:
         Where unknowns have, all other batches are looked after, too.
         """
         values = [self._network.state.values(batch.columns) for batch in fresh]
-        far = any(b.has_moved(theta, MOVED) for b, theta in zip(fresh, values, strict=True))
-        due = [(b, t) for b, t in zip(fresh, values, strict=True) if far or b.points_moved() > MOVED * b.height_m]
+        far = any(b.has_moved(theta, self._moved) for b, theta in zip(fresh, values, strict=True))
+        due = [(b, t) for b, t in zip(fresh, values, strict=True) if far or b.points_moved() > self._moved * b.height_m]
         for batch, theta in due:
             self._network.batches.linearise(batch, theta, reweigh=False)
         if far:
@@ -170,7 +174,7 @@ class Relinearisation:
                 continue
             theta = self._network.state.values(batch.columns)
             reweigh = batch.noise_version != self._network.noise_version
-            if reweigh or batch.has_moved(theta, MOVED):
+            if reweigh or batch.has_moved(theta, self._moved):
                 if reweigh:
                     self._maker.refresh([batch])
                 batch.back_substitute(theta)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...geometry.trajectory import Poses
 from ...models import MODELS
 from ...models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
 from ...models.dgr import DgrOptions
@@ -13,6 +14,7 @@ from ...models.ppm import PpmOptions
 from ...models.slow_errors import LEARNING_TIME_S, SlowErrors
 from ...models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
 from ..results import WindowOptions
+from .platform import LivePlatform
 from .unknowns import WindowState
 
 Array = NDArray[np.floating]
@@ -94,8 +96,10 @@ class WindowStrip:
         state: WindowState,
         joined_s: float = -np.inf,
         factor: Array | None = None,
+        platform: LivePlatform | None = None,
     ):
         self.id = id
+        self._platform = platform
         self.first_line_time_s, self.line_rate_hz = first_line_time_s, line_rate_hz
         self.lines = lines
         self.slow = slow
@@ -160,10 +164,16 @@ class WindowStrip:
             self.lines = lines
             self.end_s = float(self.time_of(lines))
 
-    def design(self, time_s: ArrayLike) -> Design:
-        """Design with the unknowns' numbers in the window."""
+    def design(self, time_s: ArrayLike, poses: Poses | None = None) -> Design:
+        """Design with the unknowns' numbers in the window, those of the platform among them.
+
+        Parameters
+        ----------
+        poses : measured orientation at the times, if the caller has it
+        """
         d = self.model.design(time_s)
-        return Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
+        d = Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
+        return d if self._platform is None else self._platform.joined(d, np.asarray(time_s, dtype=float), poses)
 
     def left_out_variance(self, time_s: Array) -> Array:
         """(n, 6) what the model cannot follow; 0 for models that do not say."""

@@ -21,7 +21,9 @@ HELD_WEIGHT = 1e30
 
 @dataclass(frozen=True)
 class Information:
-    """What a batch knows of the unknowns ``theta`` of its columns: cost ``square - 2 rhs theta + theta matrix theta``.
+    """What some observations know of the unknowns ``theta`` of their columns.
+
+    Their cost is ``square - 2 rhs theta + theta matrix theta``.
 
     Attributes
     ----------
@@ -94,7 +96,14 @@ class Border:
     def add(
         self, places: IntArray, numbers: IntArray, G: Array, H: Array | float = 0.0, r: Array | float = 0.0
     ) -> None:
-        """Add equations (u, k), (k, k), (k,) of quantities at places (k,), those beyond the last one being new."""
+        """Add weighted equations of k quantities, beside u unknowns.
+
+        Parameters
+        ----------
+        places : (k,) of the quantities among those of the border; beyond the last one they are new
+        numbers : (u,) of the unknowns
+        G, H, r : (u, k), (k, k), (k,): ``A'PB``, ``B'PB`` and ``B'Pl``
+        """
         more = max(int(places.max(initial=-1)) + 1 - len(self), 0)
         at = places_of(self.numbers, numbers)
         new = np.flatnonzero(at < 0)
@@ -221,7 +230,20 @@ class WindowState:
         self._changed()
 
     def observe(self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array) -> None:
-        """Add a-priori observations (m, t) of present unknowns; column -1 is none, infinite sigma no weight."""
+        """Add m independent observations ``sum_t coefficients[i, t] theta[columns[i, t]] = value[i]``.
+
+        They go to the fixed part, which is never linearised again: nothing takes them back.
+
+        Parameters
+        ----------
+        columns : (m, t) numbers of present unknowns, -1 for none
+        coefficients : (m, t)
+        value, sigma : (m,) in one unit; infinite sigma: no weight
+
+        Raises
+        ------
+        ValueError : an unknown that is not present
+        """
         self._observe(*self._rows(columns, coefficients, value, sigma))
 
     def reweigh(self, columns: NDArray[np.int32], coefficients: Array, value: Array, before: Array, now: Array) -> None:

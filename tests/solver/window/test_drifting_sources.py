@@ -240,6 +240,7 @@ def test_a_source_that_drifts_as_a_whole_is_named_and_the_good_one_never_alone(f
     assert orientation_errors(simulation, result.whole).nees.mean() < 3.0
 
 
+@pytest.mark.study
 def test_one_line_of_one_of_two_sources_is_named_alone_and_the_other_source_holds_the_orientation(flight, monkeypatch):
     simulation, poses = flight
     second = _with_sources(monkeypatch, simulation)

@@ -335,6 +335,7 @@ def test_the_limit_is_the_users():
         assert least <= (summary(rows)[0] == GOOD).mean() <= most and {w.alert_limit_m for _, w, _ in rows} == {limit_m}
 
 
+@pytest.mark.study
 def test_more_tie_points_do_not_make_the_light_worse():
     few, many = (summary(fly(2, ties=ties, control=4, strip_s=30.0, limit_m=5.5)[0])[0] == GOOD for ties in (3.0, 15.0))
     assert many.mean() > few.mean() - 0.02 and many.mean() > 0.12

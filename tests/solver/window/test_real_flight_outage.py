@@ -31,6 +31,7 @@ def flight():
     return simulation, navigate(simulation)
 
 
+@pytest.mark.study
 def test_on_line_is_as_good_as_the_causal_batch_without_the_outliers(flight):
     simulation, poses = flight
     assert 0.03 < simulation.images.outlier.mean() < 0.07

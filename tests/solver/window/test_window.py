@@ -142,6 +142,7 @@ def test_the_backward_pass_gives_every_time_what_the_whole_strip_knows(flight):
         assert np.sqrt(np.diag(point.covariance)) == pytest.approx(sigma, rel=0.02)
 
 
+@pytest.mark.study
 def test_several_strips():
     simulation = simulate(
         FlightPlan(strips=2, strip_s=20.0, turns=False, gap_s=4.0, lead_in_s=3.0, lead_out_s=2.0), 7, SENSORS, TIES
