@@ -12,15 +12,19 @@ axes, are told in axes that are turned with it (`rotation.measured_angles`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from ..geometry.frames import LocalFrame, navigation_from_R_lc
 from ..geometry.rotation import matrix_from_angles, measured_angles
 from ..geometry.trajectory import Trajectory
 from ..models.gauss_markov import second_order_gauss_markov
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
 
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
@@ -130,6 +134,8 @@ def draw_slow_errors(
     ------
     ValueError : strips that overlap in time
     """
+    from scipy.interpolate import CubicHermiteSpline
+
     strip_s = np.asarray(strip_s, dtype=float)
     if not (np.diff(strip_s.ravel()) > 0).all():
         raise ValueError("strips must follow each other in time")
@@ -150,6 +156,8 @@ def draw_slow_errors(
 
 def _systematic(strip_s: Array, constant: Array, drift: Array, start_s: float, end_s: float) -> CubicHermiteSpline:
     """Straight lines over the strips and on beyond the first and the last, smooth bridges between."""
+    from scipy.interpolate import CubicHermiteSpline
+
     change = np.hstack([np.zeros_like(drift), drift])
     slope = change / np.diff(strip_s, axis=1)
     value = np.stack([constant, constant + change], axis=1).reshape(-1, 6)

@@ -48,6 +48,7 @@ def match_strip(
     lost: Sequence[NDArray[np.bool_]] | None = None,
     wrong_rad: float = 0.0,
     options: MatchingOptions | None = None,
+    ground: float | None = None,
 ) -> MatchedStrip:
     """Match the first strip of a flight with slow attitude errors of some hundredths of a degree.
 
@@ -58,9 +59,12 @@ def match_strip(
     lost : of each CCD line (lines,), which never come
     wrong_rad : amplitude of an error of omega that swings in 40 s, and is in the sigmas
     options : of the matcher
+    ground : lowest height from which on the ground is looked for; None: it is known to be about 0
     """
     strip, camera = flight.strips[0], flight.camera
     matcher = TieMatcher(camera, options or MatchingOptions())
+    if ground is not None:
+        matcher.search_ground(ground)
     matcher.begin_strip(strip.id, strip.first_line_time_s, strip.line_rate_hz)
     time_s = np.arange(0.0, flight.truth.end_s, POSE_S)
     truth = flight.truth.at(time_s)

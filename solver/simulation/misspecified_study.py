@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..adjustment.drift_hypotheses import ALL
 from ..adjustment.job import Job, NotAdjustableError
 from ..adjustment.job import run as run_batch
+from ..models.platform import USUAL_PLATFORM
 from ..models.wander import WanderOptions
 from ..window.quality.light import GOOD
 from ..window.results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal, WindowOptions
@@ -202,7 +203,7 @@ class FlightFigures:
 
 def through_window(simulation: Simulation, poses: list[TimedPose]) -> OnlineAnswer:
     """The window without nodes. Its updates come at fixed times alone, so that it is not all that `process` does."""
-    result = adjust_online(simulation, poses, WindowOptions(grid_hz=GRID_HZ), live=False)
+    result = adjust_online(simulation, poses, WindowOptions(grid_hz=GRID_HZ), live=False, platform=USUAL_PLATFORM)
     last, with_rays = result.reports[-1].quality, [r for r in result.reports if r.rays]
     return OnlineAnswer(
         result.whole or result.final,

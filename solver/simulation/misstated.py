@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from ..camera.line_camera import LineCamera
 from ..geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ..geometry.trajectory import Trajectory
+from ..quantiles import norm, student
 from .error_models import ErrorModel, ErrorRealisation, Three
 from .observations import Looks
 from .streams import stream

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..camera.line_camera import LineCamera
-from ..camera.sensors import lens_rotation, lens_views_deg, multi_lens_camera, preset
+from ..camera.sensors import lens_rotation, lens_views_deg, multi_lens_camera, preset, with_pixels
 from ..geometry.earth import GM, ROTATION_RATE, SEMI_MAJOR_M
 from ..geometry.rotation import R_BC_NOMINAL, matrix_from_navigation
 from ..location.look_directions import TableLook
@@ -71,9 +71,12 @@ def _presets() -> dict[str, OrbitalSensor]:
     moms = multi_lens_camera("moms-02", 237.2, {"F": 8304, "B": 8304}, 0.010)
     eros = multi_lens_camera("eros-a1", 3450.0, {"P": 7043}, 0.013)
     known = {name: (preset(name), lens_views_deg(name)) for name in ("alos-prism", "spot5-hrs", "aster-vnir")}
+    views = lens_views_deg("spot5-hrs")
     return {
         "alos-prism": OrbitalSensor(*known["alos-prism"], 691_650.0, 98.16, 0.37e-3, 14_496),
         "spot5-hrs": OrbitalSensor(*known["spot5-hrs"], 832_000.0, 98.7, 0.752e-3, 12_000),
+        # the same field in pixels of 400 m: image lines that are soon rendered
+        "spot5-hrs-small": OrbitalSensor(with_pixels(preset("spot5-hrs"), 300), views, 832_000.0, 98.7, 0.060, 150),
         "aster-vnir": OrbitalSensor(*known["aster-vnir"], 705_000.0, 98.2, 2.199e-3, 4200),
         "eros-a1": OrbitalSensor(eros, {"P": 0.0}, 480_000.0, 97.3, 1.4e-3, 6600, -0.63),
         "moms-02": OrbitalSensor(moms, {"F": 21.4, "B": -21.4}, 296_000.0, 28.5, 1.8e-3, 8000),

@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import oaconvolve
 
 Array = NDArray[np.floating]
 
@@ -176,6 +175,8 @@ def fly_legs(
 
 def _rounded(pieces: list[_Piece], n: int, speed: float, step_s: float) -> tuple[Array, Array, Array]:
     """Positions (n, 2) smoothed with a cubic B-spline kernel, which leaves straight lines as they are."""
+    from scipy.signal import oaconvolve
+
     box = np.full(round(ROUNDING_S / 4.0 / step_s), 1.0)
     kernel = np.convolve(np.convolve(box, box), np.convolve(box, box))
     kernel /= kernel.sum()

@@ -154,24 +154,29 @@ def scattered_points(
     n: int,
     rng: np.random.Generator,
     height_m: tuple[float, float] = (0.0, 1500.0),
-    inside_px: float = 50.0,
+    inside_px: float | tuple[float, float] = 50.0,
 ) -> Array:
     """Ground points (n, 3), Earth-fixed, evenly over what the first image sees and within all others.
+
+    Parameters
+    ----------
+    height_m : between which they lie
+    inside_px : lines and samples at the edges of every image in which none lies
 
     Raises
     ------
     ValueError : images that do not see the same ground
     """  # fmt: skip
     found: list[Array] = []
-    first = images[0].sensor
+    first, margin = images[0].sensor, np.broadcast_to(inside_px, 2)
     for _ in range(20):
         u, v = rng.uniform(0.0, first.lines - 1.0, n), rng.uniform(0.0, first.samples - 1.0, n)
         P = first.ground(u, v, rng.uniform(*height_m, n))
         inside = np.isfinite(P).all(axis=1)
         for image in images:
             pixel = image.sensor.ground_to_pixel(P)
-            ends = np.array([image.sensor.lines, image.sensor.samples]) - 1.0 - inside_px
-            inside &= ((pixel >= inside_px) & (pixel <= ends)).all(axis=1)
+            ends = np.array([image.sensor.lines, image.sensor.samples]) - 1.0 - margin
+            inside &= ((pixel >= margin) & (pixel <= ends)).all(axis=1)
         found.append(P[inside])
         if sum(map(len, found)) >= n:
             return np.concatenate(found)[:n]

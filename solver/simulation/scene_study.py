@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.self_calibration import lens, prism
-from ..models.base import ModelOptions
+from ..models.base import ModelOptions, same
 from ..models.dgr import DgrOptions
 from ..models.ppm import PpmOptions
 from ..scene_adjustment.solution import adjust, points_enu, prepare
@@ -22,23 +22,19 @@ Array = NDArray[np.floating]
 SENSORS = ("alos-prism", "spot5-hrs", "aster-vnir")
 
 
-def _all(sigma: float) -> tuple[float, float, float]:
-    return sigma, sigma, sigma
-
-
 #: Trajectory models of the study: errors of GNSS orbits and star trackers, and what wanders within a scene.
 MODELS: dict[str, ModelOptions] = {
-    "dgr": DgrOptions(_all(2.0), _all(0.005), _all(0.0005)),
+    "dgr": DgrOptions(same(2.0), same(0.005), same(0.0005)),
     "ppm": PpmOptions(
         2,
-        offset_sigma_m=_all(2.0),
-        shift_sigma_deg=_all(0.005),
-        first_sigma_m=_all(0.5),
-        first_sigma_deg=_all(0.0005),
-        second_sigma_m=_all(0.2),
-        second_sigma_deg=_all(0.0002),
-        continuity_sigma_m=_all(0.05),
-        continuity_sigma_deg=_all(0.000005),
+        offset_sigma_m=same(2.0),
+        shift_sigma_deg=same(0.005),
+        first_sigma_m=same(0.5),
+        first_sigma_deg=same(0.0005),
+        second_sigma_m=same(0.2),
+        second_sigma_deg=same(0.0002),
+        continuity_sigma_m=same(0.05),
+        continuity_sigma_deg=same(0.000005),
     ),
 }
 #: Model, and whether additional parameters are estimated.

@@ -17,7 +17,12 @@ Array = NDArray[np.floating]
 
 
 def choose_control(xy: Array, count: int) -> NDArray[np.int64]:
-    """Indices of points (n, 2) that are spread well: one at a corner, then always the one furthest from all chosen."""
+    """Indices of points (n, 2) that are spread well: one at a corner, then always the one furthest from all chosen.
+
+    One point alone is the one nearest the middle.
+    """
+    if count == 1:
+        return np.argmin(np.linalg.norm(xy - xy.mean(axis=0), axis=1), keepdims=True)
     first = int(np.argmin(xy[:, 0] - xy[:, 0].min() + xy[:, 1] - xy[:, 1].min()))
     chosen = [first]
     distance = np.linalg.norm(xy - xy[first], axis=1)

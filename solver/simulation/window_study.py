@@ -9,9 +9,11 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
+from ..adjustment.surface_control import SurfaceControl
 from ..camera.self_calibration import SelfCalibration
 from ..geometry.space_intersection import ImageRays, intersect
 from ..geometry.trajectory import Trajectory
+from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from ..models.slow_errors import SlowErrors
 from ..navigation.kinematic import KinematicFilter
 from ..navigation.kinematic_model import KinematicOptions
@@ -124,6 +126,8 @@ def adjust_online(
     watch: Callable[[float, Window], None] | None = None,
     update_s: float = UPDATE_S,
     so_far: Callable[[float, OnlineResult], None] | None = None,
+    platform: PlatformErrors = NO_PLATFORM_ERRORS,
+    surface: SurfaceControl | None = None,
 ) -> OnlineResult:
     """Fly a simulation through the window as an on-line system would.
 
@@ -133,9 +137,11 @@ def adjust_online(
     watch : called after every update with time and window
     update_s : platform time between updates
     so_far : called after every update with time and what has come out so far
+    platform : constant errors of the platform that are unknowns
+    surface : on which tie points lie
     """
     slow = slow_errors_of(simulation.errors)
-    window = _window(simulation, options or WindowOptions(), self_calibration)
+    window = _window(simulation, options or WindowOptions(), self_calibration, platform, surface)
     events = _events(simulation, poses)
     result = OnlineResult(window=window)
     now, waiting = update_s, {False: [], True: []}
@@ -162,6 +168,7 @@ def adjust_at_once(
     options: WindowOptions | None = None,
     self_calibration: SelfCalibration | None = None,
     until_s: float = np.inf,
+    surface: SurfaceControl | None = None,
 ) -> OnlineResult:
     """The batch adjustment of what was known at a time: one update with all of it, nothing let go before.
 
@@ -169,7 +176,7 @@ def adjust_at_once(
     """
     slow = slow_errors_of(simulation.errors)
     options = replace(options or WindowOptions(), window_s=NEVER_S, settle_s=NEVER_S)
-    window = _window(simulation, options, self_calibration)
+    window = _window(simulation, options, self_calibration, surface=surface)
     waiting: dict[bool, list[NavigationPose]] = {False: [], True: []}
     result = OnlineResult(window=window)
     now = 0.0
@@ -187,9 +194,16 @@ def adjust_at_once(
     return result
 
 
-def _window(simulation: Simulation, options: WindowOptions, self_calibration: SelfCalibration | None) -> Window:
+def _window(
+    simulation: Simulation,
+    options: WindowOptions,
+    self_calibration: SelfCalibration | None,
+    platform: PlatformErrors = NO_PLATFORM_ERRORS,
+    surface: SurfaceControl | None = None,
+) -> Window:
     """A window that knows the control points."""
-    window = Window(simulation.flight.camera, slow_errors_of(simulation.errors), options, self_calibration)
+    slow = slow_errors_of(simulation.errors)
+    window = Window(simulation.flight.camera, slow, options, self_calibration, platform, surface=surface)
     for i, role in enumerate(simulation.points.role):
         if role != "tie":
             given = simulation.observation_plan.control_sigma_m
@@ -340,9 +354,10 @@ def direct_points(simulation: Simulation, poses: Iterable[TimedPose]) -> Errors:
     measured = Trajectory([p.time_s for p in chosen], [p.position_l for p in chosen], [p.quaternion for p in chosen])
     flight, images = simulation.flight, simulation.images
     looks = images.looks
-    at = measured.at(looks.time_s)
-    xy, pitch = flight.camera.image_coordinates(looks.ccd, images.sample)
     period = np.array([1.0 / s.line_rate_hz for s in flight.strips])[looks.strip]
+    first_s = np.array([s.first_line_time_s for s in flight.strips])[looks.strip]
+    at = measured.at(first_s + images.line * period)  # as measured
+    xy, pitch = flight.camera.image_coordinates(looks.ccd, images.sample)
     sigma = np.full(len(looks), simulation.observation_plan.image_sigma_px)
     rays = ImageRays(
         looks.point, at.time_s, period, at.position_l, at.angles, at.velocity_l, at.angle_rate, xy, pitch,

@@ -77,7 +77,7 @@ class Rig:
 
     def stop(self, process: subprocess.Popen[bytes], number: int = signal.SIGINT) -> int:
         process.send_signal(number)
-        return process.wait(20)
+        return process.wait(20 * PATIENCE)
 
     def __enter__(self) -> Rig:
         return self

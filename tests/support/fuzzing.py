@@ -1,0 +1,533 @@
+"""Hostile files and messages for every reader and node, with checksums kept right so that the inside is reached.
+
+A *case* is one file that was read, one buffer that was parsed, or one message that a node was given. What a target does
+with it is either an answer or a `UserError` of one line; anything else is a `Finding`: another exception, a node that
+failed inside, more than two seconds, memory beyond ten times the file.
+"""
+
+from __future__ import annotations
+
+import resource
+import struct
+import time
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import sample_messages
+from driven_flight import SETTINGS
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, write_isd
+from small_block import FILES, write_files
+from test_imports import write_sbet_file
+from test_ros2 import flight_of, write_bag
+
+from triline.nodes import config, registry
+from triline.nodes.errors import UserError
+from triline.nodes.formats import detect
+from triline.nodes.formats.block_folder import read_block
+from triline.nodes.formats.camera_json import read_camera
+from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.formats.keys import Keys
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.sensor_folder import read_sensor_folder
+from triline.nodes.node import Message
+from triline.nodes.ordering import StreamCheck
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.sensors.nmea import NmeaParser, NmeaSettings
+from triline.nodes.simulator.flight_settings import simulated_flight
+from triline.nodes.simulator.simulator import Simulator
+from triline.nodes.step_driver import StepDriver
+from triline.schemas import codec
+from triline.schemas.envelope import Envelope
+from triline.schemas.image_lines import LineBlock
+
+#: A case must not take longer, s, nor take more memory than so many times the file plus a start, bytes.
+LONGEST_S, MEMORY_TIMES, MEMORY_START = 2.0, 10, 64_000_000
+#: What numbers are replaced by, and words.
+NUMBERS = ("nan", "-inf", "1e999", "-0", "0", "1e-300", "-1", "2147483648", "9223372036854775808", "1e18", "0x10", "")
+WORDS = (
+    b"", b"nan", b"[", b"]" * 3, b'"', b"'", b",", b",,,", b"\n", b"\r", b"\0", b"\xff\xfe", "\u202e".encode(),
+    b"\x1b[2J",
+    b"<!ENTITY a 'b'>", b"&a;", b"[" * 200, b"{" * 200, b"= 1\n", b"9" * 400, b"-", b"e", b"../../etc", b"true", b"=",
+)  # fmt: skip
+_PLACE = st.floats(0, 1, exclude_max=True)
+#: Changes of a file: (what, where, where else, word).
+EDITS = st.lists(
+    st.tuples(st.integers(0, 8), _PLACE, _PLACE, st.sampled_from(WORDS) | st.binary(max_size=8)), min_size=1, max_size=4
+)
+#: Changes of a message: (what, which field, value).
+VALUES = st.sampled_from(
+    [0.0, -1.0, 1e-300, 1e18, 1e300, -1e9, float("nan"), float("inf"), 2**31 - 1, -(2**31), 2**63 - 1, -(2**63)]
+)
+CHANGES = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 60), VALUES), max_size=3)
+#: What happens to the order of messages: index, repeats, change of stamp in s, of the number, of the source.
+ORDER = st.tuples(
+    st.integers(0, 30),
+    st.sampled_from([0.0, 0.0, 0.0, -1.0, 0.3, 3600.0, -1e6, 1e9]),
+    st.sampled_from([1, 1, 1, 0, 7, 10**6]),
+)
+
+
+@dataclass
+class Finding:
+    """What was wrong, how often, and the first file or message that showed it."""
+
+    target: str
+    what: str
+    example: bytes
+    times: int = 1
+
+
+@dataclass
+class Campaign:
+    """What a campaign has done."""
+
+    cases: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+    longest_s: Counter[str] = field(default_factory=Counter)
+    findings: dict[str, Finding] = field(default_factory=dict)
+
+    def run(self, target: str, example: bytes, work: Callable[[], Any], size: int = 0) -> None:
+        """One case."""
+        before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        begun = time.perf_counter()
+        self.cases[target] += 1
+        try:
+            work()
+        except UserError as error:
+            self.refused[target] += 1
+            if "\n" in str(error):
+                self._found(target, f"more than one line: {str(error)[:80]!r}", example)
+        except Exception as error:
+            trace = error.__traceback__
+            while trace is not None and trace.tb_next is not None:
+                trace = trace.tb_next
+            place = f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}" if trace else ""
+            text = str(error)
+            if isinstance(error, AssertionError) and "failed inside" in text:
+                place, text = text[text.rfind("(") :], text[:200]
+            self._found(target, f"{type(error).__name__} at {place}: {text[:200]!r}", example)
+        took = time.perf_counter() - begun
+        self.longest_s[target] = max(self.longest_s[target], took)  # type: ignore[assignment]
+        if took > LONGEST_S:
+            self._found(target, "hangs: more than 2 s", example)
+        grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb)
+        if grown > MEMORY_TIMES * (size or len(example)) + MEMORY_START:
+            self._found(target, "memory beyond ten times the file", example)
+
+    def _found(self, target: str, what: str, example: bytes) -> None:
+        key = f"{target}: {what.partition(': ')[0]}"
+        if key in self.findings:
+            self.findings[key].times += 1
+        else:
+            self.findings[key] = Finding(target, what, example[:4000])
+
+
+class _Over(Exception):
+    """The time is over: hypothesis would go on to draw examples."""
+
+
+# ---- files
+
+
+def edited(data: bytes, edits: list[tuple[int, float, float, bytes]]) -> bytes:
+    """A file with some changes: bytes, lines, numbers and words."""
+    for what, a, b, word in edits:
+        i, j = int(a * len(data)), int(b * len(data))
+        if what == 0:
+            data = data[:i]
+        elif what == 1:
+            data = data[:i] + word + data[i + len(word) :]
+        elif what == 2:
+            data = data[:i] + word + data[i:]
+        elif what == 3:
+            data = data[: min(i, j)] + data[max(i, j) :] if abs(i - j) < 200 else data[:i] + data[i + 16 :]
+        elif what in (4, 5):  # a line twice, or gone
+            first = data.rfind(b"\n", 0, i) + 1
+            last = data.find(b"\n", i) + 1 or len(data)
+            data = (
+                data[:last] + data[first:last] * (what == 4) + data[last:] if what == 4 else data[:first] + data[last:]
+            )
+        elif what in (6, 7):  # a number becomes another
+            k = i
+            while k < len(data) and not 48 <= data[k] <= 57:
+                k += 1
+            end = k
+            while end < len(data) and (48 <= data[end] <= 57 or data[end : end + 1] in b".-+eE"):
+                end += 1
+            data = data[:k] + NUMBERS[int(b * len(NUMBERS))].encode() + data[end:]
+        else:
+            data = data[:i] + data[j : j + 60] + data[i:]
+    return data
+
+
+def with_checksums(data: bytes) -> bytes:
+    """An MCAP file whose chunks have the checksums of what is in them now."""
+    out, place = bytearray(data), 8
+    while place + 9 <= len(out):
+        kind, size = out[place], struct.unpack_from("<Q", out, place + 1)[0]
+        start, end = place + 9, place + 9 + size
+        if end > len(out):
+            break
+        if kind == 0x06 and size > 40:
+            words = struct.unpack_from("<I", out, start + 28)[0]
+            first = start + 32 + words + 8
+            if not words and first <= end:
+                struct.pack_into("<I", out, start + 24, zlib.crc32(out[first:end]))
+        elif kind == 0x0F and size == 4:
+            struct.pack_into("<I", out, start, 0)  # of the data section: not given
+        elif kind == 0x02 and size == 20:
+            struct.pack_into("<I", out, start + 16, 0)  # of the summary: not given
+        place = end
+    return bytes(out)
+
+
+def sentence_of(body: bytes) -> bytes:
+    """An NMEA sentence with its checksum."""
+    total = 0
+    for byte in body:
+        total ^= byte
+    return b"$" + body + f"*{total:02X}\r\n".encode()
+
+
+NMEA = (
+    b"GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00,090.00,221126,,,A",
+    b"GNGST,092750.20,0.9,0.03,0.02,10.0,0.021,0.034,0.055",
+    b"GNGGA,092750.20,5321.680200,N,00630.337200,W,4,18,0.8,61.7,M,55.2,M,1.0,0000",
+    b"GNZDA,092750.00,22,11,2026,00,00",
+    b"GNHDT,123.4,T",
+)
+
+
+@dataclass(frozen=True)
+class FileTarget:
+    """A reader: the file that is changed, its good content, and how it is read."""
+
+    name: str
+    path: Path
+    good: bytes
+    read: Callable[[], Any]
+    checked: Callable[[bytes], bytes] = bytes
+
+
+def _read_all(path: Path) -> None:
+    for _ in detect.read_any(path, detect.kind_of_path(path)).messages:
+        pass
+
+
+def _recording(path: Path) -> None:
+    reader = RecordingReader(path)
+    for _ in reader.sorted_messages():
+        pass
+
+
+def file_targets(folder: Path) -> list[FileTarget]:
+    """Every reader of files, with a small whole file of its kind each."""
+    out: list[FileTarget] = []
+
+    def whole(name: str, path: Path, read: Callable[[], Any], checked: Callable[[bytes], bytes] = bytes) -> None:
+        out.append(FileTarget(name, path, path.read_bytes(), read, checked))
+
+    sbet = write_sbet_file(folder)
+    whole("SBET", sbet, partial(_read_all, sbet))
+    poses = folder / "poses.csv"
+    poses.write_text(
+        "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n"
+        + "".join(f"{i},48.{i},11,500,0,0,45\n" for i in range(20))
+    )
+    whole("trajectory CSV", poses, partial(_read_all, poses))
+    bag = write_bag(folder / "bag", flight_of()) / "bag.mcap"
+    whole("ROS 2 bag", bag, partial(_read_all, bag), with_checksums)
+    recording = folder / "flight.mcap"
+    with open(recording, "wb") as file:
+        writer = RecordingWriter(file)
+        for message in sample_messages.flight(0.5, lines=True):
+            writer.write(message)
+        writer.close()
+    whole("recording", recording, partial(_recording, recording), with_checksums)
+    block = write_files(folder / "block")
+    for name in FILES:
+        whole(f"block: {name}", block / name, partial(read_block, block))
+    whole("camera.json", block / "camera.json", partial(read_camera, block / "camera.json"))
+    truth = Truth(lines=4000, samples=500)
+    for name, path in (
+        ("DIMAP 1", write_dimap1(folder / "dimap1.xml", truth)),
+        ("DIMAP 2", write_dimap2(folder / "dimap2.xml", truth)),
+        ("CSM ISD", write_isd(folder / "scene.json", truth)),
+    ):
+        whole(name, path, partial(read_scene, path))
+    scene = write_folder(folder / "scene", truth)
+    for path in sorted(scene.iterdir()):
+        if path.is_file() and path.stat().st_size < 200_000:
+            whole(f"scene folder: {path.name}", path, partial(read_scene, scene))
+    sensors = folder / "sensors"
+    sensors.mkdir()
+    (sensors / "imu.csv").write_text(
+        "time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s\n"
+        + "".join(f"{1 + 0.01 * i:.2f},0.1,0.2,-9.81,0.01,0.02,0.03\n" for i in range(60))
+    )
+    (sensors / "gnss.csv").write_text(
+        "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n"
+        + "".join(f"{1 + 0.1 * i:.1f},48.0{i},11.0,500,0.1,0.1,0.2\n" for i in range(6))
+    )
+    for name in ("imu.csv", "gnss.csv"):
+        whole(f"sensor folder: {name}", sensors / name, partial(read_sensor_folder, sensors))
+    flight = folder / "flight"
+    flight.mkdir()
+    (flight / "flight.toml").write_text(
+        '[flight]\nname = "f"\nplatform = "p"\ncrs = "EPSG:32632"\nvertical_datum = "ellipsoid"\n'
+        '[camera]\nfile = "camera.json"\n[mounting]\nlever_arm_m = [0, 0, 0]\ncamera_lever_arm_m = [0, 0, 0]\n'
+        'boresight_deg = [0, 0, 0]\n[navigation]\ngnss = "rtk"\nimu = "tactical"\n'
+        '[[sensor]]\nkind = "nmea"\naddress = "udp://:4001"\nclock = "utc"\n'
+    )
+    (flight / "camera.json").write_text(FILES["camera.json"])
+    whole("flight.toml", flight / "flight.toml", partial(read_flight, flight))
+    settings_file = folder / "nodes.toml"
+    settings_file.write_text('[adjuster]\nmodel = "wander"\nupdate_s = 0.2\n[matcher]\npace = "load"\n')
+    whole("nodes.toml", settings_file, partial(config.load, settings_file))
+    return out
+
+
+def run_files(campaign: Campaign, target: FileTarget, cases: int, number: int, until: float) -> None:
+    """Read so many changed files, or until a time (`time.monotonic`)."""
+
+    @seed(number)
+    @_settings(cases)
+    @given(EDITS)
+    def case(edits: list[tuple[int, float, float, bytes]]) -> None:
+        if time.monotonic() > until:
+            raise _Over
+        data = target.checked(edited(target.good, edits))
+        target.path.write_bytes(data)
+        campaign.run(target.name, data, target.read, len(target.good))
+
+    try:
+        with suppress(_Over):
+            case()
+    finally:
+        target.path.write_bytes(target.good)
+
+
+def run_nmea(campaign: Campaign, cases: int, number: int, until: float) -> None:
+    """Sentences whose fields are changed and whose checksums are right, many in a row into one parser."""
+    made = partial(
+        NmeaParser, NmeaSettings.read(Keys(Path("flight.toml"), {"address": "udp://:4001"}, "sensor[0]"), Path())
+    )
+    parser = made(lambda kind, text: None)
+
+    @seed(number)
+    @_settings(cases)
+    @given(st.sampled_from(NMEA), EDITS, st.booleans())
+    def case(body: bytes, edits: list[tuple[int, float, float, bytes]], right: bool) -> None:
+        if time.monotonic() > until:
+            raise _Over
+        data = edited(body, edits).replace(b"\n", b" ")
+        data = sentence_of(data) if right else b"$" + data + b"*00\r\n"
+        campaign.run("NMEA", data, lambda: list(parser.feed(data)))
+
+    with suppress(_Over):
+        case()
+
+
+# ---- messages
+
+
+def changed(body: Any, changes: list[tuple[int, int, Any]]) -> Any:
+    """A copy of a message with some of its fields changed, in whatever depth."""
+    copy = type(body)()
+    copy.CopyFrom(body)
+    for what, which, value in changes:
+        _change(copy, what, which, value)
+    return copy
+
+
+def _change(body: Any, what: int, which: int, value: Any) -> None:
+    fields = body.DESCRIPTOR.fields
+    if not fields:
+        return
+    f = fields[which % len(fields)]
+    many = not isinstance(getattr(body, f.name), (int, float, str, bytes, bool)) and not hasattr(
+        getattr(body, f.name), "DESCRIPTOR"
+    )
+    try:
+        if what == 0:
+            body.ClearField(f.name)
+        elif many:
+            values = getattr(body, f.name)
+            if what == 1 and len(values):
+                del values[-1]
+            elif f.message_type is not None:
+                if len(values):
+                    _change(values[which % len(values)], what, which // 2, value)
+                elif hasattr(values, "add"):
+                    values.add()
+            elif what == 2:
+                values.extend(list(values) or [_as(f, value)])
+            elif len(values):
+                values[which % len(values)] = _as(f, value)
+            else:
+                values.append(_as(f, value))
+        elif f.message_type is not None:
+            _change(getattr(body, f.name), what, which // 2, value)
+        else:
+            setattr(body, f.name, _as(f, value))
+    except (ValueError, TypeError, OverflowError):
+        pass  # protobuf does not take the value
+
+
+def _as(f: Any, value: Any) -> Any:
+    """The value in the type of a field."""
+    kind = f.cpp_type
+    if kind in (f.CPPTYPE_DOUBLE, f.CPPTYPE_FLOAT):
+        return float(value)
+    if kind == f.CPPTYPE_STRING:
+        return {0.0: "", -1.0: "\x1b[2J[/b]", 1e18: "x" * 5000}.get(value, "S1")
+    if f.type == f.TYPE_BYTES:
+        return b"\xff" * 7
+    if kind == f.CPPTYPE_BOOL:
+        return bool(value == value and value > 0)
+    return int(value) if value == value and abs(value) < 1e19 else 0
+
+
+def node_names() -> list[str]:
+    return [*registry.STEP_NODES, "monitor"]
+
+
+def _made(name: str) -> Any:
+    if name == "monitor":
+        from triline.nodes.monitor.monitor import Monitor
+
+        return Monitor()
+    return registry.node_class(name)()
+
+
+@cache
+def flown() -> tuple[Message, ...]:
+    """A small flight with image lines, and what navigator, matcher and adjuster make of it, in the order of stamps."""
+    small = simulated_flight({**SETTINGS, "seconds": 5.0})
+    drivers = [StepDriver(_made(name)) for name in ("navigator", "matcher", "adjuster")]
+    out: list[Message] = []
+
+    def give(message: Message) -> None:
+        out.append(message)
+        for driver in drivers:
+            if any(_matches(name, message.topic) for name in driver.inputs):
+                for made in driver.step(message):
+                    give(made)
+
+    for message in Simulator(small.simulation, small.imager).messages(sample_messages.EPOCH_NS):
+        give(message)
+    return tuple(out)
+
+
+class NodeTarget:
+    """A node behind all that stands before it live: decoding, the check of its streams, voices, the driver.
+
+    It gets a flight of which most messages are as they should be; a new node is made for each turn of it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._inputs = StepDriver(_made(name)).inputs
+        self._flight = [x for x in flown() if self._takes(x.topic)]
+        self._others = [t for t in sample_messages.names() if self._takes(t)]
+        self._place = 0
+        self._begin()
+
+    def _takes(self, topic: str) -> bool:
+        return any(_matches(name, topic) for name in self._inputs)
+
+    def _begin(self) -> None:
+        self.node = _made(self.name)
+        self._driver = StepDriver(self.node)
+        self._check: StreamCheck[Message] = StreamCheck()
+        self._numbers: Counter[tuple[str, str]] = Counter()
+        self._failed = 0
+
+    def _give(self, message: Message, by_s: float, number: int) -> None:
+        key = message.topic, message.source
+        self._numbers[key] += number
+        envelope = Envelope(message.stamp_ns + round(by_s * 1e9), message.source, self._numbers[key], 1)
+        try:
+            body = codec.decode(message.topic, codec.encode(message.body))
+        except ValueError:
+            return  # the bus drops it, and counts it
+        sent = Message(message.topic, envelope.stamp_ns, body, message.source, envelope.sequence, 1)
+        for passed in self._check.accept(message.topic, envelope, sent):
+            self._driver.step(passed)
+        self._judge()
+
+    def _judge(self) -> None:
+        failed = self.node.counters["failed"]
+        if failed > self._failed:
+            self._failed = failed
+            raise AssertionError(f"the node failed inside: {self.node.last_problem}")
+
+    def _finish(self) -> None:
+        self._driver.finish()
+        self._judge()
+
+    def case(self, campaign: Campaign, which: int, changes: list, order: tuple[int, float, int]) -> None:
+        """The next message of the flight, or one of another topic before it, with some changes."""
+        skipped, by_s, number = order
+        if which < 5:  # something that does not belong here
+            message = sample_messages.message(self._others[skipped % len(self._others)], self._place)
+        else:
+            if self._place >= len(self._flight):
+                campaign.run(self.name, b"the end", self._finish, 1_000_000)
+                self._place = 0
+                self._begin()
+            message = self._flight[self._place]
+            self._place += 1 if which < 45 else skipped
+        body = message.body
+        if abs(by_s) > 60.0 and not message.topic.startswith(("sensor/", "observation/")):
+            by_s = 0.0  # live the sequencer holds what leaps
+        if which >= 15 and which < 45:
+            by_s, number = 0.0, 1
+        elif isinstance(body, LineBlock):
+            body = sample_messages.line_block(skipped, width=int(min(abs(changes[0][1]), 999)) + 1) if changes else body
+        else:
+            body = changed(body, changes)
+        sent = Message(message.topic, message.stamp_ns, body, message.source or "test")
+        example = f"{message.topic} {str(body)[:1500]}".encode()
+        campaign.run(self.name, example, lambda: self._give(sent, by_s, number), 1_000_000)
+
+
+def _matches(name: str, topic: str) -> bool:
+    return name == topic or (name.endswith("*") and topic.startswith(name[:-1]))
+
+
+def run_node(campaign: Campaign, target: NodeTarget, cases: int, number: int, until: float) -> None:
+    """Give a node so many messages, some as they should be and most not; many to an example of hypothesis."""
+    of_one = st.tuples(st.integers(0, 50), CHANGES, ORDER)
+
+    @seed(number)
+    @_settings(max(1, cases // 20))
+    @given(st.lists(of_one, min_size=20, max_size=20))
+    def case(messages: list) -> None:
+        for which, changes, order in messages:
+            if time.monotonic() > until:
+                raise _Over
+            target.case(campaign, which, changes, order)
+
+    with suppress(_Over):
+        case()
+
+
+def _settings(cases: int) -> settings:
+    return settings(
+        max_examples=max(1, cases),
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
