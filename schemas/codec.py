@@ -114,7 +114,7 @@ def validate(body: Any) -> None:
         raise ValueError(f"camera {body.name!r} with {len(body.lenses)} lenses and {len(body.lines)} CCD lines")
     if isinstance(body, m.PoseInFrame):
         q = body.pose.orientation
-        norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+        norm = math.hypot(q.x, q.y, q.z, q.w)
         if abs(norm - 1) > 1e-3:
             raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
 

@@ -14,6 +14,7 @@ from triline.nodes.player.player import play, shifted
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.writer import RecordingWriter
 from triline.schemas import codec
+from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
 from triline.schemas.messages import message_class
 from triline.schemas.topics import TOPICS, Family, find, rank
@@ -158,3 +159,10 @@ def test_foxglove_types_agree_with_the_published_ones(type_name):
         "metadata",
         "velocity",
     }
+
+
+def test_a_quaternion_beyond_all_bounds_is_refused():
+    pose = m.PoseInFrame()
+    pose.pose.orientation.x = 1e300
+    with pytest.raises(ValueError, match="quaternion of length 1e"):
+        codec.validate(pose)
