@@ -17,10 +17,18 @@ from typing import Any
 from .errors import UserError
 
 Tables = dict[str, dict[str, Any]]
+#: Keys of ``[dem]`` in a flight.toml: the adjuster's setting, its type, and what is wanted.
+_ELEVATION: dict[str, tuple[str, Any, str]] = {
+    "file": ("dem", str, "a raster of heights in the folder"),
+    "sigma_m": ("dem_sigma_m", int | float, "the sigma of a height at a place, m"),
+    "shift_sigma_m": ("dem_shift_sigma_m", int | float, "the sigma of the error that all heights share, m"),
+    "crs": ("dem_crs", str, 'what its heights count from: "ellipsoid", or a vertical CRS as "EPSG:5773"'),
+}
 
 
 def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
-    """The tables of a configuration file, none without a file; of a ``flight.toml`` those in ``[nodes]``.
+    """The tables of a configuration file, none without a file; of a ``flight.toml`` those in ``[nodes]``, and the
+    elevation model of its ``[dem]`` as settings of the adjuster.
 
     Parameters
     ----------
@@ -43,13 +51,65 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     except ValueError as error:  # numbers of thousands of digits
         raise UserError(f"{path}: not a TOML file: {error}") from None
     if isinstance(tables.get("flight"), dict):  # the settings of nodes in a flight.toml
+        dem = elevation(Path(path)) if "dem" in tables else {}
         tables = tables.get("nodes", {})
+        if dem and isinstance(tables.get("adjuster", {}), dict):
+            tables = tables | {"adjuster": dem | tables.get("adjuster", {})}
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise UserError(f"{path}: {name} stands outside a table, wanted [node] tables")
         if known is not None and name not in known:
             raise UserError(f"{path}: table [{name}] is not known, wanted one of {', '.join(known)}")
     return tables
+
+
+def elevation(path: Path, wanted: bool = False) -> dict[str, Any]:
+    """Settings of the adjuster that say what ``[dem]`` of a ``flight.toml`` does.
+
+    None without such a table, and where it states no sigma: then the raster is no control of heights.
+
+    Raises
+    ------
+    UserError : not TOML, no such table or no sigma where they are wanted, a value that is not of its kind
+    """
+    found = _dem(path, ("file", "sigma_m") if wanted else ())
+    return found if "dem_sigma_m" in found else {}
+
+
+def raster_of_heights(path: Path) -> tuple[Path, str | None]:
+    """File and, where it is stated, CRS of ``[dem]`` of a ``flight.toml``.
+
+    Raises
+    ------
+    UserError : not TOML, no such table, a value that is not of its kind
+    """
+    found = _dem(path, ("file",))
+    return Path(found["dem"]), found.get("dem_crs")
+
+
+def _dem(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
+    """What ``[dem]`` states, as settings of the adjuster; some keys are wanted, or none and not even the table."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8")).get("dem")
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not a TOML file: {error}") from None
+    if table is None and not wanted:
+        return {}
+    if not isinstance(table, dict):
+        raise UserError(f"{path}: wanted a table [dem] with {' and '.join(wanted or ('file',))}")
+    found: dict[str, Any] = {}
+    for key, (setting, kind, what) in _ELEVATION.items():
+        value = table.get(key)
+        if value is None and key not in (wanted or ("file",)):
+            continue
+        good = isinstance(value, kind) and not isinstance(value, bool)
+        if not good or (isinstance(value, int | float) and not 0 < value < float("inf")):
+            raise UserError(f"{path}: dem.{key} is {'missing' if value is None else repr(value)}, wanted {what}")
+        found[setting] = str(path.parent / str(value)) if key == "file" else value
+    unknown = [key for key in table if key not in _ELEVATION]
+    if unknown:
+        raise UserError(f"{path}: dem.{unknown[0]}: not known, wanted {', '.join(_ELEVATION)}")
+    return found
 
 
 def build(cls: Any, tables: Tables, name: str | None = None) -> Any:

@@ -281,6 +281,11 @@ def ground_point_message(
     )  # fmt: skip
 
 
+def enum_name(enum: Any, value: int) -> str:
+    """Name of a value of a protobuf enumeration in lower case; the number where it has none."""
+    return enum.Name(value).lower() if value in enum.values() else str(value)
+
+
 def role_of(ground_point: Any) -> str:
     """control, planimetric, height or check."""
     return m.GroundPoint.Role.Name(ground_point.role).lower()

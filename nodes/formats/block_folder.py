@@ -16,7 +16,7 @@ from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matr
 from ...solver.geometry.trajectory import Trajectory
 from ..errors import UserError
 from .camera_json import read_camera
-from .keys import read_toml
+from .keys import Keys, read_toml
 from .projection import missing_grids
 from .table import Column, Table, one_line, read_table
 
@@ -54,6 +54,9 @@ _IMAGE = (
     Column("sample"),
     Column("sigma_px", optional=True, blank=True, above=0.0),
 )
+
+#: Settings of trajectory models that are whole numbers.
+_WHOLE = ("segments", "fixes", "order", "continuity")
 
 Key = tuple[str, str | None]  # strip and lens
 
@@ -141,17 +144,38 @@ def _project(folder: Path, notes: list[str]) -> tuple[str, str, Apriori]:
     project, apriori, trajectory = file.table("project"), file.table("apriori"), file.table("trajectory")
     name, crs = project.text("name", default), project.text("crs", "local")
     sigma = apriori.number("image_sigma_px", Apriori.image_sigma_px, positive=True)
-    settings: dict[str, object] = {}
-    for key, value in trajectory.values.items():
-        if "_sigma" in key:  # one number stands for all three components
-            many = isinstance(value, list)
-            three = trajectory.numbers(key, 3, positive=True) if many else (trajectory.number(key, positive=True),) * 3
-            settings[key] = three
-        else:
-            settings[key] = trajectory.raw(key)
+    settings, then = trajectory_settings(trajectory)
     for table in (file, project, apriori):
         notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
-    return name, crs, Apriori(sigma, settings)
+    return name, crs, Apriori(sigma, settings, then)
+
+
+def trajectory_settings(table: Keys) -> tuple[dict[str, object], dict[str, object]]:
+    """Settings of the trajectory models in a table ``[trajectory]``, and those in ``[trajectory.then]``.
+
+    Raises
+    ------
+    UserError : ``file: key: what it holds, what was wanted``
+    """
+    then = table.table("then")
+    if "then" in then.values:
+        raise then.refuse("then", "no third step")
+    return _settings(table), _settings(then)
+
+
+def _settings(table: Keys) -> dict[str, object]:
+    settings: dict[str, object] = {}
+    for key, value in table.values.items():
+        if key == "then":
+            continue
+        if "_sigma" in key:  # one number stands for all three components
+            many = isinstance(value, list)
+            settings[key] = table.numbers(key, 3, positive=True) if many else (table.number(key, positive=True),) * 3
+        elif key in _WHOLE:
+            settings[key] = table.integer(key)
+        else:
+            settings[key] = table.raw(key)
+    return settings
 
 
 def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:

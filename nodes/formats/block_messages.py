@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from heapq import merge
 from typing import Any
 
@@ -50,6 +50,7 @@ def not_carried(block: BlockData) -> list[str]:
     """The parts of a block that messages cannot hold, a line each."""
     notes = []
     keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, "wander_time_s")]
+    keys += [f"then.{key}" for key in block.apriori.then]
     if keys:
         notes.append(f"project.toml: trajectory.{', trajectory.'.join(keys)}: not carried by a recording")
     for strip in block.strips:
@@ -62,8 +63,8 @@ def not_carried(block: BlockData) -> list[str]:
 
 
 def strip_shifts(block: BlockData) -> NDArray[np.float64]:
-    """Seconds (strips,) to add to the times of each strip so that no two overlap; lenses of a strip stay together."""
-    names = [_file_name(strip) for strip in block.strips]
+    """Seconds (strips,) to add to the times of each strip so that no two trajectories overlap."""
+    names = _file_names(block.strips)
     spans: dict[str, tuple[float, float]] = {}
     for name, strip in zip(names, block.strips, strict=True):
         ends = [strip.trajectory.start_s, strip.trajectory.end_s]
@@ -83,8 +84,13 @@ def strip_shifts(block: BlockData) -> NDArray[np.float64]:
     return np.array([shift[name] for name in names])
 
 
-def _file_name(strip: Strip) -> str:
-    return strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}")
+def _file_names(strips: Sequence[Strip]) -> list[str]:
+    """What each strip is shifted with: lenses that share a trajectory keep their times to each other."""
+    names = [strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}") for strip in strips]
+    trajectories: dict[str, set[int]] = {}
+    for name, strip in zip(names, strips, strict=True):
+        trajectories.setdefault(name, set()).add(id(strip.trajectory))
+    return [name if len(trajectories[name]) == 1 else strip.id for name, strip in zip(names, strips, strict=True)]
 
 
 class _Times:
@@ -186,7 +192,7 @@ def _pose_messages(block: BlockData, times: _Times, i: int, source: str) -> Iter
             angles[k],
             covariance,
             quaternion=trajectory.quaternion[k],
-            strip=strip.id,
+            strip="" if block.heading else strip.id,
             velocity_l=velocity[k],
         )
         yield Message("trajectory/smoothed", stamp, body, source)

@@ -36,6 +36,9 @@ def _project(block: BlockData) -> str:
     if block.apriori.trajectory:
         lines.append("[trajectory]")
         lines += [f"{key} = {_toml(value)}" for key, value in block.apriori.trajectory.items()]
+    if block.apriori.then:
+        lines.append("[trajectory.then]")
+        lines += [f"{key} = {_toml(value)}" for key, value in block.apriori.then.items()]
     return "\n".join(lines) + "\n"
 
 

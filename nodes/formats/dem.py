@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from ...solver.adjustment.surface_control import SurfaceControl
 from ...solver.geometry.frames import LocalFrame
 from ...solver.orthoimage.ground_grid import heights_in_frame
 from ...solver.orthoimage.surface import HeightField
@@ -73,3 +74,21 @@ def dem_in_frame(path: Path, frame: LocalFrame, dem_crs: str | None = None) -> H
         return heights_in_frame(frame, heights.crs, heights.z_m, heights.x0, heights.y0, heights.dx, heights.dy)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
+
+
+def surface_control(
+    path: Path, frame: LocalFrame, dem_crs: str | None, sigma_m: float, shift_sigma_m: float | None = None
+) -> SurfaceControl:
+    """A raster of heights as control of the heights of tie points.
+
+    Parameters
+    ----------
+    sigma_m : of a height, independent from place to place
+    shift_sigma_m : of the error that all heights share; None = as large as `sigma_m`
+
+    Raises
+    ------
+    UserError : as `dem_in_frame`
+    """
+    field = dem_in_frame(path, frame, dem_crs)
+    return SurfaceControl(field.height, field.step_m, sigma_m, shift_sigma_m or sigma_m)

@@ -8,6 +8,8 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...solver.camera.line_camera import LineCamera
 from ...solver.navigation.inertial_data import InertialGrade
 from ..convert import camera_message
@@ -19,13 +21,18 @@ from .block_folder import is_block_folder, read_block
 from .block_messages import block_messages, not_carried
 from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
+from .gpx import has_attitudes, is_gpx, position_messages, read_gpx, read_positions
+from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import ros2_messages
+from .ros2_images import ImageTopics
 from .sbet import is_sbet, read_sbet
-from .scene_block import is_scene_block
+from .scene_block import is_scene_block, read_scene_block
+from .scene_recording import local_block
 from .sensor_recording import sensor_messages
 from .tie_points import statistics, tie_point_messages
+from .tiff_image import is_tiff
 from .time_columns import same_day
 from .track import Accuracy, Mounting, NavigationTrack, frame_of, track_messages
 from .trajectory_csv import is_trajectory_csv, read_trajectory_csv
@@ -35,6 +42,7 @@ from .vendor_poses import is_headwall, is_resonon, read_headwall, read_resonon
 KINDS = {
     "flight": "flight folder (flight.toml)",
     "block": "block folder (camera.json, strips.csv, trajectory.csv, ground_points.csv, image_points.csv)",
+    "scenes": "block of satellite scenes (project.toml with [scenes.NAME])",
     "sensors": "sensor folder (imu.csv, gnss.csv, attitude.csv)",
     "avirisng": "AVIRIS-NG line-by-line poses (angYYYYMMDDtHHMMSS_eph_att)",
     "avirisc": "AVIRIS-C ephemeris (fYYMMDDtNNpNNrNN..._eph)",
@@ -43,8 +51,9 @@ KINDS = {
     "csv": "trajectory as CSV",
     "headwall": "Headwall poses (imu_gps.txt)",
     "resonon": "Resonon poses (.lcf)",
-    "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix and Imu",
-    "lines": "image lines, an ENVI image with .hdr",
+    "gpx": "GPX track",
+    "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix, Imu and Image",
+    "lines": "image lines: ENVI image with .hdr, TIFF, or with --raw plain values",
     "ties": "AVIRIS-NG tie points (GeoCal XML)",
     "camera": "AVIRIS-NG camera (GLAS GFM XML)",
 }
@@ -64,7 +73,8 @@ class Options:
     seconds_of_day : SBET times count from midnight
     accuracy : of poses
     lines : images of a strip, beside poses or sensors, or (with the file itself as image) alone
-    ground_height_m : of the origin of the local frame, above the ellipsoid
+    ground : where the origin of the local frame is to lie
+    without_images : images of a bag are left alone
     poses_only : poses that belong to image lines make no strip
     grade : of the inertial unit of a sensor folder, in place of its platform.toml
     """
@@ -77,8 +87,9 @@ class Options:
     seconds_of_day: bool | None = None
     accuracy: Accuracy = field(default_factory=Accuracy)
     lines: LinesGiven | None = None
-    ground_height_m: float = 0.0
+    ground: GroundGiven = NOT_GIVEN
     poses_only: bool = False
+    without_images: bool = False
     grade: InertialGrade | None = None
 
 
@@ -103,7 +114,7 @@ def kind_of_path(path: Path) -> str:
         if (path / "flight.toml").is_file():
             return "flight"
         if is_scene_block(path):
-            raise UserError(f"{path}: a block of satellite scenes, which `triline adjust` takes as it is")
+            return "scenes"
         if is_block_folder(path):
             return "block"
         if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "attitude.csv")):
@@ -123,6 +134,8 @@ def kind_of_path(path: Path) -> str:
         return "avirisng"
     if is_avirisc(path):
         return "avirisc"
+    if is_gpx(head):
+        return "gpx"
     if head.lstrip().startswith(b"<?xml") or b"boost_serialization" in head:
         kind = kind_of(path)
         if kind is None and b"dimap_document" in head.lower():
@@ -143,7 +156,7 @@ def kind_of_path(path: Path) -> str:
         return "csv"
     if is_sbet(path):
         return "sbet"
-    if is_envi_image(path):
+    if is_envi_image(path) or is_tiff(path):
         return "lines"
     if path.suffix.lower() == ".csv":  # its reader names the columns that are missing
         return "csv"
@@ -151,7 +164,7 @@ def kind_of_path(path: Path) -> str:
 
 
 def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
-    """The poses in a file of one of the kinds avirisng, avirisc, pos, sbet, csv, headwall, resonon.
+    """The poses in a file of one of the kinds avirisng, avirisc, pos, sbet, csv, headwall, resonon, gpx.
 
     Raises
     ------
@@ -169,6 +182,8 @@ def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
         return read_headwall(path, options.day)
     if kind == "resonon":
         return read_resonon(path, options.day)
+    if kind == "gpx":
+        return read_gpx(path, options.day)
     return read_trajectory_csv(path, options.crs, options.day)
 
 
@@ -181,12 +196,12 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     """
     kind = kind_of_path(path) if kind is None else kind
     options = Options() if options is None else options
-    if options.day is not None and kind in ("block", "ties"):
+    if options.day is not None and kind in ("block", "scenes", "ties"):
         raise UserError(f"{path}: --date does not go with a {KINDS[kind]}: its times stand for themselves")
-    if options.lines is not None and kind in ("block", "ties"):
+    if options.lines is not None and kind in ("block", "scenes", "ties"):
         raise UserError(f"{path}: --lines do not go with a {KINDS[kind]}, wanted poses or sensors of the flight")
-    if kind == "block":
-        block = read_block(path)
+    if kind in ("block", "scenes"):
+        block = read_block(path) if kind == "block" else local_block(read_scene_block(path))
         return Imported(kind, block_messages(block), [*block.notes, *not_carried(block)])
     if kind == "ties":
         ties = read_tie_points(path)
@@ -194,12 +209,21 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     if kind == "lines":
         return _image_alone(path, options)
     notes: list[str] = []
-    if kind in ("sensors", "ros2"):
-        messages = (
-            sensor_messages(path, notes, grade=options.grade) if kind == "sensors" else ros2_messages(path, notes)
-        )
-        messages = _at_height(_on_day(path, messages, options.day), options.ground_height_m)
-        strip = None if options.lines is None else _strip_of(options, options.lines)
+    if kind in ("sensors", "ros2") or (kind == "gpx" and not has_attitudes(path)):
+        topics = _image_topics(options) if kind == "ros2" else None
+        if kind == "gpx":
+            positions = read_positions(path, options.day)
+            notes.extend(positions.notes)
+            messages = position_messages(positions, options.accuracy, notes, "import")
+        elif topics is None:
+            messages = sensor_messages(path, notes, grade=options.grade)
+        else:
+            messages = ros2_messages(path, notes, given=topics)
+        messages = _on_day(path, messages, options.day)
+        if options.ground.stated:
+            messages = _at_height(path, kind, messages, options, notes)
+        images = options.lines is not None and options.lines.files and (topics is None or topics.topics is None)
+        strip = _strip_of(options, options.lines) if images and options.lines is not None else None
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
@@ -214,13 +238,29 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             check_within(strip, track)
         if strip is not None or options.poses_only:
             track = replace(track, line_rate_hz=0.0)
-        frame = replace(frame_of(track), height_m=options.ground_height_m)
+        frame = replace(frame_of(track), height_m=options.ground.height(path, track.geodetic, notes))
         messages = track_messages(track, "import", options.mounting, frame, options.accuracy)
     messages = _with_camera(messages, options.camera)
     if strip is not None:
         notes.extend(strip.notes)
         messages = with_lines(messages, strip, notes)
     return Imported(kind, messages, notes)
+
+
+def _image_topics(options: Options) -> ImageTopics:
+    """What the user says about images of a bag."""
+    lines = options.lines
+    if options.without_images:
+        return ImageTopics({})
+    if lines is None:
+        return ImageTopics(camera=options.camera)
+    if lines.files and lines.topics is None:  # image files beside the bag
+        return ImageTopics({}, options.camera)
+    if lines.band is not None or lines.span is not None or lines.times is not None or lines.first is not None:
+        raise UserError(
+            "--band, --grey-range, --line-times and --first-time are of image files, not of the images in a bag"
+        )
+    return ImageTopics(lines.topics, options.camera, lines.rate_hz, lines.strip)
 
 
 def _strip_of(options: Options, lines: LinesGiven, track: NavigationTrack | None = None) -> ImageStrip:
@@ -270,8 +310,16 @@ def _on_day(path: Path, messages: Iterable[Message], day: date | None) -> Iterat
     yield from messages
 
 
-def _at_height(messages: Iterable[Message], height_m: float) -> Iterator[Message]:
-    """The messages, with the origin of the local frame at a height (of sensors: they are not in the local frame)."""
+def _at_height(
+    path: Path, kind: str, messages: Iterable[Message], options: Options, notes: list[str]
+) -> Iterator[Message]:
+    """The messages, with the origin of the local frame on the ground (of sensors: they are not in the local frame)."""
+    fixes = np.empty((0, 3))
+    if options.ground.height_m is None:
+        found = read_any(path, kind, Options(options.day, grade=options.grade, without_images=True)).messages
+        places = [m.body for m in found if m.topic == "sensor/gnss"]
+        fixes = np.array([(b.latitude, b.longitude, b.altitude) for b in places]).reshape(-1, 3)
+    height_m = options.ground.height(path, fixes, notes)
     for message in messages:
         if message.topic == "configuration/project":
             message.body.origin_height = height_m

@@ -24,8 +24,11 @@ from ..errors import UserError
 from ..node import Message
 from .block_folder import read_ground_points
 from .camera_json import read_camera
+from .dem import read_dem
 from .detect import KINDS, Imported, Options, check_within, kind_of_path, read_any, read_track
+from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
+from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, read_toml
 from .projection import missing_grids
@@ -35,7 +38,7 @@ from .track import Accuracy, Mounting, NavigationTrack
 
 FILE = "flight.toml"
 #: What `navigation.file` may be.
-NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon")
+NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
 #: Slow errors of positions by kind of GNSS solution, m: constant in a strip, and wandering (east, north, up), and the
 #: correlation time, s. Usual figures of such solutions, to be replaced by what is known of the own one.
 POSITION_ERRORS = {
@@ -54,15 +57,28 @@ _SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma
 _IMU = ("gyro_noise_deg_sqrt_h", "gyro_bias_deg_h", "accel_noise_m_s_sqrt_h", "accel_bias_mgal", "bias_time_s")
 #: Table of a flight.toml -> its keys; "" has the tables themselves.
 _KEYS = {
-    "": ("flight", "camera", "mounting", "navigation", "trajectory", "imu", "control", "strips", "nodes", "sensor"),
-    "flight": ("name", "platform", "crs", "vertical_datum", "ground_height_m", "origin_deg"),
+    "": (
+        "flight",
+        "camera",
+        "mounting",
+        "navigation",
+        "trajectory",
+        "imu",
+        "control",
+        "dem",
+        "strips",
+        "nodes",
+        "sensor",
+    ),
+    "flight": ("name", "platform", "crs", "vertical_datum", "ground_height_m", "above_ground_m", "origin_deg"),
     "camera": ("file", "preset"),
     "mounting": ("lever_arm_m", "camera_lever_arm_m", "boresight_deg"),
-    "navigation": ("file", "kind", "date", "gnss", "imu"),
+    "navigation": ("file", "kind", "date", "gnss", "imu", "images", "line_rate_hz"),
     "trajectory": (*_SIGMAS, "wander_time_s"),
     "imu": (*_IMU, "gyro_scale_ppm", "accel_scale_ppm"),
     "control": ("file",),
-    "strips": ("id", "images", "line_times", "first_time", "line_rate_hz", "band", "grey_range"),
+    "dem": ("file", "crs", "sigma_m", "shift_sigma_m"),
+    "strips": (*("id", "images", "line_times", "first_time", "line_rate_hz", "band", "grey_range", "type", "samples"),),
 }
 _ZERO = (0.0, 0.0, 0.0)
 T = TypeVar("T")
@@ -77,7 +93,8 @@ class Flight:
     folder : it stands in
     name, platform : of the flight; the platform is the first word of the topics on the bus
     crs : of control and results, with the vertical datum
-    ground_height_m : above the ellipsoid, the height of the local frame's origin
+    ground_height_m : above the ellipsoid, the height of the local frame's origin, where it is known by now
+    ground : what is said of it, for what has positions of the flight
     camera : LineCamera
     lever_arm_m : antenna from the inertial sensor, body axes forward-right-down
     mounting : of the camera on the body
@@ -90,6 +107,7 @@ class Flight:
     origin_deg : latitude and longitude of the local frame of a live flight, where they are stated
     announced : strips of a live flight that are known beforehand: id, time of the first line in ns, lines a second
     sensors : tables of the sensor programs of a live flight
+    lines : image topics of a ROS 2 bag, where they are stated
     notes : remarks
     problems : what is wrong or missing, a line each; an empty list for a flight that can be imported
     """
@@ -99,6 +117,7 @@ class Flight:
     platform: str = "aircraft"
     crs: str = ""
     ground_height_m: float = 0.0
+    ground: GroundGiven = NOT_GIVEN
     camera: LineCamera | None = None
     lever_arm_m: tuple[float, ...] = _ZERO
     mounting: Mounting = field(default_factory=Mounting)
@@ -113,6 +132,7 @@ class Flight:
     origin_deg: tuple[float, float] | None = None
     announced: list[tuple[str, int, float]] = field(default_factory=list)
     sensors: list[Keys] = field(default_factory=list)
+    lines: LinesGiven | None = None
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
@@ -157,10 +177,11 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
     flight.attempt(lambda: _mounting(flight, tables["mounting"]))
     flight.attempt(lambda: _navigation(flight, tables["navigation"], live))
     flight.attempt(lambda: _errors(flight, tables["navigation"], tables["trajectory"], tables["imu"]))
+    flight.attempt(lambda: _ground(flight, tables["dem"], tables["flight"]))
     flight.attempt(lambda: _control(flight, tables["control"], tables["flight"]))
     for keys in strips or []:
         flight.attempt(lambda keys=keys: (_announced if live else _strip)(flight, keys))
-    if not strips and not live:
+    if not strips and not live and flight.kind != "ros2":
         flight.notes.append(f"{FILE}: no [[strips]]: the recording has no image lines")
     ids = [id for id, _, _ in flight.announced] if live else [strip.id for strip in flight.strips]
     for id in sorted({id for id in ids if ids.count(id) > 1}):
@@ -221,8 +242,10 @@ def flight_messages(folder: Path) -> tuple[Imported, str]:
         flight.day,
         flight.crs,
         flight.mounting,
+        camera=flight.camera if flight.kind == "ros2" else None,
+        lines=flight.lines,
         accuracy=_accuracy(flight.sigmas),
-        ground_height_m=flight.ground_height_m,
+        ground=flight.ground if flight.ground.stated else GroundGiven(flight.ground_height_m),
         poses_only=bool(flight.strips),
         grade=flight.grade,
     )
@@ -246,7 +269,7 @@ def _accuracy(sigmas: dict[str, Any]) -> Accuracy:
 
 def _messages(flight: Flight, imported: Imported, notes: list[str]) -> Iterator[Message]:
     """Project, camera and control, then sensors or poses with the image lines among them."""
-    messages = iter(imported.messages)
+    messages = (message for message in imported.messages if message.topic != "configuration/camera")
     first = next(messages)
     start = min([first.stamp_ns, *(int(strip.time_ns[0]) for strip in flight.strips)])
     yield from _configuration(flight, first.body, start, first.source)
@@ -385,12 +408,26 @@ def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
     kind = kind or kind_of_path(path)
     if kind not in NAVIGATION:
         raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
-    options = Options(day, flight.crs or None)
+    if kind == "ros2":
+        _image_topics(flight, keys)
+    options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
     if kind in ("sensors", "ros2"):
         next(iter(read_any(path, kind, options).messages), None)
     else:
         flight.track = read_track(path, kind, options)
     flight.navigation, flight.kind = path, kind
+
+
+def _image_topics(flight: Flight, keys: Keys) -> None:
+    """Topics of a bag whose images are image lines."""
+    table = keys.table("images")
+    files = tuple((ccd, Path(table.text(ccd)), None) for ccd in table.values)
+    for ccd, topic, _ in files:
+        if not str(topic).startswith("/"):
+            raise table.refuse(ccd, "a ROS topic as /camera/nadir")
+    rate = keys.number("line_rate_hz", positive=True) if keys.has("line_rate_hz") else None
+    if files or rate is not None:
+        flight.lines = LinesGiven(files, rate_hz=rate)
 
 
 def _errors(flight: Flight, navigation: Keys, trajectory: Keys, imu: Keys) -> None:
@@ -414,19 +451,40 @@ def _errors(flight: Flight, navigation: Keys, trajectory: Keys, imu: Keys) -> No
     flight.grade = read_grade(imu, flight.notes, FILE, _GRADES[unit])
 
 
+def _ground(flight: Flight, keys: Keys, general: Keys) -> None:
+    """A raster of heights, or the height above ground: they tell where the ground is under the flight."""
+    if keys.values:
+        config.elevation(keys.path)
+        path = _beside(flight, keys, "file", keys.text("file"))
+        try:  # what the adjuster could not use either
+            read_dem(path, keys.text("crs") if keys.has("crs") else None)
+        except UserError as error:
+            raise UserError(f"{keys.path}: " + str(error).replace("--dem-crs", "dem.crs")) from None
+        flight.ground = GroundGiven(dem=path, dem_crs=keys.text("crs") if keys.has("crs") else None)
+    if general.has("above_ground_m"):
+        above = general.number("above_ground_m", positive=True)
+        flight.ground = flight.ground if flight.ground.stated else GroundGiven(above_m=above)
+    if general.has("ground_height_m"):
+        flight.ground = GroundGiven(flight.ground_height_m)
+    elif flight.track is not None:
+        flight.ground_height_m = flight.ground.height(keys.path, flight.track.geodetic, flight.notes)
+    elif flight.ground.dem is not None and flight.origin_deg is not None:  # a live flight
+        place = np.array([[*flight.origin_deg, 0.0]])
+        flight.ground_height_m = flight.ground.height(keys.path, place, flight.notes)
+
+
 def _control(flight: Flight, keys: Keys, general: Keys) -> None:
-    stated = general.has("ground_height_m")
+    stated = general.has("ground_height_m") or flight.ground.stated
     if not keys.values:
         if not stated:
-            flight.problems.append(
-                f"{keys.path}: neither [control] nor flight.ground_height_m, wanted one: where is the ground?"
-            )
+            wanted = "wanted one (or [dem], or flight.above_ground_m): where is the ground?"
+            flight.problems.append(f"{keys.path}: neither [control] nor flight.ground_height_m, {wanted}")
         return
     path = _beside(flight, keys, "file", keys.text("file"))
     if not flight.crs:
         return
     points, frame = read_ground_points(path, flight.crs, None, flight.notes)
-    if not stated:
+    if not stated or (flight.ground.above_m is not None and flight.track is None):  # live, nobody has flown yet
         flight.ground_height_m = round(float(np.median(frame.to_geodetic(points.xyz_l)[:, 2])), 1)
         flight.notes.append(
             f"{path.name}: median height {flight.ground_height_m:g} m above the ellipsoid is the origin's"
@@ -470,7 +528,10 @@ def _strip(flight: Flight, keys: Keys) -> None:
         raise keys.refuse("grey_range", "two numbers, the lower one first")
     band = keys.text("band") if keys.has("band") else None
     pair = None if span is None else (span[0], span[1])
-    given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day)
+    raw = (keys.text("type"), keys.integer("samples", 0)) if keys.has("type") else None
+    if raw is not None and raw[0] not in TYPES:
+        raise keys.refuse("type", f"one of {', '.join(TYPES)}")
+    given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day, raw)
     track = flight.track
     pose_times = track.time_ns if track is not None and track.line_rate_hz > 0 else None
     if times is None and first is None and pose_times is None:
@@ -507,7 +568,8 @@ platform = "aircraft"             # first word of the topics on the bus
 crs = "EPSG:32632"                # horizontal CRS of control and results: anything that PROJ understands
 vertical_datum = "ellipsoid"      # "ellipsoid", or the vertical CRS of the heights, as "EPSG:5773" for EGM96
 #origin_deg = [47.9, 11.1]        # latitude, longitude of a live flight's local frame; else by control or GNSS
-#ground_height_m = 300.0          # height of the ground above the ellipsoid; needed without control
+#ground_height_m = 300.0          # height of the ground above the ellipsoid; or [dem], control, or:
+#above_ground_m = 1200.0          # so high the platform flies above the ground
 
 [camera]
 file = "camera.json"              # or: preset = "ads40"
@@ -520,6 +582,7 @@ boresight_deg = [0.0, 0.0, 0.0]   # roll, pitch, heading of the camera against t
 [navigation]
 file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, ROS 2 bag, imu_gps.txt, .lcf ...
 #kind = "csv"                     # where the file does not show it: {kinds}
+#images = {{N = "/camera/nadir"}}   # topics of a ROS 2 bag whose images are image lines
 #date = 2024-05-17                # day of the flight, for files with GPS seconds of the week
 gnss = "code"                     # RTK, PPP or code: slow errors of the positions
 imu = "MEMS"                      # tactical or MEMS: slow errors of the attitudes, noise of the sensor
@@ -541,9 +604,16 @@ imu = "MEMS"                      # tactical or MEMS: slow errors of the attitud
 #[control]
 #file = "control.csv"             # point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role[,target_radius_m]
 
+#[dem]                            # heights of the ground, on which the origin of the local frame is put
+#file = "ground.tif"
+#crs = "EPSG:5773"                # what they count from, or "ellipsoid", where the file does not say
+#sigma_m = 0.5                    # with it the tie points lie on them: of a height at a place
+#shift_sigma_m = 0.5              # of the error that all heights share
+
 #[[strips]]                       # one for each strip
 #id = "S1"
-#images = {{F = "forward.img", N = "nadir.img", B = "backward.img"}}   # ENVI with .hdr; "all.img@2" is band 2
+#images = {{F = "forward.img", N = "nadir.img", B = "backward.img"}}   # ENVI, TIFF, raw; "all.img@2" is band 2
+#type = "u2"                      # of raw files without header: u1, u2, >u2 (and samples = 1000)
 #line_times = "S1_times.csv"      # line,time; or:
 #first_time = 2024-05-17T09:30:00Z
 #line_rate_hz = 200.0

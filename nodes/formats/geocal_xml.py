@@ -128,6 +128,8 @@ def read_tie_points(path: Path) -> TiePoints:
 def _body(path: Path, wanted: str) -> ET.Element:
     try:
         root = ET.parse(path).getroot()
+    except LookupError as error:  # an encoding that there is not
+        raise UserError(f"{path}:1: {error}, wanted XML in UTF-8 or another that is known") from None
     except ET.ParseError as error:
         line = error.position[0]
         raise UserError(f"{path}:{line}: not well-formed XML ({error}); truncated?") from None

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ Array = NDArray[np.floating]
 BLOCK = 512
 #: A raster of heights has no more cells than this.
 MOST_HEIGHTS = 100_000_000
+#: Names of the bands of a file of sigmas.
+SIGMA_BANDS = ("planimetric sigma, m", "height sigma, m")
 #: Tag by which a file of ours says what its heights count from.
 _DATUM = "VERTICAL_DATUM"
 
@@ -111,70 +113,19 @@ def write_heights(path: Path, heights: Heights) -> None:
             target.update_tags(**{_DATUM: "ellipsoid"})
 
 
-def write_orthoimage(path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[str, str]) -> tuple[int, int]:
-    """A mosaic as cloud-optimised GeoTIFF with overviews; 0 is no data. Returns rows and columns.
-
-    Raises
-    ------
-    UserError : nothing in the mosaic, or the file cannot be written
-    """
-    import rasterio
-    import rasterio.shutil
-    from rasterio.crs import CRS
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-    from rasterio.windows import Window
-
-    try:
-        row0, row1, column0, column1 = mosaic.extent()
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from None
-    x, y = grid.corner(column0, row0)
-    crs = None if grid.frame.crs == "local" else CRS.from_user_input(grid.frame.crs)
-    shape = row1 - row0, column1 - column0
-    profile = {
-        "width": shape[1], "height": shape[0], "count": 1, "dtype": mosaic.dtype.name, "crs": crs,
-        "transform": rasterio.Affine(grid.gsd, 0.0, x, 0.0, -grid.gsd, y), "nodata": 0,
-    }  # fmt: skip
-    with new_file(path) as part, warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        draft = part.with_suffix(".draft")
-        try:
-            # a cloud-optimised file is made from a whole one: overviews stand before the pixels
-            with rasterio.open(
-                draft, "w", driver="GTiff", tiled=True, blockxsize=BLOCK, blockysize=BLOCK, bigtiff="if_safer",
-                sparse_ok=True, compress="lzw", **profile,
-            ) as target:  # fmt: skip
-                target.update_tags(**tags)
-                for r in range(0, shape[0], BLOCK):
-                    for c in range(0, shape[1], BLOCK):
-                        height, width = min(BLOCK, shape[0] - r), min(BLOCK, shape[1] - c)
-                        cells = mosaic.read(row0 + r, row0 + r + height, column0 + c, column0 + c + width)
-                        if cells.any():
-                            target.write(cells, 1, window=Window(c, r, width, height))  # type: ignore[call-arg]
-            rasterio.shutil.copy(
-                draft, part, driver="COG", compress="deflate", predictor="yes", blocksize=BLOCK,
-                overview_resampling="average", bigtiff="if_safer",
-            )  # fmt: skip
-        except RasterioError as error:
-            raise UserError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
-        finally:
-            draft.unlink(missing_ok=True)
-    return shape
-
-
 @dataclass(frozen=True)
 class Raster:
     """What a raster of a map is, before there is anything in it.
 
     Attributes
     ----------
-    crs : what rasterio understands
+    crs : what rasterio understands; None for the local frame
     left, top, gsd : CRS coordinates of the upper left corner, and size of a cell
     rows, columns, bands, dtype, nodata : no data where nothing is written
     tags, descriptions : of the file, of its bands
     """
 
-    crs: str
+    crs: str | None
     left: float
     top: float
     gsd: float
@@ -241,7 +192,7 @@ def tiled_orthoimage(
                 target = rasterio.open(
                     draft, "w+", driver="GTiff", tiled=True, blockxsize=BLOCK, blockysize=BLOCK, bigtiff="if_safer",
                     sparse_ok=True, interleave="band", width=raster.columns, height=raster.rows, count=raster.bands,
-                    dtype=raster.dtype, nodata=raster.nodata, crs=CRS.from_user_input(raster.crs),
+                    dtype=raster.dtype, nodata=raster.nodata, crs=raster.crs and CRS.from_user_input(raster.crs),
                     transform=rasterio.Affine(raster.gsd, 0.0, raster.left, 0.0, -raster.gsd, raster.top),
                 )  # fmt: skip
             with target:
@@ -269,3 +220,45 @@ def _told(path: Path) -> Iterator[None]:
         yield
     except RasterioError as error:
         raise UserError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+
+
+def write_orthoimage(
+    path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[str, str], sigma: Path | None = None
+) -> tuple[int, int]:
+    """A mosaic as cloud-optimised GeoTIFF with overviews; 0 is no data. Returns rows and columns.
+
+    Parameters
+    ----------
+    sigma : file for its sigmas in the plane and of the height, if it has them
+
+    Raises
+    ------
+    UserError : nothing in the mosaic, or a file cannot be written
+    """
+    from rasterio.errors import NotGeoreferencedWarning
+
+    try:
+        row0, row1, column0, column1 = mosaic.extent()
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None
+    x, y = grid.corner(column0, row0)
+    shape = row1 - row0, column1 - column0
+    crs = None if grid.frame.crs == "local" else grid.frame.crs
+    raster = Raster(crs, x, y, grid.gsd, *shape, 1, mosaic.dtype.name, 0, tags)
+    with warnings.catch_warnings(), ExitStack() as stack:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        target = stack.enter_context(tiled_orthoimage(path, raster))
+        sigmas = None
+        if sigma is not None:
+            raster = replace(raster, bands=2, dtype="float32", nodata=float("nan"), descriptions=SIGMA_BANDS)
+            sigmas = stack.enter_context(tiled_orthoimage(sigma, raster))
+        for r in range(0, shape[0], BLOCK):
+            for c in range(0, shape[1], BLOCK):
+                end = min(r + BLOCK, shape[0]), min(c + BLOCK, shape[1])
+                window = row0 + r, row0 + end[0], column0 + c, column0 + end[1]
+                cells = mosaic.read(*window)
+                if cells.any():
+                    target.write(r, c, cells[None])
+                    if sigmas is not None:
+                        sigmas.write(r, c, mosaic.read_sigma(*window))
+    return shape

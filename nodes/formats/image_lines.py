@@ -1,4 +1,4 @@
-"""Image lines from files: ENVI images with the times of their lines, as the messages of a strip."""
+"""Image lines from files: ENVI, TIFF and raw images with the times of their lines, as the messages of a strip."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from ...solver.camera.line_camera import LineCamera
 from ..convert import SECOND_NS
 from ..errors import UserError
 from ..node import Message
-from .envi_image import GreyImage, open_envi
+from .envi import header_of
+from .envi_image import TYPES, open_envi, open_raw
+from .grey_image import GreyImage, ImageFile
 from .table import Column, read_table, separator_of
+from .tiff_image import is_tiff, open_tiff
 from .time_columns import WANTED, instant_ns, time_columns, times_of
 
 #: Length of a block, s, and the most bytes that it has.
@@ -43,6 +46,8 @@ class LinesGiven:
     band : of files that name none
     span : values that become black and white
     day : of the flight, for GPS seconds
+    raw : type (of `TYPES`) and samples of a line, 0 for those of the CCD line, of files without a header; None for none
+    rate_hz : lines a second of image topics of a bag, None for what their stamps say
     """
 
     files: tuple[tuple[str, Path, str | None], ...]
@@ -52,6 +57,15 @@ class LinesGiven:
     band: str | None = None
     span: tuple[float, float] | None = None
     day: date | None = None
+    raw: tuple[str, int] | None = None
+    rate_hz: float | None = None
+
+    @property
+    def topics(self) -> dict[str, str] | None:
+        """CCD line -> topic, where what is given are topics of a bag and no files; None without any."""
+        if not self.files or not all(str(name).startswith("/") and not name.exists() for _, name, _ in self.files):
+            return None
+        return {ccd: str(name) for ccd, name, _ in self.files}
 
 
 @dataclass(frozen=True)
@@ -154,12 +168,15 @@ def open_strip(
     notes: list[str] = []
     first: GreyImage | None = None
     for name, path, band in given.files:
-        envi = open_envi(path)
-        notes.extend(envi.notes)
-        view = _view(name, path, envi.samples, camera)
-        grey = GreyImage(envi, envi.weights(band or given.band), given.span)
-        if first is not None and envi.lines != first.image.lines:
-            raise UserError(f"{path}: {envi.lines} lines, wanted {first.image.lines} as in {first.image.path.name}")
+        view = _view(name, path, camera)
+        image = open_image(path, given.raw, 0 if camera is None else camera.lines[camera.line_index[view]].pixels)
+        notes.extend(image.notes)
+        if camera is not None and camera.lines[camera.line_index[view]].pixels != image.samples:
+            wanted = f"{camera.lines[camera.line_index[view]].pixels} as CCD line {view} of the camera has pixels"
+            raise UserError(f"{path}: {image.samples} samples, wanted {wanted}")
+        grey = GreyImage(image, image.weights(band or given.band), given.span)
+        if first is not None and image.lines != first.image.lines:
+            raise UserError(f"{path}: {image.lines} lines, wanted {first.image.lines} as in {first.image.path.name}")
         first = first or grey
         views[view] = grey
     if first is None:
@@ -177,10 +194,16 @@ def open_strip(
     if equal and given.first is not None:
         rate = given.first[1]
     off = float(np.abs((time_ns - time_ns[0]) * (rate * 1e-9) - np.arange(lines)).max())
-    if off > 0.1:
-        what = f"line times are off a constant rate of {rate:.4f} lines/s by {off:.1f} lines at most"
-        notes.append(f"{what}; strip and tie points take the constant rate")
+    notes.extend(off_the_rate(off, rate))
     return ImageStrip(given.strip or first.image.path.stem, views, time_ns, rate, equal, tuple(notes))
+
+
+def off_the_rate(lines: float, rate_hz: float) -> list[str]:
+    """A note where lines of a strip are further off its constant rate than tie points may be."""
+    if lines <= 0.1:
+        return []
+    what = f"line times are off a constant rate of {rate_hz:.4f} lines/s by {lines:.1f} lines at most"
+    return [f"{what}; strip and tie points take the constant rate"]
 
 
 def with_lines(messages: Iterable[Message], strip: ImageStrip, notes: list[str]) -> Iterator[Message]:
@@ -192,7 +215,33 @@ def _order(message: Message) -> tuple[int, int]:
     return message.stamp_ns, rank(message.topic)
 
 
-def _view(name: str, path: Path, samples: int, camera: LineCamera | None) -> str:
+def open_image(path: Path, raw: tuple[str, int] | None = None, samples: int = 0) -> ImageFile:
+    """An image of lines: TIFF, ENVI, or with ``raw`` what has no header.
+
+    Parameters
+    ----------
+    raw : see `LinesGiven`
+    samples : of the CCD line, 0 where the camera is not known
+
+    Raises
+    ------
+    UserError : from the reader of its format, or of no format
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    if is_tiff(path):
+        return open_tiff(path)
+    if raw is None or path.suffix.lower() == ".hdr" or header_of(path) is not None:
+        return open_envi(path)
+    kind, width = raw
+    if kind not in TYPES:
+        raise UserError(f"{path}: values of type {kind!r}, wanted one of {', '.join(TYPES)}")
+    if not (width or samples):
+        raise UserError(f"{path}: pixels of a line are not known, wanted --samples, or --camera")
+    return open_raw(path, kind, width or samples)
+
+
+def _view(name: str, path: Path, camera: LineCamera | None) -> str:
     if camera is None:
         return name or "N"
     lines = {line.id: line.pixels for line in camera.lines}
@@ -202,8 +251,6 @@ def _view(name: str, path: Path, samples: int, camera: LineCamera | None) -> str
         raise UserError(f"{path}: its CCD line is not said, wanted --lines {next(iter(lines))}={path.name}")
     if name not in lines:
         raise UserError(f"{path}: CCD line {name!r} is not in the camera, wanted one of {', '.join(lines)}")
-    if lines[name] != samples:
-        raise UserError(f"{path}: {samples} samples, wanted {lines[name]} as CCD line {name} of the camera has pixels")
     return name
 
 

@@ -1,4 +1,4 @@
-"""ROS 2 bags: ``sensor_msgs/msg/NavSatFix`` and ``sensor_msgs/msg/Imu``, decoded by rosbags.
+"""ROS 2 bags: ``sensor_msgs/msg/NavSatFix``, ``Imu`` and ``Image`` (`ros2_images`), decoded by rosbags.
 
 ROS bodies are forward-left-up against east-north-up (REP 103); ours are forward-right-down against north-east-down.
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import partial
 from heapq import merge
 from itertools import chain, islice
 from pathlib import Path
@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from ...schemas import messages as m
 from ...schemas.topics import rank
 from ...solver.geometry.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
-from ..convert import SECOND_NS, attitude_message, gnss_message
+from ..convert import attitude_message, gnss_message
 from ..errors import UserError
 from ..node import Message
 from ..recording.reader import RecordingReader
+from .ros2_decoding import FIX, decoded
+from .ros2_images import ALL_IMAGES, IMAGE, ImageTopics, ccd_lines, image_messages
 
 Array = NDArray[np.floating]
 
-FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+IMU = "sensor_msgs/msg/Imu"
 #: Taken where a message says that its covariance is not known.
 FIX_SIGMA_M = (5.0, 5.0, 10.0)
 ATTITUDE_SIGMA_RAD = (0.01, 0.01, 0.03)
@@ -85,19 +87,25 @@ class _RosbagsBag:
             raise UserError(f"{self._path}: not a whole ROS 2 bag: {error}") from None
 
 
-def ros2_messages(path: Path, notes: list[str], source: str = "import") -> Iterator[Message]:
-    """``configuration/project``, ``sensor/gnss``, ``sensor/imu`` and ``sensor/attitude``, sorted by stamp and rank.
+def ros2_messages(
+    path: Path, notes: list[str], source: str = "import", given: ImageTopics = ALL_IMAGES
+) -> Iterator[Message]:
+    """What a bag holds of a flight, sorted by stamp and rank.
+
+    ``configuration/project``, ``sensor/gnss``, ``sensor/imu`` and ``sensor/attitude``, and of images
+    ``configuration/strip`` and ``sensor/lines/*``.
 
     Parameters
     ----------
     path : bag folder, ``.db3`` file or MCAP file
-    notes : gets what is not imported. Where several topics have the same type, the one with most messages is taken.
-        Messages that cannot be decoded, fixes without a fix and times that do not come after the one before are left
-        out and counted.
+    notes : gets what is not imported. Where several topics have the same type, the one with most messages is taken; of
+        images all whose CCD line is known. Messages that cannot be decoded, fixes without a fix and times that do not
+        come after the one before are left out and counted.
+    given : which topics are image lines
 
     Raises
     ------
-    UserError : not a bag that can be read, or no NavSatFix and no Imu in it that can be used
+    UserError : not a bag that can be read, nothing in it that can be used, or from `image_messages`
     """
     bag = _RosbagsBag(path) if path.is_dir() or path.suffix == ".db3" else _McapBag(path, notes)
     chosen = {}
@@ -107,23 +115,29 @@ def ros2_messages(path: Path, notes: list[str], source: str = "import") -> Itera
     others = [
         f"{count} {kind} of {topic}"
         for (topic, kind), count in sorted(bag.topics.items())
-        if count and chosen.get(kind) != topic
+        if count and kind != IMAGE and chosen.get(kind) != topic
     ]
     if others:
         notes.append(f"{path.name}: not imported: {', '.join(others)}")
+    images = {topic: count for (topic, kind), count in sorted(bag.topics.items()) if kind == IMAGE and count}
+    views = ccd_lines(path, images, given, notes)
+    if views and given.camera is None:
+        notes.append("no camera given (--camera): recorded without configuration/camera, image lines cannot be matched")
     fixes = fix_messages(bag.payloads(chosen[FIX], FIX), chosen[FIX], notes, source) if FIX in chosen else iter(())
     inertial: Iterator[Message] = iter(())
     if IMU in chosen:
         inertial = inertial_messages(bag.payloads(chosen[IMU], IMU), chosen[IMU], notes, source)
     fix = next(fixes, None)
+    readers = {ccd: partial(bag.payloads, topic, IMAGE) for ccd, topic in views.items()}
     messages = merge(
         chain([] if fix is None else [fix], fixes),
         inertial,
+        image_messages(path, readers, given, notes, source),
         key=lambda message: (message.stamp_ns, rank(message.topic)),
     )
     first = next(messages, None)
     if first is None:
-        raise UserError("; ".join([f"{path}: no usable {FIX} or {IMU}", *notes]))
+        raise UserError("; ".join([f"{path}: no usable {FIX}, {IMU} or {IMAGE}", *notes]))
     project = m.Project(name=path.stem, crs="local")
     if fix is not None:
         project.origin_latitude, project.origin_longitude = round(fix.body.latitude, 6), round(fix.body.longitude, 6)
@@ -132,34 +146,6 @@ def ros2_messages(path: Path, notes: list[str], source: str = "import") -> Itera
     yield Message("configuration/project", first.stamp_ns, project, source)
     yield first
     yield from messages
-
-
-@cache
-def _types() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.LATEST)
-
-
-def decoded(payloads: Iterable[bytes | memoryview], kind: str, left_out: Counter[str]) -> Iterator[tuple[int, Any]]:
-    """Header time in ns and message of each that can be used, each later than the one before."""
-    from rosbags.serde import SerdeError
-
-    types, last = _types(), -1
-    for payload in payloads:
-        try:
-            message = types.deserialize_cdr(payload, kind)
-        except SerdeError:
-            left_out["not decodable"] += 1
-            continue
-        time_ns = message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
-        if kind == FIX and not (message.status.status >= 0 and np.isfinite(message.latitude + message.longitude)):
-            left_out["without a fix"] += 1
-        elif time_ns <= last:
-            left_out["not later than the one before"] += 1
-        else:
-            last = time_ns
-            yield time_ns, message
 
 
 def fix_messages(

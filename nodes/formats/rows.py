@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ...schemas import codec, topics
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ..node import Message
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 #: Repeated sub-messages whose elements become rows by default; a type with only one need not be named here.
 _SPREAD = {"triline.Camera": "lines"}
@@ -108,6 +111,8 @@ class RowLayout:
 
     def frame(self, messages: Iterable[Message]) -> pd.DataFrame:
         """The rows of many messages."""
+        import pandas as pd
+
         columns = self.columns
         rows = [row for message in messages for row in self.rows(message)]
         table = pd.DataFrame(rows, columns=list(columns), dtype=object)

@@ -32,7 +32,7 @@ from ...solver.scene_adjustment.functional import (
 from ...solver.scene_adjustment.images import ImageModel
 from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
-from .block_folder import GROUND, known_points
+from .block_folder import GROUND, known_points, trajectory_settings
 from .keys import Keys, read_toml
 from .projection import missing_grids
 from .satellite.read import read_scene
@@ -41,6 +41,20 @@ from .table import Column, Table, read_table, write_table
 
 Array = NDArray[np.floating]
 
+#: Sigmas of the corrections where neither the project nor the metadata state them: what a satellite with GNSS and star
+#: trackers has, rounded up. Tuned.
+DEFAULTS: Mapping[str, object] = {
+    "offset_sigma_m": [5.0, 5.0, 5.0],
+    "shift_sigma_deg": [0.01, 0.01, 0.01],
+    "drift_sigma_deg": [0.001, 0.001, 0.001],
+    "first_sigma_m": [1.0, 1.0, 1.0],
+    "first_sigma_deg": [0.001, 0.001, 0.001],
+    "second_sigma_m": [0.5, 0.5, 0.5],
+    "second_sigma_deg": [0.0005, 0.0005, 0.0005],
+    "continuity_sigma_m": [0.1, 0.1, 0.1],
+    "continuity_sigma_deg": [0.00001, 0.00001, 0.00001],
+    "segments": 2,
+}
 #: Models that a scene may be adjusted with.
 MODELS = ("rigorous", "rpc", "affine", "dlt")
 #: Image points so far outside their scene cannot be used, pixels.
@@ -116,7 +130,7 @@ class SceneBlockData:
     point_ids : of ground and image points
     rays : ``image`` is the place in `images`; only those that can be used
     ground : known points
-    trajectory : the table ``[trajectory]``
+    trajectory, then : the tables ``[trajectory]`` and ``[trajectory.then]``
     rpc : the table ``[rpc]``: correction, shift_sigma_px, slope_sigma_px
     ellipsoid : of the scenes
     notes : remarks for the user
@@ -129,6 +143,7 @@ class SceneBlockData:
     rays: ImagePoints
     ground: KnownPoints
     trajectory: Mapping[str, object]
+    then: Mapping[str, object]
     rpc: Mapping[str, object]
     ellipsoid: Ellipsoid
     image_sigma_px: float
@@ -144,6 +159,18 @@ class SceneBlockData:
         return KnownGround(
             np.array([place[id] for id in self.ground.id], dtype=np.int64), position, covariance, self.ground.role
         )
+
+    def trajectory_settings(self) -> dict[str, object]:
+        """Sigmas of the corrections: of the project, else of the metadata (the largest of all scenes), else usual."""
+        stated = [e.scene.scene.sigmas for e in self.images if e.scene.model == "rigorous"]
+        found: dict[str, object] = {}
+        for key, values in (
+            ("offset_sigma_m", [s.position_m for s in stated]),
+            ("shift_sigma_deg", [np.degrees(s.attitude_rad) for s in stated]),
+        ):
+            if values and np.min(values) > 0:
+                found[key] = np.max(values, axis=0).tolist()
+        return {**DEFAULTS, **found, **self.trajectory}
 
     def block(self, images: tuple[ImageModel, ...]) -> SceneBlock:
         """The block of images made of `images`, in the same order."""
@@ -184,6 +211,7 @@ def read_scene_block(folder: Path) -> SceneBlockData:
     project, apriori, trajectory = file.table("project"), file.table("apriori"), file.table("trajectory")
     name, crs = project.text("name", folder.resolve().name), project.text("crs", "EPSG:4979")
     sigma = apriori.number("image_sigma_px", 0.3, positive=True)
+    settings, then = trajectory_settings(trajectory)
     rpc = _rpc_settings(file.table("rpc"))
     scenes = _scenes(folder, file.table("scenes"), notes)
     for table in (file, project, apriori):
@@ -197,9 +225,7 @@ def read_scene_block(folder: Path) -> SceneBlockData:
     notes.extend(f"image {image}: no image points; it takes no part" for image in unused)
     images = tuple(images[k] for k in used)
     rays = replace(rays, image=np.searchsorted(used, rays.image))
-    return SceneBlockData(
-        name, frame, images, ids, rays, ground, dict(trajectory.values), rpc, ellipsoid, sigma, tuple(notes)
-    )
+    return SceneBlockData(name, frame, images, ids, rays, ground, settings, then, rpc, ellipsoid, sigma, tuple(notes))
 
 
 def _rpc_settings(table: Keys) -> dict[str, object]:

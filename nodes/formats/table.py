@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import UserError
 
-#: Numbers are read to the last bit, which is the default only since pandas 3.
-_EXACT: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 #: The search for problems of a file ends after so many.
 MOST_PROBLEMS = 10
@@ -144,6 +141,10 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     ------
     UserError : ``file:line: column: what is wrong``, and how many more problems there are
     """
+    import pandas as pd  # takes longer to import than all the rest
+
+    # numbers to the last bit, which is the default only since pandas 3
+    exact: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
     header = _header(path, columns, notes)
     separator, decimal = separator_of(path)
     known = {column.name: column for column in columns if column.name in header}
@@ -159,7 +160,7 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             index_col=False,
             sep=separator,
             decimal=decimal,
-            **_EXACT,
+            **exact,
         )
     except (ValueError, pd.errors.ParserError):  # pandas does not say where, so every line is checked
         raise UserError(one_line(_problems(path, known) or [f"{path}: cannot be read as CSV"])) from None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from datetime import UTC, date, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ..convert import SECOND_NS
@@ -15,6 +15,10 @@ from ..errors import UserError
 from .gps_time import DAY_S, WEEK_S, unwrap_weeks, utc_ns_from_gps
 from .table import Column, Table
 from .track import times_from_gps
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 Array = NDArray[np.floating]
 
@@ -85,6 +89,8 @@ def instant_ns(text: str, what: str) -> int:
     ------
     UserError : naming ``what``
     """
+    import pandas as pd
+
     read = pd.to_datetime(pd.Series([text]), format="ISO8601", utc=True, errors="coerce")
     if read.isna().any():
         raise UserError(f"{what}: {text!r}, wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z")
@@ -101,6 +107,8 @@ def _datetime_ns(times: pd.Series) -> NDArray[np.int64]:
 
 
 def _from_words(table: Table, columns: list[Column]) -> NDArray[np.int64]:
+    import pandas as pd
+
     name = columns[0].name
     words = table[name].astype(str)
     if len(columns) > 1:

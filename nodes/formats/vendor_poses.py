@@ -7,7 +7,6 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ..errors import UserError
@@ -94,6 +93,8 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
 
 def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Times (n,) in ns since the Unix epoch of ``2018/08/28 19:34:25.05`` (or a month in words), and which are none."""
+    import pandas as pd
+
     month = "%b" if re.match(r"\d+/[A-Za-z]", words[0]) else "%m"
     whole = pd.to_datetime([w.partition(".")[0] for w in words], format=f"%Y/{month}/%d %H:%M:%S", errors="coerce")
     instants = np.asarray(whole, dtype="datetime64[ns]")

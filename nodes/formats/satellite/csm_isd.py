@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ....solver.geometry.ellipsoid import Ellipsoid
 from ....solver.location.look_directions import TableLook
@@ -120,6 +119,7 @@ def _body_fixed(file: Keys) -> Callable[[], Motion]:
         V = None
 
     def build() -> Motion:
+
         return Motion(
             InterpolatedOrbit(t, P, V, margin_s=_BEYOND * (t[1] - t[0])),
             SplineAttitude(tq, q, margin_s=_BEYOND * (tq[1] - tq[0])),
@@ -130,6 +130,8 @@ def _body_fixed(file: Keys) -> Callable[[], Motion]:
 
 
 def _inertial(file: Keys, centre_s: float, notes: list[str]) -> Callable[[], Motion]:
+    from scipy.spatial.transform import Rotation
+
     for name in ("instrument_position", "instrument_pointing", "body_rotation"):
         if not file.has(name):
             raise file.refuse(

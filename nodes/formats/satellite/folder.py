@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ....solver.camera.line_camera import LineCamera
 from ....solver.geometry.earth import ROTATION_RATE
@@ -252,6 +251,8 @@ def _orbit(table: Table, stamps: NDArray[np.int64], reference: int, settings: _S
 
 
 def _attitude(table: Table, stamps: NDArray[np.int64], reference: int, settings: _Settings) -> Attitude:
+    from scipy.spatial.transform import Rotation
+
     _increasing(table, stamps)
     t = (stamps - reference) * 1e-9
     if all(name in table for name in ("qx", "qy", "qz", "qw")):

@@ -150,6 +150,8 @@ def read_xml(path: Path) -> Element:
     """
     try:
         root = ET.parse(path).getroot()
+    except LookupError as error:  # an encoding that there is not
+        raise UserError(f"{path}:1: {error}, wanted XML in UTF-8 or another that is known") from None
     except ET.ParseError as error:
         line = error.position[0]
         raise UserError(f"{path}:{line}: not whole XML: {error.msg.split(':')[0]}, wanted a whole document") from None

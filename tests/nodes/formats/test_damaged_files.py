@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from places import DATA
 from small_block import FILES, write_files
+from test_gpx import HEAD, attitude, point
 from test_imports import write_sbet_file
 from test_ros2 import flight_of, write_bag
 
@@ -52,6 +53,8 @@ def _samples(folder: Path) -> dict[str, bytes]:
         "sbet.out": write_sbet_file(folder).read_bytes(),
         "poses.csv": (csv + "".join(f"{i},48.{i},11,500,0,0,45\n" for i in range(20))).encode(),
     }
+    gpx = "".join(point(i, attitude(i)) for i in range(20))
+    found["track.gpx"] = f"{HEAD}{gpx}</trkseg></trk></gpx>".encode()
     found["ros.mcap"] = (write_bag(folder / "bag", flight_of()) / "bag.mcap").read_bytes()
     if DATA.is_dir():
         avirisng = DATA / "avirisng"
@@ -82,7 +85,14 @@ def samples(tmp_path_factory):
     return _samples(tmp_path_factory.mktemp("samples"))
 
 
-_NAMES = ["sbet.out", "poses.csv", "ros.mcap", "ang20170323t202244_eph_att", "f180522t01p00r07rdn_e_lonlat_eph"]
+_NAMES = [
+    "sbet.out",
+    "poses.csv",
+    "track.gpx",
+    "ros.mcap",
+    "ang20170323t202244_eph_att",
+    "f180522t01p00r07rdn_e_lonlat_eph",
+]
 
 
 @pytest.mark.parametrize("name", [*_NAMES, "pos.txt", "camera.xml", "ties.xml"])

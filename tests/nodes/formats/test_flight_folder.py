@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pyproj
 import pytest
+import rasterio
 from envi_files import write_camera, write_image
 from tracks import ns
 
@@ -14,6 +15,7 @@ from triline.nodes.cli import main
 from triline.nodes.config import load
 from triline.nodes.convert import local_frame, pose_sample
 from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.formats.geotiff import Heights, write_heights
 from triline.nodes.recording.reader import RecordingReader
 
 START = "2020-06-01T12:00:00"
@@ -112,6 +114,49 @@ def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
     blocks = [message.body for message in reader.messages(["sensor/lines/N"])]
     assert blocks[-1].strip == "S2" and blocks[-1].pixels.dtype == np.uint16
     assert load(folder / "flight.toml", ["matcher"]) == {"matcher": {"ground_m": 5.0}}
+
+
+def test_the_origin_lies_on_the_ground_by_raster_or_height_above_it(folder, tmp_path, capsys):
+    place = rasterio.Affine(0.002, 0, LON - 0.1, 0, -0.002, LAT + 0.1)
+    with rasterio.open(
+        folder / "dem.tif", "w", driver="GTiff", width=100, height=100, count=1, dtype="float32", crs="EPSG:4326",
+        transform=place,
+    ) as file:  # fmt: skip
+        file.write(np.full((1, 100, 100), 431.5, np.float32))
+    poses, out = str(folder / "poses.csv"), tmp_path / "o.mcap"
+    dem = ["--dem", str(folder / "dem.tif"), "--dem-crs", "ellipsoid"]
+    for arguments, height in (
+        (dem, 431.5),
+        (["--above-ground", "1400"], 600.0),
+        (["--ground-height", "55"], 55.0),
+        ([], 0),
+    ):
+        assert main(["import", poses, "-o", str(out), *arguments]) == 0
+        (project,) = [m.body for m in RecordingReader(out).messages(["configuration/project"])]
+        assert project.origin_height == pytest.approx(height, abs=0.06), arguments
+    assert "note: median height of dem.tif under the flight" in capsys.readouterr().out
+    dem[1] = str(tmp_path / "far.tif")
+    with rasterio.open(folder / "dem.tif") as file:
+        profile = file.profile | {"transform": rasterio.Affine(0.002, 0, LON + 1, 0, -0.002, LAT)}
+        with rasterio.open(dem[1], "w", **profile) as far:
+            far.write(file.read())
+    for arguments, wanted in (
+        (dem, "far.tif: has no height under the flight, wanted a raster of the same area"),
+        (dem[:2], "does not say what its heights count from"),
+        (dem[2:], "--dem-crs ellipsoid: is of a raster of heights, wanted --dem FILE with it"),
+        (["--ground-height", "5", *dem], "--ground-height and --dem: wanted one of them"),
+        (["--above-ground", "-5"], "--above-ground -5, wanted more than 0 m"),
+        (["--ground-height", "1e5"], "--ground-height 100000, wanted metres from -500 to 9000"),
+    ):
+        assert main(["import", poses, "-o", str(out), *arguments]) == 1
+        assert wanted in capsys.readouterr().err, arguments
+    text = (folder / "flight.toml").read_text()
+    (folder / "flight.toml").write_text(text + '\n[dem]\nfile = "dem.tif"\ncrs = "ellipsoid"\n')
+    assert main(["check", str(folder)]) == 0
+    assert "ground at 431.5 m" in capsys.readouterr().out
+    (folder / "flight.toml").write_text(text + '\n[dem]\nfile = "dem.tif"\n')
+    assert main(["check", str(folder)]) == 1
+    assert "does not say what its heights count from, wanted dem.crs ellipsoid" in capsys.readouterr().out
 
 
 def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
@@ -223,6 +268,28 @@ def test_what_is_wrong_is_said_once_and_nothing_else(folder, what):
     problems = read_flight(folder).problems
     n = 2 if what == "another day" else 1  # of the poses and of the lines
     assert len(problems) == n and wanted in problems[0] and "\n" not in problems[0], problems
+
+
+def test_an_elevation_model_without_datum_is_asked_for_it(folder):
+    write_heights(folder / "dem.tif", Heights("EPSG:4326", np.zeros((4, 4)), LON - 0.15, LAT + 0.15, 0.1, -0.1))
+    table = '[dem]\nfile = "dem.tif"\nsigma_m = 0.5\n'
+    for more, wanted in (
+        ("", "does not say what its heights count from, wanted dem.crs ellipsoid"),
+        ('crs = "EPSG:32632"\n', "dem.crs EPSG:32632: says nothing of heights"),
+        ("sigma = 1\n", "dem.sigma: not known, wanted file, crs"),
+    ):
+        (folder / "flight.toml").write_text(TOML + table + more)
+        problems = read_flight(folder).problems
+        assert any(wanted in line for line in problems) and "\n" not in "".join(problems), problems
+    (folder / "flight.toml").write_text(TOML + table + 'crs = "ellipsoid"\n')
+    assert not read_flight(folder).problems
+    assert load(folder / "flight.toml")["adjuster"] == {
+        "dem": str(folder / "dem.tif"), "dem_sigma_m": 0.5, "dem_crs": "ellipsoid",
+    }  # fmt: skip
+    (folder / "flight.toml").write_text(TOML + '[dem]\nfile = "dem.tif"\ncrs = "ellipsoid"\n')  # for other things
+    assert not read_flight(folder).problems and "adjuster" not in load(folder / "flight.toml")
+    (folder / "dem.tif").unlink()
+    assert "dem.file: no dem.tif in the folder" in read_flight(folder).problems[0]
 
 
 def test_options_that_the_folder_says(folder, tmp_path, capsys):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from envi_files import write_camera, write_image
+from rasterio.errors import NotGeoreferencedWarning
 from tracks import ns
 
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any
-from triline.nodes.formats.envi_image import GreyImage, open_envi
+from triline.nodes.formats.envi_image import open_envi
+from triline.nodes.formats.grey_image import GreyImage
 from triline.nodes.formats.image_lines import LinesGiven, files_of
 from triline.nodes.recording.reader import RecordingReader
 
@@ -115,6 +119,85 @@ def test_bands_that_are_not_there(tmp_path):
     with pytest.raises(UserError, match=r"b.img: no ENVI header beside it, wanted b.img.hdr or b.hdr"):
         (tmp_path / "b.img").write_bytes(b"x")
         open_envi(tmp_path / "b.img")
+
+
+# ---- other formats
+
+
+def write_tiff(path: Path, cube: np.ndarray, **profile) -> Path:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        lines, samples, bands = cube.shape
+        with rasterio.open(
+            path, "w", driver="GTiff", width=samples, height=lines, count=bands, dtype=cube.dtype.name, **profile
+        ) as file:
+            file.write(np.moveaxis(cube, 2, 0))
+            if bands == 3:
+                file.descriptions = ("Red", "Green", "NIR")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_a_tiff_and_a_raw_strip_give_the_lines_of_the_envi_image(tmp_path, capsys, kind):
+    cube = cube_of(kind)
+    out, times, poses = tmp_path / "o.mcap", str(write_times(tmp_path / "t.csv")), str(write_poses(tmp_path / "p.csv"))
+    camera = ["--camera", str(write_camera(tmp_path / "camera.json")), "--line-times", times]
+    tiff = write_tiff(tmp_path / "all.tif", cube, compress="deflate", tiled=True, blockxsize=16, blockysize=16)
+    raw = tmp_path / "nadir.raw"
+    raw.write_bytes(cube[..., 1].tobytes())
+    files = f"F={tiff}@1,N={raw},B={tiff}@NIR"
+    assert kind_of_path(tiff) == "lines"
+    assert main(["import", poses, "-o", str(out), "--lines", files, "--raw", kind, *camera]) == 0
+    for ccd, band in (("F", 0), ("N", 1), ("B", 2)):
+        np.testing.assert_array_equal(pixels_of(out, ccd), cube[..., band])
+    capsys.readouterr()
+    # alone; big end first, pixels of a line stated
+    raw.write_bytes(cube[..., 1].astype(">u2").tobytes() + b"abc")
+    alone = ["--raw", ">u2", "--samples", "7", "--first-time", START, "--line-rate", "100"]
+    assert main(["import", str(raw), "-o", str(out), *alone]) == 0
+    assert (
+        "nadir.raw: 3 bytes after the last of 50 lines of 7 samples of type >u2 (14 bytes)" in capsys.readouterr().out
+    )
+    np.testing.assert_array_equal(pixels_of(out, "N"), cube[..., 1])
+
+
+def test_a_tiff_with_coordinates_is_told(tmp_path):
+    place = {"crs": "EPSG:32632", "transform": rasterio.Affine(1, 0, 5e5, 0, -1, 5e6)}
+    tiff = write_tiff(tmp_path / "a.tif", cube_of("u1", bands=1), **place)
+    imported = read_any(tiff, options=Options(lines=LinesGiven((), first=(START, 100.0))))
+    assert any("a.tif: has coordinates" in note for note in imported.notes)
+
+
+def test_tiff_and_raw_strips_that_cannot_be(tmp_path, capsys):
+    poses, camera = str(write_poses(tmp_path / "p.csv")), str(write_camera(tmp_path / "camera.json"))
+    times, out = ["--line-times", str(write_times(tmp_path / "t.csv"))], tmp_path / "o.mcap"
+    tiff = write_tiff(tmp_path / "a.tif", cube_of("u1"))
+    cut = tmp_path / "cut.tif"
+    cut.write_bytes(tiff.read_bytes()[:300])
+    complex_tiff = write_tiff(tmp_path / "c.tif", np.ones((50, 7, 1), np.complex64))
+    raw, empty = tmp_path / "a.raw", tmp_path / "empty.raw"
+    raw.write_bytes(bytes(349))
+    empty.write_bytes(bytes(3))
+    for arguments, wanted in (
+        (["--lines", f"F={tiff}"], "a.tif: 3 bands, wanted one of them (--band 2)"),
+        (["--lines", f"F={tiff}@Blue"], "a.tif: band 'Blue': not in it, wanted 1 to 3 or one of Red, Green, NIR"),
+        (["--lines", f"F={tiff}@1", "--camera", "ads40"], "a.tif: 7 samples, wanted 12000 as CCD line F"),
+        (["--lines", f"F={cut}@1"], "cut.tif: "),
+        (["--lines", f"F={complex_tiff}"], "c.tif: values of type complex64, wanted real numbers"),
+        (["--lines", f"F={raw}"], "a.raw: no ENVI header beside it, wanted a.raw.hdr or a.hdr, a TIFF, or --raw TYPE"),
+        (
+            ["--lines", f"F={raw}", "--raw", "u1"],
+            "a.raw: pixels of a line are not known, wanted --samples, or --camera",
+        ),
+        (["--lines", f"F={raw}", "--raw", "u1", "--camera", camera], "a.raw: 49 lines, but "),
+        (["--lines", f"F={empty}", "--raw", "u1", "--camera", camera], "empty.raw: 3 bytes, wanted lines of 7 samples"),
+        (["--lines", f"F={tiff}@1", "--samples", "7"], "--samples 7: wanted the pixels of a line, with --raw TYPE"),
+        (["--raw", "u1"], "--raw is of images, wanted --lines VIEW=FILE with it"),
+    ):
+        more = ["--format", "csv"] if arguments == ["--raw", "u1"] else times
+        assert main(["import", poses, "-o", str(out), *arguments, *more]) == 1, arguments
+        err = capsys.readouterr().err
+        assert wanted in err and err.count("\n") == 1 and not out.exists(), (arguments, err)
 
 
 # ---- with times and poses

@@ -12,6 +12,7 @@ from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, wr
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import kind_of_path
 from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.xml_file import read_xml
 
 TRUTH = Truth(lines=4000, samples=500)
 
@@ -230,3 +231,10 @@ def test_years_that_no_satellite_saw(tmp_path):
     path = write_dimap2(tmp_path / "scene.xml", TRUTH)
     path.write_text(path.read_text().replace("<START>2021", "<START>9021"))
     refused(path, "START: '9021.*' lies outside the years 1900 to 2200")
+
+
+def test_an_encoding_that_there_is_not(tmp_path):
+    path = tmp_path / "DIM.XML"
+    path.write_text('<?xml version="1.0" encoding="UTF-0x10"?>\n<Dimap_Document></Dimap_Document>\n')
+    with pytest.raises(UserError, match=r"DIM\.XML:1: unknown encoding: UTF-0x10, wanted XML in UTF-8"):
+        read_xml(path)

@@ -1,0 +1,127 @@
+"""Satellite scenes as a recording: the on-line adjustment against the batch and against the truth, and bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording
+from triline.nodes.cli import main
+from triline.nodes.formats.block_recording import block_from_messages
+from triline.nodes.formats.scene_block import read_scene_block
+from triline.nodes.formats.scene_recording import local_block
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.block_data import network_from_block
+from triline.solver.models.dgr import DgrOptions
+
+
+def on_line(messages, **options):
+    """Points of the adjuster: name -> (xyz, covariance), and the node."""
+    node = Adjuster(**options)
+    points = {}
+    found = [out for message in messages if message.topic in node.inputs for out in node.step(message)]
+    for out in [*found, *node.finish()]:
+        if out.topic == "point/object":
+            body = out.body
+            points[body.point] = np.array([body.x, body.y, body.z]), np.reshape(body.covariance, (3, 3))
+    return points, node
+
+
+def truth_of(messages):
+    return {m.body.point: np.array([m.body.x, m.body.y, m.body.z]) for m in messages if m.topic == "truth/point"}
+
+
+def nees_of(messages, points):
+    """Squared errors of the points without known coordinates by their covariance, a coordinate."""
+    truth = truth_of(messages)
+    known = {m.body.point for m in messages if m.topic == "observation/control"}
+    free = [id for id in points if id not in known]
+    return [(e := points[id][0] - truth[id]) @ np.linalg.solve(points[id][1], e) / 3 for id in free]
+
+
+@pytest.mark.parametrize("satellite", ["alos-prism", "spot5-hrs", "aster-vnir"])
+def test_on_line_is_as_the_batch(satellite):
+    """Lenses minutes apart, a strip each: all points, within hundredths of a sigma of the batch."""
+    messages, _ = simulated_recording(SceneSimulation(satellite, points=60, check=10))
+    points, node = on_line(messages, model="dgr")
+    assert not node.counters["failed"] and len(points) == 60
+    block = block_from_messages(messages, "recording")
+    network = network_from_block(block)
+    solution = adjust(network, DgrOptions.from_settings(block.apriori.trajectory))
+    batch = dict(zip(network.point_ids, solution.state.points_l, strict=True))
+    off = np.array([np.abs(xyz - batch[id]) / np.sqrt(np.diag(C)) for id, (xyz, C) in points.items()])
+    assert off.mean() < 0.01 and off.max() < 0.05
+    # the true orientation is far from the measured one: without corrections points are tens of metres off
+    assert 0.5 < np.mean(nees_of(messages, points)) < 2.0
+
+
+@pytest.mark.parametrize("options", [{"model": "ppm"}, {"model": "lim"}, {"model": "dgr", "self_calibration": "lens"}],
+                         ids=["ppm", "lim", "lens"])  # fmt: skip
+def test_other_models_and_lens_sets(options):
+    messages, _ = simulated_recording(SceneSimulation("spot5-hrs", points=60, check=10, seed=4))
+    points, node = on_line(messages, **options)
+    assert len(points) == 60 and not node.counters["failed"]
+    assert 0.4 < np.mean(nees_of(messages, points)) < 2.5
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("satellite", ["alos-prism", "spot5-hrs", "aster-vnir", "misr"])
+def test_errors_are_as_large_as_their_sigmas(satellite):
+    """NEES over seeds."""
+    found = []
+    for seed in range(10):
+        messages, _ = simulated_recording(SceneSimulation(satellite, points=60, check=10, seed=seed))
+        found += nees_of(messages, on_line(messages, model="dgr")[0])
+    assert 0.6 < np.mean(found) < 1.6
+
+
+def test_the_earth_is_curved_in_the_local_frame():
+    """The origin lies on the ground in the middle; points at the edge of the swath of MISR lie far below its plane."""
+    messages, _ = simulated_recording(SceneSimulation("misr", points=60, check=10))
+    truth = np.array(list(truth_of(messages).values()))
+    assert np.linalg.norm(truth[:, :2].mean(axis=0)) < 60_000
+    far = np.linalg.norm(truth[:, :2], axis=1)
+    drop = far**2 / (2 * 6.37e6)
+    assert drop.max() > 1000
+    # what is left is relief (0 to 1500 m), about the height of the origin
+    assert np.abs(truth[:, 2] + drop).max() < 1200
+
+
+def test_cameras_and_strips(tmp_path, capsys):
+    folder = tmp_path / "triplet"
+    assert main(["simulate", "-q", "-o", str(folder), "--satellite", "alos-prism", "--points", "40"]) == 0
+    block = local_block(read_scene_block(folder))
+    assert [strip.id for strip in block.strips] == ["scene/F", "scene/N", "scene/B"]
+    assert [lens.id for lens in block.camera.lenses] == ["F", "N", "B"]
+    assert block.camera.lines[0].chips == (0, 4960, 9920, 14880)
+    assert block.camera.lenses[0].focal_length_mm == 1939.0
+    recording = tmp_path / "x.mcap"
+    assert main(["import", str(folder), "-o", str(recording)]) == 0
+    capsys.readouterr()
+    assert main(["info", str(recording), "--json"]) == 0
+    assert "scene/N" in capsys.readouterr().out
+    result = tmp_path / "result"
+    assert main(["adjust", str(recording), "--model", "dgr", "-q", "-o", str(result)]) == 0
+    assert json.loads((result / "result.json").read_text())["chi_square_test"]["passed"]
+
+
+def test_bad_input(tmp_path, capsys):
+    folder = tmp_path / "pair"
+    assert main(["simulate", "-q", "-o", str(folder), "--satellite", "spot5-hrs", "--points", "40"]) == 0
+    affine = shutil.copytree(folder, tmp_path / "affine")
+    project = affine / "project.toml"
+    project.write_text(project.read_text().replace('[scenes."scene"]', '[scenes."scene"]\nmodel = "affine"'))
+    out = str(tmp_path / "x.mcap")
+    for arguments, match in (
+        ([str(affine)], "model affine, wanted the rigorous one: a recording holds orbit and attitude"),
+        ([str(folder), "--date", "2020-01-01"], "--date does not go with a block of satellite scenes"),
+        ([str(folder), "--camera", "si-100"], "--camera does not go with block of satellite scenes"),
+    ):
+        capsys.readouterr()
+        assert main(["import", *arguments, "-o", out]) != 0
+        error = capsys.readouterr().err
+        assert match in error and error.count("\n") == 1
