@@ -15,7 +15,7 @@ from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control
 from ...solver.adjustment.reliability import Reliability, reliability
 from ...solver.adjustment.snooping import control_tests
-from ...solver.adjustment.statistics import PointAccuracy, mean_sigma, strongest_correlations
+from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
 from ...solver.adjustment.surface_control import SurfaceFit
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
@@ -47,23 +47,12 @@ class Adjustment:
     block : input
     job, result : what was done, what came out
     seconds : wall time of the job
-    surface : what came of the heights of a surface, where there was one
     """
 
     block: BlockData
     job: Job
     result: BatchResult
     seconds: float
-    surface: SurfaceFit | None = None
-
-    @property
-    def surveyed(self) -> Control:
-        """Control that was given point by point, without heights of a surface."""
-        control = self.result.network.control
-        if self.surface is None:
-            return control
-        mine = ~np.isfinite(self.surface.difference_m[control.point])
-        return Control(control.point[mine], control.xyz_l[mine], control.sigma_m[mine])
 
     def camera(self) -> LineCamera | None:
         """The camera with the estimated additional parameters in its tables; None where none was estimated."""
@@ -71,7 +60,7 @@ class Adjustment:
         if full is None:
             return None
         solution = self.result.solution
-        names = solution.layout.names[solution.layout.n_model :]
+        names = _parameter_names(solution)
         values = dict(zip(names, solution.camera_parameters.tolist(), strict=True))
         return calibrated(self.result.network.camera, full, values) if values else None
 
@@ -118,8 +107,9 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
         "seconds": adjustment.seconds,
         "strips": strips_of(adjustment, solution),
         "additional_parameters": parameters_of(result, adjustment.job.self_calibration),
-        **accuracies(result, adjustment.surveyed),
-        **({} if adjustment.surface is None else {"dem": _surface(adjustment.surface)}),
+        **platform_of(result),
+        **accuracies(result),
+        **({} if result.surface is None else {"dem": _surface(result.surface)}),
         "rejected": rejected(adjustment),
         "rejected_control": [
             {"point": result.network.point_ids[r.point], "coordinate": "XYZ"[r.axis], "w": r.w}
@@ -167,15 +157,27 @@ def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
     return found
 
 
+def platform_of(result: BatchResult) -> dict[str, Any]:
+    """Constant errors of the platform, with their sigmas; nothing where none is an unknown."""
+    solution, layout = result.solution, result.solution.layout
+    sigma = result.sigma0 * np.sqrt(np.maximum(solution.factor.variances(), 0.0))
+    found = {
+        name: {"value": float(solution.state.theta[k]), "sigma": float(sigma[k]), "unit": layout.platform.UNITS[name]}
+        for name, k in zip(layout.platform.unknown_names, layout.platform_columns.tolist(), strict=True)
+    }
+    return {"platform": found} if found else {}
+
+
 def parameters_of(result: BatchResult, full: SelfCalibration | None) -> dict[str, Any]:
     """All additional parameters of the set; for those that are gone value 0, and sigma and t when they went."""
     if full is None:
         return {}
     solution = result.solution
-    first = solution.layout.n_model
-    sigma = result.sigma0 * np.sqrt(np.maximum(solution.factor.variances()[first:], 0.0))
-    value = dict(zip(solution.layout.names[first:], solution.camera_parameters, strict=True))
-    spread = dict(zip(solution.layout.names[first:], sigma, strict=True))
+    names, first = _parameter_names(solution), solution.layout.n_model
+    variances = solution.factor.variances()[first : first + len(names)]
+    sigma = result.sigma0 * np.sqrt(np.maximum(variances, 0.0))
+    value = dict(zip(names, solution.camera_parameters, strict=True))
+    spread = dict(zip(names, sigma, strict=True))
     gone = {r.name: r for r in result.removed}
     found: dict[str, Any] = {}
     for name in full.unknown_names:
@@ -193,25 +195,37 @@ def parameters_of(result: BatchResult, full: SelfCalibration | None) -> dict[str
     return found
 
 
+def _parameter_names(solution: Solution) -> tuple[str, ...]:
+    """Names of the additional parameters that were estimated."""
+    first = solution.layout.n_model
+    return solution.layout.names[first : first + solution.layout.n_camera]
+
+
 def _surface(fit: SurfaceFit) -> dict[str, Any]:
-    d = fit.difference_m[np.isfinite(fit.difference_m)]
-    counts = fit.weight[fit.weight > 0]
+    """Heights of a raster: differences are raster minus points, of those that count in full, less the shift."""
+    known = np.isfinite(fit.off_m)
+    good = known & (fit.weight > 0.5)
+    d = fit.off_m[good]
     return {
-        "n": len(d),
+        "n": int(known.sum()),
         "sigma_m": fit.sigma_m,
-        "rmse_m": float(np.sqrt(np.mean(d**2))),
-        "median_m": float(np.median(d)),
-        "half_weight_or_less": int((counts <= 0.5).sum()),
-        "rounds": fit.rounds,
+        "rmse_m": float(np.sqrt(np.mean(d**2))) if len(d) else None,
+        "half_weight_or_less": int((known & ~good).sum()),
+        "shift_sigma_apriori_m": fit.shift_sigma_m,
+        "shift_m": fit.shift.shift_m,
+        "shift_sigma_m": fit.shift.sigma_m,
+        "shift_w": fit.shift.w,
+        "holds_height": not fit.shift.free,
     }
 
 
-def accuracies(result: BatchResult, surveyed: Control) -> dict[str, Any]:
+def accuracies(result: BatchResult) -> dict[str, Any]:
     """Empirical and theoretical accuracy of check, control and tie points, and of direct georeferencing.
 
     Direct georeferencing is compared with the check points, or with the control where there are none.
     """
     network, points, sigma = result.network, result.adjusted_points(), result.point_sigma_m
+    surveyed = network.control
     tie = np.ones(network.n_points, dtype=bool)
     tie[network.check.point] = tie[surveyed.point] = False
     reference = network.check if len(network.check) else surveyed
@@ -287,7 +301,7 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     elif not result.test.passed:
         notes.append(_sigma0_note(result))
     notes += _test_notes(adjustment)
-    notes += _control_notes(network)
+    notes += _control_notes(result)
     notes += _weakness_notes(result)
     if result.doubtful:
         notes.append(_doubt_note(result))
@@ -314,6 +328,10 @@ def _sigma0_note(result: BatchResult) -> str:
     said = f"sigma0 {test.sigma0:.3f} outside [{test.low:.3f}, {test.high:.3f}] (95 %)"
     if test.sigma0 > test.high:
         return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit"
+    _, squares, redundancy = result.groups.get("surface", (0, 0.0, 0.0))
+    surface = global_test(squares, round(redundancy))
+    if redundancy > 1.0 and surface.sigma0 < surface.low:
+        return f"{said}: the heights of the raster fit better than their sigma says; --dem-sigma may be smaller"
     if image.sigma0 >= image.low:
         return f"{said}: the a-priori weights of the trajectory are loose; of the image points it is {image.sigma0:.3f}"
     return f"{said}: the errors are smaller than the a-priori sigmas"
@@ -367,8 +385,22 @@ def worst_strip(adjustment: Adjustment) -> str:
     return f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
 
 
-def _control_notes(network: Any) -> list[str]:
-    control: Control = network.control
+def _control_notes(result: BatchResult) -> list[str]:
+    network, control, notes = result.network, result.network.control, []
+    full, fit = np.isfinite(control.sigma_m), result.surface
+    if fit is not None and fit.shift.free:
+        other = "control" if full[:, 2].any() else "the trajectories"
+        s = fit.shift
+        notes.append(
+            f"the raster's heights differ from those of {other} by {s.shift_m:+.2f} +- {s.sigma_m:.2f} m, w {s.w:.1f}: "
+            f"vertical datum of --dem-crs? Its relief counts, its height does not: Z is that of {other}"
+        )
+    if fit is not None and not full.any() and not fit.shift.free:
+        return ["no control: position and rotation of the block come from its trajectories, its height from the raster"]
+    return [*notes, *_spread_notes(network, control)]
+
+
+def _spread_notes(network: Any, control: Control) -> list[str]:
     full = np.isfinite(control.sigma_m)
     if not full.any():
         return ["no control: position, rotation and scale of the block come from its trajectories"]

@@ -24,6 +24,7 @@ def summary_lines(content: Content, *, verbose: bool = False) -> Iterator[str]:
     yield from _head(content)
     yield from _accuracy(content)
     yield from _strips(content)
+    yield from _platform(content)
     yield from _parameters(content)
     yield from _components(content)
     yield from _rejected(content, verbose)
@@ -70,8 +71,12 @@ def _accuracy(c: Content) -> Iterator[str]:
         d = c["dem"]
         yield (
             f"  heights of the raster {d['n']:5d} points with sigma {d['sigma_m']:g} m; "
-            f"differences {d['rmse_m']:.3f} m RMS, median {d['median_m']:+.3f} m; "
-            f"{d['half_weight_or_less']} count half or less"
+            f"differences {_number(d['rmse_m'])} m RMS without {d['half_weight_or_less']} that count half or less"
+        )
+        yield (
+            f"  {'':22s}{'':5s} raster minus all else {d['shift_m']:+.3f} +- {d['shift_sigma_m']:.3f} m "
+            f"(stated {d['shift_sigma_apriori_m']:g} m, w {d['shift_w']:.1f})"
+            + ("" if d["holds_height"] else ": NO height datum of the raster")
         )
 
 
@@ -95,6 +100,11 @@ def _strips(content: Content) -> Iterator[str]:
             yield f"image {id}, {strip['model']}"
             for name, c in strip["coefficients"].items():
                 yield f"  {name:24s}{c['value']:16.8g} +- {_number(c['sigma'])}"
+
+
+def _platform(c: Content) -> Iterator[str]:
+    for name, p in c.get("platform", {}).items():
+        yield f"{name}: {p['value']:.6f} +- {p['sigma']:.6f} {p['unit']}"
 
 
 def _parameters(c: Content) -> Iterator[str]:

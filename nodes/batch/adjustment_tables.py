@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ...solver.adjustment.adjustment import Solution
 from ...solver.adjustment.layout import CorrectionSet
+from ...solver.adjustment.refined_orientation import design_at
 from ...solver.adjustment.reliability import reliability
 from ...solver.geometry.rotation import angles_from_matrix, corrected_angles, matrix_from_angles
 from ..formats.line_orientation import OrientedLines
 from .adjustment_result import TABLES, Adjustment, set_name
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 Array = NDArray[np.floating]
 
@@ -34,6 +39,8 @@ def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
 
 def points_table(adjustment: Adjustment) -> pd.DataFrame:
     """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined."""
+    import pandas as pd
+
     block, result = adjustment.block, adjustment.result
     network = result.network
     order = np.array([network.point_index[id] for id in block.point_ids if id in network.point_index], dtype=np.int64)
@@ -53,13 +60,13 @@ def points_table(adjustment: Adjustment) -> pd.DataFrame:
     columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
     doubtful = np.isin(order, [d.point for d in result.doubtful]).astype(int)
     role = network.role()
-    if adjustment.surface is not None:  # a height of the raster makes no control of a tie point
-        role[np.isfinite(adjustment.surface.difference_m)] = "tie"
     return pd.DataFrame(columns | {"rays": in_use[order], "role": role[order], "doubtful": doubtful})
 
 
 def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
     """Residuals of all image points that could be used, in the order of the input, pixels."""
+    import pandas as pd
+
     block, result = adjustment.block, adjustment.result
     rays, s = result.network.rays, result.rays
     order = np.argsort(rays.source)
@@ -90,6 +97,8 @@ def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
 
 def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
     """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas."""
+    import pandas as pd
+
     frame, reference = adjustment.block.frame, adjustment.block.time_reference_ns
     parts = []
     for item in adjustment.result.solution.layout.sets:
@@ -154,18 +163,19 @@ def correction_functions(adjustment: Adjustment, item: CorrectionSet, time_s: Ar
     total = np.zeros((len(time_s), 6))
     for stage in result.stages:
         mine = next(s for s in stage.layout.sets if (s.strip, s.lens) == (item.strip, item.lens))
-        total += mine.model.evaluate(stage.state.theta[mine.columns], time_s)
+        total += design_at(stage, mine, time_s).evaluate(stage.state.theta)
     return total, result.sigma0 * correction_sigma(result.solution, item, time_s)
 
 
 def correction_sigma(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
     """Sigmas (n, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
-    design = item.model.design(time_s)
-    Q = solution.factor.cofactors(np.arange(item.columns.start, item.columns.stop))
-    Q = np.pad(Q, ((0, 1), (0, 1)))  # column -1 reads zeros
+    design = design_at(solution, item, time_s)
+    numbers = design.unknowns()
+    Q = np.pad(solution.factor.cofactors(numbers), ((0, 1), (0, 1)))  # the last column reads zeros
+    columns = np.where(design.columns >= 0, np.searchsorted(numbers, design.columns), -1)
     variance = np.zeros((len(time_s), 6))
     for a in range(design.columns.shape[1]):
         for b in range(design.columns.shape[1]):
             weight = design.coefficients[:, a] * design.coefficients[:, b]
-            variance += weight[:, None] * Q[design.columns[:, a], design.columns[:, b]]
+            variance += weight[:, None] * Q[columns[:, a], columns[:, b]]
     return np.sqrt(np.maximum(variance, 0.0))

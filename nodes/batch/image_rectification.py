@@ -23,7 +23,7 @@ from ...solver.rectification.occlusion import hidden, reach_cells
 from ...solver.rectification.pixel_to_cell import meet_terrain, mesh_cells
 from ...solver.rectification.sampled import some_cells
 from ..errors import UserError
-from ..formats.geotiff import BLOCK, Raster, tiled_orthoimage
+from ..formats.geotiff import BLOCK, SIGMA_BANDS, Raster, tiled_orthoimage
 from ..formats.height_raster import HeightRaster, RasterFile
 
 Array = NDArray[np.floating]
@@ -39,8 +39,6 @@ CACHE_MB = 192
 MISSING = {
     0: "value", 1: "outside the image", 2: "height not known", 3: "hidden by relief", 4: "no data in the image",
 }  # fmt: skip
-#: Bands of the map of sigmas.
-SIGMA_BANDS = ("planimetric sigma, m", "height sigma, m")
 
 
 @dataclass(frozen=True)

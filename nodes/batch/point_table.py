@@ -57,6 +57,6 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
             if covariance:
                 values += ["" if np.isnan(c) else f"{c:.6e}" for c in C[i][[0, 0, 1], [1, 2, 2]]]
             name = f'"{p.point}"' if set(p.point) & set(',"\n') else p.point
-            status = m.ObjectPoint.Status.Name(p.status).lower()
+            status = convert.enum_name(m.ObjectPoint.Status, p.status)
             file.write(",".join([name, *values, str(p.rays), p.role, status]) + "\n")
     return len(best)

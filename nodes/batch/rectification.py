@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
 from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation
 from ...solver.geometry.rotation import quaternion_from_matrix
-from ...solver.models.base import COMPONENTS
+from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ...solver.orthoimage.heights_of_points import heights_of_points
 from ...solver.orthoimage.mosaic import Mosaic
@@ -25,6 +26,7 @@ from ...solver.orthoimage.surface import HeightField, Surface
 from ...solver.simulation.flight import Flight
 from .. import convert
 from ..errors import UserError
+from ..formats.camera_json import read_camera
 from ..formats.geotiff import Heights
 from ..formats.line_orientation import OrientedLines
 from ..formats.projection import refuse_missing_grids
@@ -45,8 +47,6 @@ ORIENTATIONS: dict[str, str] = {
 REFINED = ("whole", "final", "live")
 #: Lines that are missing are left black, so that the others stay in their places, if there are not more than this.
 LARGEST_GAP = 5000
-#: First words of the names of a strip's own parameters in reports.
-_OF_STRIP = tuple(f"d{c}" for c in COMPONENTS) + COMPONENTS
 
 
 @dataclass
@@ -69,6 +69,8 @@ class Rectified:
 
 def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOrientation, int]:
     """The orientation of a recording: which it is, the orientation, and the stamp (ns) that its times count from.
+
+    Where its poses have covariances, it has them, too.
 
     Parameters
     ----------
@@ -100,6 +102,7 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
     reference_ns = int(base.time_ns[0])
     gap_s = max(0.3, 2.5 * float(np.median(np.diff(base.time_ns))) * 1e-9)
     orientation = LineOrientation((base.time_ns - reference_ns) * 1e-9, base.position_l, base.quaternion, gap_s)
+    stated = base
     if name in REFINED:
         refined = recording.poses(ORIENTATIONS[name])
         if name == "whole" and "orientation/final" in held:  # of a strip whose backward pass is missing
@@ -108,6 +111,11 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
             orientation.refine((refined.time_ns - reference_ns) * 1e-9, refined.position_l, refined.quaternion)
         except ValueError as error:
             raise UserError(f"{path}: {ORIENTATIONS[name]}: {error}") from None
+        stated = refined
+    if name == "truth":
+        orientation.state_covariance([0.0], np.zeros((1, 6, 6)))
+    elif np.isfinite(stated.covariance).all(axis=(1, 2)).any():
+        orientation.state_covariance((stated.time_ns - reference_ns) * 1e-9, stated.covariance)
     return name, orientation, reference_ns
 
 
@@ -145,17 +153,41 @@ def estimated_camera(recording: Recording, camera: LineCamera) -> tuple[LineCame
     last = None
     for message in recording.messages("adjustment/report"):
         last = message.body if message.body.parameters else last
-    values = {p.name: p.value for p in (last.parameters if last is not None else ()) if p.value}
+    sets = []
     for make in SELF_CALIBRATIONS.values():
-        try:
-            parameters = make(camera)
-        except ValueError:
-            continue
-        mine = {name: value for name, value in values.items() if name in parameters.names}
-        # a strip has parameters of its own beside those of the camera, which have other names
-        if mine and all(name in parameters.names or name.split(" ")[0] in _OF_STRIP for name in values):
-            return calibrated(camera, parameters, mine), len(mine)
+        with suppress(ValueError):
+            sets.append(make(camera))
+    # what is not of the camera, as parameters of a strip, is in none of the sets
+    of_camera = {name for parameters in sets for name in parameters.names}
+    told = last.parameters if last is not None else ()
+    values = {p.name: p.value for p in told if p.value and p.name in of_camera}
+    for parameters in sets if values else ():
+        if values.keys() <= set(parameters.names):
+            return calibrated(camera, parameters, values), len(values)
     return camera, 0
+
+
+def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Path | None]:
+    """The calibrated camera that `triline adjust` wrote beside a table of orientation, which goes with it.
+
+    Returns
+    -------
+    camera : the one given where there is none
+    path : its file; None where there is none
+
+    Raises
+    ------
+    UserError : a camera that cannot be read, or with other CCD lines
+    """
+    path = trajectory.parent / "camera.json"
+    if not path.exists():
+        return camera, None
+    beside = read_camera(path)
+    lines, wanted = ({line.id: line.pixels for line in c.lines} for c in (beside, camera))
+    if lines != wanted:
+        words = ", ".join(f"{id} with {pixels} pixels" for id, pixels in wanted.items())
+        raise UserError(f"{path}: stands beside {trajectory.name} and has other lines, wanted {words}")
+    return beside, path
 
 
 def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines]]:
@@ -166,7 +198,7 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
     UserError : the recording does not hold it, or no strip
     """
     name, orientation, reference_ns = orientation_of(recording, name)
-    strips = {message.body.id: message.body for message in recording.messages("configuration/strip")}
+    strips = recording.last_strips()
     if not strips:
         raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
     topic = ORIENTATIONS[name]
@@ -277,15 +309,16 @@ class Rectification:
     surface, grid, resampling : as in `StripRectifier`
     orientation, reference_ns : of the lines
     factor : pixels that are put together to one, along and across, where cells are that much larger
+    errors : besides those of the orientation; then the orthoimage has sigmas
     """
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
-        orientation: LineOrientation, reference_ns: int, factor: int = 1,
+        orientation: LineOrientation, reference_ns: int, factor: int = 1, errors: GroundErrors | None = None,
     ) -> None:  # fmt: skip
         self.rays = rays_of(camera, ccd, factor=factor)
         self.surface, self.grid, self.resampling = surface, grid, resampling
-        self.orientation, self.reference_ns, self.factor = orientation, reference_ns, factor
+        self.orientation, self.reference_ns, self.factor, self.errors = orientation, reference_ns, factor, errors
         self.result: Rectified | None = None
         self._strip = ""
         self._rectifier: StripRectifier | None = None
@@ -304,7 +337,7 @@ class Rectification:
         if block.strip != self._strip:
             self._close()
             self._strip = block.strip
-            self._rectifier = StripRectifier(self.rays, self.surface, self.grid, self.resampling)
+            self._rectifier = StripRectifier(self.rays, self.surface, self.grid, self.resampling, errors=self.errors)
             self._next_line = int(block.first_line)
         pixels, first = block.pixels, int(block.first_line)
         time_s = (block.times_ns() - self.reference_ns) * 1e-9
@@ -355,7 +388,8 @@ class Rectification:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
         for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             position, R = self.orientation.at(time_s[begin:end])
-            for patch in self._rectifier.add(first + begin, pixels[begin:end], usable[begin:end], position, R):
+            Q = None if self.errors is None else self.orientation.covariance_at(time_s[begin:end])
+            for patch in self._rectifier.add(first + begin, pixels[begin:end], usable[begin:end], position, R, Q):
                 self.result.mosaic.add(patch)
             lines = self.factor * int(usable[begin:end].sum())
             self.result.strips[self._strip] = self.result.strips.get(self._strip, 0) + lines

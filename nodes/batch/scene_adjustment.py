@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ...solver.adjustment.reliability import CRITICAL_W, reliability
 from ...solver.adjustment.statistics import GlobalTest, global_test, mean_sigma, point_accuracy, strongest_correlations
@@ -38,23 +37,10 @@ from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
 from .adjustment_result import reliability_summary
 from .json_values import plain
+from .two_steps import step_settings
 
 Array = NDArray[np.floating]
 
-#: Sigmas of the corrections where neither the project nor the metadata state them: what a satellite with GNSS and star
-#: trackers has, rounded up. Tuned.
-DEFAULTS: Mapping[str, object] = {
-    "offset_sigma_m": [5.0, 5.0, 5.0],
-    "shift_sigma_deg": [0.01, 0.01, 0.01],
-    "drift_sigma_deg": [0.001, 0.001, 0.001],
-    "first_sigma_m": [1.0, 1.0, 1.0],
-    "first_sigma_deg": [0.001, 0.001, 0.001],
-    "second_sigma_m": [0.5, 0.5, 0.5],
-    "second_sigma_deg": [0.0005, 0.0005, 0.0005],
-    "continuity_sigma_m": [0.1, 0.1, 0.1],
-    "continuity_sigma_deg": [0.00001, 0.00001, 0.00001],
-    "segments": 2,
-}
 #: Trajectory models that correct a scene, and sets of additional parameters that a line of detectors can have.
 SCENE_MODELS = ("dgr", "ppm", "lim")
 SCENE_CALIBRATIONS = ("none", "lens", "prism30")
@@ -76,7 +62,7 @@ class SceneJob:
     Attributes
     ----------
     model, then : names of trajectory models; ``then`` corrects what the first one left, None for one stage
-    settings : of the models: sigmas, segments, fixes
+    given : options of the models by name (`two_steps.OWNERS`)
     self_calibration : name of a set, or "none"
     free : additional parameters without a-priori weight
     sets : a correction set for each "lens", or for each "scene" with all its lenses
@@ -86,7 +72,7 @@ class SceneJob:
 
     model: str = "dgr"
     then: str | None = None
-    settings: Mapping[str, object] | None = None
+    given: Mapping[str, int | None] = field(default_factory=dict)
     self_calibration: str = "none"
     free: bool = False
     sets: str = "lens"
@@ -106,6 +92,7 @@ class SceneAdjustment:
     solution : after it
     snooping : what was left out; None where nothing was looked for
     seconds : wall time of the adjustment
+    before : problem and solution of the first of two steps
     """
 
     data: SceneBlockData
@@ -114,11 +101,12 @@ class SceneAdjustment:
     solution: SceneSolution
     snooping: SceneSnooping | None
     seconds: float
+    before: tuple[Problem, SceneSolution] | None = None
 
     @property
     def test(self) -> GlobalTest:
         """Chi-square test of sigma0."""
-        return global_test(self.solution.weighted_squares, max(self.solution.redundancy, 0))
+        return _test(self.solution)
 
     def values_of(self, image: int) -> Array:
         """Unknowns of an image."""
@@ -138,19 +126,23 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
             sensors: list[PushbroomSensor | None] = [
                 e.location if isinstance(e.location, PushbroomSensor) else None for e in data.images
             ]
-            problem, solution, found = _stage(data, job, job.model, sensors)
-            if job.then:
-                sensors = _corrected(problem, solution, sensors)
-                problem, solution, found = _stage(data, job, job.then, sensors)
+            first, second = step_settings(data.trajectory_settings(), data.then, job.model, job.then, job.given)
+            model, then = _model(data, job.model, first), None if job.then is None else _model(data, job.then, second)
+            problem, solution, found = _stage(data, job, model, sensors)
+            before = None
+            if then is not None:
+                before, sensors = (problem, solution), _corrected(problem, solution, sensors)
+                problem, solution, found = _stage(data, job, then, sensors)
     except NotAdjustableError as error:
         raise UserError(f"{data.name}: {error}") from None
     except ValueError as error:
         raise UserError(f"{data.name}: cannot be adjusted: {error}") from None
-    return SceneAdjustment(data, job, problem, solution, found, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    return SceneAdjustment(data, job, problem, solution, found, seconds, before)
 
 
 def _stage(
-    data: SceneBlockData, job: SceneJob, model: str, sensors: Sequence[PushbroomSensor | None]
+    data: SceneBlockData, job: SceneJob, model: ModelOptions, sensors: Sequence[PushbroomSensor | None]
 ) -> tuple[Problem, SceneSolution, SceneSnooping | None]:
     problem = prepare(data.block(images_of(data, job, model, sensors)))
     solution = adjust(problem, max_iterations=job.iterations)
@@ -174,10 +166,9 @@ def _corrected(
 
 
 def images_of(
-    data: SceneBlockData, job: SceneJob, model: str, sensors: Sequence[PushbroomSensor | None]
+    data: SceneBlockData, job: SceneJob, options: ModelOptions, sensors: Sequence[PushbroomSensor | None]
 ) -> tuple[ImageModel, ...]:
     """The images of a block with their unknowns."""
-    options = _options(data, job, model)
     spans = [None if s is None else _span(s) for s in sensors]
     shared: dict[str, CorrectionSet] = {}
     images: list[ImageModel] = []
@@ -214,25 +205,11 @@ def _calibration(entry: ImageEntry, sensor: PushbroomSensor, job: SceneJob) -> A
     return calibration_of(key, sensor, entry.view, make)
 
 
-def _options(data: SceneBlockData, job: SceneJob, model: str) -> ModelOptions:
-    settings = {**DEFAULTS, **_stated(data), **data.trajectory, **(job.settings or {})}
+def _model(data: SceneBlockData, model: str, settings: Mapping[str, object]) -> ModelOptions:
     try:
         return MODELS[model].from_settings(settings)
     except ValueError as error:
         raise UserError(f"{data.name}: model {model}: {error}") from None
-
-
-def _stated(data: SceneBlockData) -> dict[str, object]:
-    """Sigmas that the metadata of all scenes state, the largest of each."""
-    stated = [e.scene.scene.sigmas for e in data.images if e.scene.model == "rigorous"]
-    found: dict[str, object] = {}
-    for key, values in (
-        ("offset_sigma_m", [s.position_m for s in stated]),
-        ("shift_sigma_deg", [np.degrees(s.attitude_rad) for s in stated]),
-    ):
-        if values and np.min(values) > 0:
-            found[key] = np.max(values, axis=0).tolist()
-    return found
 
 
 def _span(sensor: PushbroomSensor) -> tuple[float, float]:
@@ -246,30 +223,9 @@ def _span(sensor: PushbroomSensor) -> tuple[float, float]:
 def scene_result(a: SceneAdjustment) -> dict[str, Any]:
     """The content of ``result.json``: keys as of any adjustment, what cannot be computed is None."""
     s, data = a.solution, a.data
-    sigma = a.test.sigma0 * np.sqrt(np.maximum(np.diag(s.values_covariance), 0.0))
+    sigma = _sigmas(s)
     image_sigma = float(np.median(data.rays.sigma_px))
-    layout = a.problem.block.layout
-    strips: dict[str, Any] = {}
-    parameters: dict[str, Any] = {}
-    models = {image.corrections.key: image.corrections.model for image in _rigorous(a)}
-    for k, group in enumerate(layout.groups):
-        part = slice(int(layout.first[k]), int(layout.first[k + 1]))
-        value, spread = s.state.values[part], sigma[part]
-        if group.kind == ORIENTATION:
-            strips[group.key] = {"model": "rigorous"} | models[group.key].describe(value, spread)
-        elif group.kind == IMAGE:
-            kind = next(i.kind for i in a.problem.block.images if i.name == group.key)
-            coefficients = {
-                name.removesuffix(f" of {group.key}"): {"value": v, "sigma": e}
-                for name, v, e in zip(group.names, value, spread, strict=True)
-            }
-            strips[group.key] = {"model": kind, "coefficients": coefficients}
-        elif group.kind == CAMERA:
-            for name, v, e in zip(group.names, value, spread, strict=True):
-                parameters[_unique(name, group.key, parameters)] = {
-                    "value": v, "sigma": e, "t": v / e if e > 0 else 0.0, "status": "estimated", "reason": "",
-                    "unit": unit_of(name), "lens": group.key,
-                }  # fmt: skip
+    strips, parameters = _unknowns(a.problem, s)
     seen = a.problem.block.rays
     content = {
         "project": data.name,
@@ -306,7 +262,48 @@ def scene_result(a: SceneAdjustment) -> dict[str, Any]:
         "undetermined": [{"words": words, "share": 0.0, "unknowns": [words]} for words in s.undetermined],
         "notes": _notes(a),
     }
+    if a.before is not None:
+        problem, solution = a.before
+        strips, _ = _unknowns(problem, solution)
+        content["before"] = [{"model": a.job.model, "sigma0": _test(solution).sigma0, "strips": strips}]
     return plain(content)
+
+
+def _test(solution: SceneSolution) -> GlobalTest:
+    return global_test(solution.weighted_squares, max(solution.redundancy, 0))
+
+
+def _sigmas(solution: SceneSolution) -> Array:
+    """Sigmas (u,) of the unknowns, a posteriori."""
+    return _test(solution).sigma0 * np.sqrt(np.maximum(np.diag(solution.values_covariance), 0.0))
+
+
+def _unknowns(problem: Problem, solution: SceneSolution) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Corrections of every strip or image, and additional parameters."""
+    layout, sigma = problem.block.layout, _sigmas(solution)
+    strips: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
+    rigorous = [image for image in problem.block.images if isinstance(image, RigorousImage)]
+    models = {image.corrections.key: image.corrections.model for image in rigorous}
+    for k, group in enumerate(layout.groups):
+        part = slice(int(layout.first[k]), int(layout.first[k + 1]))
+        value, spread = solution.state.values[part], sigma[part]
+        if group.kind == ORIENTATION:
+            strips[group.key] = {"model": "rigorous"} | models[group.key].describe(value, spread)
+        elif group.kind == IMAGE:
+            kind = next(i.kind for i in problem.block.images if i.name == group.key)
+            coefficients = {
+                name.removesuffix(f" of {group.key}"): {"value": v, "sigma": e}
+                for name, v, e in zip(group.names, value, spread, strict=True)
+            }
+            strips[group.key] = {"model": kind, "coefficients": coefficients}
+        elif group.kind == CAMERA:
+            for name, v, e in zip(group.names, value, spread, strict=True):
+                parameters[_unique(name, group.key, parameters)] = {
+                    "value": v, "sigma": e, "t": v / e if e > 0 else 0.0, "status": "estimated", "reason": "",
+                    "unit": unit_of(name), "lens": group.key,
+                }  # fmt: skip
+    return strips, parameters
 
 
 def _unique(name: str, lens: str, taken: Mapping[str, Any]) -> str:
@@ -324,6 +321,18 @@ def _known(a: SceneAdjustment, *roles: str) -> NDArray[np.int64]:
     return np.array([k for k in places if a.solution.determined[known.point[k]]], dtype=np.int64)
 
 
+def differences(a: SceneAdjustment, *roles: str) -> tuple[NDArray[np.int64], Array]:
+    """Determined known points (k,) of some roles, and adjusted minus given (k, 3): east, north, up, metres.
+
+    NaN where the role says that a coordinate is not given.
+    """
+    known, k = a.problem.block.known, _known(a, *roles)
+    points = known.point[k]
+    d = points_enu(a.problem, a.solution.state.position_e, known.position_e[k], points)
+    check = np.array([known.role[i] == "check" for i in k], dtype=bool)
+    return points, np.where(known.given[k] | check[:, None], d, np.nan)
+
+
 def point_sigmas(a: SceneAdjustment) -> Array:
     """Sigmas (p, 3) in metres of all points, east, north, up, a posteriori; NaN where not determined."""
     return a.test.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", a.solution.points_covariance), 0.0))
@@ -334,11 +343,7 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     known = block.known
     found: dict[str, Any] = {}
     for key, roles in (("check", ("check",)), ("control", ("control", "planimetric", "height"))):
-        k = _known(a, *roles)
-        points = known.point[k]
-        d = points_enu(a.problem, a.solution.state.position_e, known.position_e[k], points)
-        if key == "control":
-            d = np.where(known.given[k], d, np.nan)
+        points, d = differences(a, *roles)
         found[key] = _accuracy(d, sigma[points])
     tie = a.solution.determined.copy()
     tie[known.point] = False
@@ -346,7 +351,8 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     against = "check" if "check" in known.role else "control"
     k = _known(a, against)
     locating = np.array([image.locates for image in block.images])[block.rays.image]
-    position, determined = intersect(a.problem, _beforehand(a), locating)
+    first, solution = a.before or (a.problem, a.solution)
+    position, determined = intersect(first, _beforehand(first, solution), locating)
     k = k[determined[known.point[k]]] if len(k) else k
     points = known.point[k]
     d = points_enu(a.problem, position, known.position_e[k], points)
@@ -354,13 +360,13 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     return found
 
 
-def _beforehand(a: SceneAdjustment) -> Any:
+def _beforehand(problem: Problem, solution: SceneSolution) -> Any:
     """Points as they are, with the unknowns of images that locate by themselves at zero."""
-    values = a.solution.state.values.copy()
-    for image, columns in zip(a.problem.block.images, a.problem.block.layout.columns, strict=True):
+    values = solution.state.values.copy()
+    for image, columns in zip(problem.block.images, problem.block.layout.columns, strict=True):
         if image.locates:
             values[columns] = 0.0
-    return type(a.solution.state)(a.solution.state.position_e, values)
+    return type(solution.state)(solution.state.position_e, values)
 
 
 def _accuracy(difference: Array, sigma: Array) -> dict[str, Any]:
@@ -507,6 +513,8 @@ _SIGMAS = ("sigma_along_m", "sigma_across_m", "sigma_up_m", "sigma_roll_deg", "s
 
 def _write_orientation(a: SceneAdjustment, path: Path) -> None:
     """Earth-fixed pose of the body at lines of the rigorous images, with sigmas of the corrections."""
+    from scipy.spatial.transform import Rotation
+
     columns: dict[str, list[Any]] = {
         name: [] for name in ("strip", "ccd", "line", "time_s", "time_utc", *_AXES, *_SIGMAS)
     }

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from heapq import merge
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from ...schemas.image_lines import LineBlock
+from ...schemas.topics import rank
+from ...solver.adjustment.block_data import BlockData
+from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.models.dgr import DgrOptions
+from ...solver.scene_adjustment.block import Layout
+from ...solver.simulation.orbital_imagery import render, texture_of
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ...solver.simulation.satellite_block import rigorous_images, scattered_points, simulate_block
+from ..convert import SECOND_NS, ground_point_message
 from ..errors import UserError
+from ..formats.block_messages import block_messages
 from ..formats.satellite.folder_writer import write_overpass
-from ..formats.scene_block import write_scene_block
-from ..formats.table import write_table
-from .scene_adjustment import DEFAULTS
+from ..formats.scene_block import DEFAULTS, read_scene_block, write_scene_block
+from ..formats.scene_recording import local_block
+from ..formats.table import Column, read_table, write_table
+from ..node import Message
 
+#: Lines longer than this are not rendered: a scene of them would take minutes.
+_MOST_PIXELS = 2000
+_BLOCK_LINES = 25
 #: Smallest and largest gross error, pixels.
 _GROSS_PX = (5.0, 30.0)
 
@@ -33,6 +48,7 @@ class SceneSimulation:
     image_sigma_px, control_sigma_m : noise
     outliers : share of the image points of tie points that are gross errors
     seed : of the random numbers
+    images : whether a recording gets image lines
     """
 
     satellite: str
@@ -45,6 +61,59 @@ class SceneSimulation:
     control_sigma_m: float = 0.5
     outliers: float = 0.0
     seed: int = 1
+    images: bool = False
+
+
+def simulated_recording(what: SceneSimulation) -> tuple[list[Message], dict[str, Any]]:
+    """The same as the messages of a flight, with the true points on ``truth/point``, and what they hold.
+
+    Raises
+    ------
+    UserError : as `write_simulated_scenes`
+    """
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch) / what.satellite
+        result, sensors = _write(folder, what)
+        block = local_block(read_scene_block(folder))
+        truth = read_table(folder / "truth.csv", (Column("point", "text"), *map(Column, ("X_m", "Y_m", "Z_m"))), [])
+    xyz = block.frame.from_crs(truth.stack("X_m", "Y_m", "Z_m"))
+    messages = list(block_messages(block, "simulator"))
+    start = messages[0].stamp_ns
+    points = [
+        Message("truth/point", start, ground_point_message(id, position, np.zeros((3, 3)), "check"), "simulator")
+        for id, position in zip(truth["point"], xyz, strict=True)
+    ]
+    after = next(
+        k for k, message in enumerate(messages) if message.topic.startswith(("observation/tie", "trajectory/"))
+    )
+    messages = [*messages[:after], *points, *messages[after:]]
+    if what.images:
+        lines = _image_lines(block, messages, sensors, what.seed)
+        messages = list(merge(messages, lines, key=lambda message: (message.stamp_ns, rank(message.topic))))
+    return messages, result
+
+
+def _image_lines(
+    block: BlockData, messages: Sequence[Message], sensors: Sequence[PushbroomSensor], seed: int
+) -> list[Message]:
+    """Blocks of image lines of all strips, through the true sensors, of ground at the height of the local frame."""
+    strips = {m.body.id: m.body for m in messages if m.topic == "configuration/strip"}
+    texture = texture_of(sensors[0], seed)
+    found = []
+    for strip, sensor in zip(block.strips, sensors, strict=True):
+        ccd = strip.lens or ""
+        if sensor.samples > _MOST_PIXELS:
+            raise UserError(
+                f"{sensor.name}: lines of {sensor.samples} pixels, wanted at most {_MOST_PIXELS} for images"
+            )
+        pixels = render(sensor, block.frame, texture, block.frame.height_m, np.random.default_rng([seed, len(found)]))
+        period, first_ns = SECOND_NS / strip.line_rate_hz, strips[strip.id].first_line_time_ns
+        for first in range(0, len(pixels), _BLOCK_LINES):
+            part = pixels[first : first + _BLOCK_LINES]
+            body = LineBlock(part, ccd, strip.id, first, first_ns + round(first * period), round(period))
+            stamp = first_ns + round((first + len(part) - 1) * period)
+            found.append(Message(f"sensor/lines/{ccd}", stamp, body, "simulator"))
+    return sorted(found, key=lambda message: (message.stamp_ns, rank(message.topic)))
 
 
 def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any]:
@@ -54,6 +123,11 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
     ------
     UserError : a satellite that is not known or does not reach the place, numbers that do not fit together
     """
+    return _write(folder, what)[0]
+
+
+def _write(folder: Path, what: SceneSimulation) -> tuple[dict[str, Any], list[PushbroomSensor]]:
+    """The same; the true sensors of the images beside."""
     if what.satellite not in ORBITAL_SENSORS:
         raise UserError(f"satellite {what.satellite!r}, wanted one of {', '.join(ORBITAL_SENSORS)}")
     if min(what.points, what.control, what.check) < 0 or what.control + what.check > what.points:
@@ -67,7 +141,7 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
     try:
         scene = overpass(sensor, what.lat_deg, what.lon_deg)
     except ValueError as error:
-        raise UserError(str(error)) from None
+        raise UserError(f"--place: {error}") from None
     rng = np.random.default_rng(what.seed)
     images = rigorous_images([scene], DgrOptions.from_settings(DEFAULTS))
     try:
@@ -77,9 +151,11 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
     control = range(what.control)
     check = range(what.control, what.control + what.check)
     spread = (what.control_sigma_m, what.control_sigma_m, what.control_sigma_m)
-    block = simulate_block(
+    simulated = simulate_block(
         images, position, control, check, rng, image_sigma_px=what.image_sigma_px, control_sigma_m=spread
-    ).block
+    )
+    block, layout = simulated.block, Layout.of(images)
+    sensors = [image.located(simulated.values[columns]) for image, columns in zip(images, layout.columns, strict=True)]
     if what.outliers:
         rays = block.rays
         mine = rng.random(len(rays)) < what.outliers
@@ -107,7 +183,7 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
         {"point": block.point_ids, "X_m": np.degrees(lon), "Y_m": np.degrees(lat), "Z_m": height},
         {"X_m": ".10f", "Y_m": ".10f", "Z_m": ".4f"},
     )
-    return {
+    result = {
         "folder": str(folder),
         "satellite": what.satellite,
         "images": names,
@@ -118,3 +194,4 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
         "outliers": wrong,
         "seed": what.seed,
     }
+    return result, sensors

@@ -13,12 +13,15 @@ from typing import Any
 
 from ...schemas import topics
 from ...schemas.envelope import RawMessage
+from ..bus.authority import AUTHORITY, CERTIFICATE, KEY
+from ..bus.bundle import Bundle, load_bundle
 from ..bus.program import ProgramOptions
 from ..bus.session import Bus
 from ..bus.status import StatusPublisher
 from ..errors import UserError
 from ..node import Node
 from ..ordering import StreamCheck, order_key
+from ..recording.seal import Seal
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 
 #: The open chunk is closed at least so often: what SIGKILL can cost.
@@ -40,8 +43,9 @@ DISK_PERIOD_S, FULL_SOON_MIN, FULL_SOON_BYTES = 5.0, 10.0, 200_000_000
 class RecordingFile:
     """An unbuffered file that never ends inside a record: a write that fails is taken back."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, bundle: Bundle | None = None) -> None:
         self.path = path
+        self._seal = None if bundle is None else _seal(path, bundle)
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         self._size = 0
 
@@ -56,6 +60,8 @@ class RecordingFile:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
             raise
         self._size += done
+        if self._seal is not None:
+            self._seal.took(view)
         return done
 
     def tell(self) -> int:
@@ -64,8 +70,19 @@ class RecordingFile:
     def flush(self) -> None:
         """Every write goes to the operating system at once."""
 
-    def close(self) -> None:
+    def sign(self) -> None:
+        """Sign what has been written, where the recording is signed."""
+        if self._seal is not None:
+            self._seal.sign()
+
+    def close(self, whole: bool = False) -> None:
         os.close(self._descriptor)
+        if self._seal is not None and whole:
+            self._seal.close()
+
+
+def _seal(path: Path, bundle: Bundle) -> Seal:
+    return Seal(path, bundle.folder / CERTIFICATE, bundle.folder / AUTHORITY, bundle.folder / KEY)
 
 
 class Recorder(Node):
@@ -76,18 +93,22 @@ class Recorder(Node):
     output : path of the recording; where there is one already, a number is added to the name
     compression : ``none``, ``lz4`` or ``zstd``
     rotate_mb : start a new file after so many megabytes; 0 = one file
+    sign : bundle of `triline keys` in whose name recordings are signed; "" = not at all
     """
 
     name = "recorder"
     inputs = tuple(row.name for row in topics.TOPICS if row.recorded)
     outputs = ()
 
-    def __init__(self, output: str = "recording.mcap", compression: str = "none", rotate_mb: float = 0) -> None:
+    def __init__(
+        self, output: str = "recording.mcap", compression: str = "none", rotate_mb: float = 0, sign: str = ""
+    ) -> None:
         super().__init__()
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression is {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
         if rotate_mb < 0:
             raise ValueError(f"rotate_mb is {rotate_mb}, wanted 0 or more")
+        self._bundle = load_bundle(Path(sign)) if sign else None
         self._path = Path(output)
         self._compression = compression
         self._rotate_bytes = int(rotate_mb * 1e6)
@@ -153,6 +174,8 @@ class Recorder(Node):
             self._flushed_s = now
             try:
                 self._writer.flush()
+                if self._file is not None:
+                    self._file.sign()
                 self._unflushed = 0
                 if self._rotate_bytes and self._writer.size > self._rotate_bytes:
                     self._close()
@@ -172,7 +195,7 @@ class Recorder(Node):
     def _open(self) -> None:
         number = len(self.files)
         path = self._next_path()
-        self._file = RecordingFile(path)
+        self._file = RecordingFile(path, self._bundle)
         try:
             self._writer = RecordingWriter(self._file, self._compression, platform=self.platform)  # type: ignore[arg-type]
             for raw in self._latched if number else ():
@@ -201,7 +224,7 @@ class Recorder(Node):
         if self._writer is not None and self._file is not None:
             self._bytes_before += self._writer.size
             self._writer.close()
-            self._file.close()
+            self._file.close(whole=True)
             self._writer = self._file = None
 
     def _write(self, raw: RawMessage) -> None:

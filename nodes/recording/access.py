@@ -144,15 +144,17 @@ class Recording:
         body = self.reader.first("truth/world")
         return "" if body is None else body.message
 
+    def last_strips(self) -> dict[str, Any]:
+        """The strips by name, each as its last message has it, in the order in which they began."""
+        return {message.body.id: message.body for message in self.messages("configuration/strip")}
+
     def strips(self) -> pd.DataFrame:
         """One row a strip: first line time, line rate, number of lines as known last."""
         import pandas as pd  # takes longer to import than all the rest
 
-        table = self.table("configuration/strip")
-        if table.empty:
-            return table
         columns = ["id", "first_line_time_ns", "line_rate_hz", "lines", "ended"]
-        return pd.DataFrame(table[columns].groupby("id", sort=False).last())
+        rows = [[getattr(body, name) for name in columns] for body in self.last_strips().values()]
+        return pd.DataFrame(rows, columns=pd.Index(columns)).set_index("id")
 
     def _first(self, topic: str) -> Any:
         body = self.reader.first(self._check(topic))

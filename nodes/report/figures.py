@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
 from ...solver.accuracy import angle_difference
+from ...solver.quantiles import chi2, norm
 from .. import convert
 from .evaluation import corrections_of, orientation_errors
 from .flight import Flight, Key, Look, PoseSeries, rejected_key, updates_with_new_rays
@@ -205,7 +205,7 @@ def _histogram(ax: Axes, rows: Array, rms: float, first: bool) -> None:
         values = rows[:, column]
         spread = float(np.sqrt(np.mean(values**2)))
         ax.hist(values, edges.tolist(), color=color, alpha=0.55, label=f"{label}, RMS {spread:.2f}")
-    density = norm.pdf(middle, scale=rms) * len(rows) * (edges[1] - edges[0])
+    density = norm.pdf(middle / rms) / rms * len(rows) * (edges[1] - edges[0])
     ax.plot(middle, density, color="black", lw=1, label="normal" if first else None)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)

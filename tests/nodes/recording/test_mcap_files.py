@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -99,4 +100,7 @@ def test_a_chunk_of_the_wrong_length_costs_that_chunk_alone(tmp_path, compressio
             broken[place + bit // 8] ^= 1 << bit % 8
             (tmp_path / "b.mcap").write_bytes(broken)
             again = RecordingReader(tmp_path / "b.mcap")
-            assert len(again.index) == kept and len(again.damage) == 1, (place - begin, bit)
+            assert len(again.index) == kept and again.damage, (place - begin, bit)
+            # some lengths lead into the middle of a record: that is a second piece of the same damage
+            for one, other in itertools.pairwise(again.damage):
+                assert one.offset + one.length == other.offset, (place - begin, bit)
