@@ -1,70 +1,143 @@
-"""How nodes keep up under load: a pace in levels, decided live, announced in a message, followed from its time on."""
+"""How nodes keep up under load: a pace in levels, decided live, announced in a message, followed from its time on.
+
+What a node can do is measured: the time that it works for a second of the flight. It is the sum of what every second
+costs and of what each level saves, so that the time at a level that was never tried is known, too. A heap of messages
+alone is no reason to shed work, since it goes away if there is time enough; only one that hurts is, and then as much is
+shed as lets it go away within some seconds.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
 
 P = TypeVar("P")
 
-#: Waiting time between two steps up, before a step down, and the longest that this grows to.
-UP_S, DOWN_S, LONGEST_DOWN_S = 0.3, 5.0, 80.0
-#: Of the window, the share to be behind at which nothing is tried out any more.
+#: Behind by this share of the window, and by so much at least, hurts: answers come late. Tuned.
+HURTS, HURTS_S = 0.15, 2.0
+#: Behind by more, levels are used that lose nothing, s. Tuned.
+NOTICED_S = 0.5
+#: Behind by this share of the window, a level at which nothing is seen may be used. Tuned.
 ALARM = 0.4
+#: A heap is to go away within so long, s, in this share of the time there is. Tuned.
+DRAIN_S, USED = 5.0, 0.95
+#: The cost is measured over so much of the flight or of work, s; so much of what was known counts on. Tuned.
+MEASURED_S, KEPT = 0.5, 0.8
+#: Time between two changes, s. Tuned.
+CHANGED_S = 1.0
+#: A level at which nothing is seen is left after so long, s, to see whether there is time again. Tuned.
+BLIND_S = 10.0
+#: Before anything is known, this share of the work is there at any level. Tuned.
+FIXED = 0.3
+
+
+class Cost:
+    """Work a second of the flight, ``fixed u + saved v``, at levels that do the parts u and v of all there is to do."""
+
+    def __init__(self) -> None:
+        self._parts: Array | None = None  # fixed and saved, s a second
+        # what is known beforehand is the ratio of the two, and little of that
+        row = np.array([1.0 - FIXED, -FIXED])
+        self._information = 0.1 * np.outer(row, row) + 1e-3 * np.eye(2)
+
+    def measure(self, parts: tuple[float, float], cost: float) -> None:
+        """At a level of these parts a second of the flight took ``cost`` seconds.
+
+        Only what the level tells is forgotten (directional forgetting): how the two parts are to each other, which one
+        level alone cannot tell, stays known.
+        """
+        row = np.array(parts)
+        if self._parts is None:
+            share = np.array([FIXED, 1.0 - FIXED])
+            self._parts = share * cost / max(float(row @ share), 1e-3)
+        told = self._information @ row
+        forgotten = np.outer(told, told) / float(row @ told)
+        self._information = self._information - (1.0 - KEPT) * forgotten + np.outer(row, row)
+        found = self._parts + np.linalg.solve(self._information, row) * (cost - float(row @ self._parts))
+        for k in np.flatnonzero(found < 0):  # then the other one is all there is
+            found[k], found[1 - k] = 0.0, cost / max(row[1 - k], 1e-3)
+        self._parts = found
+
+    def at(self, parts: tuple[float, float]) -> float:
+        """Seconds of work a second of the flight at a level of these parts."""
+        return 0.0 if self._parts is None else float(self._parts @ parts)
 
 
 class Governor:
-    """Decides on the pace from how far behind the node is. Only live runs ask it; times are waiting times.
+    """Decides on the pace from what the node can do and from how far behind it is. Only live runs ask it.
 
     Parameters
     ----------
-    levels : how many there are; level 0 is the normal pace
-    behind_s, caught_up_s : behind by more (and an interval), a level up, unless it is catching up; behind by less for a
-        while, one down
-    down_s : that while; it grows where steps down were too early
-    patience_s : for so long it looks whether a heap goes away by itself, as one does that was held up by others
+    parts : of each level, of the work that is there in any case and of the rest, the share that it does; level 0 is the
+        normal pace and does all
+    lossless : levels up to this one lose nothing
     """
 
-    def __init__(
-        self, levels: int, behind_s: float = 0.4, caught_up_s: float = 0.2, down_s: float = DOWN_S,
-        patience_s: float = 0.0,
-    ) -> None:  # fmt: skip
+    def __init__(self, parts: Sequence[tuple[float, float]], lossless: int = 0) -> None:
         self.level = 0
-        self._patience_s = patience_s
-        self._top, self._behind_s, self._caught_up_s = levels - 1, behind_s, caught_up_s
-        self._changed_s = -1e9
-        self._went_down = False
-        self._fine_since_s: float | None = None
-        self._behind_since_s: float | None = None
-        self._down_s = down_s
-        self._worst_s = 0.0  # behind by so much at the last look
+        self._parts, self._lossless = tuple(parts), lossless
+        self._cost = Cost()
+        self._known = False
+        self._rate = 1.0  # seconds of the flight that come a second
+        self._begun: tuple[float, float, float, float] | None = None  # work, flight, time, lag at the last measurement
+        self._changed_s = -np.inf
 
-    def look(self, lag_s: float, now_s: float, interval_s: float, window_s: float) -> bool:
-        """Look at the lag of platform time, s; whether the level has changed."""
-        before = self.level
-        behind = lag_s > self._behind_s + interval_s
-        if behind:
-            self._fine_since_s = None
-            if self._behind_since_s is None:
-                self._behind_since_s = now_s
-                self._worst_s = lag_s if self._patience_s else self._worst_s
-            growing = lag_s > 0.95 * self._worst_s
-            waited = now_s - self._changed_s > UP_S and now_s - self._behind_since_s >= self._patience_s
-            if growing and (waited or (self._patience_s and lag_s > ALARM * window_s)):
-                step = self._top if lag_s > ALARM * window_s else 2 if lag_s > 0.5 * ALARM * window_s else 1
-                self.level = min(self.level + step, self._top)
-                if self._went_down and now_s - self._changed_s < self._down_s:  # that was too early
-                    self._down_s = min(2.0 * self._down_s, LONGEST_DOWN_S)
-                self._changed_s, self._worst_s, self._went_down = now_s, lag_s, False
-            elif not growing:
-                self._worst_s = max(0.98 * self._worst_s, lag_s)
-        elif lag_s < self._caught_up_s + interval_s:
-            self._behind_since_s = None
-            if self._fine_since_s is None:
-                self._fine_since_s = now_s
-            if self.level and now_s - max(self._fine_since_s, self._changed_s) > self._down_s:
-                self.level -= 1
-                self._changed_s, self._worst_s, self._went_down = now_s, 0.0, True
-        return self.level != before
+    def look(self, lag_s: float, now_s: float, busy_s: float, flown_s: float, window_s: float) -> bool:
+        """Look how far behind the node is; whether the level has changed.
+
+        Parameters
+        ----------
+        lag_s : for how long the message waited that was worked on last, s
+        now_s : a steady clock, s
+        busy_s : for how long the node has worked so far, s
+        flown_s : platform time that it has reached, s
+        window_s : of the node
+        """
+        self._measure(lag_s, now_s, busy_s, flown_s)
+        hurts = lag_s > max(HURTS * window_s, HURTS_S)
+        in_need = lag_s > ALARM * window_s
+        if not self._known or (now_s - self._changed_s < CHANGED_S and not in_need):
+            return False
+        if not self.level and lag_s <= NOTICED_S:
+            return False
+        wanted = self._wanted(lag_s, hurts, in_need)
+        if not any(self._parts[self.level]) and not hurts and now_s - self._changed_s > BLIND_S:
+            wanted = min(wanted, self.level - 1)
+        if wanted == self.level:
+            return False
+        self.level, self._changed_s, self._begun = wanted, now_s, None
+        return True
+
+    def _measure(self, lag_s: float, now_s: float, busy_s: float, flown_s: float) -> None:
+        if self._begun is None:
+            self._begun = busy_s, flown_s, now_s, lag_s
+            return
+        worked, flown, passed = busy_s - self._begun[0], flown_s - self._begun[1], now_s - self._begun[2]
+        if passed <= 0 or max(worked, flown) < MEASURED_S:
+            return
+        parts = self._parts[self.level]
+        if flown > 0 and any(parts):
+            self._cost.measure(parts, worked / flown)
+            # a heap that grows says that more comes than is worked off
+            came = flown / passed / max(1.0 - (lag_s - self._begun[3]) / passed, 0.1)
+            self._rate = came if not self._known else self._rate + (1.0 - KEPT) * (came - self._rate)
+            self._known = True
+        self._begun = busy_s, flown_s, now_s, lag_s
+
+    def _wanted(self, lag_s: float, hurts: bool, in_need: bool) -> int:
+        """The best level that leaves time to work a heap off, or, without one that hurts, that keeps up."""
+        drain = 1.0 + lag_s / DRAIN_S if hurts else 1.0
+        most = USED / (self._rate * drain)
+        last = max(k for k, parts in enumerate(self._parts) if parts[0] > 0 or in_need)
+        if not hurts:  # work is shed where it hurts only; what was shed comes back when there is time
+            last = max(self.level, self._lossless)
+        wanted = next((k for k in range(last) if self._cost.at(self._parts[k]) <= most), last)
+        return max(wanted, self.level) if hurts else wanted
 
 
 class Announced(Generic[P]):

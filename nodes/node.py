@@ -61,8 +61,15 @@ class Node:
         """What was still held back when the last message has come."""
         return ()
 
-    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
-        """What follows from working on messages that have waited for ``lag_s`` at time ``now_s``; live only."""
+    def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
+        """What follows from working on messages that have waited for ``lag_s``; live only.
+
+        Parameters
+        ----------
+        lag_s : waiting time of the message that was worked on last, s
+        now_s : a steady clock, s
+        busy_s : for how long the node has worked on messages so far, s
+        """
         return ()
 
     def state(self) -> str:

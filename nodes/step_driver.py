@@ -70,9 +70,9 @@ class StepDriver:
             body.timestamp.FromNanoseconds(self.time_ns)
             yield Message("event/log", self.time_ns, body)
 
-    def behind(self, lag_s: float, now_s: float) -> list[Message]:
+    def behind(self, lag_s: float, now_s: float, busy_s: float) -> list[Message]:
         """The decisions that follow from being behind; see `Node.behind`."""
-        return self._collect(self.node.behind, lag_s, now_s)
+        return self._collect(self.node.behind, lag_s, now_s, busy_s)
 
     def finish(self) -> list[Message]:
         """The outputs that were held back."""

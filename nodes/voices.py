@@ -83,7 +83,8 @@ class Voices:
     def hear(self, message: Message) -> Heard:
         """Whether a message is used, and what an operator has to know of it."""
         if message.topic == VERDICT:
-            return self._verdict(message) if message.body.topic else Heard((message,))
+            about_voice = message.body.topic and not message.body.HasField("clock_s")
+            return self._verdict(message) if about_voice else Heard((message,))
         family = topics.find(message.topic).family
         if family not in (Family.CONFIGURATION, Family.SENSOR) and message.topic != CONTROL:
             self._flying = self._flying or family is not Family.STATUS

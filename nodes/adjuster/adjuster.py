@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from ...solver.adjustment.surface_control import SurfaceControl
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS
+from ...solver.models.platform import MOST_CLOCK_S, USUAL_PLATFORM, PlatformErrors
 from ...solver.window.output import WindowUpdate
 from ...solver.window.results import Look, Refusal, WindowOptions
 from ...solver.window.window import Window
 from .. import convert
+from ..errors import UserError
 from ..governor import Governor
 from ..node import Message, Node
+from .elevation import Elevation
 from .outputs import AdjusterOutputs, log
-from .pace import LEVELS, Pace, Pacing, pace_message
+from .pace import LOSSLESS, PARTS, Pace, Pacing, pace_message
 from .stated_control import StatedControl
 from .strips import AdjustedStrips
 
@@ -26,6 +30,9 @@ APRIORI = ("trajectory", "project")
 PACES = ("load", "normal", "throughput")
 #: Platform time between updates at the pace for throughput, s.
 THROUGHPUT_S = 5.0
+#: Longest strip, s, and how far the time of a pose can be after the stamp of its message, s: what goes beyond is
+#: no flight, and unknowns for all of it would take the memory and the time of the others.
+LONGEST_STRIP_S, POSE_AHEAD_S = 86_400.0, 60.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -54,12 +61,18 @@ class Adjuster(Node):
     self_calibration : set of additional parameters, or "none"
     camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of
         the image): 0.03 for a camera that a calibration left half a pixel off
+    clock_sigma_s : what is known beforehand of the difference between the clocks of poses and image lines, which is an
+        unknown all along; 0 = they agree
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
         for a pose with a known attitude.
     alert_limit_m : what an error on the ground must stay below for the light to be good; 0 = 25 ground sample
         distances, and no more than 2.5 per mille of the height of flight
     datum : "control" or "gnss": whose datum is published where control agrees with itself and differs from GNSS
+    dem : raster of heights on which tie points lie; "" for none
+    dem_sigma_m, dem_shift_sigma_m : of a height, independent from place to place, and of the error that all heights
+        share (0: as large)
+    dem_crs : what its heights count from, where it does not say: "ellipsoid", or a vertical CRS
     """
 
     name = "adjuster"
@@ -100,9 +113,14 @@ class Adjuster(Node):
         pace: str = "load",
         self_calibration: str = "none",
         camera_sigma: float = 1.0,
+        clock_sigma_s: float = USUAL_PLATFORM.clock_sigma_s,
         apriori: str = "trajectory",
         alert_limit_m: float = 0.0,
         datum: str = "control",
+        dem: str = "",
+        dem_sigma_m: float = 0.0,
+        dem_shift_sigma_m: float = 0.0,
+        dem_crs: str = "",
     ) -> None:
         super().__init__()
         if not update_s > 0:
@@ -116,6 +134,8 @@ class Adjuster(Node):
             raise ValueError(f"self_calibration: {self_calibration!r} is not known, wanted one of {known}")
         if not camera_sigma > 0:
             raise ValueError(f"camera_sigma: wanted more than 0, got {camera_sigma}")
+        if not 0 <= clock_sigma_s < MOST_CLOCK_S:
+            raise ValueError(f"clock_sigma_s: wanted 0 or more, and less than {MOST_CLOCK_S:g} s, got {clock_sigma_s}")
         if pace not in PACES:
             raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if apriori not in APRIORI:
@@ -129,8 +149,10 @@ class Adjuster(Node):
         self._update_rays = update_rays if self._early else sys.maxsize
         self._by_load = pace == "load"
         self._rays_waiting = 0
-        self._pacing, self._governor = Pacing(), Governor(len(LEVELS))
+        self._pacing, self._governor = Pacing(), Governor(PARTS, LOSSLESS)
         self._self_calibration, self._camera_sigma = self_calibration, camera_sigma
+        self._elevation = Elevation.stated(dem, dem_crs, dem_sigma_m, dem_shift_sigma_m)
+        self._platform = PlatformErrors(clock_sigma_s)
         self._window: Window | None = None
         self._project: Any = None
         self._camera: Any = None
@@ -155,11 +177,12 @@ class Adjuster(Node):
             self.problem("malformed", f"{message.topic}: {error}")
         return outputs
 
-    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
+    def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
         if self._window is None or self._next_update_ns is None or not self._by_load:
             return ()
-        interval_s = self._interval_ns / convert.SECOND_NS
-        if not self._governor.look(lag_s, now_s, interval_s, self._window.length_s or DEFAULT_WINDOW_S):
+        waits_s = max(lag_s - self._interval_ns / convert.SECOND_NS, 0.0)  # for an update, none is due before
+        flown_s, window_s = self._stamp_ns / convert.SECOND_NS, self._window.length_s or DEFAULT_WINDOW_S
+        if not self._governor.look(waits_s, now_s, busy_s, flown_s, window_s):
             return ()
         body = pace_message(self._governor.level, lag_s, max(self._next_update_ns, self._stamp_ns + 1))
         self._pacing.announce(body)
@@ -210,7 +233,7 @@ class Adjuster(Node):
     def _take(self, message: Message) -> list[Message]:
         topic, body = message.topic, message.body
         if topic.startswith("trajectory/"):
-            return self._pose(body, topic == "trajectory/smoothed")
+            return self._pose(body, topic == "trajectory/smoothed", message.stamp_ns)
         if topic == "observation/tie":
             return self._tie_came(body, message.source, message.stamp_ns)
         if topic == "adjustment/pace":
@@ -245,18 +268,37 @@ class Adjuster(Node):
         parameters = None
         if self._self_calibration != "none":
             parameters = SELF_CALIBRATIONS[self._self_calibration](camera).scaled(self._camera_sigma)
-        self._window = Window(camera, convert.slow_errors_of(self._project), self.options, parameters)
+        surface, told = self._surface()
+        slow = convert.slow_errors_of(self._project)
+        self._window = Window(camera, slow, self.options, parameters, self._platform, surface=surface)
         self._strips.begin_window(self._window)
         self._outputs.reference_ns = self._reference_ns
         for strip in self._strips.bodies.values():
             self._begin(strip)
         for point in self._control.bodies.values():
             self._control.take(point, self._window)
-        return [self._log("configuration changed: the window starts again", warning=True)] if again else []
+        return told + ([self._log("configuration changed: the window starts again", warning=True)] if again else [])
+
+    def _surface(self) -> tuple[SurfaceControl | None, list[Message]]:
+        """The elevation model that tie points lie on, if there is one, in the frame of the project; what there is to
+        say of it."""
+        if self._elevation is None:
+            return None, []
+        try:
+            surface = self._elevation.surface(convert.local_frame(self._project))
+        except UserError as error:
+            self.problem("no heights", str(error))
+            return None, [self._log(f"tie points take no heights: {error}", warning=True)]
+        said = f"tie points lie on {self._elevation.path.name} +- {surface.sigma_m:g} m"
+        return surface, [self._log(f"{said}, all of it +- {surface.shift_sigma_m:g} m")]
 
     def _strip(self, body: Any) -> list[Message]:
         if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
             raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+        if not 0 <= body.lines <= LONGEST_STRIP_S * body.line_rate_hz:
+            raise ValueError(
+                f"strip {body.id!r} of {body.lines} lines, {body.line_rate_hz:g} a second: more than a day"
+            )
         known = self._strips.bodies.get(body.id)
         if known is not None and known.ended and body.ended:
             return []
@@ -280,6 +322,8 @@ class Adjuster(Node):
                 self._tie(body, source)
 
     def _verdict(self, body: Any) -> list[Message]:
+        if body.topic:  # about who speaks on a topic, or its clock
+            return []
         self._control.judge(body, self._window)
         verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
         return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
@@ -330,13 +374,16 @@ class Adjuster(Node):
             else:
                 self._outputs.refusals.append(Refusal("", look, "point without a name"))
 
-    def _pose(self, body: Any, smoothed: bool) -> list[Message]:
+    def _pose(self, body: Any, smoothed: bool, stamp_ns: int) -> list[Message]:
         if self._window is None:
             self.problem("before configuration", "a pose came before configuration/project and camera")
             return []
         sample = convert.pose_sample(body)
         if sample.covariance is None:
             raise ValueError("pose without covariance")
+        ahead_s = (sample.time_ns - stamp_ns) * 1e-9
+        if ahead_s > POSE_AHEAD_S:  # a window that long would not be solved in a day
+            raise ValueError(f"pose of a time {ahead_s:g} s after the stamp of its message")
         time_s = self._seconds(sample.time_ns)
         self._poses.add(time_s, sample, smoothed, body.reason)
         if self._strips.any_held:

@@ -17,6 +17,9 @@ from ..governor import Announced
 
 #: Factor on the time and the number of rays between updates, and share of the tie points kept, by level.
 LEVELS = ((1, 1.0), (2, 1.0), (5, 1.0), (5, 0.5), (5, 0.25), (5, 0.125), (5, 0.05), (5, 0.0))
+#: What they do of the work on updates, and of that on tie points, and how many leave no point out; see `Governor`.
+PARTS = tuple((1.0 / factor, kept) for factor, kept in LEVELS)
+LOSSLESS = 2
 
 
 @dataclass(frozen=True)

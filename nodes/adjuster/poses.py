@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.camera.line_camera import LineCamera, finest_pixel
 from ...solver.geometry.trajectory import Trajectory
-from ...solver.models.slow_errors import SlowErrors
+from ...solver.models.slow_errors import LEAST_NOISE, SlowErrors
 from .. import convert
 
 Array = NDArray[np.floating]
@@ -34,10 +35,28 @@ MOST_STATED = 200
 KEPT_S = 600.0
 
 
-class SlowHistory:
-    """Which slow errors hold from when on."""
+#: No attitude has less white noise than this share of a pixel. Derived: with an image sigma of a third of a pixel it
+#: takes part with a thousandth.
+LEAST_NOISE_PX = 0.01
 
-    def __init__(self) -> None:
+
+def least_noise(camera: LineCamera) -> tuple[float, float]:
+    """White noise, m and rad, that no pose of a camera is without: small against a pixel, in orbit too."""
+    finest = finest_pixel(camera)
+    metres, radians = LEAST_NOISE
+    return metres, min(radians, LEAST_NOISE_PX * finest) if finest > 0 else radians
+
+
+class SlowHistory:
+    """Which slow errors hold from when on.
+
+    Parameters
+    ----------
+    least : white noise, m and rad, that no pose is without
+    """
+
+    def __init__(self, least: tuple[float, float] = LEAST_NOISE) -> None:
+        self._least = least
         self._from_s: list[float] = []
         self._slow: list[SlowErrors] = []
 
@@ -58,7 +77,7 @@ class SlowHistory:
             return covariance
         out = np.empty_like(covariance)
         for i in np.unique(which):
-            out[which == i] = self._slow[i].without(covariance[which == i])
+            out[which == i] = self._slow[i].without(covariance[which == i], self._least)
         return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...solver.models.slow_errors import SlowErrors
 from ...solver.models.wander import Wander
 from ...solver.window.window import AHEAD_S, Window
-from .poses import PoseBuffer, SlowHistory
+from .poses import PoseBuffer, SlowHistory, least_noise
 
 #: A pose so long before the first line of a strip, s, still says how good the trajectory is there.
 NEAR_START_S = 1.0
@@ -48,7 +48,7 @@ class AdjustedStrips:
 
     def begin_window(self, window: Window) -> None:
         """A window begins with nothing in it."""
-        self._slow = SlowHistory()
+        self._slow = SlowHistory(least_noise(window.camera))
         self._slow.add(-np.inf, window.slow)
         self._stated.clear()
         self._handed_s = self._used_to_s = -np.inf

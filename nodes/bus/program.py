@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import queue
 import signal
 import sys
 import threading
@@ -73,14 +74,34 @@ def stop_with_parent(stop: threading.Event) -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
+def end_by_signal(stop: threading.Event) -> Callable[[int, object], None]:
+    """A signal handler that asks for a clean end.
+
+    A handler runs in the main thread between two steps of whatever that thread does, also while it waits for `stop` and
+    holds the lock inside it: to set `stop` there would be to wait for oneself for ever. So the handler only puts a word
+    into a queue whose `put` may interrupt itself, and a thread of its own sets the event.
+    """
+    asked: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def handle(number: int, frame: object) -> None:
+        asked.put(None)
+
+    def wait() -> None:
+        asked.get()
+        stop.set()
+
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+    return handle
+
+
 def stop_on_signals(stop: threading.Event) -> None:
     """SIGINT and SIGTERM ask for a clean end; the third one ends at once."""
-    count = 0
+    end, count = end_by_signal(stop), 0
 
     def handle(number: int, frame: object) -> None:
         nonlocal count
         count += 1
-        stop.set()
+        end(number, frame)
         if count > 2:
             sys.exit(1)
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from ..bus.bundle import load_bundle
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
+from ..bus.program import end_by_signal
 from ..errors import UserError
 from ..monitor.monitor import display
 
@@ -344,7 +345,8 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
 def _interruptible(stop: threading.Event) -> Iterator[None]:
     """Make Ctrl-C, SIGTERM and a closed terminal end the flight in good order."""
     numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    handle = end_by_signal(stop)
+    previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:

@@ -16,7 +16,7 @@ from .. import convert
 from ..governor import Announced, Governor
 from ..node import Message, Node
 from .found_strips import FoundStrips
-from .pace import BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S, SHARES, WINDOW_S, MatcherPace
+from .pace import PARTS, WINDOW_S, MatcherPace
 from .targets import DoubtfulTargets
 
 DEFAULTS = MatchingOptions()
@@ -25,7 +25,9 @@ PACES = ("load", "normal")
 DELAY_S = 0.8
 #: So many places of a strip that came to nothing, without any tie point, are told; the counters of those places.
 PLACES_WITHOUT_TIES = 60
-FAILED = ("too few looks", "looks never came", "contradiction")
+FAILED = ("too few looks", "looks never came", "contradiction", "ground not found")
+#: No ground is lower above the ellipsoid, m, than the shore of the Dead Sea.
+LOWEST_GROUND_M = -450.0
 #: Platform time between two words on how far the matcher is, ns.
 PROGRESS_NS = 40_000_000
 
@@ -40,9 +42,9 @@ class Matcher(Node):
     Parameters
     ----------
     points_per_s, window_rays, window_points, largest_sigma_px, least_score, least_reach_px, largest_reach_px,
-    relief_sigma_m, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
+    relief_sigma_m, image_sigma_px, least_rays, budget_mb, chips_mb, full_scale : as in `MatchingOptions`
     ground_m : height of the ground about which the search begins, local frame; without it that of control and check
-        points with a height, or 0
+        points with a height; without these it is looked for, first about 0
     delay_s : observations are stamped so long after the message that completed them. The adjuster works them in at
         that time, so they may be so long on their way: live and from a recording it sees them at the same place.
     pace : "load", fewer places where the machine is too slow, and in `process` where it was in flight; "normal", all of
@@ -73,6 +75,7 @@ class Matcher(Node):
         least_reach_px: float = DEFAULTS.least_reach_px,
         largest_reach_px: float = DEFAULTS.largest_reach_px,
         relief_sigma_m: float = DEFAULTS.relief_sigma_m,
+        image_sigma_px: float = DEFAULTS.image_sigma_px,
         least_rays: int = DEFAULTS.least_rays,
         budget_mb: float = DEFAULTS.budget_mb,
         chips_mb: float = DEFAULTS.chips_mb,
@@ -92,14 +95,15 @@ class Matcher(Node):
             points_per_s=points_per_s, window_rays=window_rays, window_points=window_points, chips_mb=chips_mb,
             largest_sigma_px=largest_sigma_px, least_score=least_score,
             least_reach_px=least_reach_px, largest_reach_px=largest_reach_px, relief_sigma_m=relief_sigma_m,
-            least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
+            image_sigma_px=image_sigma_px, least_rays=least_rays, budget_mb=budget_mb, full_scale=full_scale,
         )  # fmt: skip
         self._targets = DoubtfulTargets()
         self._by_load, self._pace = pace == "load", MatcherPace()
         self._announced: Announced[MatcherPace] = Announced()
-        self._governor = Governor(len(SHARES), BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S)
+        self._governor = Governor(PARTS)
         self._ground_m = ground_m
         self._heights: dict[str, float] = {}  # of control and check points
+        self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._delay_ns = round(delay_s * convert.SECOND_NS)
         self._matcher: TieMatcher | None = None
@@ -134,8 +138,10 @@ class Matcher(Node):
     def finish(self) -> Iterable[Message]:
         return [self._strip(strip) for strip in self._found.finish()]
 
-    def behind(self, lag_s: float, now_s: float) -> Iterable[Message]:
-        if self._matcher is None or not self._by_load or not self._governor.look(lag_s, now_s, 0.0, WINDOW_S):
+    def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
+        if self._matcher is None or not self._by_load:
+            return ()
+        if not self._governor.look(lag_s, now_s, busy_s, self._stamp_ns / convert.SECOND_NS, WINDOW_S):
             return ()
         pace = MatcherPace(self._governor.level, lag_s)
         self._announced.add(self._stamp_ns + 1, pace)
@@ -163,7 +169,11 @@ class Matcher(Node):
 
     def _take(self, message: Message) -> list[Message]:
         topic, body = message.topic, message.body
-        if topic == "configuration/camera":
+        if topic == "configuration/project":
+            if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
+                self._origin_m = float(body.origin_height)
+                self._set_ground()
+        elif topic == "configuration/camera":
             return self._configure(body, message.stamp_ns)
         if topic == "configuration/strip":
             if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
@@ -186,7 +196,8 @@ class Matcher(Node):
                 self._heights[body.point] = float(body.z)
                 self._set_ground()
         elif topic == "observation/verdict":
-            return self._targets.verdict(body, self._observed_ns)
+            # those about who speaks on a topic, or its clock, are not the matcher's
+            return [] if body.topic else self._targets.verdict(body, self._observed_ns)
         return []
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -202,16 +213,15 @@ class Matcher(Node):
         self._targets.configure(camera, self._matcher.orientation)
         return [self._log("configuration changed: matching starts again", warning=True)] if again else []
 
-    @property
-    def _height_m(self) -> float:
-        """Of the ground, before any tie point is known."""
-        if self._ground_m is not None:
-            return self._ground_m
-        return float(np.median(list(self._heights.values()))) if self._heights else 0.0
-
     def _set_ground(self) -> None:
-        if self._matcher is not None:
-            self._matcher.set_mean_height(self._height_m)
+        """What is known of the ground's height before any tie point is."""
+        if self._matcher is None or self._matcher.ground_found:
+            return
+        self._matcher.search_ground(LOWEST_GROUND_M - self._origin_m)
+        if self._ground_m is not None:
+            self._matcher.set_mean_height(self._ground_m)
+        elif self._heights:
+            self._matcher.set_mean_height(float(np.median(list(self._heights.values()))))
 
     def _without_ties(self, failed: int, ties: int, strip: str) -> list[str]:
         """A line for the operator where a strip gives no tie points though many places were tried; once a strip."""
@@ -223,8 +233,14 @@ class Matcher(Node):
         tried, self._failed = self._failed, -1
         if ties:
             return []
+        ground_m = None if self._matcher is None else self._matcher.ground_m
+        if ground_m is None:
+            where = "the ground was looked for at all heights and not found: wrong camera, orientation or line times? "
+            return [
+                f"{strip}: no tie point at {tried} places; {where}If its height is known, give ground_m in [matcher]"
+            ]
         return [
-            f"{strip}: no tie point at {tried} places; the ground is taken to be at {self._height_m:.0f} m in the "
+            f"{strip}: no tie point at {tried} places; the ground is taken to be at {ground_m:.0f} m in the "
             "local frame: if it is not, give ground_m in [matcher]"
         ]
 

@@ -14,11 +14,12 @@ from ...schemas import messages as m
 
 #: Share of the places that are tried, by level; at the last level lines go by unseen.
 SHARES = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0, 0.0)
-#: Behind by more than the first, and growing for the fourth, a level up; by less than the second for the third, one
-#: down; s.
-BEHIND_S, CAUGHT_UP_S, DOWN_S, PATIENCE_S = 0.25, 0.1, 2.0, 0.3
-#: Behind by much of such a window, s, nothing is tried out any more.
+#: What the levels do of the work on lines, and of that on places; see `Governor`.
+PARTS = (*((1.0, share) for share in SHARES[:-1]), (0.0, 0.0))
+#: Of answers later than a share of such a window, s, the adjuster has little.
 WINDOW_S = 12.0
+#: Behind by less, s, a pace is not because of a heap.
+CAUGHT_UP_S = 0.5
 
 
 @dataclass(frozen=True)

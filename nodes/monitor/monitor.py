@@ -126,7 +126,7 @@ class Monitor(Node):
             view.rejected = max(view.rejected, body.rejected_total)
             view.final_until_ns = max(view.final_until_ns, body.window_start_ns)
         elif message.topic == "event/log":
-            level = m.Log.Level.Name(body.level).lower()
+            level = convert.enum_name(m.Log.Level, body.level)
             view.events.append((message.stamp_ns, level, plain(f"{body.name}: {body.message}", LONGEST_TEXT)))
         return ()
 

@@ -13,6 +13,9 @@ from ...schemas import messages as m
 from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.clock_check import LARGEST_DELAY_S, ClockCheck, offset_in_words
+from ...solver.navigation.clock_offset import OffsetWatch
+from ...solver.navigation.gnss_fix import local_fix
+from ...solver.navigation.inertial_data import GnssData
 from ...solver.navigation.inertial_navigator import InertialNavigator
 from ...solver.navigation.kinematic import KinematicFilter
 from ...solver.navigation.online_poses import OnlineOptions
@@ -26,6 +29,11 @@ AHEAD_S = 1.0
 #: Fixes that stand so far before the first attitude are of another clock, s: nobody waits on the ground for so long
 #: with one sensor and without the other.
 EARLY_S = 900.0
+#: Attitudes that have not changed in any digit for so long, s, are those of a sensor that hangs (tuned: sensors that
+#: round to 0.01 deg repeat themselves for some samples).
+FROZEN_S = 1.0
+#: Largest correction of GNSS times on an operator's word, s.
+LARGEST_CORRECTION_S = 100.0
 #: Numbers of fixes that are missing without time going on: the clock was set back.
 FEW_NUMBERS = 5
 
@@ -41,18 +49,29 @@ class Navigator(Node):
     ----------
     filtered_s : least distance of filtered poses, s; 0 = all of them, which those who want them at once need
     smooth_every_s : from inertial data smoothed poses come so often, s
+    gnss_clock_s : GNSS times are behind by so much; it is added to them. A verdict on ``sensor/gnss`` changes it
     """
 
     name = "navigator"
-    inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss")
+    inputs = ("configuration/project", "sensor/imu", "sensor/attitude", "sensor/gnss", "observation/verdict")
     outputs = ("trajectory/filtered", "trajectory/smoothed", "event/log")
 
-    def __init__(self, *, filtered_s: float = 0.0, smooth_every_s: float = OnlineOptions.smooth_every_s) -> None:
+    def __init__(
+        self,
+        *,
+        filtered_s: float = 0.0,
+        smooth_every_s: float = OnlineOptions.smooth_every_s,
+        gnss_clock_s: float = 0.0,
+    ) -> None:
         super().__init__()
         if not 0.0 <= filtered_s <= 1.0:
             raise ValueError(f"filtered_s is {filtered_s:g}, wanted 0 to 1 s")
         if not 0.0 < smooth_every_s <= 10.0:
             raise ValueError(f"smooth_every_s is {smooth_every_s:g}, wanted more than 0 and at most 10 s")
+        if not abs(gnss_clock_s) <= LARGEST_CORRECTION_S:
+            raise ValueError(f"gnss_clock_s is {gnss_clock_s:g}, wanted at most {LARGEST_CORRECTION_S:g} s either way")
+        self._correction_s = float(gnss_clock_s)
+        self._offset = OffsetWatch()
         self._filtered_s, self._smooth_every_s = filtered_s, smooth_every_s
         self._engine: KinematicFilter | InertialNavigator | None = None
         self._configuration: Any = None
@@ -62,6 +81,7 @@ class Navigator(Node):
         self._project = b""
         self._notes: list[Message] = []
         self._frame = LocalFrame(0.0, 0.0, 0.0)
+        self._same = 0, (np.nan, np.nan, np.nan)  # since when the attitude has been the same
         self._covariance_key: tuple[float, ...] = ()
         self._covariance = np.zeros((3, 3))
         self._clock = ClockCheck()
@@ -82,6 +102,9 @@ class Navigator(Node):
                 poses = self._attitude(message.body)
             elif message.topic == "sensor/gnss":
                 poses = self._gnss(message)
+            elif message.topic == "observation/verdict":
+                self._verdict(message)
+                poses = []
             else:
                 return self._configure(message)
         except ValueError as error:
@@ -97,7 +120,9 @@ class Navigator(Node):
     def state(self) -> str:
         if self._engine is None:
             return "waiting for configuration/project"
-        return self._engine.status if isinstance(self._engine, InertialNavigator) else "running"
+        state = self._engine.status if isinstance(self._engine, InertialNavigator) else "running"
+        # so long the clock of GNSS can be off by tenths of a second, and control alone would show it
+        return state if self._offset.seen or not self._newest_ns else f"{state}, GNSS clock not seen: no turn yet"
 
     def _configure(self, message: Message) -> Iterable[Message]:
         content = message.body.SerializeToString(deterministic=True)
@@ -115,17 +140,41 @@ class Navigator(Node):
         self._reference_ns = message.stamp_ns
         return ()
 
-    @staticmethod
-    def _check_time(message: Message) -> None:
+    def _verdict(self, message: Message) -> None:
+        """An operator says by how much GNSS times are to be corrected."""
         body = message.body
-        time_ns = convert.time_ns(body.timestamp) if message.topic == "sensor/gnss" else body.time_ns
+        if body.topic != "sensor/gnss" or not body.HasField("clock_s"):
+            return
+        if not abs(body.clock_s) <= LARGEST_CORRECTION_S:
+            raise ValueError(f"GNSS times are not corrected by {body.clock_s:g} s")
+        by = body.by or "an operator"
+        self._correction_s, self._clock, self._offset = body.clock_s, ClockCheck(), OffsetWatch()
+        self.alarms.pop("clock", None)
+        self._start_anew()
+        text = f"sensor/gnss is corrected by {body.clock_s:+.3f} s from now on ({by})"
+        self._notes.append(self._log(self._stamp_ns, text))
+
+    def _start_anew(self) -> None:
+        """Forget what fixes of another time have made of the state."""
+        if self._configuration is None:
+            return
+        self._engine = kinematic_engine(self._configuration, self._filtered_s)
+        self._seen = Counter()
+
+    def _time_ns(self, fix: Any) -> int:
+        """Time of a fix, as corrected on an operator's word."""
+        return convert.time_ns(fix.timestamp) + round(self._correction_s * convert.SECOND_NS)
+
+    def _check_time(self, message: Message) -> None:
+        body = message.body
+        time_ns = self._time_ns(body) if message.topic == "sensor/gnss" else body.time_ns
         ahead = (time_ns - message.stamp_ns) * 1e-9
         if ahead > AHEAD_S:
             raise ValueError(f"measured {ahead:.3f} s after the stamp of its message")
 
     def _right_clock(self, message: Message) -> bool:
         """Whether a fix has the time that attitude and inertial data have; the operator is told where it has not."""
-        time_ns = convert.time_ns(message.body.timestamp)
+        time_ns = self._time_ns(message.body)
         if self._renumbered(message.sequence, time_ns):
             return False
         if not self._newest_ns:
@@ -143,8 +192,8 @@ class Navigator(Node):
             self._notes.append(self._log(self._stamp_ns, "GNSS clock agrees again: fixes are used"))
         return right
 
-    def _wrong_clock(self, words: str) -> None:
-        text = f"{words}: GNSS is left out"
+    def _wrong_clock(self, words: str, remedy: str = "") -> None:
+        text = f"{words}: GNSS is left out{'; ' if remedy else ''}{remedy}"
         self.alarms["clock"] = text
         self.problem("clock", text)
         self._notes.append(self._log(self._stamp_ns, text, warning=True))
@@ -193,10 +242,12 @@ class Navigator(Node):
                 self._configuration, body, filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s
             )
             self._seen = Counter()
+            self._offset.settings = self._engine.settings
             wrong = stated_noise(body)[2]
             if wrong:
                 self.problem("inertial noise", f"sensor/imu: {wrong}")
                 self._notes.append(self._log(self._stamp_ns, f"sensor/imu: {wrong}", warning=True))
+        self._offset.sample(self._seconds(body.time_ns), body.interval_ns * 1e-9, *force, *rate)
         return self._engine.add_inertial(self._seconds(body.time_ns), body.interval_ns * 1e-9, force, rate)
 
     def _attitude(self, body: Any) -> list[NavigationPose]:
@@ -212,7 +263,27 @@ class Navigator(Node):
             raise ValueError("roll, pitch or heading is not finite")
         if max(abs(rpy[0]), abs(rpy[1])) > 2.0 or abs(rpy[2]) > 7.0:
             raise ValueError(f"roll, pitch, heading {rpy} are not radians of an aircraft")
+        if self._is_frozen(body.time_ns, rpy):
+            return []
+        self._offset.sample(self._seconds(body.time_ns), *rpy)
         return self._engine.add_attitude(self._seconds(body.time_ns), rpy, self._attitude_covariance(body.covariance))
+
+    def _is_frozen(self, time_ns: int, rpy: tuple[float, float, float]) -> bool:
+        """Whether an attitude has been the same for long: then it is no measurement."""
+        if rpy != self._same[1]:
+            if self.alarms.pop("frozen", ""):
+                self._notes.append(self._log(self._stamp_ns, "attitude changes again"))
+            self._same = time_ns, rpy
+            return False
+        for_s = (time_ns - self._same[0]) * 1e-9
+        if for_s <= FROZEN_S:
+            return False
+        self.counters["attitude frozen"] += 1
+        text = f"attitude has been the same for {for_s:.1f} s: the sensor hangs, and is not used"
+        if "frozen" not in self.alarms:
+            self._notes.append(self._log(self._stamp_ns, text, warning=True))
+        self.alarms["frozen"] = text
+        return True
 
     def _attitude_covariance(self, values: Any) -> Any:
         """(3, 3); the array of the last message again if it had the same values, so that nothing is computed twice."""
@@ -240,12 +311,36 @@ class Navigator(Node):
         frame = self._frame
         antenna_l = frame.from_geodetic(*geodetic)
         R_l_enu = frame.R_ln(antenna_l) @ R_ENU_NED
-        time_s = self._seconds(convert.time_ns(body.timestamp))
+        time_s = self._seconds(self._time_ns(body))
         covariance_l = R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
+        velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
+        if not self._in_step(local_fix(frame, time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)):
+            return []
         if isinstance(self._engine, KinematicFilter):
             return self._engine.add_gnss(time_s, antenna_l, covariance_l)
-        velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
         return self._engine.add_gnss(time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
+
+    def _in_step(self, fix: GnssData) -> bool:
+        """Whether motion says that a fix has the time of the other sensors, as far as motion has shown it."""
+        changed, offset = self._offset.fix(fix), self._offset.offset
+        out = offset is not None and offset.is_too_large
+        if out:
+            self.counters["gnss of another clock"] += 1
+        if not changed:
+            return not out
+        if offset is None:
+            self.alarms.pop("clock", None)
+            self._notes.append(self._log(self._stamp_ns, "GNSS clock agrees again: fixes are used"))
+            return True
+        words = f"{offset_in_words(offset.offset_s, self._other)}, +- {offset.sigma_s:.2f} s"
+        remedy = f"'triline confirm sensor/gnss --clock {self._correction_s + offset.offset_s:.3f}' corrects it"
+        if out:
+            self._wrong_clock(words, remedy)
+            self._start_anew()
+        else:
+            self.alarms.pop("clock", None)
+            self._notes.append(self._log(self._stamp_ns, f"{words}: GNSS is used; {remedy}", warning=True))
+        return not out
 
     @staticmethod
     def _velocity(body: Any, R_l_enu: Any) -> tuple[Any, Any]:
@@ -281,6 +376,7 @@ class Navigator(Node):
         for kind, n in self._engine.counters.items():
             self.counters[kind] += n - self._seen[kind]
             self._seen[kind] = n
+        self.alarms["gnss"] = self._engine.alarm if isinstance(self._engine, InertialNavigator) else ""
         for event in self._engine.take_events():
             out.append(self._log(self._reference_ns + round(event.time_s * 1e9), event.text))
         return out

@@ -18,6 +18,7 @@ from ...solver.camera.line_camera import LineCamera
 from ..convert import SECOND_NS
 from ..errors import UserError
 from ..formats.envi import header_integer, header_of, read_header
+from ..formats.envi_image import TYPES
 from ..formats.keys import Keys
 from ..formats.time_columns import instant_ns
 from ..node import Message
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
 
 KEYS = ("images", "folder", "samples", "type", "strip", "first_time", "line_times", "line_rate_hz")
-TYPES = {"u1": np.dtype("u1"), "u2": np.dtype("<u2"), ">u2": np.dtype(">u2")}
 #: Types of ENVI images whose values are grey values as they are.
 _ENVI = {1: "u1", 12: "u2"}
 #: CCD line, number of its first line in the strip, UTC of that line in ns.

@@ -128,7 +128,7 @@ class NmeaParser:
             return []
         try:
             return getattr(self, "_" + kind.lower())(sentence)
-        except (TypeError, ValueError, AttributeError):  # a field that is empty or no number
+        except (TypeError, ValueError, AttributeError, OverflowError):  # a field that is empty, no number or too large
             self._problem("field missing", _shown(line))
             return []
 

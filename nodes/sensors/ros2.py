@@ -12,12 +12,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
@@ -25,17 +22,17 @@ from ..bus.session import listen_elsewhere
 from ..convert import SECOND_NS, set_time
 from ..errors import UserError
 from ..formats.keys import Keys
-from ..formats.ros2 import FIX, IMU, decoded, fix_messages, inertial_messages
+from ..formats.ros2 import IMU, fix_messages, inertial_messages
+from ..formats.ros2_decoding import FIX
+from ..formats.ros2_images import IMAGE, image_rows, lines_missing, strip_name
 from ..node import Message
-from .blocks import block_message, pixels_of
+from .blocks import block_message
 from .program import LOOK_S, SILENT_S, Clock, Sensor, noise_of, publish, refuse_unknown
 
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
 
 KEYS = ("endpoint", "domain", "imu", "fix", "images", "line_rate_hz", "strip")
-IMAGE = "sensor_msgs/msg/Image"
-_PIXELS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 #: Samples that wait to be decoded; then ROS publishers are slowed down.
 _DEPTH = 2000
 
@@ -105,33 +102,18 @@ def image_messages(
     """
     period_ns = round(SECOND_NS / settings.rate_hz)
     strip, line, next_ns = "", 0, 0
-    for time_ns, image in decoded(payloads, IMAGE, left_out):
-        kind = _PIXELS.get(image.encoding)
-        size = image.height * image.step
-        if kind is None or not image.height or not image.width or len(image.data) != size:
-            left_out["images of a wrong size" if kind else "images that are not grey"] += 1
-            continue
-        pixels = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
-        if image.step < image.width * pixels.itemsize:
-            left_out["images of a wrong size"] += 1
-            continue
-        rows = image.data.reshape(image.height, image.step)[:, : image.width * pixels.itemsize]
+    for time_ns, pixels in image_rows(payloads, left_out):
         utc_ns = settings.clock.utc(time_ns)
         if not strip or time_ns - next_ns > SILENT_S * SECOND_NS:
-            strip, line = settings.strip + _named(utc_ns), 0
+            strip, line = settings.strip + strip_name(utc_ns), 0
         else:
-            missing = round((time_ns - next_ns) / period_ns)
-            if missing > image.height // 2:
+            missing = lines_missing(time_ns, next_ns, period_ns, len(pixels))
+            if missing:
                 left_out["image lines missing"] += missing
                 line += missing
-        values = pixels_of(np.ascontiguousarray(rows).tobytes(), image.width, pixels)
-        yield block_message(settings.clock, LineBlock(values, ccd, strip, line, utc_ns, period_ns))
-        line += image.height
-        next_ns = time_ns + image.height * period_ns
-
-
-def _named(utc_ns: int) -> str:
-    return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).strftime("%H%M%S")
+        yield block_message(settings.clock, LineBlock(pixels, ccd, strip, line, utc_ns, period_ns))
+        line += len(pixels)
+        next_ns = time_ns + len(pixels) * period_ns
 
 
 class Ros2(Sensor):

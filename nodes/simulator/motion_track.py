@@ -20,7 +20,7 @@ POSE_TOPICS = (
     *("trajectory/smoothed", "trajectory/filtered"),
 )
 #: Kinds of files with poses.
-TRACKS = ("avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon")
+TRACKS = ("avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
 
 
 def motion_track(path: Path) -> NavigationTrack:

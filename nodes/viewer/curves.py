@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ...solver.accuracy import angle_difference
+from ...solver.quantiles import chi2
 from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
 from ..convert import PoseSample

@@ -110,7 +110,8 @@ def test_reports_add_up(done):
     busy = max(reports, key=lambda r: r.rays)
     assert busy.observations - busy.unknowns > 0 and busy.control >= 3 and busy.strip == "S1"
     names = [p.name for p in busy.parameters]
-    assert names == ["dX", "dY", "dZ", "domega", "dphi", "dkappa", "omega drift", "phi drift", "kappa drift"]
+    of_strip = ["dX", "dY", "dZ", "domega", "dphi", "dkappa", "omega drift", "phi drift", "kappa drift"]
+    assert names == [*of_strip, "clock"]
     assert all(p.sigma > 0 and p.t == pytest.approx(p.value / p.sigma) for p in busy.parameters)
     assert 0.0 < busy.data_latency_s < 1.0
 
@@ -246,6 +247,8 @@ def test_settings_are_checked():
         Adjuster(self_calibration="tls99")
     with pytest.raises(ValueError, match="camera_sigma: wanted more than 0, got -1"):
         Adjuster(camera_sigma=-1)
+    with pytest.raises(ValueError, match="clock_sigma_s: wanted 0 or more, and less than 0"):
+        Adjuster(clock_sigma_s=-1)
     with pytest.raises(ValueError, match="window_s"):
         Adjuster(window_s=-1.0)
     with pytest.raises(ValueError, match="spline"):

@@ -149,6 +149,7 @@ def test_a_new_filter_in_the_middle_of_a_strip_has_another_error():
     assert (final < 20.0).any() and not ((final > 21.0) & (final < 35.0)).any() and (final > 48.0).any()
 
 
+@pytest.mark.study
 def test_a_new_filter_that_aligns_after_the_strip_says_nothing_of_it():
     """Its poses of the strip are not taken for those of the old filter; old looks that waited for it are of no use."""
     simulation, adjuster = fly(1, 30.0, TACTICAL), adjuster_of()
@@ -159,6 +160,7 @@ def test_a_new_filter_that_aligns_after_the_strip_says_nothing_of_it():
     assert nees(out, simulation) < 2.0
 
 
+@pytest.mark.study
 def test_with_measured_attitude_both_give_the_same_bytes():
     flight = simulate(FlightPlan(strip_s=12.0, lead_in_s=3.0), 1, ErrorModel(attitude_rate_hz=100.0))
     first, second = (

@@ -10,9 +10,8 @@ import pytest
 from bus_rig import Rig, triline, wait_for
 from recording_file import payloads
 
-from triline.nodes.adjuster.pace import LEVELS, Pacing, pace_message
+from triline.nodes.adjuster.pace import Pacing, pace_message
 from triline.nodes.bus.session import Bus
-from triline.nodes.governor import Governor
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import codec
 from triline.solver.matching.thinning import Candidate, Thinning
@@ -73,40 +72,6 @@ def test_an_overloaded_adjuster_keeps_up_says_how_and_recovers(tmp_path):
     assert triline("process", live, "-o", again).returncode == 0
     for topic in ("orientation/live", "orientation/final", "point/object", "adjustment/pace", "event/log"):
         assert payloads(live, topic) == payloads(again, topic), topic
-
-
-def test_the_governor_goes_up_step_by_step_and_comes_down_when_there_is_room():
-    governor = Governor(len(LEVELS))
-    levels, lag, now = [], 0.0, 0.0
-    for _ in range(600):  # a load that needs level 4, for a minute
-        now += 0.1
-        interval = 0.2 * LEVELS[governor.level][0]
-        lag = max(lag + (0.1 if governor.level < 4 else -0.2) * 0.5, 0.0)
-        governor.look(lag, now, interval, 25.0)
-        levels.append(governor.level)
-    assert levels[0] == 0 and max(levels) >= 4
-    assert (np.diff(levels) <= 2).all()
-    for _ in range(3000):  # and then none
-        now += 0.1
-        governor.look(0.0, now, 0.2 * LEVELS[governor.level][0], 25.0)
-    assert governor.level == 0
-
-
-def test_a_patient_governor_lets_a_heap_go_away_that_others_held_up():
-    for patience_s, level in ((0.0, 1), (0.3, 0)):
-        governor = Governor(8, 0.25, 0.1, 2.0, patience_s)
-        for i in range(20):  # worked off at twice the speed of life
-            governor.look(max(1.7 - 0.1 * i, 0.0), 10.0 + 0.1 * i, 0.0, 12.0)
-        assert governor.level == level
-    for i in range(6):  # but not one that grows
-        governor.look(0.4 + 0.1 * i, 20.0 + 0.1 * i, 0.0, 12.0)
-    assert governor.level >= 1
-
-
-def test_far_behind_it_tries_nothing_out_any_more():
-    governor = Governor(len(LEVELS))
-    governor.look(12.0, 1.0, 0.2, 25.0)
-    assert governor.level == len(LEVELS) - 1
 
 
 def test_a_pace_holds_from_its_time_on():

@@ -111,14 +111,14 @@ def test_the_monitor_says_how_many_and_which_not(flown):
             seen.add(monitor.overview.line().partition(" parameters")[0].rpartition("| ")[2])
     assert len(seen) >= 5  # it changes in flight
     view = monitor.overview
-    assert f"{view.estimated} of 27 parameters estimated" in view.line()
+    assert f"{view.estimated} of 28 parameters estimated" in view.line()
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(screen(view, "platform"))
     text = console.export_text()
     worst = max((p for p in view.parameters if p.status != ESTIMATED), key=lambda p: abs(p.correlation))
-    assert f"parameters: {view.estimated} of 27 estimated; not yet {worst.name} ({worst.correlation:+.2f}" in text
+    assert f"parameters: {view.estimated} of 28 estimated; not yet {worst.name} ({worst.correlation:+.2f}" in text
     list(monitor.step(replace(message, topic="adjustment/report", body=type(flown[1][0][0])())))
-    assert len(monitor.overview.parameters) == 27  # a report without any, in a turn, forgets nothing
+    assert len(monitor.overview.parameters) == 28  # a report without any, in a turn, forgets nothing
 
 
 def test_the_report_has_status_time_and_correlation(flown, tmp_path):

@@ -106,13 +106,13 @@ def test_recorded_paces_are_followed(tmp_path):
 
 def test_a_pace_holds_from_its_time_on_and_levels_there_are_not_are_refused():
     matcher = Matcher()
-    list(matcher.step(Message("matching/pace", 1_000, MatcherPace(2, 0.4).message(2_000))))
+    list(matcher.step(Message("matching/pace", 1_000, MatcherPace(2, 2.4).message(2_000))))
     assert matcher.state().startswith("waiting") and not matcher.counters
     assert not [x for x in matcher.step(Message("trajectory/filtered", 1_999, m.PoseInFrame())) if "log" in x.topic]
     said = [
         x.body.message for x in matcher.step(Message("trajectory/filtered", 2_000, m.PoseInFrame())) if "log" in x.topic
     ]
-    assert said == ["0.4 s behind: 50 % of the tie points"]
+    assert said == ["2.4 s behind: 50 % of the tie points"]
     list(matcher.step(Message("matching/pace", 3_000, m.Pace(start_ns=4_000, level=len(SHARES)))))
     assert matcher.counters["malformed"] == 1 and "level 8" in matcher.last_problem
 

@@ -39,12 +39,12 @@ def messages():
     return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
-def run(tmp_path, messages, points_per_s=4.0):
+def run(tmp_path, messages, points_per_s=4.0, **settings):
     """Process messages with navigator, matcher and adjuster; returns summary, ties and what was told."""
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     write_recording(flight, messages)
     with RecordingWriter(out) as writer:
-        nodes = [Navigator(), Matcher(points_per_s=points_per_s), Adjuster()]
+        nodes = [Navigator(), Matcher(points_per_s=points_per_s, **settings), Adjuster()]
         summary = process(RecordingReader(flight), nodes, writer.write_raw)
     reader = RecordingReader(out)
     ties = [m.body for m in reader.messages(["observation/tie"]) if "-M" in m.body.point]
@@ -242,20 +242,28 @@ def short():
     return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
-@pytest.mark.parametrize("by_m", [1000.0, *(pytest.param(by_m, marks=pytest.mark.study) for by_m in (300.0, 2500.0))])
-def test_ties_do_not_hang_on_the_height_of_the_origin(tmp_path, short, by_m):
+@pytest.mark.study
+@pytest.mark.parametrize("control", [True, False])
+@pytest.mark.parametrize("by_m", [300.0, 1000.0, 2500.0])
+def test_ties_do_not_hang_on_the_height_of_the_origin(tmp_path, short, by_m, control):
     (tmp_path / "as it is").mkdir()
-    _, ties, told = run(tmp_path / "as it is", short)
-    _, as_many, _ = run(tmp_path, list(raised(short, by_m)))
+    _, ties, _ = run(tmp_path / "as it is", list(raised(short, 0.0, control)))
+    _, as_many, told = run(tmp_path, list(raised(short, by_m, control)))
     assert len(ties) > 20 and abs(len(as_many) - len(ties)) <= 0.05 * len(ties)
-    assert not [text for text in told if "ground_m" in text]
+    if control:  # while the ground is looked for, a line may ask for its height
+        assert not [text for text in told if "ground_m" in text]
+    assert control != any("the ground was found at about" in text for text in told)
 
 
-def test_where_the_ground_is_not_known_to_be_a_line_says_what_to_give(tmp_path, messages):
-    _, ties, told = run(tmp_path, list(raised(messages, 300.0, control=False)))
-    assert not ties
+@pytest.mark.parametrize("ground_m", [None, pytest.param(0.0, marks=pytest.mark.study)])
+def test_where_nothing_matches_a_line_says_what_to_give(tmp_path, short, ground_m):
+    def other(ccd, line, pixels):
+        return pixels if ccd == "N" else pixels[:, ::-1].copy()
+
+    _, ties, told = run(tmp_path, spoilt(raised(short, 300.0, control=False), other), ground_m=ground_m)
     (line,) = [text for text in told if "ground_m" in text]
-    assert "the ground is taken to be at 0 m" in line
+    assert not ties and "no tie point at" in line
+    assert ("the ground is taken to be at 0 m" if ground_m is not None else "looked for at all heights") in line
 
 
 def test_a_ground_that_is_no_height_is_refused():

@@ -141,6 +141,7 @@ def test_targets_are_measured_within_a_tenth_of_a_pixel_and_say_how_well(flown, 
     assert 0.25 < np.mean((off / sigma) ** 2) < 1.3
 
 
+@pytest.mark.study
 def test_on_an_unstabilised_mount_they_are_measured_as_well():
     flown = simulated_flight(FLIGHT | {"unstabilised": True, "seconds": 14.0, "seed": 5})
     names, places = signalised(flown)
@@ -150,6 +151,7 @@ def test_on_an_unstabilised_mount_they_are_measured_as_well():
     assert 0.25 < np.mean((off / sigma) ** 2) < 1.5
 
 
+@pytest.mark.study
 def test_lines_that_are_lost_here_and_there_cost_few_targets(flown, images):
     names, places = signalised(flown)
     true = true_looks(flown, names, places)
@@ -169,6 +171,7 @@ def test_lines_that_are_lost_here_and_there_cost_few_targets(flown, images):
     assert np.hypot(*error.T).max() < 0.1 and 0.25 < np.mean((error / sigma) ** 2) < 1.3
 
 
+@pytest.mark.study
 def test_nothing_is_taken_for_a_target_where_there_is_none(flown, images):
     _, places = signalised(flown)
     rng = np.random.default_rng(7)
