@@ -94,6 +94,7 @@ class BusRunner:
         self._patience = _Patience()
         self._worked_ns = 0
         self._looked_s = 0.0
+        self._busy_s = 0.0  # so far on messages
         self._opened_anew = 0
         self._heard_s: dict[str, float] = {}  # when something of a topic was worked on
         self._open_strip = ""
@@ -241,7 +242,7 @@ class BusRunner:
         self._hear(message.topic)
         if message.topic == "configuration/strip":
             self._open_strip = "" if message.body.ended else message.body.id
-        failed = self.node.counters["failed"]
+        failed, begun = self.node.counters["failed"], time.monotonic()
         with self._lock:  # queries are answered between steps
             outputs = self._driver.step(message)
         if self.node.counters["failed"] > failed:
@@ -249,9 +250,10 @@ class BusRunner:
         for output in outputs:
             self.bus.publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)
+        self._busy_s += time.monotonic() - begun
 
     def _look_behind(self, received_ns: int) -> None:
-        """Tell the node for how long the message has waited that it worked on last, and publish what it decides.
+        """Tell the node for how long its last message has waited and it has worked, and publish what it decides.
 
         0 = nothing waits. Waiting time, not platform time: a replay may be faster than life.
         """
@@ -261,7 +263,7 @@ class BusRunner:
         self._looked_s = now
         with self._lock:
             lag_s = max(time.time_ns() - received_ns, 0) / 1e9 if received_ns else 0.0
-            decisions = self._driver.behind(lag_s, now)
+            decisions = self._driver.behind(lag_s, now, self._busy_s)
         for decision in decisions:
             self.bus.publish(decision)
 

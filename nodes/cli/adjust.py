@@ -21,22 +21,23 @@ from ...solver.adjustment.job import run as run_job
 from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
 from ...solver.adjustment.straightened import straightened
-from ...solver.adjustment.surface_control import run_with_surface
+from ...solver.adjustment.surface_control import SurfaceControl
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, SelfCalibration
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
-from ...solver.orthoimage.surface import HeightField
+from ...solver.models.platform import MOST_CLOCK_S, PlatformErrors
 from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
 from ..batch.adjustment_summary import summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.scene_adjustment import SETS
+from ..batch.two_steps import OWNERS, UNUSED, step_settings
 from ..errors import UserError
 from ..formats.block_folder import is_block_folder, read_block
 from ..formats.block_recording import TOPICS, block_from_messages
 from ..formats.camera_json import write_camera
-from ..formats.dem import dem_in_frame
+from ..formats.dem import surface_control
 from ..formats.importable import refuse_importable
 from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import refuse_unless_folder
@@ -45,6 +46,7 @@ from ..recording.reader import RecordingReader
 from ..recording.summary import damage_lines
 from ..terminal import drawing, plain
 from .adjust_scenes import run_scenes
+from .dem_options import add_dem_options, dem_settings
 from .locate import refraction_of
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
@@ -67,8 +69,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--then", choices=sorted(MODELS), help="a second model on the orientation the first one refined")
     group.add_argument("--segments", type=int, metavar="N", help="segments a strip, for ppm")
+    group.add_argument("--order", type=int, choices=(1, 2), help="of the polynomials of ppm (2)")
     group.add_argument("--sets", choices=SETS, help="satellite scenes: corrections a lens, or a scene (lens)")
     group.add_argument("--fixes", type=int, metavar="N", help="orientation fixes a strip, for lim")
+    group.add_argument(
+        "--clock-sigma", type=float, default=0.0, metavar="S",
+        help="clocks of poses and image lines differ by an unknown constant, beforehand known to S seconds (0)",
+    )  # fmt: skip
     selfcal = ["none", *SELF_CALIBRATIONS]
     group.add_argument("--selfcal", choices=selfcal, default="none", help="additional parameters of the camera (none)")
     group.add_argument("--free", action="store_true", help="additional parameters without a-priori weight")
@@ -87,12 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--variance-components", action="store_true", help="estimate sigmas of image, control, position and attitude"
     )
-    group.add_argument("--dem", type=Path, metavar="FILE", help="heights of a raster as control of all tie points")
-    group.add_argument("--dem-sigma", type=float, metavar="M", help="of these heights, 1 sigma; wanted with --dem")
-    group.add_argument(
-        "--dem-crs", metavar="CRS",
-        help="of the raster: 'ellipsoid', a vertical CRS (EPSG:5773), or the whole, where it does not say",
-    )  # fmt: skip
+    add_dem_options(group)
     group.add_argument(
         "--refraction", nargs="*", type=float, metavar="VALUE", help="take the bending of rays in the air off: as in "
         "'triline locate'; behind the input",
@@ -109,12 +111,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--plots needs a folder for the pictures: -o DIR")
     if args.per_line and not args.output:
         raise UserError("--per-line needs a folder for the table: -o DIR")
-    if (args.dem is None) != (args.dem_sigma is None):
-        raise UserError("--dem and --dem-sigma: wanted both, the raster and the sigma of its heights")
-    if args.dem is None and args.dem_crs is not None:
-        raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
-    if args.dem_sigma is not None and not 0 < args.dem_sigma < float("inf"):
-        raise UserError(f"--dem-sigma {args.dem_sigma:g}, wanted more than 0")
+    dem = dem_settings(args)
     if not args.critical > 0:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
     if args.iterations < 1:
@@ -122,17 +119,22 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         refuse_unless_folder(Path(args.output))
     if is_scene_block(Path(args.input)):
+        if args.clock_sigma:
+            raise UserError("--clock-sigma does not go with satellite scenes")
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
     block = read_input(Path(args.input))
     surface = None
-    if args.dem is not None:
-        surface = dem_in_frame(args.dem, block.frame, args.dem_crs), float(args.dem_sigma or 0.0)
+    if dem:
+        path, crs = Path(dem["dem"]), dem.get("dem_crs")
+        surface = surface_control(path, block.frame, crs, dem["dem_sigma_m"], dem.get("dem_shift_sigma_m"))
     air = None
     if args.refraction is not None:
         air = refraction_of(args.refraction, WGS84, str(args.input))
         block = replace(block, notes=(*block.notes, "refraction taken off the image points"))
+    if block.apriori.then and args.then is None:
+        block = replace(block, notes=(*block.notes, UNUSED))
     adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface, air)
     content = result_of(adjustment)
     if args.output:
@@ -168,19 +170,13 @@ def read_input(path: Path) -> BlockData:
 
 def job_of(args: argparse.Namespace, block: BlockData) -> Job:
     """The job that the options ask for."""
-    settings: dict[str, object] = dict(block.apriori.trajectory)
-    settings |= {key: value for key in ("segments", "fixes") if (value := getattr(args, key)) is not None}
-    model = args.model or ("wander" if _wanders(settings) else "dgr")
-    models = {model, args.then}
-    for option, owner in (("segments", "ppm"), ("fixes", "lim")):
-        if getattr(args, option) is not None and owner not in models:
-            raise UserError(f"--{option} is for the model {owner}; asked for is {model}")
-    _refuse_more_than_rays_carry(settings, models, block)
+    model = args.model or ("wander" if wanders(block.apriori.trajectory) else "dgr")
+    first, second = models_of(block, model, args.then, {option: getattr(args, option) for option in OWNERS})
     limits = Limits(keep_significant=args.keep == "significant")
     robust = WEIGHT_FUNCTIONS[args.robust]() if args.robust else None
     return Job(
-        _model(model, settings),
-        _model(args.then, settings) if args.then else None,
+        first,
+        second,
         _self_calibration(args, block),
         args.keep != "all",
         limits,
@@ -190,15 +186,40 @@ def job_of(args: argparse.Namespace, block: BlockData) -> Job:
         args.reweight,
         args.variance_components,
         max_iterations=args.iterations,
+        platform=_platform(args),
     )
 
 
-def _wanders(settings: Mapping[str, object]) -> bool:
+def models_of(
+    block: BlockData, model: str, then: str | None, given: Mapping[str, int | None]
+) -> tuple[ModelOptions, ModelOptions | None]:
+    """The trajectory models of one or two steps, with the project's settings and the options ``given`` by name.
+
+    Raises
+    ------
+    UserError : settings that a model does not take, more segments or fixes than the rays of a strip can determine
+    """
+    steps = step_settings(block.apriori.trajectory, block.apriori.then, model, then, given)
+    first, second = (
+        None if name is None else _model(name, settings, block)
+        for name, settings in zip((model, then), steps, strict=True)
+    )
+    assert first is not None
+    return first, second
+
+
+def _platform(args: argparse.Namespace) -> PlatformErrors:
+    if not 0 <= args.clock_sigma < MOST_CLOCK_S:
+        raise UserError(f"--clock-sigma {args.clock_sigma:g}, wanted 0 or more, and less than {MOST_CLOCK_S:g} s")
+    return PlatformErrors(args.clock_sigma)
+
+
+def wanders(settings: Mapping[str, object]) -> bool:
     """Whether the project states a sigma for wandering errors of the trajectory."""
     return any(np.any(np.asarray(settings.get(key, 0.0), float)) for key in ("wander_sigma_m", "wander_sigma_deg"))
 
 
-def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str], block: BlockData) -> None:
+def _refuse_more_than_rays_carry(settings: Mapping[str, object], name: str, block: BlockData) -> None:
     """Raise UserError for more segments or fixes than rays can determine: a segment has 18 unknowns, a ray 2 equations.
 
     Fixes with too few rays are merged, up to a limit.
@@ -207,14 +228,15 @@ def _refuse_more_than_rays_carry(settings: Mapping[str, object], models: set[str
     most, strip = int(rays.max()), block.strips[int(rays.argmax())].id
     for option, model, share in (("segments", "ppm", 9), ("fixes", "lim", 2)):
         number, limit = settings.get(option), max(most // share, FEW)
-        if model in models and isinstance(number, int) and number > limit:
+        if model == name and isinstance(number, int) and number > limit:
             raise UserError(
                 f"--{option} {number}: more than the image points carry, wanted at most {limit} "
                 f"(strip {strip} has the most image points, {most})"
             )
 
 
-def _model(name: str, settings: Mapping[str, object]) -> ModelOptions:
+def _model(name: str, settings: Mapping[str, object], block: BlockData) -> ModelOptions:
+    _refuse_more_than_rays_carry(settings, name, block)
     try:
         return MODELS[name].from_settings(settings)
     except ValueError as error:
@@ -235,7 +257,7 @@ def adjust_block(
     block: BlockData,
     job: Job,
     tell: Any = None,
-    surface: tuple[HeightField, float] | None = None,
+    surface: SurfaceControl | None = None,
     refraction: Refraction | None = None,
 ) -> Adjustment:
     """Adjust a block as a job asks.
@@ -243,7 +265,7 @@ def adjust_block(
     Parameters
     ----------
     tell : is called with what happens
-    surface : ground on which tie points lie, and the sigma of its heights, m
+    surface : on which tie points lie
     refraction : is taken off the image points
 
     Raises
@@ -253,13 +275,10 @@ def adjust_block(
     start = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # results that are not finite are refused below
-            network, fit = network_from_block(block), None
+            network = replace(network_from_block(block), surface=surface)
             if refraction is not None:
                 network = straightened(network, block.frame, refraction)
-            if surface is None:
-                result = run_job(network, job, tell)
-            else:
-                result, fit = run_with_surface(network, job, surface[0].height, surface[1], tell)
+            result = run_job(network, job, tell)
     except NotAdjustableError as error:
         raise UserError(f"{block.name}: {error}") from None
     except ValueError as error:
@@ -267,7 +286,7 @@ def adjust_block(
     finally:
         if isinstance(tell, _ProgressLines):
             tell.close()
-    adjustment = Adjustment(block, job, result, time.perf_counter() - start, fit)
+    adjustment = Adjustment(block, job, result, time.perf_counter() - start)
     if not result.solution.converged and result.test.sigma0 > HOPELESS:
         raise UserError(f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {worst_strip(adjustment)}")
     return adjustment

@@ -20,6 +20,7 @@ from ..batch.scene_adjustment import (
     scene_result,
     write_scene_tables,
 )
+from ..batch.two_steps import OWNERS, UNUSED
 from ..errors import UserError
 from ..formats.scene_block import SceneBlockData, read_scene_block
 from .locate import refraction_of
@@ -33,6 +34,8 @@ def run_scenes(args: argparse.Namespace) -> int:
     data = read_scene_block(Path(args.input))
     if args.refraction is not None:
         data = _in_air(data, refraction_of(args.refraction, data.ellipsoid, str(args.input)))
+    if data.then and args.then is None:
+        data = replace(data, notes=(*data.notes, UNUSED))
     adjustment = run_scene_job(data, scene_job(args, data))
     content = scene_result(adjustment)
     if args.output:
@@ -75,7 +78,7 @@ def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
     """
     for option, given in (
         ("--robust", args.robust), ("--reweight", args.reweight), ("--variance-components", args.variance_components),
-        ("--plots", args.plots),
+        ("--plots", args.plots), ("--dem", args.dem),
     ):  # fmt: skip
         if given:
             raise UserError(f"{option} does not go with a block of satellite scenes")
@@ -86,18 +89,13 @@ def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
         wanted = ", ".join(SCENE_CALIBRATIONS)
         raise UserError(f"--selfcal {args.selfcal}: does not go with satellite scenes, wanted {wanted}")
     model = args.model or "dgr"
-    settings: dict[str, object] = {}
-    for option, owner in (("segments", "ppm"), ("fixes", "lim")):
-        value = getattr(args, option)
-        if value is None:
-            continue
-        if owner not in (model, args.then):
-            raise UserError(f"--{option} is for the model {owner}; asked for is {model}")
-        if not 1 <= value <= MOST_PIECES:
+    given = {option: getattr(args, option) for option in OWNERS}
+    for option in ("segments", "fixes"):
+        value = given[option]
+        if value is not None and not 1 <= value <= MOST_PIECES:
             raise UserError(f"--{option} {value}, wanted 1 to {MOST_PIECES}")
-        settings[option] = value
     return SceneJob(
-        model, args.then, settings, args.selfcal, args.free, args.sets or "lens", args.snoop, args.critical,
+        model, args.then, given, args.selfcal, args.free, args.sets or "lens", args.snoop, args.critical,
         args.iterations,
     )  # fmt: skip
 

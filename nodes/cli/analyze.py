@@ -28,6 +28,8 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     ------
     UserError : nothing to analyse, or the page cannot be written
     """
+    if not recording.exists():
+        raise UserError(f"{recording}: no such file or folder")
     from ..report.analysis import analyse
     from ..report.page import page
     from ..report.source import read

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 
+from ..bus.authority import CERTIFICATE
 from ..errors import UserError
 from ..recording.reader import RecordingReader
+from ..recording.seal import seal_of, verify
 from ..recording.summary import findings
 
-EXAMPLE = "triline check flight.mcap"
+EXAMPLE = """triline check flight.mcap
+  triline check flight.mcap --authority survey      # signed in the name of one of its bundles, and not altered"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING_OR_FOLDER", help="flight.mcap, or a folder with flight.toml"
+    )
+    parser.add_argument(
+        "--authority", type=Path, metavar="FOLDER", help="of `triline keys`: who signed must be certified by it"
     )
 
 
@@ -24,8 +31,16 @@ def run(args: argparse.Namespace) -> int:
         return _check_folder(args)
     reader = RecordingReader(args.recording)
     found = findings(reader)
+    authority = args.authority / CERTIFICATE if args.authority and args.authority.is_dir() else args.authority
+    seal = verify(args.recording, authority)
+    if seal is None and authority is not None:
+        raise UserError(f"{args.recording}: not signed, {seal_of(args.recording).name} is not there")
+    if seal is not None:
+        found = [*(f"not as {seal.signer!r} signed it: {line}" for line in seal.altered), *found]
     if args.json:
-        print(json.dumps({"file": str(args.recording), "whole": not found, "findings": found}, indent=2))
+        signed = None if seal is None else asdict(seal)
+        said = {"file": str(args.recording), "whole": not found, "findings": found, "signed": signed}
+        print(json.dumps(said, indent=2))
         return 1 if found else 0
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 and not args.verbose else ""
@@ -33,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
             print("\n".join(found))
         raise UserError(f"{args.recording}: {found[0]}{more}")
     if not args.quiet:
-        print(f"{args.recording}: whole, {len(reader.index)} messages in {reader.n_chunks} chunks")
+        said = "" if seal is None else f"; {seal}, nothing was altered"
+        print(f"{args.recording}: whole, {len(reader.index)} messages in {reader.n_chunks} chunks{said}")
     return 0
 
 

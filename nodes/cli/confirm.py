@@ -21,10 +21,13 @@ from .bus_options import add_bus_arguments, bus_of
 EXAMPLE = """triline confirm GCP3 --port 17447
   triline confirm GCP3 --reject
   triline confirm configuration/camera              # another camera than the flight began with
-  triline confirm sensor/gnss --source receiver2    # its messages count from now on"""
+  triline confirm sensor/gnss --source receiver2    # its messages count from now on
+  triline confirm sensor/gnss --clock 0.1           # add 0.1 s to its times from now on"""
 
 #: Time from the newest platform time until the verdict takes effect, ns: by then every node has received it.
 AHEAD_NS = 500_000_000
+#: Largest correction of GNSS times, s, as the navigator takes it.
+LARGEST_CLOCK_S = 100.0
 #: Longest wait for ground points and platform time, and for the answer to the verdict, s.
 LISTEN_S, NOBODY_S, ANSWER_S = 1.0, 4.0, 6.0
 
@@ -34,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "point", metavar="POINT", help="name of the ground point, or topic of configuration, sensors or control"
     )
     parser.add_argument("--source", default="", metavar="NAME", help="of the topic (default: what was refused last)")
+    parser.add_argument("--clock", type=float, metavar="S", help="of sensor/gnss: seconds to be added to its times")
     parser.add_argument(
         "--reject",
         action="store_true",
@@ -51,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
     topic = args.point if _is_topic(args.point) else ""
     if args.source and not topic:
         raise UserError(f"--source {args.source}: wanted a topic before it, as in sensor/gnss, not {args.point}")
+    if args.clock is not None and (topic != "sensor/gnss" or args.reject or not abs(args.clock) <= LARGEST_CLOCK_S):
+        raise UserError(f"--clock {args.clock:g}: wanted sensor/gnss and at most {LARGEST_CLOCK_S:g} s, to be added")
     with Bus(source="surveyor", file=args.bus, **bus_of(args)) as bus:
         heard = _Heard(args.point)
         for name in ("status/*", "trajectory/filtered", "observation/control", "observation/target", "event/log"):
@@ -65,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
         verdict = m.Verdict(point=args.point, accepted=not args.reject, by=args.by)
         if topic:
             verdict = m.Verdict(topic=topic, publisher=args.source, accepted=not args.reject, by=args.by)
+        if args.clock is not None:
+            verdict.clock_s = args.clock
         heard.sent.set()
         bus.publish(Message("observation/verdict", heard.stamp_ns + AHEAD_NS, verdict))
         answered = _wait(lambda: heard.answer != "", ANSWER_S)

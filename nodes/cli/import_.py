@@ -1,4 +1,4 @@
-"""``triline import``: block and sensor folders, AVIRIS, POS Export, SBET, CSV, ROS 2, ENVI images to a recording."""
+"""``triline import``: block and sensor folders, AVIRIS, POS Export, SBET, CSV, ROS 2, images to a recording."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from ..errors import UserError
 from ..formats.avirisc import LINE_RATE_HZ
 from ..formats.camera_json import read_camera, write_camera
 from ..formats.detect import KINDS, Imported, Options, kind_of_path, read_any
+from ..formats.envi_image import TYPES
 from ..formats.flight_folder import flight_messages
 from ..formats.geocal_xml import read_glas_camera, read_tie_points
+from ..formats.ground_height import NOT_GIVEN, GroundGiven
 from ..formats.image_lines import LinesGiven, files_of
 from ..formats.new_file import new_file
 from ..formats.tie_points import statistics, write_tie_points
@@ -63,10 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"lines a second: of images, of AVIRIS-C (default {LINE_RATE_HZ:g})",
     )
     parser.add_argument("--seconds-of-day", action="store_true", default=None, help="SBET times count from midnight")
+    ground = parser.add_argument_group("the ground, where the origin of the local frame is put (one of them)")
+    ground.add_argument("--ground-height", type=float, metavar="M", help="of the ground above the ellipsoid")
+    ground.add_argument("--above-ground", type=float, metavar="M", help="so high the platform flies above the ground")
+    ground.add_argument("--dem", type=Path, metavar="FILE", help="raster of heights: their median under the flight")
+    ground.add_argument("--dem-crs", metavar="CRS", help="of the raster's heights: ellipsoid, EPSG:5773 ..")
     images = parser.add_argument_group("image lines")
     images.add_argument(
         "--lines", action="append", default=[], metavar="VIEW=FILE,..",
-        help="ENVI images of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for a band of it",
+        help="images (ENVI, TIFF, raw) of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for "
+        "a band of it; of a ROS 2 bag topics (N=/camera/nadir)",
     )  # fmt: skip
     images.add_argument("--strip", default="", metavar="ID", help="of the images (default: name of the first file)")
     images.add_argument(
@@ -74,6 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     images.add_argument("--first-time", metavar="ISO", help="time of line 0 (UTC), with --line-rate")
     images.add_argument("--band", metavar="BAND", help="number from 1, name, or weighted sum: 2:0.5,3:0.5")
+    images.add_argument("--raw", choices=TYPES, metavar="TYPE", help=f"of files without a header: {', '.join(TYPES)}")
+    images.add_argument(
+        "--samples", type=int, metavar="N", help="pixels of a raw line (default: of the camera's CCD line)"
+    )
     images.add_argument(
         "--grey-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="values that become black and white"
     )
@@ -90,10 +102,10 @@ def run(args: argparse.Namespace) -> int:
     source, output = Path(args.input), Path(args.output)
     if args.line_rate is not None and not args.line_rate > 0:
         raise UserError(f"--line-rate {args.line_rate:g}, wanted more than 0 Hz")
-    kind = args.format or kind_of_path(source)
+    kind = args.format or ("lines" if args.raw and not args.lines else kind_of_path(source))
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
-    if args.camera and kind in ("block", "ties", "camera"):
+    if args.camera and kind in ("block", "scenes", "ties", "camera"):
         raise UserError(f"--camera does not go with {KINDS[kind]}")
     if args.date is not None and kind == "camera":
         raise UserError(f"--date does not go with {KINDS[kind]}")
@@ -118,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
             args.seconds_of_day,
             _accuracy(args),
             _lines(args, kind),
+            _ground(args, kind),
         )
         imported = read_any(source, kind, options)
         result = _write(source, imported, output, "demo", shown=not args.quiet and not args.json)
@@ -129,6 +142,30 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _ground(args: argparse.Namespace, kind: str) -> GroundGiven:
+    """What the arguments say about the height of the ground.
+
+    Raises
+    ------
+    UserError : arguments that do not go together, or with the kind of input
+    """
+    given = [name for name in ("ground_height", "above_ground", "dem") if getattr(args, name) is not None]
+    if not given:
+        if args.dem_crs is not None:
+            raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
+        return NOT_GIVEN
+    shown = [f"--{name.replace('_', '-')}" for name in given]
+    if len(given) > 1:
+        raise UserError(f"{' and '.join(shown)}: wanted one of them")
+    if kind in ("block", "ties", "camera", "lines"):
+        raise UserError(f"{shown[0]} does not go with {KINDS[kind]}, wanted poses or sensors")
+    if args.above_ground is not None and not 0 < args.above_ground < math.inf:
+        raise UserError(f"--above-ground {args.above_ground:g}, wanted more than 0 m")
+    if args.ground_height is not None and not -500 < args.ground_height < 9000:
+        raise UserError(f"--ground-height {args.ground_height:g}, wanted metres from -500 to 9000")
+    return GroundGiven(args.ground_height, args.dem, args.dem_crs, args.above_ground)
+
+
 def _lines(args: argparse.Namespace, kind: str) -> LinesGiven | None:
     """What the arguments say about images; None without any.
 
@@ -136,22 +173,28 @@ def _lines(args: argparse.Namespace, kind: str) -> LinesGiven | None:
     ------
     UserError : arguments that do not go together
     """
+    if args.samples is not None and (args.raw is None or args.samples < 1):
+        raise UserError(f"--samples {args.samples}: wanted the pixels of a line, with --raw TYPE")
+    raw = None if args.raw is None else (args.raw, args.samples or 0)
     if not args.lines and kind != "lines":
-        for name in ("strip", "line_times", "first_time", "band", "grey_range"):
-            if getattr(args, name):
+        of_topics = ("strip",) if kind == "ros2" else ()
+        for name in ("strip", "line_times", "first_time", "band", "grey_range", "raw"):
+            if getattr(args, name) and name not in of_topics:
                 raise UserError(f"--{name.replace('_', '-')} is of images, wanted --lines VIEW=FILE with it")
-        return None
+        return LinesGiven((), args.strip, rate_hz=args.line_rate) if kind == "ros2" else None
     first = None
     if args.first_time is not None:
         if args.line_rate is None:
             raise UserError("--first-time without --line-rate, wanted both")
         first = (args.first_time, args.line_rate)
-    elif args.line_rate is not None and kind != "avirisc":
+    elif args.line_rate is not None and kind not in ("avirisc", "ros2"):
         raise UserError("--line-rate without --first-time, wanted both")
     span = None if args.grey_range is None else (args.grey_range[0], args.grey_range[1])
     if span is not None and not -math.inf < span[0] < span[1] < math.inf:
         raise UserError(f"--grey-range {span[0]:g} {span[1]:g}, wanted two numbers, the lower one first")
-    return LinesGiven(files_of(args.lines), args.strip, args.line_times, first, args.band, span, args.date)
+    return LinesGiven(
+        files_of(args.lines), args.strip, args.line_times, first, args.band, span, args.date, raw, args.line_rate
+    )
 
 
 def _accuracy(args: argparse.Namespace) -> Accuracy:
@@ -192,9 +235,9 @@ def _import_camera(source: Path, output: Path) -> dict[str, Any]:
 def _refuse_options(args: argparse.Namespace) -> None:
     """Raise UserError for an option that says what flight.toml says."""
     names = ("date", "crs", "camera", "position_sigma", "attitude_sigma", "line_rate", "seconds_of_day", "lines")
-    given = [
-        name for name in (*names, "strip", "line_times", "first_time", "band", "grey_range") if getattr(args, name)
-    ]
+    names = (*names, "strip", "line_times", "first_time", "band", "grey_range", "raw", "samples")
+    names = (*names, "ground_height", "above_ground", "dem", "dem_crs")
+    given = [name for name in names if getattr(args, name)]
     given += [name for name in ("lever_arm", "boresight") if any(getattr(args, name))]
     if given:
         raise UserError(f"--{given[0].replace('_', '-')} does not go with a flight folder: it stands in flight.toml")

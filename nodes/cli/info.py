@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..convert import iso
 from ..formats.importable import refuse_importable
 from ..recording.access import Recording
+from ..recording.seal import verify
 from ..recording.summary import findings, holdings
 from ..terminal import plain
 
@@ -45,6 +47,9 @@ def _summary(recording: Recording) -> dict[str, Any]:
         "topics": [vars(row) for row in rows],
         "damage": findings(reader, decode=False, outside=False),
     }
+    seal = verify(reader.path)
+    if seal is not None:
+        summary["signed"] = {**asdict(seal), "words": str(seal)}
     if "configuration/project" in present:
         p = recording.project()
         summary["project"] = {
@@ -60,9 +65,9 @@ def _summary(recording: Recording) -> dict[str, Any]:
         }
     if "configuration/strip" in present:
         summary["strips"] = [
-            {"id": str(name), "start": iso(int(s.first_line_time_ns)), "line_rate_hz": float(s.line_rate_hz),
+            {"id": name, "start": iso(int(s.first_line_time_ns)), "line_rate_hz": float(s.line_rate_hz),
              "lines": int(s.lines), "ended": bool(s.ended)}
-            for name, s in recording.strips().iterrows()
+            for name, s in recording.last_strips().items()
         ]  # fmt: skip
     if "truth/world" in present:
         summary["world"] = recording.true_world()
@@ -94,6 +99,9 @@ def _lines(s: dict[str, Any]) -> list[str]:
         sources = ", ".join(row["sources"])
         lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
     lines.append("start, end: of what was measured and computed; rate: between the first and last message of the topic")
+    if "signed" in s:
+        lines.append(f"{s['signed']['words']}{'' if s['signed']['altered'] else ', nothing was altered'}")
+        lines += [f"altered: {text}" for text in s["signed"]["altered"]]
     lines += [f"damaged: {text}" for text in s["damage"]]
     return lines
 

@@ -20,6 +20,7 @@ from ..recording.reader import RecordingReader
 from ..recording.runner import ProcessSummary, process
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
+from .dem_options import add_dem_options, dem_settings
 from .progress import progress
 
 EXAMPLE = "triline process flight.mcap -o out.mcap"
@@ -42,12 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="throughput: larger batches and filtered poses at 5 Hz, for long flights; as accurate, but results come "
         "later (default: load, the pace of a live flight with its recorded changes under load)",
     )  # fmt: skip
+    add_dem_options(parser.add_argument_group("heights"))
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the output (default: none)")
     parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
 
 
 def run(args: argparse.Namespace) -> int:
     tables = at_pace(load(args.config, registry.names()), args.pace)
+    dem = dem_settings(args)
+    if dem:
+        tables = tables | {"adjuster": tables.get("adjuster", {}) | dem}
     refuse_importable(args.recording)
     reader = RecordingReader(args.recording)
     _check(reader, args)

@@ -11,16 +11,20 @@ from typing import Any
 import numpy as np
 
 from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import LocalFrame
+from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
+from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.resampling import TAPS
-from ...solver.orthoimage.surface import Ellipsoid, Surface
+from ...solver.orthoimage.surface import Ellipsoid, Surface, UnderAir
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import (
     ORIENTATIONS,
     REFINED,
     Rectification,
     Rectified,
+    camera_beside,
     estimated_camera,
     frame_for,
     ground_of_points,
@@ -31,18 +35,22 @@ from ..batch.rectification import (
     project_frame,
     trajectory_orientation,
 )
+from ..config import raster_of_heights
 from ..errors import UserError
 from ..formats.dem import dem_in_frame
 from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
 from ..recording.access import Recording
 from . import rectify_image
+from .locate import refraction_of
 from .progress import progress
 
 EXAMPLE = """triline rectify flight.mcap -o ortho.tif
   triline rectify flight.mcap -o before.tif --orientation measured --dem heights.tif --gsd 0.25
   triline rectify scene.tif --sensor DIM_PHR1A.XML --dem N44E005.hgt --dem-datum EPSG:5773 -o ortho.tif"""
 
+#: Options of an image that a recording takes, too.
+_OF_BOTH = ("dem_crs", "refraction", "sigma", "pixel_sigma", "height_sigma")
 #: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
 MOST_CELLS = 4e9
 
@@ -67,8 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--dem", metavar="FILE", action="append",
-        help="raster of heights; of a recording also 'points': object points; of an image: with --dem-datum, may be "
-        "given again, or a folder of tiles",
+        help="raster of heights; of a recording also a flight folder with [dem], or 'points': object points; of an "
+        "image: with --dem-datum, may be given again, or a folder of tiles",
     )  # fmt: skip
     parser.add_argument(
         "--height",
@@ -89,9 +97,11 @@ def run(args: argparse.Namespace) -> int:
     camera = recording.camera()
     ccd = _ccd(recording, camera, args.ccd)
     _check_strips(recording, args.strip)
+    of_camera = None
     if args.trajectory is not None:
         name = args.trajectory.name
         orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
+        camera, of_camera = camera_beside(args.trajectory, camera)
     else:
         name, orientation, reference_ns = orientation_of(recording, args.orientation)
     estimated = 0
@@ -100,6 +110,10 @@ def run(args: argparse.Namespace) -> int:
     frame = project_frame(recording)
     target = frame_for(frame, args.crs or _crs(frame))
     surface, ground_m, ground = _ground(args, recording, frame)
+    if args.refraction is not None:
+        surface = UnderAir(surface, frame, refraction_of(args.refraction, WGS84, str(args.input)))
+        ground += ", refraction taken off"
+    errors = _errors(args, camera, ccd, name, orientation)
     above = float(np.median(orientation.measured.position_l[:, 2])) - ground_m
     if above <= 0:
         raise UserError(
@@ -109,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     grid = GroundGrid(target, args.gsd or float(f"{pixel:.2g}"))
     factor = max(int(grid.gsd / pixel + 0.1), 1)
     _check_size(recording, camera, ccd, pixel, grid)
-    work = Rectification(camera, ccd, surface, grid, args.resampling, orientation, reference_ns, factor)
+    work = Rectification(camera, ccd, surface, grid, args.resampling, orientation, reference_ns, factor, errors)
     with progress("rectifying", args.quiet or args.json) as told:
         for block in line_blocks(recording, camera.lines[ccd].id, args.strip, told):
             try:
@@ -124,12 +138,14 @@ def run(args: argparse.Namespace) -> int:
         "TIFFTAG_SOFTWARE": "triline",
         "TIFFTAG_IMAGEDESCRIPTION": f"{camera.name} {camera.lines[ccd].id}, {name} orientation, {ground}",
     }
-    shape = write_orthoimage(args.output, done.mosaic, grid, tags)
+    shape = write_orthoimage(
+        args.output, done.mosaic, grid, tags, sigma=None if args.sigma is None else Path(args.sigma)
+    )
     result = {
         "output": str(args.output), "orientation": name, "ccd": camera.lines[ccd].id, "crs": target.crs,
         "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
-        "pixels_together": factor, "camera_parameters": estimated,
-        "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
+        "pixels_together": factor, "camera_parameters": estimated, "camera": of_camera and str(of_camera),
+        "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args)
@@ -141,13 +157,23 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"{args.input}: no such file")
     if args.input.is_dir():
         raise UserError(f"{args.input}: is a folder, wanted a recording with image lines")
-    refuse_unless_file(args.output)
-    if args.output.resolve() == args.input.resolve():
-        raise UserError(f"{args.output}: the orthoimage would overwrite the recording")
+    for path in (args.output, *(() if args.sigma is None else (Path(args.sigma),))):
+        refuse_unless_file(path)
+        if path.resolve() == args.input.resolve():
+            raise UserError(f"{path}: the orthoimage would overwrite the recording")
+    if args.sigma is not None and Path(args.sigma).resolve() == args.output.resolve():
+        raise UserError("-o, --sigma: wanted different files")
     for name in ("gsd", "height"):
         value = getattr(args, name)
         if value is not None and not np.isfinite(value):
             raise UserError(f"--{name} {value}: wanted a number")
+    for name in ("pixel_sigma", "height_sigma"):
+        value = getattr(args, name)
+        option = f"--{name.replace('_', '-')}"
+        if value is not None and not 0 <= value < np.inf:
+            raise UserError(f"{option} {value}: wanted a number of at least 0")
+        if value is not None and args.sigma is None:
+            raise UserError(f"{option}: goes with --sigma FILE, for which it counts")
     if args.gsd is not None and not args.gsd > 0:
         raise UserError(f"--gsd {args.gsd}: wanted more than 0")
     if args.trajectory is not None and args.orientation is not None:
@@ -161,7 +187,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.resampling not in TAPS:
         raise UserError(f"--resampling {args.resampling}: goes with --sensor, wanted one of {', '.join(TAPS)}")
     for name in rectify_image.OPTIONS:
-        if name != "dem_crs" and getattr(args, name) not in (None, False):
+        if name not in _OF_BOTH and getattr(args, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
 
 
@@ -179,7 +205,7 @@ def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
 
 
 def _check_strips(recording: Recording, wanted: list[str] | None) -> None:
-    there = recording.strips().index.tolist()
+    there = list(recording.last_strips())
     for strip in wanted or ():
         if strip not in there:
             raise UserError(f"{recording.reader.path}: no strip {strip!r}, there are: {', '.join(there)}")
@@ -202,16 +228,36 @@ def _ground(args: argparse.Namespace, recording: Recording, frame: LocalFrame) -
         field = ground_of_points(recording)
         return field, float(np.median(known_points(recording)[:, 2])), "heights of object points"
     if args.dem is not None:
-        field = dem_in_frame(Path(args.dem[0]), frame, args.dem_crs)
+        path, crs = Path(args.dem[0]), args.dem_crs
+        if (path / "flight.toml").is_file():
+            if crs is not None:
+                raise UserError(f"--dem-crs: [dem] of {path / 'flight.toml'} says it")
+            path, crs = raster_of_heights(path / "flight.toml")
+        field = dem_in_frame(path, frame, crs)
         if not np.isfinite(field.z_m).any():
-            raise UserError(f"{args.dem[0]}: lies far from the project")
-        return field, float(np.nanmedian(field.z_m)), f"heights of {Path(args.dem[0]).name}"
+            raise UserError(f"{path}: lies far from the project")
+        return field, float(np.nanmedian(field.z_m)), f"heights of {path.name}"
     if args.height is not None:
         h = args.height
     else:
         points = known_points(recording)
         h = float(np.median(frame.to_geodetic(points)[:, 2])) if len(points) else frame.height_m
     return Ellipsoid(frame, h), h - frame.height_m, f"height {h:.1f} m above the ellipsoid"
+
+
+def _errors(
+    args: argparse.Namespace, camera: LineCamera, ccd: int, name: str, orientation: LineOrientation
+) -> GroundErrors | None:
+    """What counts for the sigmas besides the orientation; None where nobody asked for them."""
+    if args.sigma is None:
+        return None
+    if args.trajectory is not None:
+        raise UserError(f"--sigma: {name} has sigmas without their correlations, wanted --orientation of the recording")
+    if not orientation.has_covariance:
+        raise UserError(f"{args.input}: --sigma: the {name} orientation has no covariance")
+    xy = camera.lines[ccd].xy_mm
+    pitch_mm = float(np.linalg.norm(xy[-1] - xy[0])) / (len(xy) - 1)
+    return GroundErrors((args.pixel_sigma or 0.0) * pitch_mm, args.height_sigma or 0.0)
 
 
 def _check_size(recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid) -> None:
@@ -235,6 +281,10 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> 
     )
     if result["camera_parameters"]:
         print(f"  camera with {result['camera_parameters']} estimated parameters")
+    if result["sigma"]:
+        print(f"  sigmas in the plane and of the height, metres: {result['sigma']}")
+    if result["camera"]:
+        print(f"  camera of {result['camera']}")
     if done.left_out:
         print("  left out: " + ", ".join(f"{n} lines {why}" for why, n in done.left_out.items()))
     if done.missed_rays:

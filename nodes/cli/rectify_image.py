@@ -53,7 +53,10 @@ _DEM_NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that go with an image."""
-    group = parser.add_argument_group("an image of a sensor (with --sensor)")
+    group = parser.add_argument_group(
+        "an image of a sensor (with --sensor)",
+        "--refraction, --sigma, --pixel-sigma, --height-sigma and --dem-crs go with a recording, too",
+    )
     group.add_argument(
         "--sensor", metavar="META",
         help="metadata of the image: JSON of a frame camera (docs/rectification.md); " + "; ".join(KINDS.values()),

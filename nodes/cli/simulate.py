@@ -14,7 +14,7 @@ import numpy as np
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
 from .. import convert
 from ..batch.rectification import true_relief
-from ..batch.simulated_scenes import SceneSimulation, write_simulated_scenes
+from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
 from ..errors import UserError
 from ..formats.geotiff import write_heights
 from ..formats.new_file import new_file, refuse_unless_folder
@@ -29,7 +29,8 @@ EXAMPLE = """triline simulate -o flight.mcap --sensor ads40 --strips 6 --cross 2
   triline simulate -o flight.mcap --motion trajectory.csv --ground 310
   triline simulate -o flight.mcap --sensor ads40-small --images --seconds 60
   triline simulate -o flight.mcap --true sine=0.02@0.1 --true clock=5ms
-  triline simulate -o pair --satellite spot5-hrs --seed 1"""
+  triline simulate -o pair --satellite spot5-hrs --seed 1
+  triline simulate -o triplet.mcap --satellite alos-prism --seed 1"""
 
 DEFAULT_EPOCH = "2026-05-01T10:00:00Z"
 _GROUPS = {
@@ -51,9 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     satellite = parser.add_argument_group(
         "satellite scenes",
         "a block of scenes for `adjust` in place of a flight; of the other options --seed, --control, --check, "
-        "--image-sigma, --control-sigma and --outliers go with it",
+        "--image-sigma, --control-sigma, --outliers and --images (of a recording) go with it",
     )
-    satellite.add_argument("--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a folder")
+    satellite.add_argument(
+        "--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a folder, or NAME.mcap"
+    )
     satellite.add_argument("--place", type=float, nargs=2, metavar=("LAT", "LON"), help="passed over (36 139.6)")
     satellite.add_argument("--points", type=int, metavar="N", help="ground points in all (120)")
     about = {"world": f"messages and sigmas stay as the other options say; the flight has these as well: {HELP}"}
@@ -113,21 +116,34 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
-    """A block of satellite scenes, as a folder."""
-    goes = {"seed", "control", "check", "image_sigma", "control_sigma", "outliers"}
+    """A block of satellite scenes, as a folder or as a recording."""
+    goes = {"seed", "control", "check", "image_sigma", "control_sigma", "outliers", "images"}
     other = [name for name, value in given.items() if value is not None and name not in goes]
     other += [name for name in ("epoch", "dem") if getattr(args, name) is not None]
     if other:
         raise UserError(f"--{other[0].replace('_', '-')} does not go with --satellite")
-    refuse_unless_folder(Path(args.output))
+    output = Path(args.output)
+    recording = output.suffix.lower() == ".mcap"
+    if not recording:
+        if given["images"]:
+            raise UserError(f"{output}: --images goes with a recording, wanted a name that ends with .mcap")
+        refuse_unless_folder(output)
     keys = {"seed": "seed", "control": "control", "check": "check", "image_sigma": "image_sigma_px",
-            "control_sigma": "control_sigma_m", "outliers": "outliers"}  # fmt: skip
+            "control_sigma": "control_sigma_m", "outliers": "outliers", "images": "images"}  # fmt: skip
     stated = {keys[name]: _single(given[name]) for name in goes if given[name] is not None}
     if isinstance(stated.get("control_sigma_m"), list):
         raise UserError("--control-sigma: wanted one number with --satellite")
     stated |= {} if args.place is None else {"lat_deg": args.place[0], "lon_deg": args.place[1]}
     stated |= {} if args.points is None else {"points": args.points}
-    result = write_simulated_scenes(Path(args.output), SceneSimulation(args.satellite, **stated))
+    what = SceneSimulation(args.satellite, **stated)
+    if recording:
+        messages, result = simulated_recording(what)
+        result |= {"folder": args.output}
+        with new_file(output) as part, RecordingWriter(part, args.compression) as writer:
+            for message in messages:
+                writer.write(message)
+    else:
+        result = write_simulated_scenes(output, what)
     if args.json:
         print(json.dumps(result, indent=2))
     elif not args.quiet:

@@ -6,14 +6,19 @@ import argparse
 import importlib
 from typing import Any
 
-#: study -> (module beside this one, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args).
+#: study -> (module beside this one, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args),
+#: and WANTS_INPUT where it needs data of the user.
 STUDIES: dict[str, tuple[str, str]] = {
-    "testfields": ("study_testfields", "the testfields of the dissertation, simulated: published accuracy beside ours"),
+    "testfields": ("study_testfields", "published errors beside sigmas and simulated errors of the same networks"),
     "online": ("study_online", "the demo flight with many seeds through the on-line nodes, against truth"),
     "matching": ("study_matching", "tie points from image lines alone, held against truth"),
     "ties": ("study_ties", "what an adjustment makes of matched tie points, beside simulated ones of the same noise"),
     "starts": ("study_starts", "flights whose orientation is wrong by 30 px, in one direction after another"),
     "misspecified": ("study_misspecified", "flights whose true errors are not as stated, on line beside the batch"),
+    "control": (
+        "study_control",
+        "a block of your own: numbers of control points and models, held against check points",
+    ),
     "sensitivity": ("study_sensitivity", "which parameter a located pixel owes its error to, by four methods"),
     "scenes": ("study_scenes", "whether errors of adjusted satellite scenes are as large as their sigmas say"),
     "rectification": ("study_rectification", "transforms of the plane, RPC and the differential method, compared"),
@@ -40,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         module.add_arguments(sub)
         sub.set_defaults(run_study=module.run)
         _add_common(sub)
-    sub = subparsers.add_parser("all", help="all of them, one after another, with their defaults")
+    sub = subparsers.add_parser("all", help="all that need no data, one after another, with their defaults")
     sub.set_defaults(run_study=_run_all)
     _add_common(sub)
 
@@ -65,6 +70,8 @@ def _run_all(args: argparse.Namespace) -> int:
     code = 0
     for name, (module_name, text) in STUDIES.items():
         module = _load(module_name)
+        if getattr(module, "WANTS_INPUT", False):
+            continue
         parser = argparse.ArgumentParser()
         module.add_arguments(parser)
         if not args.json:

@@ -1,15 +1,18 @@
-"""``triline study testfields``: published accuracies beside those of the same networks on simulated data."""
+"""``triline study testfields``: published accuracies beside sigmas and simulated errors of the same networks."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from ...solver.simulation.published_network import NetworkSigma, network_sigmas
+from ...solver.simulation.published_tables import NETWORKS
 from ...solver.simulation.testfield_study import Row, study
-from ...solver.simulation.testfields import TESTFIELDS
+from ...solver.simulation.testfields import TESTFIELDS, Published
 from ..errors import UserError
 from .progress import progress
 
@@ -17,31 +20,80 @@ EXAMPLE = "triline study testfields --seeds 10 --only pavia2000 zurich"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="simulated measurements of each network (5)")
     parser.add_argument(
-        "--only", nargs="+", metavar="FIELD", help=f"some testfields only, of {', '.join(TESTFIELDS)}", default=[]
+        "--seeds",
+        type=int,
+        default=5,
+        metavar="N",
+        help="placements of points, and simulated measurements (5)",
     )
+    parser.add_argument(
+        "--only", nargs="+", metavar="FIELD", help=f"some testfields only, of {', '.join(NETWORKS)}", default=[]
+    )
+    parser.add_argument("--sigmas", action="store_true", help="sigmas of the networks alone, nothing simulated")
 
 
 def run(args: argparse.Namespace) -> int:
-    unknown = [name for name in args.only if name not in TESTFIELDS]
+    unknown = [name for name in args.only if name not in NETWORKS]
     if unknown:
-        raise UserError(f"--only {unknown[0]}: no such testfield, wanted {', '.join(TESTFIELDS)}")
+        raise UserError(f"--only {unknown[0]}: no such testfield, wanted {', '.join(NETWORKS)}")
     if args.seeds < 1:
         raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    networks = tuple(make() for name, make in NETWORKS.items() if not args.only or name in args.only)
+    with progress("sigmas", args.quiet or args.json) as tell:
+        promised = network_sigmas(networks, args.seeds, tell)
     fields = tuple(make() for name, make in TESTFIELDS.items() if not args.only or name in args.only)
-    with progress("testfields", args.quiet or args.json) as tell:
-        rows = study(fields, args.seeds, tell)
+    rows: list[Row] = []
+    if fields and not args.sigmas:
+        with progress("testfields", args.quiet or args.json) as tell:
+            rows = study(fields, args.seeds, tell)
     if args.json:
-        print(json.dumps({"seeds": args.seeds, "rows": [_plain(row) for row in rows]}, indent=2))
-    else:
+        plain = {"networks": [_plain_sigma(row) for row in promised], "rows": [_plain(row) for row in rows]}
+        print(json.dumps({"seeds": args.seeds, **plain}, indent=2))
+        return 0
+    for line in sigma_table(promised, args.seeds):
+        print(line)
+    if rows:
+        print()
         for line in table(rows, args.seeds):
             print(line)
     return 0
 
 
+def sigma_table(rows: list[NetworkSigma], placements: int) -> Iterator[str]:
+    """Lines of the table of what networks promise; metres."""
+    yield (
+        "Published RMSE beside the sigma of the same network, m; no error is drawn, medians over "
+        f"{placements} placements of points"
+    )
+    yield (
+        f"{'':24s}{'points':>15s} {'published RMSE':>15s} {'published sigma':>15s} {'sigma here':>15s} "
+        f"{'Z between':>13s} {'RMSE / sigma':>13s} {'sigma here':>14s}"
+    )
+    yield (
+        f"{'testfield':24s}{'control':>8s}{'check':>7s}"
+        + 3 * f" {'XY':>7s} {'Z':>7s}"
+        + (f" {'':13s} {'XY':>6s} {'Z':>6s} {'/ published':>14s}")
+    )
+    key = ""
+    for i, row in enumerate(rows):
+        if row.network.key != key:
+            key = row.network.key
+            yield row.network.name
+        p = row.row.published
+        yield (
+            f"  {row.row.label:22s}{row.row.control:8d}{row.row.check:7d} {_m(p.rmse_xy)} {_m(p.rmse_z)} "
+            f"{_m(p.sigma_xy)} {_m(p.sigma_z)} {_m(row.sigma_xy)} {_m(row.sigma_z)} "
+            f"{min(row.sigma_m[:, 2]):6.3f}-{max(row.sigma_m[:, 2]):<6.3f} "
+            f"{_two(p.rmse_xy / row.sigma_xy):>6s} {_two(p.rmse_z / row.sigma_z):>6s} "
+            f"{_two(row.sigma_xy / p.sigma_xy):>7s} {_two(row.sigma_z / p.sigma_z):>6s}"
+        )
+        if i + 1 == len(rows) or rows[i + 1].network.key != key:
+            yield textwrap.fill(row.network.unsaid, 132, initial_indent=6 * " ", subsequent_indent=6 * " ")
+
+
 def table(rows: list[Row], seeds: int) -> Iterator[str]:
-    """Lines of the table; metres, RMSE of check points."""
+    """Lines of the table of simulated measurements; metres, RMSE of check points."""
     yield f"RMSE and sigma of check points, m; means over {seeds} simulated measurements"
     yield (
         f"{'':26s}{'':>7s} {'published RMSE':>15s} {'ours':>15s} {'published sigma':>15s} {'ours':>15s} "
@@ -81,21 +133,32 @@ def _range(values: tuple[float, float]) -> str:
     return f"{low:.2f}" if low == high else f"{low:.2f}-{high:.2f}"
 
 
+def _plain_sigma(row: NetworkSigma) -> dict[str, Any]:
+    p = row.row.published
+    return {
+        "testfield": row.network.key,
+        "name": row.network.name,
+        "configuration": row.row.label,
+        "control": row.row.control,
+        "check": row.row.check,
+        "published": _published(p),
+        "sigma_xy_m": row.sigma_xy,
+        "sigma_z_m": row.sigma_z,
+        "sigma_m_of_placements": row.sigma_m.tolist(),
+        "published_rmse_over_sigma": [_number(p.rmse_xy / row.sigma_xy), _number(p.rmse_z / row.sigma_z)],
+        "sigma_over_published": [_number(row.sigma_xy / p.sigma_xy), _number(row.sigma_z / p.sigma_z)],
+        "unsaid": row.network.unsaid,
+    }
+
+
 def _plain(row: Row) -> dict[str, Any]:
-    p = row.configuration.published
     return {
         "testfield": row.field.key,
         "name": row.field.name,
         "configuration": row.configuration.label,
         "control": row.configuration.control,
         "gsd_m": row.field.gsd_m,
-        "published": {
-            "rmse_xy_m": _number(p.rmse_xy),
-            "rmse_z_m": _number(p.rmse_z),
-            "sigma_xy_m": _number(p.sigma_xy),
-            "sigma_z_m": _number(p.sigma_z),
-            "sigma0_px": [_number(v) for v in p.sigma0_px],
-        },
+        "published": _published(row.configuration.published),
         "rmse_xy_m": row.rmse_xy,
         "rmse_z_m": row.rmse_z,
         "sigma_xy_m": row.sigma_xy,
@@ -104,6 +167,16 @@ def _plain(row: Row) -> dict[str, Any]:
         "sigma0_px": _number(row.sigma0_px),
         "additional_parameters": row.parameters,
         "reason": row.configuration.reason,
+    }
+
+
+def _published(p: Published) -> dict[str, Any]:
+    return {
+        "rmse_xy_m": _number(p.rmse_xy),
+        "rmse_z_m": _number(p.rmse_z),
+        "sigma_xy_m": _number(p.sigma_xy),
+        "sigma_z_m": _number(p.sigma_z),
+        "sigma0_px": [_number(v) for v in p.sigma0_px],
     }
 
 

@@ -26,10 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from ..recording.reader import RecordingReader
+
+    reader = RecordingReader(args.recording)
     from ..viewer.rerun_canvas import RerunCanvas, open_canvas
     from ..viewer.scene import TOPICS, TRUTH_TOPICS
 
-    messages = RecordingReader(args.recording).sorted_messages((*TOPICS, *TRUTH_TOPICS))
+    messages = reader.sorted_messages((*TOPICS, *TRUTH_TOPICS))
     if args.rrd is not None and args.rrd.exists() and args.rrd.samefile(args.recording):
         raise UserError(f"{args.rrd}: is the recording itself")
     mode = f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"

@@ -14,7 +14,8 @@ from recording_file import write_recording
 
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
-from triline.nodes.formats.block_messages import block_messages
+from triline.nodes.formats.block_messages import block_messages, not_carried
+from triline.nodes.formats.block_writer import write_block as write_block_folder
 from triline.solver.camera.self_calibration import tls
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.frames import LocalFrame
@@ -307,6 +308,38 @@ def test_models(folder, tmp_path, options, key):
     assert (np.array(result["check"]["rmse_m"]) < 3 * sigma).all()
 
 
+def test_the_second_step_has_settings_of_its_own(folder, tmp_path):
+    block = shutil.copytree(folder, tmp_path / "block")
+    project = block / "project.toml"
+    project.write_text(project.read_text() + "[trajectory.then]\noffset_sigma_m = 0.0001\nfixes = 6\nmerge = false\n")
+    words = ("--model", "lim", "--fixes", "4", "--then", "lim")
+    assert adjust(block, *words, "-q", "-o", tmp_path / "two") == 0
+    result = result_in(tmp_path / "two")
+    for strip, fixes in ((name, strip["fixes"]) for name, strip in result["strips"].items()):
+        assert len(result["before"][0]["strips"][strip]["fixes"]) == 4 and len(fixes) == 6
+        assert max(np.abs(fix["offset_m"]).max() for fix in fixes) < 2e-4
+    assert max(np.abs(f["offset_m"]).max() for f in result["before"][0]["strips"][strip]["fixes"]) > 0.01
+    again = tmp_path / "again"
+    write_block_folder(again, read_input(block))
+    assert read_input(again).apriori == read_input(block).apriori
+    assert "project.toml: trajectory.then.offset_sigma_m, " in " ".join(not_carried(read_input(block)))
+    # of the options the second step has those that only its model takes, whatever the project says
+    assert adjust(block, "--model", "dgr", "--then", "lim", "--fixes", "5", "-q", "-o", tmp_path / "two") == 0
+    assert {len(strip["fixes"]) for strip in result_in(tmp_path / "two")["strips"].values()} <= {4, 5}
+    assert adjust(block, "-q", "-o", tmp_path / "one") == 0
+    assert any("[trajectory.then]" in note for note in result_in(tmp_path / "one")["notes"])
+
+
+def test_order_of_the_polynomials(folder, tmp_path):
+    curved = {}
+    for order in ("1", "2"):
+        out = tmp_path / order
+        assert adjust(folder, "--model", "ppm", "--segments", "2", "--order", order, "-q", "-o", out) == 0
+        segments = [part for strip in result_in(out)["strips"].values() for part in strip["segments"]]
+        curved[order] = max(np.abs(part["second_m"]).max() for part in segments)
+    assert curved["1"] < 1e-6 < curved["2"]
+
+
 def test_everything_at_once_with_pictures(folder, tmp_path):
     options = ["--selfcal", "tls18", "--snoop", "--robust", "igg3", "--reweight", "--variance-components", "--plots"]
     assert adjust(folder, *options, "-q", "-o", tmp_path) == 0
@@ -362,6 +395,7 @@ def test_refusals_are_one_line(folder, tmp_path, capsys):
     foreign.write_bytes(b"not a recording at all")
     assert "not an MCAP recording" in refusal(capsys, foreign)
     assert "needs a folder" in refusal(capsys, folder, "--plots")
+    assert "--clock-sigma -1, wanted 0 or more, and less than 0.5 s" in refusal(capsys, folder, "--clock-sigma", "-1")
     assert "--fixes is for the model lim" in refusal(capsys, folder, "--fixes", "8")
     assert "fixes" in refusal(capsys, folder, "--model", "lim", "--fixes", "2")
     assert "segments" in refusal(capsys, folder, "--model", "ppm", "--segments", "0")
@@ -451,3 +485,12 @@ def test_unknown_option_is_a_usage_error(folder):
     with pytest.raises(SystemExit) as stop:
         adjust(folder, "--model", "spline")
     assert stop.value.code == 2
+
+
+def test_the_clock_is_an_unknown_where_it_is_asked_for(folder, tmp_path):
+    code = main(["adjust", str(folder), "--clock-sigma", "0.01", "-o", str(tmp_path), "-q"])
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert code == 0 and content["platform"]["clock"]["unit"] == "s"
+    # the block's clocks agree
+    assert 0.0 < content["platform"]["clock"]["sigma"] < 0.0101
+    assert abs(content["platform"]["clock"]["value"]) < 4.0 * content["platform"]["clock"]["sigma"]

@@ -80,6 +80,7 @@ def placed(tmp_path_factory):
         table[columns] += [5e5, 5.4e6]
         table.to_csv(folder / name, index=False, float_format="%.9f")
     text = (folder / "project.toml").read_text().replace('name = "simulated"', 'name = "s"\ncrs = "EPSG:32632"')
+    text = text.replace("offset_sigma_m = [0.1, 0.1, 0.2]", "offset_sigma_m = [0.3, 0.3, 1.0]")  # as they are drawn
     (folder / "project.toml").write_text(text)
     rng = np.random.default_rng(2)
     write_heights(folder.parent / "dem.tif", surface_with_houses(folder, folder.parent / "dem.tif", rng))
@@ -89,14 +90,30 @@ def placed(tmp_path_factory):
 def test_heights_of_a_raster_hold_the_block_in_spite_of_houses(placed, tmp_path, capsys):
     folder, _ = placed
     free, _ = adjusted(folder, tmp_path / "free")
-    held, points = adjusted(folder, tmp_path / "held", "--dem", folder.parent / "dem.tif", "--dem-sigma", 0.3)
-    assert held["check"]["sigma_m"][2] < 0.75 * free["check"]["sigma_m"][2]
+    options = ["--dem", folder.parent / "dem.tif", "--dem-sigma", 0.3, "--dem-shift-sigma", 0.05]
+    held, points = adjusted(folder, tmp_path / "held", *options)
+    assert held["check"]["sigma_m"][2] < 0.5 * free["check"]["sigma_m"][2]
     assert held["check"]["rmse_m"][2] < 2.0 * held["check"]["sigma_m"][2]
     assert abs(held["check"]["mean_m"][2]) < 0.1  # houses of 15 m on a tenth of the cells would lift it by 1.5 m
+    assert held["dem"]["holds_height"] and abs(held["dem"]["shift_m"]) < 3 * held["dem"]["shift_sigma_m"]
     assert held["dem"]["n"] > 60 and 3 <= held["dem"]["half_weight_or_less"] < 30
     assert held["control"]["n"] == 0 and set(points.role) == {"tie", "check"}
     assert main(["adjust", str(folder), "--dem", str(folder.parent / "dem.tif"), "--dem-sigma", "0.3"]) == 0
-    assert "heights of the raster" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "heights of the raster" in out and "raster minus all else" in out
+
+
+def test_a_raster_in_another_datum_is_told_and_gives_no_height(placed, tmp_path, capsys):
+    folder, _ = placed
+    free, _ = adjusted(folder, tmp_path / "free")
+    with rasterio.open(folder.parent / "dem.tif") as source:
+        z, corner = source.read(1), source.xy(0, 0)
+    write_heights(tmp_path / "geoid.tif", Heights("EPSG:32632", z + 47.0, *corner, 10.0, -10.0, above_ellipsoid=True))
+    held, _ = adjusted(folder, tmp_path / "held", "--dem", tmp_path / "geoid.tif", "--dem-sigma", 0.3)
+    assert not held["dem"]["holds_height"] and held["dem"]["shift_m"] == pytest.approx(47.0, abs=3.0)
+    assert "vertical datum of --dem-crs?" in " ".join(held["notes"])
+    assert held["check"]["mean_m"][2] == pytest.approx(free["check"]["mean_m"][2], abs=0.2)
+    assert "NO height datum of the raster" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

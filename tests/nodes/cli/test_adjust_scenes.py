@@ -117,6 +117,45 @@ def test_models_and_sets(options, block, capsys):
     assert ("2 correction sets" in printed) == ("scene" not in options)
 
 
+def test_the_second_step_has_settings_of_its_own(block, capsys):
+    """What `[trajectory.then]` states is of the second model alone, and direct georeferencing of neither."""
+    project = block / "project.toml"
+    words = ["adjust", str(block), "--snoop", "--json", "--then", "lim", "--fixes", "4"]
+    assert main(words) == 0
+    free = json.loads(capsys.readouterr().out)
+    project.write_text(project.read_text() + "[trajectory.then]\noffset_sigma_m = 0.001\nshift_sigma_deg = 1e-9\n")
+    assert main(words) == 0
+    held = json.loads(capsys.readouterr().out)
+    assert held["then"] == "lim" and held["before"] == free["before"] and held["before"][0]["model"] == "dgr"
+    for strip in free["strips"]:
+        fixes = [
+            np.array([[fix["offset_m"], fix["offset_m_sigma"]] for fix in run["strips"][strip]["fixes"]])
+            for run in (free, held)
+        ]
+        assert np.abs(fixes[0]).max() > 0.1 and np.abs(fixes[1]).max() < 0.002
+    assert main(words[:-4]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert any("[trajectory.then]" in note for note in alone["notes"]) and "before" not in alone
+    for run in (free, held):
+        assert not any("[trajectory.then]" in note for note in run["notes"])
+        np.testing.assert_allclose(
+            run["direct_georeferencing"]["rmse_m"], alone["direct_georeferencing"]["rmse_m"], rtol=1e-3
+        )
+
+
+def test_locate_says_which_line_of_detectors_it_takes(made, tmp_path, capsys):
+    (tmp_path / "pixels.csv").write_text("column,row,height_m\n0,0,500\n")
+    words = ["locate", str(made / "spot5-hrs"), "--pixels", str(tmp_path / "pixels.csv"), "-o"]
+    texts = {}
+    for ccd in ("", "F", "B"):
+        out = tmp_path / f"{ccd}.csv"
+        assert main([*words, str(out), *(["--ccd", ccd] if ccd else [])]) == 0
+        said = "line of detectors F of F, B: --ccd takes another" in capsys.readouterr().out
+        assert said == (not ccd)
+        texts[ccd] = out.read_text()
+    assert texts[""] == texts["F"] != texts["B"]
+
+
 def test_rpc_and_dlt_beside_rigorous(block, capsys):
     scene = read_scene(block / "spot5-hrs")
     for ccd in "FB":
@@ -153,7 +192,9 @@ BAD = {
     "unknown model": ("project.toml", lambda t: t + 'model = "magic"\n', r"model: .*wanted one of rigorous, rpc"),
     "no polynomials": ("project.toml", lambda t: t + 'model = "rpc"\n', r"has no rational polynomials"),
     "crs": ("project.toml", lambda t: put(t, ("EPSG:4979", "EPSG:99999999")), r"project.crs: PROJ does not know"),
-    "sigma": ("project.toml", lambda t: t + "[trajectory]\noffset_sigma_m = [1, 2]\n", r"offset_sigma_m: wanted three"),
+    "sigma": ("project.toml", lambda t: t + "[trajectory]\noffset_sigma_m = [1, 2]\n", r"offset_sigma_m: .*wanted 3"),
+    "third step": ("project.toml", lambda t: t + "[trajectory.then.then]\nfixes = 4\n", r"then: .*no third step"),
+    "fixes of then": ("project.toml", lambda t: t + '[trajectory.then]\nfixes = "x"\n', r"then.fixes: 'x', wanted an"),
     "bad correction": ("project.toml", lambda t: t + '[rpc]\ncorrection = "cubic"\n', r"correction: .*affine or shift"),
     "role": ("ground_points.csv", lambda t: put(t, ("control", "anchor")), r"ground_points.csv:2: role: "),
     "sigma of control": ("ground_points.csv", lambda t: put(t, (",0.5,0.5,0.5,", ",0.5,,0.5,")), r"sigma_Y_m: missing"),
@@ -290,11 +331,6 @@ def test_new_scenes(made, tmp_path, capsys):
         assert match in capsys.readouterr().err
 
 
-def test_import_names_adjust(made, tmp_path, capsys):
-    assert main(["import", str(made), "-o", str(tmp_path / "a.mcap")]) == 1
-    assert "a block of satellite scenes, which `triline adjust` takes" in capsys.readouterr().err
-
-
 def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys):
     path = block / "image_points.csv"
     lines = path.read_text().splitlines()
@@ -324,6 +360,7 @@ def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys)
         (["--segments", "3"], "--segments is for the model ppm; asked for is dgr"),
         (["--model", "ppm", "--segments", "500"], "--segments 500, wanted 1 to 60"),
         (["--reweight"], "--reweight does not go with a block of satellite scenes"),
+        (["--dem", "d.tif", "--dem-sigma", "1"], "--dem does not go with a block of satellite scenes"),
     ],
 )
 def test_options_that_do_not_go(options, match, made, capsys):

@@ -118,6 +118,7 @@ def test_recover(capsys, flight, tmp_path):
 # ---- process
 
 
+@pytest.mark.study
 def test_process_twice_gives_the_same_bytes(tmp_path):
     one, two = tmp_path / "1.mcap", tmp_path / "2.mcap"
     for path in (one, two):
@@ -298,6 +299,7 @@ def test_replay_command(tmp_path, flight):
     assert got["sensor/lines/F"] == result["messages"]["sensor/lines/F"] and got["configuration/camera"] == 1
 
 
+@pytest.mark.study
 def test_replay_says_that_nobody_hears_it(tmp_path, flight):
     with Rig(tmp_path) as rig:
         done = command("replay", flight, "--rate", 0, "--port", rig.port)

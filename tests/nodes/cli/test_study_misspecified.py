@@ -47,7 +47,7 @@ def test_the_command(tmp_path, capsys):
     assert (stated["row"], datum["row"]) == ("stated", "gnss-datum")  # the baseline comes first
     assert datum["true"] == "gnss-datum=0.5" and len(datum["each"]) == 1
     assert datum["direct_m"] == pytest.approx(0.5 * np.sqrt(3), rel=0.5)
-    assert datum["direct_m"] > 2 * stated["direct_m"]
+    assert datum["direct_m"] > 1.5 * stated["direct_m"]  # which has the noise of the lines in it, mostly in height
     for cell in document["cells"]:
         for name in ("online_m", "batch_m", "components_m", "points_nees", "orientation_nees", "sigma0"):
             assert np.isfinite(cell[name]) and cell[name] > 0

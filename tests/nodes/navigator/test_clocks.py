@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from triline.nodes import convert
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
 from triline.nodes.simulator.simulator import Simulator
+from triline.schemas import messages as schema
 from triline.solver.navigation.clock_check import ClockCheck, offset_in_words
+from triline.solver.navigation.inertial_data import TACTICAL
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.inertial_sensors import InertialPlan
 from triline.solver.simulation.scenario import simulate
 
 EPOCH = 1_700_000_000_000_000_000
@@ -143,3 +147,178 @@ def test_fixes_are_used_again_when_the_clock_is_right_again():
         events[-1] == "GNSS clock agrees again: fixes are used" or "GNSS clock agrees again: fixes are used" in events
     )
     assert not node.alarm and off_m < 3.0
+
+
+# ---- tenths of a second
+
+
+@functools.cache
+def turning(imu: bool) -> tuple[Message, ...]:
+    """A turn between two strips: the sensors alone, numbered."""
+    plan = FlightPlan(strips=2, strip_s=15.0, lead_in_s=20.0, lead_out_s=25.0)
+    # centimetres: what an offset of attitudes hides in is the slow error of the GNSS
+    errors = ErrorModel(attitude_rate_hz=50.0, wander_sigma_m=(0.05, 0.05, 0.1), gnss_rate_hz=2.0)
+    unit = InertialPlan(TACTICAL, 50.0) if imu else None
+    numbers: dict[str, int] = {}
+    out = []
+    for m in Simulator(simulate(plan, 1, errors, inertial=unit)).messages(EPOCH):
+        if m.topic in Navigator.inputs:
+            n = numbers[m.topic] = numbers.get(m.topic, -1) + 1
+            out.append(Message(m.topic, m.stamp_ns, m.body, "simulator", n))
+    return tuple(out)
+
+
+def heard(messages, node: Navigator | None = None) -> tuple[Navigator, list[str], list]:
+    """The node, its event log and its smoothed poses."""
+    node = node or Navigator(filtered_s=1.0, smooth_every_s=4.0)  # answers are rarely wanted here
+    out = [o for message in messages for o in node.step(message)] + list(node.finish())
+    events = [o.body.message for o in out if o.topic == "event/log"]
+    return node, events, [o.body for o in out if o.topic == "trajectory/smoothed"]
+
+
+@functools.cache
+def in_step(imu: bool) -> tuple[Navigator, list[str], list]:
+    """The same of clocks that agree."""
+    return heard(turning(imu))
+
+
+def late_receiver(offset_s: float, imu: bool) -> list[Message]:
+    """A receiver whose clock is off all along; its fixes come when they come."""
+    return [shifted(m, offset_s) if m.topic == "sensor/gnss" else m for m in turning(imu)]
+
+
+@pytest.mark.parametrize("imu", [False, True])
+def test_clocks_that_agree_are_not_accused(imu):
+    node, events, _ = in_step(imu)
+    assert not any("clock" in text for text in events) and not node.alarm
+    assert "GNSS clock" not in node.state()  # the turn has shown it
+
+
+@pytest.mark.parametrize(("offset_s", "imu"), [(0.1, True), (0.9, True), (0.9, False)])
+def test_tenths_of_a_second_are_named_after_a_turn_and_corrected_on_the_operators_word(offset_s, imu):
+    messages = late_receiver(offset_s, imu)
+    node, events, poses = heard(messages)
+    named = [text for text in events if "GNSS is left out" in text]
+    found = re.search(r"GNSS clock ([0-9.]+) s (behind|ahead of) the (inertial|attitude) clock", named[0])
+    assert found, named
+    ahead_s = float(found[1]) * (1.0 if found[2] == "ahead of" else -1.0)
+    assert ahead_s == pytest.approx(offset_s, abs=0.03 if imu else 0.12)
+    assert "GNSS is left out" in node.alarm and "triline confirm sensor/gnss --clock" in node.alarm
+    assert node.counters["gnss of another clock"] > 20
+    newest = max(convert.time_ns(b.timestamp) for b in poses) if poses else 0
+    assert newest < messages[-1].stamp_ns - 10 * SECOND  # nothing is said of the end of the flight
+    # the same with the operator's word from the start
+    verdict = schema.Verdict(topic="sensor/gnss", accepted=True, by="ann", clock_s=-offset_s)
+    first = next(i for i, message in enumerate(messages) if message.topic != "configuration/project")
+    told = Message("observation/verdict", messages[first].stamp_ns, verdict, "surveyor", 0)
+    node, events, poses = heard([*messages[:first], told, *messages[first:]])
+    assert f"sensor/gnss is corrected by {-offset_s:+.3f} s from now on (ann)" in events
+    assert not node.alarm and not any("left out" in text for text in events)
+    right = positions(in_step(imu)[2])
+    off = [np.linalg.norm(p - right[t]) for t, p in positions(poses).items() if t in right]
+    assert len(off) > 300 and max(off) < 0.5
+
+
+def test_a_recording_is_processed_with_the_clock_set_right():
+    _, events, poses = heard(late_receiver(0.9, True), Navigator(filtered_s=1.0, smooth_every_s=4.0, gnss_clock_s=-0.9))
+    assert not any("clock" in text for text in events) and len(poses) > 300
+    with pytest.raises(ValueError, match="gnss_clock_s is 1e"):
+        Navigator(gnss_clock_s=1e6)
+    node = Navigator()
+    bad = schema.Verdict(topic="sensor/gnss", accepted=True, clock_s=float("nan"))
+    assert not list(node.step(Message("observation/verdict", EPOCH, bad))) and node.counters["malformed"] == 1
+
+
+def test_without_a_turn_nothing_shows_tenths_and_the_node_says_so():
+    node, events, _ = heard([shifted(m, 0.1) if m.topic == "sensor/gnss" else m for m in flight()])
+    assert not any("clock" in text for text in events)
+    assert node.state() == "running, GNSS clock not seen: no turn yet"
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("imu", [False, True])
+def test_offsets_are_as_uncertain_as_they_say(imu):
+    found = []
+    for seed in range(12):
+        plan = FlightPlan(strips=2, strip_s=15.0, lead_in_s=20.0, lead_out_s=25.0)
+        unit = InertialPlan(TACTICAL, 50.0) if imu else None
+        node = Navigator()
+        for message in Simulator(
+            simulate(plan, seed, ErrorModel(attitude_rate_hz=50.0, gnss_rate_hz=2.0), inertial=unit)
+        ).messages(EPOCH):
+            if message.topic in Navigator.inputs:
+                node.step(message)
+        assert not node.alarm
+        found.append(node._offset._last)
+    w = np.array([f.offset_s / f.sigma_s for f in found if f])
+    assert len(w) > 9 and 0.3 < np.sqrt(np.mean(w**2)) < 1.8
+
+
+# ---- positions that drift
+
+
+def drifting(message: Message, first_s: float, to_s: float, rate_m_s: float) -> Message:
+    """A forged fix in the receiver's name: north of the true one, by more and more."""
+    t = (message.stamp_ns - EPOCH) / SECOND
+    if message.topic != "sensor/gnss" or not first_s < t < to_s:
+        return message
+    body = type(message.body)()
+    body.CopyFrom(message.body)
+    body.latitude += rate_m_s * (t - first_s) / 111_200.0
+    return Message(message.topic, message.stamp_ns, body, message.source, message.sequence)
+
+
+def test_gnss_forged_with_a_drift_is_named_and_genuine_fixes_are_used_afterwards():
+    first, to = 40.0, 60.0
+    node = Navigator(filtered_s=1.0, smooth_every_s=4.0)
+    events, poses, alarms = [], [], set()
+    for message in turning(True):
+        out = list(node.step(drifting(message, first, to, 0.5)))
+        events += [o.body.message for o in out if o.topic == "event/log"]
+        poses += [o.body for o in out if o.topic == "trajectory/smoothed"]
+        alarms.add(node.alarm)
+    poses += [o.body for o in node.finish() if o.topic == "trajectory/smoothed"]
+    named = [text for text in events if "GNSS positions contradict the inertial data" in text]
+    rate = re.search(r"most north, changing by ([0-9.]+) m/s: not used", named[0])
+    assert len(named) == 1 and rate and float(rate[1]) == pytest.approx(0.5, abs=0.1)
+    assert any("GNSS positions contradict" in alarm for alarm in alarms) and not node.alarm
+    assert any(text.startswith("GNSS positions agree again after") for text in events)
+    right = positions(in_step(True)[2])
+    off = {t: np.linalg.norm(p - right[t]) for t, p in positions(poses).items() if t in right}
+    assert max(off.values()) < 1.5  # of the 10 m that were forged
+    after = [o for t, o in off.items() if t > EPOCH + round((to + 3.0) * SECOND)]
+    assert len(after) > 100 and max(after) < 0.1
+
+
+def test_with_attitude_alone_the_jump_back_is_named_and_genuine_fixes_are_used_after_a_second():
+    half = (flight()[len(flight()) // 2].stamp_ns - EPOCH) / SECOND
+    node, events, poses = heard([drifting(message, half - 12.0, half, 0.5) for message in flight()])
+    assert any("GNSS position jumped by" in text and "wrong is what was before" in text for text in events), events
+    right = positions(right_poses())
+    after = EPOCH + round((half + 4.0) * SECOND)
+    off = [np.linalg.norm(p - right[t]) for t, p in positions(poses).items() if t in right and t > after]
+    assert len(off) > 100 and max(off) < 1.0
+    assert node.counters["gnss refused"] < 8
+
+
+def test_attitudes_that_are_silent_accuse_no_clock_and_frozen_ones_are_not_used():
+    half = flight()[len(flight()) // 2].stamp_ns
+    silent, frozen, held = [], [], None
+    for message in flight():
+        inside = message.topic == "sensor/attitude" and half < message.stamp_ns < half + 5 * SECOND
+        if inside:
+            held = held or message.body
+            body = type(held)()
+            body.CopyFrom(message.body)
+            body.roll, body.pitch, body.heading = held.roll, held.pitch, held.heading
+            frozen.append(Message(message.topic, message.stamp_ns, body, message.source, message.sequence))
+        else:
+            silent.append(message)
+            frozen.append(message)
+    node, events, _ = heard(silent)
+    assert not any("clock" in text for text in events) and not node.alarm
+    node, events, poses = heard(frozen)
+    assert any("attitude has been the same for 1.0 s" in text for text in events) and not node.alarm
+    assert "attitude changes again" in events and node.counters["attitude frozen"] > 100
+    times = [convert.time_ns(b.timestamp) for b in poses if b.valid]
+    assert not [t for t in times if half + 2 * SECOND < t < half + 4 * SECOND]

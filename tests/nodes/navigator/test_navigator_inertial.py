@@ -92,6 +92,7 @@ def check_aligning(bodies: list) -> float:
     return (convert.time_ns(bodies[first].timestamp) - convert.time_ns(bodies[0].timestamp)) * 1e-9
 
 
+@pytest.mark.study
 def test_a_recorded_flight_is_aligned_in_motion_and_navigated(flight: Path, processed: Path):
     filtered, smoothed = (poses_of(processed, topic) for topic in TOPICS)
     assert 8.0 < check_aligning(filtered) < 40.0
@@ -279,6 +280,7 @@ def test_duplicates_and_disorder_of_samples_change_nothing(short):
     assert [o.body for o in out] == [o.body for o in good]
 
 
+@pytest.mark.study
 def test_measured_attitude_beside_inertial_data_is_left_aside_and_counted(short):
     messages, _ = short
     node = Navigator()
@@ -289,6 +291,7 @@ def test_measured_attitude_beside_inertial_data_is_left_aside_and_counted(short)
     assert [o.body for o in out] == [o.body for o in run(Navigator(), messages)]
 
 
+@pytest.mark.study
 def test_an_outage_is_told_once_the_pose_is_too_uncertain_and_ends_with_it():
     messages, truth = messages_of(4, MEMS, 110.0)
     lost = [x for x in messages if not (x.topic == "sensor/gnss" and 40.0 < (x.stamp_ns - EPOCH) / 1e9 < 90.0)]

@@ -132,6 +132,54 @@ def test_roads_become_straight(flown, simulated):
     assert off["truth"] < 0.2  # the noise of the measurement
 
 
+def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(flown, folder, capsys):
+    out = folder / "adjusted"
+    command = ["adjust", flown, "--selfcal", "tls18", "--keep", "all", "-o", out, "--per-line", "-q"]
+    assert main([*map(str, command)]) == 0
+    camera = Recording(flown).camera()
+    found, path = work.camera_beside(out / "trajectory_refined.csv", camera)
+    assert path == out / "camera.json"
+    moved = [np.abs(a.xy_mm - b.xy_mm).max() for a, b in zip(found.lines, camera.lines, strict=True)]
+    assert max(moved) > 1e-5
+    options = ["--gsd", 8, "--dem", folder / "dem.tif", "--dem-crs", "ellipsoid"]
+    whole = {}
+    for name in ("trajectory_refined.csv", "orientation_lines.csv"):
+        told = _rectify(capsys, flown, folder / "calibrated.tif", "--trajectory", out / name, *options)
+        assert told["camera"] == str(path) and told["orientation"] == name
+        with rasterio.open(folder / "calibrated.tif") as image:
+            whole[name] = image.read(1), image.transform
+    # a camera that is 40 pixels off across the track takes the orthoimage along
+    table = out / "camera_N.csv"
+    rows = np.loadtxt(table, delimiter=",", skiprows=1)
+    rows[:, 2] += 40 * abs(rows[1, 2] - rows[0, 2])
+    np.savetxt(table, rows, delimiter=",", header="sample,x_mm,y_mm", comments="", fmt=("%d", "%.9f", "%.9f"))
+    _rectify(capsys, flown, folder / "off.tif", "--trajectory", out / "trajectory_refined.csv", *options)
+    with rasterio.open(folder / "off.tif") as image:
+        apart = np.hypot(image.transform.c - whole[name][1].c, image.transform.f - whole[name][1].f)
+        assert apart > 30 or not np.array_equal(image.read(1), whole["trajectory_refined.csv"][0])
+    (out / "camera.json").write_text((out / "camera.json").read_text().replace('"id": "N"', '"id": "M"'))
+    assert (
+        main(["rectify", str(flown), "-o", str(folder / "x.tif"), "--trajectory", str(out / "orientation_lines.csv")])
+        == 1
+    )
+    assert "stands beside orientation_lines.csv and has other lines, wanted F with" in capsys.readouterr().err
+
+
+def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):
+    names = {"dX": 0.1, "phi drift": 1e-6, "shift of the surface": 0.4, "clock": 1e-4, "xp_F": 0.01, "dc": 0.02}
+    parameters = [m.ParameterEstimate(name=name, value=value) for name, value in names.items()]
+    path = folder / "parameters.mcap"
+    with RecordingWriter(path) as writer:
+        for message in RecordingReader(flown).messages(["configuration/camera"]):
+            writer.write(message)
+        report = m.AdjustmentReport(parameters=parameters)
+        writer.write(Message("adjustment/report", message.stamp_ns + 1, report, "adjuster"))
+    camera = Recording(path).camera()
+    found, n = work.estimated_camera(Recording(path), camera)
+    assert n == 2
+    assert np.abs(found.lines[0].xy_mm - camera.lines[0].xy_mm).max() > 0.005
+
+
 def test_choices_of_rectify(flown, folder, capsys):
     best = _rectify(capsys, flown, folder / "best.tif", "--gsd", 8, "--dem", "points")
     assert best["orientation"] == "whole" and best["pixels_together"] == 3 and best["gsd"] == 8
@@ -148,9 +196,55 @@ def test_choices_of_rectify(flown, folder, capsys):
     assert "whole orientation, height" in capsys.readouterr().out
 
 
+def test_heights_of_a_flight_folder(flown, dem, tmp_path, capsys):
+    toml = tmp_path / "flight.toml"
+    toml.write_text(f'[dem]\nfile = "{dem}"\ncrs = "ellipsoid"\n')
+    by_folder, by_file = (
+        _rectify(capsys, flown, tmp_path / "o.tif", "--gsd", 10, "--dem", *given)
+        for given in ((tmp_path,), (dem, "--dem-crs", "ellipsoid"))
+    )
+    assert by_folder | {"seconds": 0} == by_file | {"seconds": 0} and "dem.tif" in by_folder["ground"]
+    toml.write_text("[flight]\n")
+    assert main(["rectify", str(flown), "-o", str(tmp_path / "o.tif"), "--dem", str(tmp_path)]) == 1
+    assert "wanted a table [dem] with file" in capsys.readouterr().err
+
+
+def test_sigmas_beside_the_orthoimage(flown, dem, folder, capsys):
+    """Of the covariance of the orientation in use, the heights and matching; cells as the orthoimage."""
+    sigma, values = folder / "sigma.tif", {}
+    for name, options in {
+        "measured": (), "final": (), "truth": ("--pixel-sigma", 0.5, "--height-sigma", 2.0),
+    }.items():  # fmt: skip
+        result = _rectify(
+            capsys, flown, folder / "o.tif", "--orientation", name, "--dem", dem, "--gsd", 8, "--sigma", sigma, *options
+        )
+        with rasterio.open(sigma) as image, rasterio.open(folder / "o.tif") as grey:
+            assert image.shape == grey.shape == (result["rows"], result["columns"]) and image.crs == grey.crs
+            assert image.transform == grey.transform and np.isnan(image.nodata) and image.count == 2
+            band, seen = image.read(), grey.read(1) > 0
+        assert (np.isfinite(band[0]) == seen).mean() > 0.999
+        values[name] = np.nanmedian(band, axis=(1, 2))
+    # the measured orientation is known to some metres and tenths of a degree; ties and control make much more of it
+    assert 5.0 < values["measured"][0] < 50.0 and values["final"][0] < 0.2 * values["measured"][0]
+    pixel = _rectify(capsys, flown, folder / "p.tif", "--dem", dem)["gsd"]
+    assert values["truth"] == pytest.approx([np.hypot(np.sqrt(2) * 0.5 * pixel, 0.3), 2.0], rel=0.25)
+
+
+def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder, capsys):
+    plain = _rectify(capsys, flown, folder / "r0.tif", "--gsd", 8, "--crs", "local")
+    bent = _rectify(capsys, flown, folder / "r1.tif", "--gsd", 8, "--crs", "local", "--refraction")
+    assert "refraction" in bent["ground"] and "refraction" not in plain["ground"]
+    with rasterio.open(folder / "r0.tif") as a, rasterio.open(folder / "r1.tif") as b:
+        assert np.abs(np.subtract(a.bounds, b.bounds)).max() <= 8.0  # centimetres at this height: the same cells
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
+        (["--refraction", "1", "2"], "--refraction: 2 values, wanted none, or temperature"),
+        (["--pixel-sigma", "0.3"], "--pixel-sigma: goes with --sigma FILE"),
+        (["--sigma", "s.tif", "--height-sigma", "-1"], "--height-sigma -1.0: wanted a number of at least 0"),
+        (["--position-sigma", "1", "1", "1"], "--position-sigma: goes with an image and its --sensor"),
         (["--ccd", "X"], "no image lines of CCD line 'X', there are: F, N, B"),
         (["--strip", "S9"], "no strip 'S9', there are: S1"),
         (["--gsd", "0"], "--gsd 0.0: wanted more than 0"),
@@ -293,6 +387,7 @@ def test_node_counts_what_it_cannot_use(flown):
             Rectifier(**bad)
 
 
+@pytest.mark.study
 def test_a_small_budget_does_not_wait_for_the_final_orientation(flown):
     node = Rectifier(budget_mb=0.05)
     out = [t for message in RecordingReader(flown).sorted_messages(list(node.inputs)) for t in node.step(message)]

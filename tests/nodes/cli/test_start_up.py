@@ -1,0 +1,58 @@
+"""What a command imports before it works, which says without a clock how long people wait for help and errors."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+from places import ROOT
+
+#: Packages that take 0.1 s and more to import each.
+HEAVY = (
+    "pandas",
+    "scipy.stats",
+    "scipy.signal",
+    "scipy.interpolate",
+    "rasterio",
+    "matplotlib",
+    "rerun",
+    "rosbags",
+    "h5py",
+)
+
+
+def imported(*words: str) -> set[str]:
+    """Which heavy packages a command has imported when it ends."""
+    code = (
+        "import json, sys\nfrom triline.nodes.cli import main\n"
+        f"try:\n    main({list(words)!r})\nexcept SystemExit:\n    pass\n"
+        f"print('\\n' + json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    return set(json.loads(run.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "recordings/strip.mcap"),
+        ("adjust", "none.mcap"),
+        ("rectify", "none.mcap", "-o", "none.tif"),
+        ("navigate", "none"),
+        ("import", "none", "-o", "none.mcap"),
+        ("export", "none.mcap", "--topic", "event/log", "--csv", "none.csv"),
+        ("analyze", "none.mcap"),
+        ("view", "none.mcap"),
+        ("fly", "none"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_help_pages_errors_and_info_import_nothing_heavy(words):
+    assert imported(*words) == set()
+
+
+def test_a_heavy_package_would_be_seen(tmp_path):
+    words = ("export", "recordings/strip.mcap", "--topic", "sensor/gnss", "--csv", str(tmp_path / "gnss.csv"))
+    assert "pandas" in imported(*words)
