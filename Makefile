@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # tests and studies use processes, not BLAS threads
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test docs lint bench study schemas golden clean
+.PHONY: help demo test docs lint bench study lowest schemas golden clean
 
 help:
 	@echo "make demo    live on-line triangulation of a simulated flight (headless where there is no display)"
@@ -12,7 +12,8 @@ help:
 	@echo "make lint    ruff, type checker, import contract"
 	@echo "make bench   benchmarks; writes their tables into docs/benchmarks.md"
 	@echo "make docs    the documentation as a site, in build/docs"
-	@echo "make study   slow statistical studies"
+	@echo "make study   slow statistical studies and the fuzz campaign"
+	@echo "make lowest  all tests with the lowest versions that pyproject.toml allows"
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
 
@@ -58,7 +59,15 @@ bench: $(VENV)/.bench
 
 study: $(VENV)/.bench
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m study
+	$(BIN)/python bench/fuzz.py --cases 1000000 --seconds 3600
 	$(BIN)/triline study all
+
+# the oldest dependencies that pyproject.toml names, in an environment of their own
+lowest:
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet uv
+	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[dev]'
+	PATH="$(CURDIR)/.venv-lowest/bin:$$PATH" .venv-lowest/bin/python -m pytest -n 2 --dist worksteal
 
 golden: $(VENV)/.dev
 	$(BIN)/python recordings/golden.py

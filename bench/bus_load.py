@@ -2,6 +2,7 @@
 
     python bench/bus_load.py            # 30 s
     python bench/bus_load.py --seconds 5
+    python bench/bus_load.py --secure    # the same over TLS with certificates and access lists
 
 Every publisher is a process of its own; the recorder is ``triline node recorder`` as it is. Prints what was lost, how
 much of a core the recorder took, and the latency from publishing to reception.
@@ -18,11 +19,14 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import frame
 import numpy as np
 import psutil
 
+from triline.nodes.bus.authority import Authority
+from triline.nodes.bus.bundle import load_bundle
 from triline.nodes.bus.processes import ALLOCATOR
 from triline.nodes.bus.session import Bus
 from triline.nodes.convert import gnss_message
@@ -33,18 +37,20 @@ from triline.schemas.image_lines import LineBlock
 
 N_SAMPLES, LINES, LINE_RATE_HZ = 12_000, 32, 800.0
 RATES_HZ = {"F": LINE_RATE_HZ / LINES, "N": LINE_RATE_HZ / LINES, "B": LINE_RATE_HZ / LINES, "imu": 500.0, "gnss": 5.0}
-START_DELAY_S = 3.0
+START_DELAY_S = 8.0
+PLATFORM = "aircraft1"
 #: What the recorder may take of a core.
 WANTED_CORES = 0.5
 
 
-def publish(what: str, port: int, seconds: float, begin: float) -> None:
+def publish(what: str, port: int, seconds: float, begin: float, bundle: str = "") -> None:
     """One publisher; prints how many messages it sent and how much of a core it took."""
     rate = RATES_HZ[what]
     n = round(seconds * rate)
     # 12-bit grey values with noise, as a camera gives them
     pixels = np.random.default_rng(1).normal(1500, 3, (LINES, N_SAMPLES)).astype("<u2") if len(what) == 1 else None
-    with Bus(port=port, source=what) as bus:
+    where: dict[str, Any] = {"platform": PLATFORM, "secure": load_bundle(Path(bundle))} if bundle else {}
+    with Bus(port=port, source=what, **where) as bus:
         time.sleep(max(0.0, begin - time.time()))
         cpu = time.process_time()
         for i in range(n):
@@ -68,16 +74,20 @@ def _message(what: str, i: int, pixels: np.ndarray | None) -> Message:
     return Message("sensor/gnss", now, gnss_message(now, (48.9, 8.9, 2000.0), (0.02, 0.02, 0.04)))
 
 
-def measure(seconds: float, port: int, compression: str) -> dict:
+def measure(seconds: float, port: int, compression: str, secure: bool = False) -> dict:
     """Run recorder and publishers, read the recording."""
     environment = {**os.environ, **ALLOCATOR}
     with tempfile.TemporaryDirectory(prefix="triline-bench-") as folder:
         output = Path(folder) / "load.mcap"
+        bundle = (
+            str(Authority.create(Path(folder) / "survey").certify(PLATFORM, "aircraft", [], port)) if secure else ""
+        )
         command = [*frame.TRILINE, "node", "recorder", "-q", "--port", str(port)]
         command += ["-o", str(output), "--set", f"compression={compression}"]
+        command += ["--platform", PLATFORM, "--secure", bundle] if secure else []
         recorder = subprocess.Popen(command, env=environment)
         begin = time.time() + START_DELAY_S
-        arguments = [str(port), str(seconds), str(begin)]
+        arguments = [str(port), str(seconds), str(begin), bundle]
         publishers = [
             subprocess.Popen(
                 [sys.executable, __file__, "--publish", what, *arguments], env=environment, stdout=subprocess.PIPE
@@ -119,13 +129,14 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--port", type=int, default=17547)
     parser.add_argument("--compression", default="none", choices=("none", "lz4", "zstd"))
-    parser.add_argument("--publish", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--secure", action="store_true", help="TLS with certificates, and access lists")
+    parser.add_argument("--publish", nargs=5, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.publish:
-        what, port, seconds, begin = args.publish
-        publish(what, int(port), float(seconds), float(begin))
+        what, port, seconds, begin, bundle = args.publish
+        publish(what, int(port), float(seconds), float(begin), bundle)
         return 0
-    result = measure(args.seconds, args.port, args.compression)
+    result = measure(args.seconds, args.port, args.compression, args.secure)
     if args.json:
         print(json.dumps(result, indent=2))
     else:

@@ -209,8 +209,8 @@ BENCHMARKS = (
     Benchmark(
         "bus-load",
         "Do bus and recorder keep up with three full CCD lines, 57.6 MB/s?",
-        ("python bench/bus_load.py",),
-        1,
+        ("python bench/bus_load.py", "python bench/bus_load.py --secure"),
+        2,
     ),
     Benchmark(
         "recordings",
@@ -277,6 +277,12 @@ BENCHMARKS = (
         12,
     ),
     Benchmark(
+        "real-pixels",
+        "How good are matches of real pushbroom pixels, and does the matcher know it?",
+        ("python bench/real_pixels.py", "python bench/real_pixels.py --largest-sigma 0.3"),
+        1,
+    ),
+    Benchmark(
         "matched-ties",
         "Are matched tie points worth as much as simulated ones of the same noise?",
         (
@@ -295,7 +301,13 @@ BENCHMARKS = (
         "testfields",
         "Does the adjustment reach the accuracy published for real testfields?",
         ("triline study testfields --seeds 10",),
-        1,
+        8,
+    ),
+    Benchmark(
+        "scenes",
+        "Are errors of adjusted satellite scenes as large as their sigmas say?",
+        ("triline study scenes --seeds 50",),
+        2,
     ),
     Benchmark(
         "batch-sigmas",
@@ -307,6 +319,24 @@ BENCHMARKS = (
         "freezes",
         "Does a node that stood still around the lease of its links hear its sensors again?",
         ("python bench/link_freezes.py --freezes 12 --least 4.4 --most 5.0",),
+        6,
+    ),
+    Benchmark(
+        "faults",
+        "What is lost when nodes are killed or stand still, how long until all is right, what is the operator told?",
+        ("python bench/faults.py --kind processes",),
+        18,
+    ),
+    Benchmark(
+        "faults-data",
+        "The same of sensors that fail: clocks, NaN, frozen, silent, lost, twice, out of order, drifting",
+        ("python bench/faults.py --kind data",),
+        3,
+    ),
+    Benchmark(
+        "fuzz",
+        "Do readers and nodes stand hostile files and messages whose checksums are right?",
+        ("python bench/fuzz.py --cases 4000 --seconds 40",),
         6,
     ),
     Benchmark(
