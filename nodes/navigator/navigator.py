@@ -314,11 +314,12 @@ class Navigator(Node):
         time_s = self._seconds(self._time_ns(body))
         covariance_l = R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
         velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
-        if not self._in_step(local_fix(frame, time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)):
+        fix = local_fix(frame, time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
+        if not self._in_step(fix):
             return []
         if isinstance(self._engine, KinematicFilter):
             return self._engine.add_gnss(time_s, antenna_l, covariance_l)
-        return self._engine.add_gnss(time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
+        return self._engine.add_fix(fix)
 
     def _in_step(self, fix: GnssData) -> bool:
         """Whether motion says that a fix has the time of the other sensors, as far as motion has shown it."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from ..ordering import Key, StreamCheck, is_orderly, order_key
 from ..step_driver import StepDriver
 from ..voices import VERDICT
 from .reader import RecordingReader
-from .runner_apart import BATCH, UNDER_WAY, Apart, Item, flat_from, raw_from, raw_of
+from .runner_apart import Ahead
 
 
 @dataclass
@@ -49,6 +50,20 @@ class ProcessSummary:
     states: dict[str, str] = field(default_factory=dict)
     first_ns: int = 0
     last_ns: int = 0
+
+    def drop(self, kind: str, text: str, n: int = 1) -> None:
+        """Count messages that are not usable."""
+        self.dropped[kind] += n
+        self.last_problem = text
+
+    def add(self, other: ProcessSummary) -> None:
+        """What other nodes of the same run did; inputs are counted once."""
+        self.outputs += other.outputs
+        self.dropped += other.dropped
+        self.last_problem = other.last_problem or self.last_problem
+        self.counters |= other.counters
+        self.problems |= other.problems
+        self.states |= other.states
 
 
 def active_nodes(nodes: Sequence[Node], recorded: Iterable[str]) -> list[Node]:
@@ -123,17 +138,92 @@ def process(
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
     drivers = [StepDriver(node) for node in running]
-    if apart and Apart.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
-        line: _Line = _LineApart(reader, drivers, write, summary)
+    numbers = _usable(reader, made, summary)
+    told = _Progress(progress, len(numbers))
+    if apart and Ahead.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
+        line = _Line(drivers[-1:], write, summary)
+        ahead = Ahead(lambda: _handed_on(reader, numbers, drivers[:-1]), " and ".join(summary.nodes[:-1]))
+        try:
+            for batch in ahead:
+                told.add(_take(batch, reader, line, summary))
+        finally:
+            ahead.close()
+        summary.counters = {name: summary.counters.get(name, {}) for name in summary.nodes[:-1]} | summary.counters
     else:
         line = _Line(drivers, write, summary)
-    try:
-        for number, message, raw in _inputs(reader, made, line.is_heard, summary, progress):
-            line.take(number, message, raw)
-        line.finish()
-    finally:
-        line.close()
+        for recorded_message in reader.raws(numbers):
+            line.take(_at_its_stamp(recorded_message))
+            told.add(1)
+    line.finish()
     return summary
+
+
+#: A message that a node has made, on its way from the other process: topic, stamp, source, number, payload.
+Flat = tuple[str, int, str, int, bytes]
+#: What is handed on from there: the number of a recorded message or what a node has made; None where the recording has
+#: ended; at last what the nodes there said.
+Item = int | Flat | ProcessSummary | None
+
+
+def _handed_on(reader: RecordingReader, numbers: NDArray[np.int64], drivers: Sequence[StepDriver]) -> Iterator[Item]:
+    """The first nodes over the recording: what they hand on to the last one, in order."""
+    summary = ProcessSummary()
+    handed: list[RawMessage] = []
+    line = _Line(drivers, handed.append, summary)
+    for number, recorded in zip(numbers.tolist(), reader.raws(numbers), strict=True):
+        raw = _at_its_stamp(recorded)
+        line.take(raw)
+        for one in handed:
+            yield number if one is raw else _flat(one)
+        handed.clear()
+    line.settle()
+    yield from map(_flat, handed)
+    handed.clear()
+    yield None
+    line.finish()
+    yield from map(_flat, handed)
+    yield summary
+
+
+def _take(batch: list[Item], reader: RecordingReader, line: _Line, summary: ProcessSummary) -> int:
+    """The last node's part of a batch; returns how many recorded messages were in it."""
+    numbers = [item for item in batch if isinstance(item, int)]
+    recorded = reader.raws(np.array(numbers, dtype=np.int64))
+    for item in batch:
+        if isinstance(item, int):
+            line.take(_at_its_stamp(next(recorded)))
+        elif isinstance(item, tuple):
+            topic, stamp_ns, source, sequence, data = item
+            line.take_made(RawMessage(topic, Envelope(stamp_ns, source, sequence), data, stamp_ns))
+        elif item is None:
+            line.settle()
+        else:
+            summary.add(item)
+    return len(numbers)
+
+
+def _flat(raw: RawMessage) -> Flat:
+    return raw.topic, raw.envelope.stamp_ns, raw.envelope.source, raw.envelope.sequence, bytes(raw.data)
+
+
+def _at_its_stamp(recorded: RawMessage) -> RawMessage:
+    """Received when it was stamped, as a node has it."""
+    return RawMessage(recorded.topic, recorded.envelope, recorded.data, recorded.envelope.stamp_ns)
+
+
+class _Progress:
+    """Tells now and then how much is done."""
+
+    def __init__(self, tell: Callable[[float], None] | None, total: int) -> None:
+        self._tell, self._total, self._done, self._told_s = tell, total, 0, time.monotonic()
+
+    def add(self, n: int) -> None:
+        """So many messages more."""
+        before = self._done // 256
+        self._done += n
+        if self._tell is not None and self._done // 256 > before and time.monotonic() - self._told_s > 0.2:
+            self._told_s = time.monotonic()
+            self._tell(self._done / self._total)
 
 
 def _feeds(node: Node, others: Sequence[Node]) -> bool:
@@ -158,33 +248,43 @@ class _Line:
         self._listeners: dict[str, list[StepDriver]] = {}
         self._pending: list[tuple[Key, Message, RawMessage]] = []
 
-    def is_heard(self, topic: str) -> bool:
-        """Whether a node listens to a topic."""
-        return bool(self._listening(topic))
-
-    def take(self, number: int, message: Message | None, raw: RawMessage) -> None:
-        """The next input, and its number in the recording; decoded if a node listens."""
+    def take(self, raw: RawMessage) -> None:
+        """The next message of the recording; what cannot be decoded, and a node would need, is left out and counted."""
+        message = None
+        if self._listening(raw.topic):
+            try:
+                message = _message(raw, codec.decode(raw.topic, raw.data))
+            except ValueError as error:
+                e = raw.envelope
+                self._summary.drop("malformed", f"{raw.topic} {e.sequence} of {e.source!r}: {error}")
+                return
+        self._summary.inputs[raw.topic] += 1
         if self._pending:
             self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        self._hand_on(message, raw, number)
+        self._hand_on(message, raw)
+
+    def take_made(self, raw: RawMessage) -> None:
+        """The next message, of a node before these."""
+        if self._pending:
+            self._hand_on_pending(order_key(raw.topic, raw.envelope))
+        heard = bool(self._listening(raw.topic))
+        self._hand_on(_message(raw, codec.parse(raw.topic, raw.data)) if heard else None, raw)
+
+    def settle(self) -> None:
+        """Hand on what the nodes have put out so far."""
+        self._hand_on_pending(None)
 
     def finish(self) -> None:
         """There are no more inputs."""
-        self._hand_on_pending(None)
+        self.settle()
         for driver in self._drivers:
             self._queue(driver.finish())
-            self._hand_on_pending(None)
+            self.settle()
             node = driver.node
-            self._conclude(node.name, node.counters, node.last_problem, node.state())
-
-    def close(self) -> None:
-        """Give back what the nodes needed."""
-
-    def _conclude(self, name: str, counters: Counter[str], problem: str, state: str) -> None:
-        self._summary.counters[name] = dict(sorted(counters.items()))
-        self._summary.states[name] = state
-        if problem:
-            self._summary.problems[name] = problem
+            self._summary.counters[node.name] = dict(sorted(node.counters.items()))
+            self._summary.states[node.name] = node.state()
+            if node.last_problem:
+                self._summary.problems[node.name] = node.last_problem
 
     def _listening(self, topic: str) -> list[StepDriver]:
         if topic not in self._listeners:
@@ -193,11 +293,14 @@ class _Line:
 
     def _queue(self, outputs: list[Message]) -> None:
         for output in outputs:
-            raw = raw_of(output)
+            raw = RawMessage(
+                output.topic, Envelope(output.stamp_ns, output.source, output.sequence), codec.encode(output.body),
+                output.stamp_ns,
+            )  # fmt: skip
             heapq.heappush(self._pending, (order_key(output.topic, raw.envelope), output, raw))
             self._summary.outputs[output.topic] += 1
 
-    def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
+    def _hand_on(self, message: Message | None, raw: RawMessage) -> None:
         self._write(raw)
         if message is not None:
             for driver in self._listening(raw.topic):
@@ -209,109 +312,17 @@ class _Line:
             self._hand_on(message, raw)
 
 
-class _LineApart(_Line):
-    """The same with the last node in a process of its own: what is handed on waits for its answer to be written."""
-
-    def __init__(
-        self,
-        reader: RecordingReader,
-        drivers: Sequence[StepDriver],
-        write: Callable[[RawMessage], None],
-        summary: ProcessSummary,
-    ) -> None:
-        super().__init__(drivers[:-1], write, summary)
-        self._last_driver = drivers[-1]
-        self._last = drivers[-1].node
-        self._heard_apart: dict[str, bool] = {}
-        self._apart = Apart(reader, drivers[-1])
-        self._batch: list[RawMessage] = []
-        self._items: list[Item] = []
-        self._waiting: deque[list[RawMessage]] = deque()
-        self._answered: list[tuple[Key, RawMessage]] = []
-
-    def is_heard(self, topic: str) -> bool:
-        return super().is_heard(topic) or self._is_heard_apart(topic)
-
-    def finish(self) -> None:
-        self._hand_on_pending(None)
-        self._write_up_to()
-        super().finish()
-        self._write_up_to()
-        end = self._apart.finish()
-        left = [raw_from(flat) for flat in end.outputs]
-        self._count(left)
-        for raw in sorted(left, key=lambda raw: order_key(raw.topic, raw.envelope)):
-            self._write(raw)
-        self._conclude(self._last.name, end.counters, end.problem, end.state)
-
-    def close(self) -> None:
-        self._apart.close()
-
-    def _is_heard_apart(self, topic: str) -> bool:
-        if topic not in self._heard_apart:
-            self._heard_apart[topic] = _listens(self._last_driver, topic)
-        return self._heard_apart[topic]
-
-    def _hand_on(self, message: Message | None, raw: RawMessage, number: int | None = None) -> None:
-        if self._is_heard_apart(raw.topic):
-            self._items.append((len(self._batch), flat_from(raw) if number is None else number))
-        self._batch.append(raw)
-        if message is not None:
-            for driver in self._listening(raw.topic):
-                self._queue(driver.step(message))
-        if len(self._batch) >= BATCH:
-            self._send()
-            while self._apart.under_way > UNDER_WAY or self._apart.ready():
-                self._write_answered()
-
-    def _send(self) -> None:
-        self._apart.send(self._items)
-        self._waiting.append(self._batch)
-        self._batch, self._items = [], []
-
-    def _write_up_to(self) -> None:
-        """Write all that was handed on so far, and what came of it."""
-        self._send()
-        while self._waiting:
-            self._write_answered()
-        self._write_before(None)
-
-    def _write_answered(self) -> None:
-        """Write the oldest batch, with what the node answered to it."""
-        batch, answer = self._waiting.popleft(), iter(self._apart.answer())
-        place, outputs = next(answer, (-1, []))
-        for i, raw in enumerate(batch):
-            if self._answered:
-                self._write_before(order_key(raw.topic, raw.envelope))
-            self._write(raw)
-            if i == place:
-                made = [raw_from(flat) for flat in outputs]
-                self._count(made)
-                for output in made:
-                    heapq.heappush(self._answered, (order_key(output.topic, output.envelope), output))
-                place, outputs = next(answer, (-1, []))
-
-    def _write_before(self, until: Key | None) -> None:
-        while self._answered and (until is None or self._answered[0][0] < until):
-            self._write(heapq.heappop(self._answered)[1])
-
-    def _count(self, outputs: list[RawMessage]) -> None:
-        for raw in outputs:
-            self._summary.outputs[raw.topic] += 1
-
-
 def _listens(driver: StepDriver, topic: str) -> bool:
     return any(topics.find(name).matches(topic) for name in (*driver.inputs, *driver.node.decisions))
 
 
-def _inputs(
-    reader: RecordingReader,
-    made: set[str],
-    is_heard: Callable[[str], bool],
-    summary: ProcessSummary,
-    progress: Callable[[float], None] | None,
-) -> Iterator[tuple[int, Message | None, RawMessage]]:
-    """The usable inputs of a recording in order, with their numbers; decoded where a node listens."""
+def _message(raw: RawMessage, body: Any) -> Message:
+    e = raw.envelope
+    return Message(raw.topic, e.stamp_ns, body, e.source, e.sequence, e.start)
+
+
+def _usable(reader: RecordingReader, made: set[str], summary: ProcessSummary) -> NDArray[np.int64]:
+    """Numbers of the inputs of a recording that are usable, in order."""
     index, known = reader.index, reader.select()
     streams: dict[tuple[str, str, int], list[NDArray[np.int64]]] = {}
     for id in np.unique(index.channel[known]).tolist():
@@ -321,20 +332,14 @@ def _inputs(
             summary.replaced[channel.topic] += len(own)
         else:
             streams.setdefault((channel.topic, channel.source, channel.start), []).append(own)
-
-    def problem(kind: str, text: str) -> None:
-        summary.dropped[kind] += 1
-        summary.last_problem = text
-
     foreign = len(index) - len(known)
     if foreign:
-        summary.dropped["foreign"] = foreign
-        summary.last_problem = f"{foreign} messages on topics of other programs"
+        summary.drop("foreign", f"{foreign} messages on topics of other programs", foreign)
     kept, doubtful = [], []
     for (topic, _, _), parts in streams.items():
         own = np.sort(np.concatenate(parts))
         (kept if is_orderly(topic, index.sequence[own], index.stamp_ns[own]) else doubtful).append(own)
-    check: StreamCheck[int] = StreamCheck(problem)
+    check: StreamCheck[int] = StreamCheck(summary.drop)
     for number in np.sort(np.concatenate([*doubtful, np.empty(0, dtype=np.int64)])).tolist():
         channel = reader.channels[int(index.channel[number])]
         stamp, sequence = int(index.stamp_ns[number]), int(index.sequence[number])
@@ -343,20 +348,4 @@ def _inputs(
     ordered = reader.sort(np.concatenate([*kept, np.empty(0, dtype=np.int64)]))
     if len(ordered):
         summary.first_ns, summary.last_ns = (int(index.stamp_ns[n]) for n in (ordered[0], ordered[-1]))
-    told = time.monotonic()
-    for done, (number, recorded) in enumerate(zip(map(int, ordered), reader.raws(ordered), strict=True)):
-        raw = RawMessage(recorded.topic, recorded.envelope, recorded.data, recorded.envelope.stamp_ns)
-        message = None
-        if is_heard(raw.topic):
-            try:
-                body = codec.decode(raw.topic, raw.data)
-            except ValueError as error:
-                problem("malformed", f"{raw.topic} {raw.envelope.sequence} of {raw.envelope.source!r}: {error}")
-                continue
-            e = raw.envelope
-            message = Message(raw.topic, e.stamp_ns, body, e.source, e.sequence, e.start)
-        summary.inputs[raw.topic] += 1
-        if progress is not None and not done % 256 and time.monotonic() - told > 0.2:
-            told = time.monotonic()
-            progress(done / len(ordered))
-        yield number, message, raw
+    return ordered

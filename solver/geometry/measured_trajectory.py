@@ -232,7 +232,13 @@ class MeasuredTrajectory:
 
     def angles_at(self, time_s: ArrayLike) -> Array:
         """Omega, phi, kappa (n, 3) at times (n,) that are covered."""
-        return self.at(time_s).poses.angles
+        t = np.atleast_1d(np.asarray(time_s, dtype=float))
+        by_smoothed = self._is_smoothed(t)
+        angles = np.empty((len(t), 3))
+        for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
+            if mine.any():
+                angles[mine] = source.angles_at(t[mine])
+        return angles
 
     def forget(self, before_s: float) -> None:
         """Drop what is older."""

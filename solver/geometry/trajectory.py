@@ -104,7 +104,9 @@ class Trajectory:
 
     def angles_at(self, time_s: ArrayLike) -> Array:
         """Omega, phi, kappa (m, 3) at times (m,) inside."""
-        return self.at(time_s).angles
+        i, h, s = self._places(np.atleast_1d(np.asarray(time_s, dtype=float)))
+        theta, _ = _hermite(s, h, self._turn[i], self._rate[i], self._rate[i + 1])
+        return angles_from_matrix(matrix_from_quaternion(self._turned(i, theta)))
 
     def at(self, time_s: ArrayLike) -> Poses:
         """Pose at times (m,).
@@ -114,24 +116,31 @@ class Trajectory:
         ValueError : a time outside the trajectory
         """
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
-        covered = self.covers(t)
-        if not covered.all():
-            bad = t[~covered][0]
-            raise ValueError(f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s")
-        i = np.minimum(np.maximum(self.time_s.searchsorted(t, side="right") - 1, 0), len(self) - 2)
-        h = (self.time_s[i + 1] - self.time_s[i])[:, None]
-        s = (t - self.time_s[i])[:, None] / h
+        i, h, s = self._places(t)
         p0, p1 = self.position_l[i], self.position_l[i + 1]
         position, velocity = _hermite(s, h, p1 - p0, self._velocity[i], self._velocity[i + 1])
         theta, theta_rate = _hermite(s, h, self._turn[i], self._rate[i], self._rate[i + 1])
-        q = quaternion_multiply(self.quaternion[i], quaternion_from_vector(theta))
-        R = matrix_from_quaternion(q)
+        R = matrix_from_quaternion(self._turned(i, theta))
         angles = angles_from_matrix(R)
         # angles between two samples are small, so theta_rate is the body rate to first order; one more term is kept
         rate_c = theta_rate - 0.5 * np.einsum("nij,nj->ni", skew(theta), theta_rate)
         rate_l = np.einsum("nij,nj->ni", R, rate_c)
         angle_rate = np.einsum("nij,nj->ni", angles_jacobian(angles), rate_l)
         return Poses(t, p0 + position, angles, velocity, angle_rate)
+
+    def _places(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Sample before each time (m,), the step from it to the next (m, 1) and the share of it (m, 1)."""
+        covered = self.covers(t)
+        if not covered.all():
+            bad = t[~covered][0]
+            raise ValueError(f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s")
+        i = np.minimum(np.maximum(self.time_s.searchsorted(t, side="right") - 1, 0), len(self) - 2)
+        h = (self.time_s[i + 1] - self.time_s[i])[:, None]
+        return i, h, (t - self.time_s[i])[:, None] / h
+
+    def _turned(self, i: NDArray[np.intp], theta: Array) -> Array:
+        """Quaternions (m, 4), turned from those of samples by rotation vectors (m, 3)."""
+        return quaternion_multiply(self.quaternion[i], quaternion_from_vector(theta))
 
 
 def slopes(step: Array, change: Array) -> Array:

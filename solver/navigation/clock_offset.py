@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .alignment_window import SUSPICIOUS_CHI2, noise_root, offset_equations
+from .alignment_window import SUSPICIOUS_CHI2, fit_window, noise_root, offset_equations, wahba
 from .error_state import NavigationSettings, bias_variances
 from .gnss_fix import stacked
 from .inertial_data import GAP_FACTOR, GnssData, InertialData
-from .inertial_windows import DataWindow, best_fit, data_windows, tells
+from .inertial_windows import DataWindow, data_windows, tells
 
 Array = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]  # north + i east
@@ -36,6 +36,8 @@ INERTIAL_STRETCH_S, ATTITUDE_STRETCH_S, AGAIN_S = 40.0, 100.0, 10.0
 #: Smaller offsets are not told, s: fixes of ordinary receivers are late by some hundredths; from the second on fixes
 #: are not used (tuned; the fixes of the KITTI drive that the tests have are 0.058 s behind its inertial data).
 LEAST_S, TOO_LARGE_S = 0.04, 0.08
+#: A step of the search for an offset, s, after which the next would change it by less than what is ever told.
+SMALL_STEP_S = 0.25 * LEAST_S
 #: An offset is told beyond so many sigma, found in two stretches that agree within a half of it (tuned).
 CERTAIN = 5.0
 #: Largest offset that is searched for, s: more is seen in the delays of messages (`clock_check`).
@@ -76,7 +78,7 @@ def inertial_offset(inertial: InertialData, gnss: GnssData, settings: Navigation
     """
     length_s = float(min(inertial.time_s[-1], gnss.time_s[-1]) - max(inertial.time_s[0], gnss.time_s[0])) - 0.2
     windows = data_windows(inertial, gnss, length_s, most=1) if length_s > 10.0 else []
-    if not windows or not tells(windows[0]):
+    if not windows or not tells(windows[0].gnss):
         return None
     window, total, sigma = windows[0], 0.0, np.inf
     for _ in range(8):
@@ -87,7 +89,7 @@ def inertial_offset(inertial: InertialData, gnss: GnssData, settings: Navigation
         window = windows[0].shifted(gnss, -total)
         if len(window.gnss) < 8:
             return None
-        if abs(step) < 2e-3:
+        if abs(step) < SMALL_STEP_S:
             return Offset(total, sigma) if chi2 < 2.0 * SUSPICIOUS_CHI2 else None
     return None
 
@@ -95,8 +97,8 @@ def inertial_offset(inertial: InertialData, gnss: GnssData, settings: Navigation
 def _inertial_step(window: DataWindow, settings: NavigationSettings) -> tuple[float, float, float]:
     """Correction of the offset, its sigma (with that of the misfit) and the misfit after it."""
     c = window.curve()
-    fit = best_fit(c, settings)
     root = noise_root(c, settings)
+    fit = fit_window(c, settings, wahba(c, settings), root, rounds=6)
     d = window.inertial
     force = np.column_stack([np.interp(window.gnss.time_s, d.time_s - 0.5 * d.dt_s, f) for f in (d.dv.T / d.dt_s)])
     design, off = offset_equations(c, settings, fit, force)
@@ -291,6 +293,8 @@ class OffsetWatch:
 
     def _estimate(self) -> Offset | None:
         gnss = stacked(list(self._fixes))
+        if self._stretch_s == INERTIAL_STRETCH_S and not tells(gnss):
+            return None
         table = np.array(self._samples)
         table = table[table[:, 0] > gnss.time_s[0] - LARGEST_S]
         if len(table) < 100:

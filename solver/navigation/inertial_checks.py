@@ -58,7 +58,7 @@ def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, 
         if not windows:
             continue
         given = misfit(windows, settings)
-        if given < _BAD or not all(tells(w) for w in windows):
+        if given < _BAD or not all(tells(w.gnss) for w in windows):
             continue
         if misfit_without_outliers(windows, settings) < _BAD:  # then a cause must explain all
             given = min(given, _BETTER * _GOOD)

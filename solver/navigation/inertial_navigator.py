@@ -237,7 +237,11 @@ class InertialNavigator:
         ------
         ValueError : values that are not finite, or a covariance that is not positive definite
         """
-        fix = local_fix(self.frame, time_s, antenna_l, covariance, velocity_l, velocity_covariance)
+        return self.add_fix(local_fix(self.frame, time_s, antenna_l, covariance, velocity_l, velocity_covariance))
+
+    def add_fix(self, fix: GnssData) -> list[NavigationPose]:
+        """One fix of the antenna, as `local_fix` makes it; times in seconds as those of inertial data."""
+        time_s = float(fix.time_s[0])
         if time_s < self._last_s - self.options.rewind_s:
             self.counters["gnss too late"] += 1
             return []

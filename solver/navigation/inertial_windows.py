@@ -89,9 +89,8 @@ def data_windows(inertial: InertialData, gnss: GnssData, length_s: float, most: 
     return out
 
 
-def tells(window: DataWindow) -> bool:
-    """Whether the velocity changes enough in a stretch for units, axes and clocks to show."""
-    g = window.gnss
+def tells(g: GnssData) -> bool:
+    """Whether the velocity changes enough between the fixes of a stretch for units, axes and clocks to show."""
     usual = float(np.median(np.diff(g.time_s)))
     far = max(1, round(3.0 * float(np.median(g.sigma_ned_m[:, :2])) / usual))
     t, r = g.time_s[::far], g.position_e[::far]

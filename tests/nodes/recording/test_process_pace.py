@@ -13,7 +13,7 @@ from triline.nodes.config import build
 from triline.nodes.errors import UserError
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.runner import process
-from triline.nodes.recording.runner_apart import Apart
+from triline.nodes.recording.runner_apart import Ahead
 from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.simulator.simulator import Simulator
 from triline.solver.accuracy import angle_difference
@@ -55,7 +55,7 @@ def processed(path, pace="load", apart=False):
 
 
 @pytest.mark.study
-@pytest.mark.skipif(not Apart.possible(), reason="one processor only, or no fork")
+@pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
 def test_two_processes_give_the_bytes_of_one(flights):
     _, path = flights["attitude"]
     (alone, expected), (apart, found) = processed(path), processed(path, apart=True)
@@ -63,19 +63,31 @@ def test_two_processes_give_the_bytes_of_one(flights):
     assert (apart.outputs, apart.counters, apart.states) == (alone.outputs, alone.counters, alone.states)
 
 
-@pytest.mark.skipif(not Apart.possible(), reason="one processor only, or no fork")
+@pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
 def test_a_process_that_is_killed_is_told_in_one_line(flights, monkeypatch):
     _, path = flights["attitude"]
-    send = Apart.send
+    listen = Ahead.__iter__
 
-    def kill(self, batch):
+    def kill(self):
         self._process.kill()
         self._process.join()
-        send(self, batch)
+        return listen(self)
 
-    monkeypatch.setattr(Apart, "send", kill)
-    with pytest.raises(UserError, match="the process of the adjuster has ended"):
+    monkeypatch.setattr(Ahead, "__iter__", kill)
+    with pytest.raises(UserError, match="the process of the navigator has ended .exit code -9"):
         processed(path, apart=True)
+
+
+@pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
+def test_what_is_wrong_in_the_other_process_is_told_here():
+    def broken():
+        yield from range(5)
+        raise UserError("flight.mcap: 12 bytes are gone")
+
+    ahead = Ahead(broken, "navigator")
+    with pytest.raises(UserError, match="12 bytes are gone"):
+        list(ahead)
+    ahead.close()
 
 
 @pytest.mark.study
