@@ -54,10 +54,11 @@ MOST_RETESTED = 100
 LEARNT_S = 2.0
 #: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
 HURRIED_S = 0.1
-#: Parts of the work that can wait: linearise what has moved, test old batches again, judge the quality.
-LOOK_AFTER, RETEST, WATCH = "look after", "retest", "watch"
+#: Parts of the work that can wait: linearise what has moved, question the sigmas, test old batches again, judge the
+#: quality.
+LOOK_AFTER, QUESTION, RETEST, WATCH = "look after", "question", "retest", "watch"
 #: Time between two turns of each part, s; it is done in the first update after that.
-TURN_S = {LOOK_AFTER: 0.1, RETEST: 0.1, WATCH: 0.3}
+TURN_S = {LOOK_AFTER: 0.1, QUESTION: 1.0, RETEST: 0.1, WATCH: 0.3}
 #: An update that has other work to do leaves a part to the next one unless it is overdue by more than this share of the
 #: time between its turns.
 PUT_OFF = 1.0
@@ -225,7 +226,7 @@ class Window:
             self._relinearisation.look_after(self._now_s)
         iterations = self._solve(fresh) + self._weigh_surface(fresh + joined, RETEST in duties, result)
         if self.options.snoop:
-            iterations += self._question_sigmas(result)
+            iterations += self._question_sigmas(QUESTION in duties, result)
             due = joined or (self._due_for_test() if RETEST in duties else [])
             iterations += self._screen(fresh, fresh + due, result)
             iterations += self._weigh_control(fresh, result)
@@ -303,9 +304,9 @@ class Window:
             self._orientation.forget()
         return solutions
 
-    def _question_sigmas(self, result: WindowUpdate) -> int:
+    def _question_sigmas(self, due: bool, result: WindowUpdate) -> int:
         """Variance components, before any look is thrown out; number of solutions computed."""
-        of_slow, of_image = self._sigma_check.look(self._now_s)
+        of_slow, of_image = self._sigma_check.look(self._now_s, due)
         result.events += self._sigma_check.take_events()
         if of_image:
             self._relinearisation.reweigh()

@@ -228,8 +228,8 @@ class DriftMonitor:
         rays, shared = self._left_rays.copy(), self._left_shared
         border = Border.of(len(self._left), self._network.state.numbers)
         border.join(np.arange(len(self._left)), self._left)
+        border.join_all((cell.places, cell.border) for cell in cells.values())
         for cell in cells.values():
-            border.join(cell.places, cell.border)
             rays += cell.rays
             shared += cell.shared
         border.keep(np.arange(EACH * len(self._groups)))
@@ -262,14 +262,15 @@ class DriftMonitor:
 
     def _scores(self, now_s: float, batches: list[Batch], cells: dict[int, Cell], border: Border) -> Scores:
         """Scores of the groups at the solution of the same data as are in the border."""
-        more = []  # information of the window that is not in the border
+        now, then = [], []  # information of batches of the window, and what of it is in the border
         for batch in batches:
             cell = cells.get(id(batch))
-            if cell is None:
-                more.append((batch.columns, batch.information))
-            elif cell.information is not batch.information:
-                more.append((batch.columns, batch.information - cell.information))
-        N, rhs = self._network.state.normal(more)
+            if cell is not None and cell.information is batch.information:
+                continue
+            now.append((batch.columns, batch.information))
+            if cell is not None:
+                then.append((batch.columns, cell.information))
+        N, rhs = self._network.state.normal(less=now, more=then)
         solved = DenseFactor(N).solve(np.column_stack([rhs, border.G]))
         V = border.H - border.G.T @ solved[:, 1:]
         return Scores(border.r - border.G.T @ solved[:, 0], 0.5 * (V + V.T), self._age(now_s), DRIFT_S)

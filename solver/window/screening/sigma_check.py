@@ -42,8 +42,6 @@ Array = NDArray[np.floating]
 
 #: Residuals of a-priori equations are compared with their redundancy over so long, s.
 MEMORY_S = 30.0
-#: Time between two looks, s; where looks disagree more than expected there is one in every update.
-CHECK_S = 1.0
 #: Probability that a right sigma is questioned, by one look at one group.
 QUESTIONED = 1e-4
 #: Redundancy of a group below which nothing is said about it.
@@ -96,7 +94,6 @@ class SigmaCheck:
         self._network = network
         self._pairs = ((POSITION_WANDER, ATTITUDE_WANDER), (OFFSET, SHIFT))[: 1 + constants]
         self._ratios: deque[float] = deque(maxlen=REMEMBERED)
-        self._looked_s = -np.inf
         self._told = np.ones(len(ERROR_GROUPS) + 1)
         self._vibration = 0.0
         self._steady = 0
@@ -111,16 +108,18 @@ class SigmaCheck:
         self._suspect = ratio > SUSPECT
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
 
-    def look(self, now_s: float) -> tuple[bool, bool]:
-        """Compare residuals with sigmas where that is due; whether those of slow errors and of looks were changed."""
+    def look(self, now_s: float, due: bool) -> tuple[bool, bool]:
+        """Compare residuals with sigmas where that is due; whether those of slow errors and of looks were changed.
+
+        Where looks disagree more than expected it is due in every update.
+        """
         network = self._network
         sigmas = network.sigmas
-        if now_s < self._looked_s + CHECK_S and sigmas.disagreement == 1.0:
+        if not due and sigmas.disagreement == 1.0:
             return False, False
         strip = next((s for s in reversed(network.flown) if s.first_line_time_s <= now_s), None)
         if strip is None or not len(network.batches):
             return False, False
-        self._looked_s = now_s
         network.state.solve()
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()

@@ -120,6 +120,19 @@ class Border:
         """Add equations of quantities that stand in another border, here at places (k,)."""
         self.add(places, other.numbers, other.G, other.H, other.r)
 
+    def join_all(self, parts: Iterable[tuple[IntArray, Border]]) -> None:
+        """The same for many borders; those of the same quantities and unknowns are added to each other first."""
+        sums: dict[tuple[bytes, bytes], tuple[IntArray, Border]] = {}
+        for places, other in parts:
+            _, total = sums.setdefault(
+                (places.tobytes(), other.numbers.tobytes()), (places, Border.of(len(places), other.numbers))
+            )
+            total.G += other.G
+            total.H += other.H
+            total.r += other.r
+        for places, total in sums.values():
+            self.join(places, total)
+
     def rows(self, numbers: IntArray) -> Array:
         """Rows (m, c) of G, zero for unknowns it does not have."""
         at = places_of(self.numbers, numbers)
@@ -335,13 +348,25 @@ class WindowState:
         self._live_rhs[place] -= information.rhs
         self._fixed_rhs[place] += information.rhs
 
-    def normal(self, less: Iterable[tuple[IntArray, Information]] = ()) -> tuple[Array, Array]:
-        """Normal equations (n, n), (n,) of all information, less some about unknowns with these numbers."""
+    def normal(
+        self, less: Iterable[tuple[IntArray, Information]] = (), more: Iterable[tuple[IntArray, Information]] = ()
+    ) -> tuple[Array, Array]:
+        """Normal equations (n, n), (n,) of all information, less some and with more about unknowns of these numbers."""
         matrix, rhs = self._fixed + self._live, self._fixed_rhs + self._live_rhs
-        for columns, information in less:
+        sums: dict[bytes, tuple[IntArray, Array, Array]] = {}  # batches of one segment have the same unknowns
+        for combine, parts in ((np.subtract, less), (np.add, more)):
+            for columns, information in parts:
+                key = columns.tobytes()
+                if key not in sums:
+                    n = len(columns)
+                    sums[key] = columns, np.zeros((n, n)), np.zeros(n)
+                _, own, own_rhs = sums[key]
+                combine(own, information.matrix, out=own)
+                combine(own_rhs, information.rhs, out=own_rhs)
+        for columns, own, own_rhs in sums.values():
             place = self.places(columns)
-            matrix[np.ix_(place, place)] -= information.matrix
-            rhs[place] -= information.rhs
+            matrix[np.ix_(place, place)] += own
+            rhs[place] += own_rhs
         return matrix, rhs
 
     def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:

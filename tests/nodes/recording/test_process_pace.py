@@ -74,7 +74,7 @@ def test_a_process_that_is_killed_is_told_in_one_line(flights, monkeypatch):
         return listen(self)
 
     monkeypatch.setattr(Ahead, "__iter__", kill)
-    with pytest.raises(UserError, match="the process of the navigator has ended .exit code -9"):
+    with pytest.raises(UserError, match=r"the process of the navigator has ended \(exit code -9\)"):
         processed(path, apart=True)
 
 
