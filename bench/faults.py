@@ -8,7 +8,8 @@ adjuster, in processes of their own, fed by `triline replay`) come in mid-strip.
 messages of the flight, which `process` works off: the exact sequence, whatever the machine.
 
 - *lost*: time of the strip without final orientation, s, less what the flight lacks without a fault
-- *right*: from the fault (the end of a freeze) to the next live orientation, s of flight; "-" where none was missing
+- *right*: from the fault until live orientation came again, s by the recorder's clock (of data: s of flight); "-" where
+  it never stopped for more than a second
 - *beyond*: live orientations under a green light whose error is beyond the protection level in X, Y or Z, of how many
 - *told*: alarms, and lines of the event log that the flight without a fault does not have, the first of them
 """
@@ -70,24 +71,26 @@ class Outcome:
 
     final_s: np.ndarray
     live_s: np.ndarray
+    heard_ns: np.ndarray
     beyond: int
     green: int
     lines: list[str]
 
     @classmethod
     def of(cls, paths: Iterable[Path], alarms: Iterable[str] = ()) -> Outcome:
-        final, live, lines, beyond, green = [], [], list(alarms), 0, 0
+        final, live, heard, lines, beyond, green = [], [], [], list(alarms), 0, 0
         for path in paths:
             reader = RecordingReader(path)
             start = reader.index.stamp_ns.min() if len(reader.index.stamp_ns) else 0
             for topic, times in (("orientation/final", final), ("orientation/live", live)):
                 times += [convert.time_ns(m.body.timestamp) for m in reader.sorted_messages([topic]) if m.body.valid]
+            heard += reader.index.receive_ns[reader.select(["orientation/live"])].tolist()
             for m in reader.sorted_messages(["event/log"]):
                 lines.append(f"{m.body.name}: {m.body.message}")
             if start:
                 a, b = _under_green(path)
                 beyond, green = beyond + a, green + b
-        return cls(np.unique(final), np.unique(live), beyond, green, lines)
+        return cls(np.unique(final), np.unique(live), np.unique(heard), beyond, green, lines)
 
 
 def _under_green(path: Path) -> tuple[int, int]:
@@ -110,17 +113,22 @@ def missing_s(times_ns: np.ndarray, strip: tuple[int, int]) -> float:
     return float(gaps[gaps > 0.3].sum())
 
 
-def row(fault: str, got: Outcome, usual: Outcome, strip: tuple[int, int], at_ns: int) -> Row:
+def _pause_s(times_ns: np.ndarray, from_ns: int, longest_s: float) -> float:
+    """From a time to the end of the longest pause in the half minute after it, s; 0 where none is longer than usual."""
+    after = times_ns[(times_ns > from_ns) & (times_ns < from_ns + 30e9)]
+    gaps = np.diff(np.concatenate([[from_ns], after])) * 1e-9
+    if not len(gaps) or gaps.max() <= longest_s:
+        return 0.0
+    return float((after[int(np.argmax(gaps))] - from_ns) * 1e-9)
+
+
+def row(fault: str, got: Outcome, usual: Outcome, strip: tuple[int, int], at_ns: int, heard_from_ns: int = 0) -> Row:
     known = {_kind(line) for line in usual.lines}
     new = [line for line in got.lines if _kind(line) not in known and not line.endswith(": good")]
-    after = got.live_s[got.live_s > at_ns]
-    usual_after = usual.live_s[usual.live_s > at_ns]
-    right = 0.0
-    if len(after) and len(usual_after):
-        gaps = np.diff(np.concatenate([[at_ns], after])) * 1e-9
-        longest = int(np.argmax(gaps[:200])) if len(gaps) else 0
-        if gaps[longest] > 0.5:
-            right = float((after[longest] - at_ns) * 1e-9)
+    if heard_from_ns:
+        right = _pause_s(got.heard_ns, heard_from_ns, 1.0)
+    else:
+        right = _pause_s(got.live_s, at_ns, 0.5)
     lost = missing_s(got.final_s, strip) - missing_s(usual.final_s, strip)
     told = "; ".join(dict.fromkeys(line[:110] for line in new[:2])) or "nothing"
     return Row(fault, max(0.0, lost), right, got.beyond, got.green, told)
@@ -231,6 +239,7 @@ class Rig:
         self.group = NodeGroup(folder / "log", "demo", self.port)
         self.flight = flight
         self.alarms: list[str] = []
+        self.fault_ns = 0  # when it came, by the clock of this machine
 
     def start(self, name: str, **named: str) -> None:
         more = ["-o", str(self.output)] if name == "recorder" else []
@@ -254,6 +263,7 @@ class Rig:
                 while fault is not None and replay.poll() is None:
                     first = first or newest[0]
                     if first and (newest[0] - first) * 1e-9 > at_s:
+                        self.fault_ns = time.time_ns()
                         fault(self)
                         break
                     time.sleep(0.02)
@@ -353,8 +363,8 @@ def main() -> int:
         strip = start_ns + round(LEAD_S * 1e9), start_ns + round((LEAD_S + SECONDS) * 1e9)
         print(f"{'fault':<44}{'lost s':>7}{'right':>7}{'beyond':>12}  told", flush=True)
 
-        def done(fault: str, got: Outcome, usual: Outcome) -> None:
-            rows.append(row(fault, got, usual, strip, at_ns))
+        def done(fault: str, got: Outcome, usual: Outcome, heard_from_ns: int = 0) -> None:
+            rows.append(row(fault, got, usual, strip, at_ns, heard_from_ns))
             print(rows[-1], flush=True)
 
         if args.kind != "processes":
@@ -371,7 +381,7 @@ def main() -> int:
                     place = _folder(folder, fault)
                     rig = Rig(flight, place, args.rate)
                     paths = readable(rig.fly(do), place)
-                    done(fault, Outcome.of(paths, rig.alarms), live)
+                    done(fault, Outcome.of(paths, rig.alarms), live, rig.fault_ns)
             if args.only in "disk full":
                 place = _folder(folder, "disk full")
                 found = disk_full(flight, place, args.rate)

@@ -114,6 +114,18 @@ class StreamCheck(Generic[T]):
             return [item] if self._is_new(stream, sequence, counts, topic, envelope) else []
         return self._next(stream, envelope, item, counts, topic)
 
+    def last(self, topic: str, envelope: Envelope) -> int | None:
+        """Newest number of the stream of a message; None before the first one."""
+        stream = self._streams.get((topic, envelope.source, envelope.start))
+        return None if stream is None else stream.last
+
+    def lacks(self, topic: str, envelope: Envelope) -> bool:
+        """Whether `accept` would take this message for one that has not come yet."""
+        stream, number = self._streams.get((topic, envelope.source, envelope.start)), envelope.sequence
+        if stream is None or number > stream.last:
+            return True
+        return number in stream.missing or (number < stream.first and number not in stream.before_first)
+
     def _next(self, stream: _Stream[T], envelope: Envelope, item: T, counts: TopicCounts, topic: str) -> list[T]:
         """A message with a number beyond the newest."""
         sequence = envelope.sequence

@@ -18,7 +18,8 @@ from ..node import Message, Node
 from ..ordering import Sequencer, StreamCheck, TopicCounts, order_key
 from ..step_driver import StepDriver
 from .inbox import NEWEST_BYTES, NEWEST_DEPTH, Inbox
-from .session import Bus
+from .recall import Recall
+from .session import KEPT_S, Bus
 from .status import StatusPublisher
 
 #: After so long without any message everything that waits is worked off. A node that lives on the results of others
@@ -35,6 +36,8 @@ LAG_PERIOD_S = 0.1
 QUIET_S, LONG_QUIET_S = 4.0, 15.0
 #: What comes while a strip is flown, and not between strips.
 IN_STRIPS = ("sensor/lines/", "orientation/", "orthoimage/")
+#: What was said before is of the flight that is under way if its stamp is not later by more, ns.
+SAME_FLIGHT_NS = 5_000_000_000
 #: Between the last message and the end of the session, for what is still on its way.
 LAST_WORDS_S = 0.2
 
@@ -96,6 +99,8 @@ class BusRunner:
         self._looked_s = 0.0
         self._busy_s = 0.0  # so far on messages
         self._opened_anew = 0
+        self._recall = Recall(bus, self._driver.inputs, self._check)
+        self._said_ns = 0  # up to here somebody of this name has spoken before
         self._heard_s: dict[str, float] = {}  # when something of a topic was worked on
         self._open_strip = ""
         self._collections = collections
@@ -121,6 +126,8 @@ class BusRunner:
         heard = self._patience.now_s()
         while not self._stop.is_set():
             raws = self._inbox.take(0.0 if self._sequencer.ready else 0.02)
+            if self._ordered:
+                raws = self._recall.complete(raws)
             now = self._patience.now_s()
             if raws:
                 heard = now
@@ -135,6 +142,7 @@ class BusRunner:
                 for message, _ in self._sequencer.flush(ahead=False):
                     self._work(message)
             self._tell()
+            self._recall.come_round()
         self._end()
 
     def _join(self) -> None:
@@ -144,6 +152,7 @@ class BusRunner:
         while time.monotonic() < until and not self._stop.is_set():
             arrived += self._inbox.take(0.05)
         latched = [raw for raw in arrived if topics.find(raw.topic).latched]
+        rest = self._under_way([raw for raw in arrived if not topics.find(raw.topic).latched])
         for raw in sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)):
             for accepted in self._check.accept(raw.topic, raw.envelope, raw):
                 message = self._decode(accepted)
@@ -152,9 +161,30 @@ class BusRunner:
                     self._work(message)
         self._worked_ns = 0  # configuration does not tell how far the flight is
         now = self._patience.now_s()
-        for raw in arrived:
-            if not topics.find(raw.topic).latched:
-                self._arrive(raw, now)
+        for raw in rest:
+            self._arrive(raw, now)
+        self._recall.come_round()
+
+    def _under_way(self, arrived: list[RawMessage]) -> list[RawMessage]:
+        """What has come, and before it what was said lately, if a flight is under way when this node begins.
+
+        What another one of its name has said before, which is gone now, is not said again.
+        """
+        if not self._ordered:
+            return arrived
+        joined = self._recall.joined(arrived)
+        if self._recall.recalled:
+            heard = self.bus.query("heard", "observation/progress", source=self.node.name)
+            said_ns, newest_ns = max((body.time_ns for body in heard), default=0), joined[-1].envelope.stamp_ns
+            self._said_ns = said_ns if said_ns < newest_ns + SAME_FLIGHT_NS else 0
+            self._report(f"{self.node.name}: begins with {self._recall.recalled} messages of the last {KEPT_S:.0f} s")
+        return joined
+
+    def _publish(self, output: Message) -> None:
+        if output.stamp_ns <= self._said_ns and not topics.find(output.topic).latched:
+            self.node.counters["said before"] += 1
+            return
+        self.bus.publish(output)
 
     def _end(self) -> None:
         now = self._patience.now_s()
@@ -165,7 +195,7 @@ class BusRunner:
         with self._lock:
             outputs = self._driver.finish()
         for output in outputs:
-            self.bus.publish(output)
+            self._publish(output)
         self._tell(force=True, state="stopping")
         self._inbox.close()
         time.sleep(LAST_WORDS_S)
@@ -248,7 +278,7 @@ class BusRunner:
         if self.node.counters["failed"] > failed:
             self._report(f"{self.node.name}: {self.node.last_problem}")
         for output in outputs:
-            self.bus.publish(output)
+            self._publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)
         self._busy_s += time.monotonic() - begun
 

@@ -34,6 +34,9 @@ from .links import BEAT_S, LinkWatch
 DEFAULT_PORT = 17447
 #: Messages of a latched topic that a publisher keeps for whoever joins later.
 LATCHED_KEPT = 100_000
+#: What else is recorded, and is not too much (pictures), a publisher keeps for those who missed it: for so long, s, at
+#: twice the usual rate of its topic, and so many messages at least.
+KEPT_S, LEAST_KEPT = 60.0, 20_000
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 Receive = Callable[[RawMessage], None]
@@ -211,20 +214,19 @@ class Bus:
 
     def _declare_publisher(self, topic: str, session: Any) -> Any:
         row = topics.find(topic)
-        encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name)
-        if row.latched:
-            return zenoh.ext.declare_advanced_publisher(
-                session,
-                self.key(topic),
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                cache=zenoh.ext.CacheConfig(max_samples=LATCHED_KEPT),
-                publisher_detection=True,
-            )
         # Status is the one thing that must never slow anybody down.
         dropped = row.family is topics.Family.STATUS
-        congestion = zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK
-        return session.declare_publisher(self.key(topic), encoding=encoding, congestion_control=congestion)
+        options: dict[str, Any] = {
+            "encoding": zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name),
+            "congestion_control": zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK,
+        }
+        kept = _kept(row)
+        if not kept:
+            return session.declare_publisher(self.key(topic), **options)
+        cache = zenoh.ext.CacheConfig(max_samples=kept)
+        return zenoh.ext.declare_advanced_publisher(
+            session, self.key(topic), cache=cache, publisher_detection=row.latched, **options
+        )
 
     # ---- receiving
 
@@ -266,6 +268,35 @@ class Bus:
             return session.declare_subscriber(self.key(name), handler)
 
         return self._declare(declare)
+
+    def recall(self, names: Iterable[str], seconds: float = KEPT_S, timeout_s: float = 3.0) -> list[RawMessage]:
+        """What others have said lately on topics (names of the table), as far as they live and keep it, in any order.
+
+        Topics that are latched are left out: whoever subscribes to them gets all of it.
+        """
+        found, prefix = [], len(self.key(""))
+        for name in names:
+            if not is_kept(name):
+                continue
+            replies = self._session.get(
+                f"{self.key(name)}/@adv/**?_time=[now(-{seconds:.3f}s)..]",  # where `zenoh.ext` answers from its cache
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                timeout=timeout_s,
+            )
+            receive_ns = time.time_ns()
+            for sample in (reply.ok for reply in replies):
+                if sample is None or sample.attachment is None:
+                    continue
+                try:
+                    envelope = unpack(sample.attachment.to_bytes())
+                except ValueError:  # it was told when it came
+                    continue
+                if envelope.start != self.start:
+                    topic = str(sample.key_expr)[prefix:]
+                    found.append(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
+        return found
 
     # ---- liveliness and queries
 
@@ -419,6 +450,21 @@ class Bus:
             # others are just learning of both sessions; one that is closed now can stay linked as a ghost
             self._ended.wait(BOTH_S)
             _withdraw(old, withdrawn)
+
+
+def is_kept(topic: str) -> bool:
+    """Whether what is said on a topic can be recalled."""
+    row = topics.find(topic)
+    return not row.latched and _kept(row) > 0
+
+
+def _kept(row: topics.Topic) -> int:
+    """How many messages of a topic its publisher keeps."""
+    if row.latched:
+        return LATCHED_KEPT
+    if not row.recorded or row.queue is topics.Queue.NEWEST:
+        return 0
+    return max(LEAST_KEPT, int(2.0 * KEPT_S * row.rate_hz))
 
 
 def _withdraw(session: Any, declared: Iterable[Any]) -> None:

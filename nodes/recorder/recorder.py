@@ -11,11 +11,13 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from ...schemas import messages as m
 from ...schemas import topics
 from ...schemas.envelope import RawMessage
 from ..bus.authority import AUTHORITY, CERTIFICATE, KEY
 from ..bus.bundle import Bundle, load_bundle
 from ..bus.program import ProgramOptions
+from ..bus.recall import Recall
 from ..bus.session import Bus
 from ..bus.status import StatusPublisher
 from ..errors import UserError
@@ -30,6 +32,9 @@ FLUSH_S = 0.3
 WAITING_BYTES = 256 << 20
 #: What comes in this time after the start is sorted: configuration and control to the head of the file.
 HEAD_S = 0.4
+#: A recorder that begins while a flight is under way takes what was said in so long before, s: one that was killed is
+#: back by then.
+BEFORE_S = 10.0
 #: When it is told to stop, a recorder takes what is still on its way until nothing has come for so long, s ...
 QUIET_S = 0.3
 #: ... but no longer than this: sensors may go on.
@@ -117,6 +122,7 @@ class Recorder(Node):
         self.newest_ns = 0
         self._check: StreamCheck[None] = StreamCheck()
         self._latched: list[RawMessage] = []
+        self._heard_ns: dict[str, int] = {}
         self._file: RecordingFile | None = None
         self._writer: RecordingWriter | None = None
         self._flushed_s = 0.0
@@ -130,6 +136,15 @@ class Recorder(Node):
     def statistics(self) -> Any:
         """Counts by topic, see `ordering.TopicCounts`."""
         return self._check.counts
+
+    @property
+    def missing(self) -> int:
+        """How many messages never came, by their numbers; what nodes say of their health does not count."""
+        return sum(c.gaps for topic, c in self._check.counts.items() if not topic.startswith("status/"))
+
+    def recall(self, bus: Bus) -> Recall:
+        """Asks for what this recorder has missed."""
+        return Recall(bus, self.inputs, self._check)
 
     def state(self) -> str:
         return "recording" if self._writer is not None else f"not recording: {self.last_problem}"
@@ -154,9 +169,16 @@ class Recorder(Node):
             self._check.accept(raw.topic, raw.envelope, None)
             if not raw.topic.startswith("status/"):
                 self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
+                said_ns, source = raw.envelope.stamp_ns, raw.envelope.source
+                self._heard_ns[source] = max(self._heard_ns.get(source, 0), said_ns)
             if topics.find(raw.topic).latched:
                 self._latched.append(raw)
             self._write(raw)
+
+    def heard(self, parameters: dict[str, str]) -> Any:
+        """``query/heard?source=..``: how far a source was heard, for who takes its place; None where it was not."""
+        said_ns = self._heard_ns.get(parameters.get("source", ""))
+        return None if said_ns is None else m.Progress(time_ns=said_ns)
 
     def tend(self) -> None:
         """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""
@@ -164,9 +186,7 @@ class Recorder(Node):
         self._tell_disk()
         if self._lost and self._writer is not None:
             self.alarms["lost"] = f"{self._lost} messages were not recorded"
-        gaps = sum(c.gaps for topic, c in self._check.counts.items() if not topic.startswith("status/"))
-        if gaps > 0:
-            self.alarms["gaps"] = f"{gaps} messages never came to the recorder"
+        self.alarms["gaps"] = f"{self.missing} messages never came to the recorder" if self.missing else ""
         if self._writer is None:
             if now >= self._retry_s:
                 self._try_again(now)
@@ -336,10 +356,10 @@ def run(options: ProgramOptions) -> int:
         record(recorder, bus, options)
     recorder.close()
     counts = recorder.statistics
-    total, gaps = sum(c.received for c in counts.values()), sum(c.gaps for c in counts.values())
+    total = sum(c.received for c in counts.values())
     lost = f", {recorder.counters['lost']} lost" if recorder.counters["lost"] else ""
     names = ", ".join(str(path) for path in recorder.files)
-    options.report(f"{total} messages in {names}; {gaps} missing by number{lost}")
+    options.report(f"{total} messages in {names}; {recorder.missing} missing by number{lost}")
     return 1 if recorder.counters["disk"] else 0
 
 
@@ -381,9 +401,13 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
         head += backlog.take(0.05)
     latched = [raw for raw in head if topics.find(raw.topic).latched]
     recorder.take(sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)))
-    recorder.take([raw for raw in head if not topics.find(raw.topic).latched])
+    recall = recorder.recall(bus)
+    recorder.take(recall.joined([raw for raw in head if not topics.find(raw.topic).latched], BEFORE_S))
+    bus.answer("heard", recorder.heard)
+    recall.come_round()
     while not options.stop.is_set():
-        recorder.take(backlog.take(0.05))
+        recorder.take(recall.complete(backlog.take(0.05)))
+        recall.come_round()
         recorder.tend()
         if recorder.last_problem != problem:
             problem = recorder.last_problem
