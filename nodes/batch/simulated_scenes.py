@@ -73,7 +73,7 @@ def simulated_recording(what: SceneSimulation) -> tuple[list[Message], dict[str,
     """
     with TemporaryDirectory() as scratch:
         folder = Path(scratch) / what.satellite
-        result, sensors = _write(folder, what)
+        result, sensors = write_with_sensors(folder, what)
         block = local_block(read_scene_block(folder))
         truth = read_table(folder / "truth.csv", (Column("point", "text"), *map(Column, ("X_m", "Y_m", "Z_m"))), [])
     xyz = block.frame.from_crs(truth.stack("X_m", "Y_m", "Z_m"))
@@ -123,11 +123,16 @@ def write_simulated_scenes(folder: Path, what: SceneSimulation) -> dict[str, Any
     ------
     UserError : a satellite that is not known or does not reach the place, numbers that do not fit together
     """
-    return _write(folder, what)[0]
+    return write_with_sensors(folder, what)[0]
 
 
-def _write(folder: Path, what: SceneSimulation) -> tuple[dict[str, Any], list[PushbroomSensor]]:
-    """The same; the true sensors of the images beside."""
+def write_with_sensors(folder: Path, what: SceneSimulation) -> tuple[dict[str, Any], list[PushbroomSensor]]:
+    """As `write_simulated_scenes`; the true sensors of the images beside, in the order of the images.
+
+    Raises
+    ------
+    UserError : as `write_simulated_scenes`
+    """
     if what.satellite not in ORBITAL_SENSORS:
         raise UserError(f"satellite {what.satellite!r}, wanted one of {', '.join(ORBITAL_SENSORS)}")
     if min(what.points, what.control, what.check) < 0 or what.control + what.check > what.points:

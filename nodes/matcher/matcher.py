@@ -10,7 +10,9 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES, find
+from ...solver.matching.lens_pass import LensPassMatcher
 from ...solver.matching.options import MatchedTie, MatchingOptions
+from ...solver.matching.round_earth import above_sphere
 from ...solver.matching.tie_matcher import TieMatcher
 from .. import convert
 from ..governor import Announced, Governor
@@ -102,11 +104,11 @@ class Matcher(Node):
         self._announced: Announced[MatcherPace] = Announced()
         self._governor = Governor(PARTS)
         self._ground_m = ground_m
-        self._heights: dict[str, float] = {}  # of control and check points
+        self._heights: dict[str, tuple[float, float, float]] = {}  # control and check points with a height
         self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._delay_ns = round(delay_s * convert.SECOND_NS)
-        self._matcher: TieMatcher | None = None
+        self._matcher: TieMatcher | LensPassMatcher | None = None
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
         self._found = FoundStrips()
@@ -126,7 +128,7 @@ class Matcher(Node):
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         out += self._begin_pace(message.stamp_ns)
         if self._keeps_time(message.topic):
-            out += [self._strip(strip) for strip in self._found.ended(message.stamp_ns)]
+            out += self._ended(self._found.ended(message.stamp_ns))
         try:
             if message.topic.startswith("sensor/lines/") and self._matcher is not None:
                 out += self._find_strip(message.body)
@@ -136,7 +138,8 @@ class Matcher(Node):
         return out
 
     def finish(self) -> Iterable[Message]:
-        return [self._strip(strip) for strip in self._found.finish()]
+        ended = self._ended(self._found.finish())
+        return ended if self._matcher is None else [*ended, *self._ties(self._matcher.finish(), "")]
 
     def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
         if self._matcher is None or not self._by_load:
@@ -179,6 +182,8 @@ class Matcher(Node):
             if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
                 raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
             self._strips[body.id] = body
+            if body.ended and self._matcher is not None:
+                return self._ties(self._matcher.end_strip(body.id), body.id)
         elif topic.startswith("sensor/lines/"):
             return self._lines(topic.rpartition("/")[2], body)
         elif topic.startswith("trajectory/"):
@@ -193,7 +198,7 @@ class Matcher(Node):
         elif topic == "observation/control":
             self._targets.ground_point(body)
             if convert.role_of(body) != "planimetric" and np.isfinite(body.z):
-                self._heights[body.point] = float(body.z)
+                self._heights[body.point] = (float(body.x), float(body.y), float(body.z))
                 self._set_ground()
         elif topic == "observation/verdict":
             # those about who speaks on a topic, or its clock, are not the matcher's
@@ -207,7 +212,8 @@ class Matcher(Node):
         camera = convert.camera_from(body)
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
-        self._matcher = TieMatcher(camera, self.options)
+        several = len(camera.lenses) > 1
+        self._matcher = LensPassMatcher(camera, self.options) if several else TieMatcher(camera, self.options)
         self._matcher.keep(self._pace.share)
         self._set_ground()
         self._targets.configure(camera, self._matcher.orientation)
@@ -221,7 +227,10 @@ class Matcher(Node):
         if self._ground_m is not None:
             self._matcher.set_mean_height(self._ground_m)
         elif self._heights:
-            self._matcher.set_mean_height(float(np.median(list(self._heights.values()))))
+            known = np.array(list(self._heights.values()))
+            round_earth = isinstance(self._matcher, LensPassMatcher)
+            heights = [above_sphere(xyz) for xyz in known] if round_earth else known[:, 2]
+            self._matcher.set_mean_height(float(np.median(heights)))
 
     def _without_ties(self, failed: int, ties: int, strip: str) -> list[str]:
         """A line for the operator where a strip gives no tie points though many places were tried; once a strip."""
@@ -253,11 +262,12 @@ class Matcher(Node):
         if sample.covariance is None:
             raise ValueError("pose without covariance")
         time_s = (sample.time_ns - self._reference_ns) * 1e-9
-        if not self._matcher.orientation.add_pose(time_s, sample.position_l, sample.quaternion, sample.covariance):
+        if not self._matcher.add_pose(time_s, sample.position_l, sample.quaternion, sample.covariance):
             self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
 
     def _correction(self, body: Any) -> None:
-        if self._matcher is None or body.strip != self._matcher.strip:
+        orientation = None if self._matcher is None else self._matcher.orientation_of(body.strip)
+        if orientation is None:
             return
         sample = convert.pose_sample(body)
         if sample.correction is None or sample.covariance is None:
@@ -265,7 +275,7 @@ class Matcher(Node):
         if sample.correction.shape != (6,) or not np.isfinite(sample.correction).all():
             raise ValueError(f"correction {sample.correction.tolist()}, wanted 6 finite values")
         time_s = (sample.time_ns - self._reference_ns) * 1e-9
-        self._matcher.orientation.add_correction(time_s, sample.correction, sample.covariance)
+        orientation.add_correction(time_s, sample.correction, sample.covariance)
 
     def _lines(self, ccd: str, block: LineBlock) -> list[Message]:
         matcher = self._matcher
@@ -278,20 +288,27 @@ class Matcher(Node):
         if matcher.strip != strip.id:
             first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
             matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
-            self._targets.begin_strip(strip, first_s)
+            self._targets.begin_strip(strip, first_s, matcher.orientation)
             self._failed = 0
         if self._pace.blind:
             self.counters["lines gone by"] += len(block.pixels)
             return []
         usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
-        ties = matcher.match()
-        out = [self._tie(strip, tie) for tie in ties]
+        out = self._ties(matcher.match(), strip.id)
         targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
         out += targets
-        out += [self._log(f"{strip.id}: {text}", warning=True) for text in (*matcher.take_events(), *words)]
-        failed = sum(matcher.counters[name] for name in FAILED)
-        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties), strip.id)]
+        out += [self._log(f"{strip.id}: {text}", warning=True) for text in words]
         self.counters.update(self._targets.take_counters())
+        return out
+
+    def _ties(self, ties: list[MatchedTie], strip: str) -> list[Message]:
+        """Ties that the lines of a strip gave, and what is to be told of it."""
+        matcher = self._matcher
+        assert matcher is not None
+        out = [self._tie(strip, tie) for tie in ties]
+        out += [self._log(f"{strip}: {text}", warning=True) for text in matcher.take_events()]
+        failed = sum(matcher.counters[name] for name in FAILED)
+        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties), strip)]
         self.counters.update(matcher.counters)
         matcher.counters.clear()
         return out
@@ -301,29 +318,39 @@ class Matcher(Node):
         out: list[Message] = []
         if block.strip not in self._strips:
             strip = self._strips[block.strip] = self._found.begin(block)
-            out += [self._strip(ended) for ended in self._found.ended(self._stamp_ns, block)]
+            out += self._ended(self._found.ended(self._stamp_ns, block))
             out += [self._strip(strip), self._log(f"{strip.id}: nobody announced it, found from its image lines")]
         off = self._found.note(block, self._stamp_ns)
         return out + ([self._log(off, warning=True)] if off else [])
+
+    def _ended(self, strips: list[Any]) -> list[Message]:
+        """Strips that were found and are over."""
+        out: list[Message] = []
+        for strip in strips:
+            if self._matcher is not None:
+                out += self._ties(self._matcher.end_strip(strip.id), strip.id)
+            out.append(self._strip(strip))
+        return out
 
     def _strip(self, strip: Any) -> Message:
         """A strip that was found; stamped as observations are, so that what the matcher says stays in order."""
         return Message("configuration/strip", self._observed_ns, strip)
 
-    def _tie(self, strip: Any, tie: MatchedTie) -> Message:
-        period_ns = convert.SECOND_NS / strip.line_rate_hz
-        images = [
-            {
-                "strip": strip.id,
-                "ccd": ray.ccd,
-                "line": ray.line,
-                "sample": ray.sample,
-                "sigma_line": ray.sigma_line,
-                "sigma_sample": ray.sigma_sample,
-                "time_ns": strip.first_line_time_ns + round(ray.line * period_ns),
-            }
-            for ray in tie.rays
-        ]
+    def _tie(self, strip_id: str, tie: MatchedTie) -> Message:
+        images = []
+        for ray in tie.rays:
+            strip = self._strips[ray.strip or strip_id]
+            images.append(
+                {
+                    "strip": strip.id,
+                    "ccd": ray.ccd,
+                    "line": ray.line,
+                    "sample": ray.sample,
+                    "sigma_line": ray.sigma_line,
+                    "sigma_sample": ray.sigma_sample,
+                    "time_ns": strip.first_line_time_ns + round(ray.line * convert.SECOND_NS / strip.line_rate_hz),
+                }
+            )
         return Message("observation/tie", self._observed_ns, convert.tie_message(tie.name, images))
 
     @property

@@ -76,10 +76,11 @@ class DoubtfulTargets:
             out += [self._observation(strip, look, stamp_ns) for strip, look in held]
         return out
 
-    def begin_strip(self, strip: Any, first_s: float) -> None:
-        """Lines that follow belong to a strip."""
+    def begin_strip(self, strip: Any, first_s: float, orientation: CurrentOrientation) -> None:
+        """Lines that follow belong to a strip, whose orientation is kept up to date by the caller."""
         self._strip = strip
         if self._finder is not None:
+            self._finder.orientation = orientation
             self._finder.begin_strip(first_s, strip.line_rate_hz)
 
     def lines(

@@ -28,6 +28,7 @@ class CurrentOrientation:
         self._poses = GrowingTrajectory()
         self._smoother, self._steady = PoseSmoother(), SteadyPositions()
         self._last_s = -np.inf
+        self._closed = False
         self._knots: dict[int, list[Array | int]] = {}
         self._covariance: dict[int, Array] = {}
         self._newest: tuple[float, Array] | None = None
@@ -35,7 +36,7 @@ class CurrentOrientation:
     @property
     def end_s(self) -> float:
         """Times before this one will not change with the next pose; minus infinity with fewer than four poses."""
-        return float(self._poses.time_s[-2]) if len(self._poses) >= 4 else -np.inf
+        return float(self._poses.time_s[-1 if self._closed else -2]) if len(self._poses) >= 4 else -np.inf
 
     @property
     def noise_left(self) -> Array:
@@ -59,6 +60,12 @@ class CurrentOrientation:
         if len(self._poses) > 4096 and self._poses.start_s < time_s - 2 * KEPT_S:
             self._poses.forget(time_s - KEPT_S)
         return True
+
+    def close(self) -> None:
+        """No more poses come: those that wait for neighbours are taken as they are."""
+        for time_s, position_l, quaternion, covariance in self._smoother.rest():
+            self._poses.append(np.array([time_s]), position_l[None], quaternion[None], covariance[None])
+        self._closed = True
 
     def add_correction(self, time_s: float, correction: Array, covariance: Array) -> None:
         """Add what an adjustment adds to the measured pose at a time (6,), and the covariance (6, 6) of the sum."""

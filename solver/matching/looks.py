@@ -206,18 +206,22 @@ class LookMatcher:
         new = good & ~known
         p.heights.add((g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[new])
 
-    def try_height(self, tracks: Sequence[Track], view: int, height_m: float) -> Array | None:
-        """Points (n, 3) of the places that are found in a view with a wide search about a height; nothing is noted.
+    def try_height(
+        self, tracks: Sequence[Track], view: int, height_m: float, reach_px: float | None = None
+    ) -> Array | None:
+        """Points (n, 3) of the places that are found in a view with a search about a height; nothing is noted.
 
-        None where the orientation of the lines is not known.
+        ``reach_px`` is how far is searched, the largest reach if None. None where the orientation of the lines is not
+        known.
         """
         p = self.prediction
-        line, _ = _at(tracks)
+        line, sample = _at(tracks)
         scan = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
         if scan is None:
             return None
-        g = self._geometry(tracks, scan, np.full(len(tracks), height_m))
-        done = self._search_view(view, g, p.options.largest_reach_px)
+        guess_l, _ = scan.to_plane(line, sample, np.full(len(tracks), height_m))
+        g = self._geometry(tracks, scan, p.heights.level(guess_l[:, :2], height_m))
+        done = self._search_view(view, g, p.options.largest_reach_px if reach_px is None else reach_px)
         if done is None:
             return None
         found, _, _, parallax = done
@@ -309,12 +313,12 @@ class LookMatcher:
         p = self.prediction
         index = p.others[view]
         expected, ground = g.expected[:, view], g.ground
-        away = p.lines_later(index, ground.centre_l[:, 2])
-        wide = p.scan(index, (g.line + away).min() - 2 * WIDE, (g.line + away).max() + 2 * WIDE)
+        there = p.look_lines(index, g.line, ground.centre_l)
+        wide = p.scan(index, there.min() - 2 * WIDE, there.max() + 2 * WIDE)
         if wide is None:
             return None
         moved = ground.moved(expected)
-        other_line, _, _ = wide.locate(moved.centre_l, g.line + away, rounds=5)
+        other_line, _, _ = wide.locate(moved.centre_l, there, rounds=5)
         other_line = np.clip(other_line, wide.first_line, wide.first_line + len(wide.position_l) - 1)
         # slope of the other rays, for what height does
         camera = wide.position_l[(other_line - wide.first_line).astype(int)]

@@ -82,13 +82,14 @@ class Place:
 
 @dataclass(frozen=True)
 class MatchedRay:
-    """One look at a tie point; px."""
+    """One look at a tie point; px. ``strip`` where it is not the one whose lines are matched now."""
 
     ccd: str
     line: float
     sample: float
     sigma_line: float
     sigma_sample: float
+    strip: str = ""
 
 
 @dataclass(frozen=True)

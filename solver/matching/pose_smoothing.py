@@ -84,6 +84,12 @@ class PoseSmoother:
         turn = moved[REACHES.index(attitude), 3:] if attitude else np.zeros(3)
         return centre[0], centre[1] + shift, quaternion_multiply(centre[2], quaternion_from_vector(turn)), centre[3]
 
+    def rest(self) -> list[tuple[float, Array, Array, Array]]:
+        """The poses that wait for neighbours, as they came: no more will come."""
+        waiting = list(self._queue)[-REACHES[0] :]
+        self._queue.clear()
+        return waiting
+
     def _learn(self, fourth: Array, moved: Array) -> None:
         self._seen = min(self._seen + 1, MEMORY)
         share = 1.0 / self._seen

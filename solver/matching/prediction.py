@@ -100,6 +100,10 @@ class Prediction:
         forward = self.views[self.master].forward - self.views[index].forward
         return forward * (above + self.nadir_m - height_m) / travel
 
+    def look_lines(self, index: int, line: Array, point_l: Array) -> Array:
+        """Lines (k,) of a view that see ground (k, 3), seen in lines (k,) of the master, about."""
+        return np.asarray(line + self.lines_later(index, point_l[:, 2]))
+
     def scan(self, index: int, first: float, last: float) -> LineScan | None:
         """Lines of a view with their orientation, as far as there is one."""
         o = self.orientation

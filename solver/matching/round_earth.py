@@ -53,13 +53,20 @@ class RoundHeights(HeightGuess):
     in_orbit: bool = False
 
     def add(self, xyz_l: Array) -> None:
-        if self.in_orbit:
-            xyz_l = np.column_stack([xyz_l[:, :2], xyz_l[:, 2] - _sphere(xyz_l[:, :2])])
-        super().add(xyz_l)
+        super().add(np.column_stack([xyz_l[:, :2], xyz_l[:, 2] - self.level(xyz_l[:, :2], 0.0)]))
+
+    def found(self, xyz_l: Array) -> None:
+        self.say(float(np.median(xyz_l[:, 2] - self.level(xyz_l[:, :2], 0.0))))
+        self.add(xyz_l)
+
+    def level(self, xy: Array, height_m: float) -> Array:
+        """Z (n,) of ground of one height at places (n, 2)."""
+        level = np.full(len(xy), height_m)
+        return level + _sphere(np.asarray(xy)) if self.in_orbit else level
 
     def at(self, xy: Array) -> tuple[Array, Array]:
         height, sigma = super().at(xy)
-        return (height + _sphere(np.asarray(xy)), sigma) if self.in_orbit else (height, sigma)
+        return height + self.level(xy, 0.0), sigma
 
 
 def _sphere(xy: Array) -> Array:

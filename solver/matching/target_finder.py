@@ -124,8 +124,8 @@ class TargetFinder:
 
     Parameters
     ----------
-    camera : line camera with one lens
-    orientation : best orientation known now; kept up to date by whoever owns it
+    camera : line camera
+    orientation : best orientation known now; kept up to date by whoever owns it, who may change it between strips
     options : see `TargetOptions`
 
     Attributes

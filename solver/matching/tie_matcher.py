@@ -72,6 +72,14 @@ class TieMatcher:
         """The orientation that places are predicted with; takes poses and corrections."""
         return self.prediction.orientation
 
+    def add_pose(self, time_s: float, position_l: Array, quaternion: Array, covariance: Array) -> bool:
+        """Add a measured pose; False for one that does not come after the last."""
+        return self.orientation.add_pose(time_s, position_l, quaternion, covariance)
+
+    def orientation_of(self, strip: str) -> CurrentOrientation | None:
+        """What takes corrections of a strip; None where its lines are not those that are matched."""
+        return self.orientation if strip == self._strip else None
+
     @property
     def strip(self) -> str:
         """The strip that lines belong to, empty before the first one."""
@@ -177,6 +185,14 @@ class TieMatcher:
         self.counters.update(self._lines.counters)
         self._lines.counters.clear()
         return out
+
+    def end_strip(self, strip: str) -> list[MatchedTie]:
+        """A strip is over: what its lines tell has been told while they came."""
+        return []
+
+    def finish(self) -> list[MatchedTie]:
+        """Nothing more comes: as `end_strip`."""
+        return []
 
     def _choose_master(self, store: LineStore, seeing: frozenset[str]) -> None:
         """Places are chosen in the steepest of the views that see; what began in another one goes on."""

@@ -43,6 +43,8 @@ class OrbitalSensor:
     period_s : from line to line
     lines : of a scene
     pitch_rate_deg_s : at which the body turns forward while it images; negative: the ground is held back
+    yaw_steered : the body flies with its x axis along the track over the turning Earth, so that all lenses see the same
+        swath; otherwise along the velocity against the stars
     """
 
     camera: LineCamera
@@ -52,6 +54,7 @@ class OrbitalSensor:
     period_s: float
     lines: int
     pitch_rate_deg_s: float = 0.0
+    yaw_steered: bool = False
 
 
 def _misr() -> tuple[LineCamera, dict[str, float]]:
@@ -70,13 +73,20 @@ def _presets() -> dict[str, OrbitalSensor]:
     misr, misr_views = _misr()
     moms = multi_lens_camera("moms-02", 237.2, {"F": 8304, "B": 8304}, 0.010)
     eros = multi_lens_camera("eros-a1", 3450.0, {"P": 7043}, 0.013)
-    known = {name: (preset(name), lens_views_deg(name)) for name in ("alos-prism", "spot5-hrs", "aster-vnir")}
-    views = lens_views_deg("spot5-hrs")
+    views_of = {name: lens_views_deg(name) for name in ("alos-prism", "spot5-hrs", "aster-vnir")}
+    known = {name: (preset(name), views) for name, views in views_of.items()}
+    # the same fields in pixels of 100 to 400 m: image lines that are soon rendered
+    prism = multi_lens_camera("alos-prism-300", 1939.0, dict.fromkeys("FNB", 300), 0.007 * 14_496 / 300)
+    aster = multi_lens_camera("aster-vnir-300", 329.0, {"3N": 300, "3B": 366}, 0.007 * 4100 / 300)
+    hrs = with_pixels(preset("spot5-hrs"), 300)
     return {
         "alos-prism": OrbitalSensor(*known["alos-prism"], 691_650.0, 98.16, 0.37e-3, 14_496),
         "spot5-hrs": OrbitalSensor(*known["spot5-hrs"], 832_000.0, 98.7, 0.752e-3, 12_000),
-        # the same field in pixels of 400 m: image lines that are soon rendered
-        "spot5-hrs-small": OrbitalSensor(with_pixels(preset("spot5-hrs"), 300), views, 832_000.0, 98.7, 0.060, 150),
+        "spot5-hrs-small": OrbitalSensor(hrs, views_of["spot5-hrs"], 832_000.0, 98.7, 0.060, 150),
+        "alos-prism-small": OrbitalSensor(
+            prism, views_of["alos-prism"], 691_650.0, 98.16, 0.0179, 300, yaw_steered=True
+        ),
+        "aster-vnir-small": OrbitalSensor(aster, views_of["aster-vnir"], 705_000.0, 98.2, 0.0301, 307),
         "aster-vnir": OrbitalSensor(*known["aster-vnir"], 705_000.0, 98.2, 2.199e-3, 4200),
         "eros-a1": OrbitalSensor(eros, {"P": 0.0}, 480_000.0, 97.3, 1.4e-3, 6600, -0.63),
         "moms-02": OrbitalSensor(moms, {"F": 21.4, "B": -21.4}, 296_000.0, 28.5, 1.8e-3, 8000),
@@ -212,9 +222,10 @@ def overpass(
     }
     start, end = min(first.values()) - _MARGIN_S, max(first.values()) + 2 * half + _MARGIN_S
     rate = np.radians(sensor.pitch_rate_deg_s)
+    yaw = _yaw_along_track(orbit) if sensor.yaw_steered else 0.0
     motion = Motion(
         replace(orbit, start_s=start, end_s=end),
-        SteadyAttitude((np.radians(roll_deg), 0.0, 0.0), (0.0, rate, 0.0), start, end),
+        SteadyAttitude((np.radians(roll_deg), 0.0, yaw), (0.0, rate, 0.0), start, end),
         attitude_frame="o",
     )
     sensors = {
@@ -229,6 +240,15 @@ def overpass(
         for k, line in enumerate(sensor.camera.lines)
     }
     return OrbitalScene(sensor, sensors, motion, first, orbit)
+
+
+def _yaw_along_track(orbit: CircularOrbit) -> float:
+    """Yaw at time 0, rad, that brings the body's x axis from the inertial velocity to that over the turning Earth."""
+    (position,), (velocity,) = orbit.at(0.0)
+    inertial = velocity + ROTATION_RATE * np.array([-position[1], position[0], 0.0])
+    right = np.cross(-position, inertial)
+    x, y = (axis @ velocity / np.linalg.norm(axis) for axis in (inertial, right))
+    return float(np.arctan2(y, x))
 
 
 def look_of(camera: LineCamera, k: int, view_deg: float) -> TableLook:

@@ -242,7 +242,7 @@ def held(flown, images):
             cov = (COORDINATE_SIGMA_M**2 * np.eye(3)).ravel().tolist()
             radius = flown.imager.texture.target_radius_m
             desk.ground_point(m.GroundPoint(point=name, x=x, y=y, z=z, covariance=cov, target_radius=radius))
-        desk.begin_strip(strip, flight.strips[0].first_line_time_s)
+        desk.begin_strip(strip, flight.strips[0].first_line_time_s, orientation)
         return desk
 
     def fly(desk, verdict_at=None, accepted=True):
