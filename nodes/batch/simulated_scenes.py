@@ -16,14 +16,15 @@ from ...schemas.topics import rank
 from ...solver.adjustment.block_data import BlockData
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.models.dgr import DgrOptions
+from ...solver.orbit.time_scales import iso_utc, parse_time
 from ...solver.scene_adjustment.block import Layout
 from ...solver.simulation.orbital_imagery import render, texture_of
-from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
+from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, OrbitalScene, OrbitalSensor, overpass_beside
 from ...solver.simulation.satellite_block import rigorous_images, scattered_points, simulate_block
 from ..convert import SECOND_NS, ground_point_message
 from ..errors import UserError
 from ..formats.block_messages import block_messages
-from ..formats.satellite.folder_writer import write_overpass
+from ..formats.satellite.folder_writer import EPOCH, write_overpass
 from ..formats.scene_block import DEFAULTS, read_scene_block, write_scene_block
 from ..formats.scene_recording import local_block
 from ..formats.table import Column, read_table, write_table
@@ -32,6 +33,12 @@ from ..node import Message
 #: Lines longer than this are not rendered: a scene of them would take minutes.
 _MOST_PIXELS = 2000
 _BLOCK_LINES = 25
+#: Place that is passed over, unless one is given: the first that the orbit reaches; geocentric degrees.
+_PLACES = ((36.0, 139.6), (20.0, 139.6), (0.0, 139.6))
+#: The outermost of several overpasses look so far aside, degrees; the next one comes so long after each.
+_ASIDE_DEG, _NEXT_NS = 15.0, 3 * 86_400 * SECOND_NS
+#: More overpasses than this are not asked for.
+MOST_OVERPASSES = 9
 #: Smallest and largest gross error, pixels.
 _GROSS_PX = (5.0, 30.0)
 
@@ -43,7 +50,8 @@ class SceneSimulation:
     Attributes
     ----------
     satellite : a name of `ORBITAL_SENSORS`
-    lat_deg, lon_deg : that the satellite passes over
+    lat_deg, lon_deg : that the satellite passes over; None for a place that its orbit reaches
+    overpasses : of the place; several look at it from aside, from the one side to the other
     points, control, check : number of ground points, and how many of them have known coordinates
     image_sigma_px, control_sigma_m : noise
     outliers : share of the image points of tie points that are gross errors
@@ -52,8 +60,8 @@ class SceneSimulation:
     """
 
     satellite: str
-    lat_deg: float = 36.0
-    lon_deg: float = 139.6
+    lat_deg: float | None = None
+    lon_deg: float | None = None
     points: int = 120
     control: int = 9
     check: int = 25
@@ -62,6 +70,7 @@ class SceneSimulation:
     outliers: float = 0.0
     seed: int = 1
     images: bool = False
+    overpasses: int = 1
 
 
 def simulated_recording(what: SceneSimulation) -> tuple[list[Message], dict[str, Any]]:
@@ -143,12 +152,11 @@ def write_with_sensors(folder: Path, what: SceneSimulation) -> tuple[dict[str, A
     if not (what.image_sigma_px > 0 and what.control_sigma_m > 0 and 0 <= what.outliers < 0.5):
         raise UserError("noise of image points and control: wanted numbers above 0; share of outliers: 0 to 0.5")
     sensor = ORBITAL_SENSORS[what.satellite]
-    try:
-        scene = overpass(sensor, what.lat_deg, what.lon_deg)
-    except ValueError as error:
-        raise UserError(f"--place: {error}") from None
+    if not 1 <= what.overpasses <= MOST_OVERPASSES:
+        raise UserError(f"{what.overpasses} overpasses, wanted 1 to {MOST_OVERPASSES}")
+    scenes = _overpasses(sensor, what)
     rng = np.random.default_rng(what.seed)
-    images = rigorous_images([scene], DgrOptions.from_settings(DEFAULTS))
+    images = rigorous_images(scenes, DgrOptions.from_settings(DEFAULTS))
     try:
         position = scattered_points(images, what.points, rng)
     except ValueError as error:
@@ -171,15 +179,18 @@ def write_with_sensors(folder: Path, what: SceneSimulation) -> tuple[dict[str, A
     else:
         wrong = 0
     folder.mkdir(parents=True, exist_ok=True)
-    write_overpass(folder / what.satellite, scene)
-    single = len(images) == 1
+    numbers = [str(k) for k in range(1, len(scenes) + 1)] if len(scenes) > 1 else [""]
+    metadata = {f"scene{number}": what.satellite + f"-{number}" * bool(number) for number in numbers}
+    for k, (name, scene) in enumerate(zip(metadata.values(), scenes, strict=True)):
+        write_overpass(folder / name, scene, epoch=iso_utc(parse_time(EPOCH) + k * _NEXT_NS))
+    single = len(sensor.camera.lines) == 1
     names = [image.name.removeprefix("1/") for image in images]
     write_scene_block(
         folder,
         f"simulated {what.satellite}",
-        {"scene": {"metadata": what.satellite}},
+        {scene: {"metadata": name} for scene, name in metadata.items()},
         block,
-        ["scene" if single else f"scene/{name}" for name in names],
+        [scene if single else f"{scene}/{line.id}" for scene in metadata for line in sensor.camera.lines],
         image_sigma_px=what.image_sigma_px,
     )
     lat, lon, height = block.ellipsoid.geodetic(position).T
@@ -200,3 +211,15 @@ def write_with_sensors(folder: Path, what: SceneSimulation) -> tuple[dict[str, A
         "seed": what.seed,
     }
     return result, sensors
+
+
+def _overpasses(sensor: OrbitalSensor, what: SceneSimulation) -> list[OrbitalScene]:
+    rolls = np.linspace(-_ASIDE_DEG, _ASIDE_DEG, what.overpasses) if what.overpasses > 1 else np.zeros(1)
+    if what.lat_deg is None or what.lon_deg is None:
+        lat_deg, lon_deg = next(place for place in _PLACES if place[0] < sensor.inclination_deg)
+    else:
+        lat_deg, lon_deg = what.lat_deg, what.lon_deg
+    try:
+        return [overpass_beside(sensor, lat_deg, lon_deg, roll) for roll in rolls.tolist()]
+    except ValueError as error:
+        raise UserError(f"--place: {error}") from None

@@ -57,7 +57,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     satellite.add_argument(
         "--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a folder, or NAME.mcap"
     )
-    satellite.add_argument("--place", type=float, nargs=2, metavar=("LAT", "LON"), help="passed over (36 139.6)")
+    satellite.add_argument(
+        "--place",
+        type=float,
+        nargs=2,
+        metavar=("LAT", "LON"),
+        help="passed over (36 139.6, or where the orbit reaches)",
+    )
+    satellite.add_argument(
+        "--overpasses", type=int, metavar="N", help="of the place, three days apart; several look aside at it (1)"
+    )
     satellite.add_argument("--points", type=int, metavar="N", help="ground points in all (120)")
     about = {"world": f"messages and sigmas stay as the other options say; the flight has these as well: {HELP}"}
     groups = {name: parser.add_argument_group(title, about.get(name)) for name, title in _GROUPS.items()}
@@ -90,8 +99,8 @@ def run(args: argparse.Namespace) -> int:
     given = {option.name: getattr(args, option.name) for option in OPTIONS}
     if args.satellite is not None:
         return _simulate_scenes(args, given)
-    if args.place is not None or args.points is not None:
-        raise UserError("--place and --points go with --satellite")
+    if any(value is not None for value in (args.place, args.points, args.overpasses)):
+        raise UserError("--place, --points and --overpasses go with --satellite")
     flight = simulated_flight({name: _single(value) for name, value in given.items() if value is not None})
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or _utc_ns(DEFAULT_EPOCH)
     simulator = Simulator(flight.simulation, flight.imager)
@@ -135,6 +144,7 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
         raise UserError("--control-sigma: wanted one number with --satellite")
     stated |= {} if args.place is None else {"lat_deg": args.place[0], "lon_deg": args.place[1]}
     stated |= {} if args.points is None else {"points": args.points}
+    stated |= {} if args.overpasses is None else {"overpasses": args.overpasses}
     what = SceneSimulation(args.satellite, **stated)
     if recording:
         messages, result = simulated_recording(what)

@@ -242,6 +242,34 @@ def overpass(
     return OrbitalScene(sensor, sensors, motion, first, orbit)
 
 
+def overpass_beside(sensor: OrbitalSensor, lat_deg: float, lon_deg: float, roll_deg: float) -> OrbitalScene:
+    """An overpass that looks aside at a place: the middle of the steepest line's scene lies there.
+
+    Parameters
+    ----------
+    sensor : camera and orbit
+    lat_deg, lon_deg : geocentric latitude and longitude of the place
+    roll_deg : look to the left of the track
+
+    Raises
+    ------
+    ValueError : a latitude that the orbit does not reach
+    """
+    lat, lon = lat_deg, lon_deg
+    steepest = min(sensor.camera.lines, key=lambda line: abs(sensor.view_deg[line.lens])).id
+    scene = overpass(sensor, lat, lon, roll_deg)
+    if not roll_deg:
+        return scene
+    for _ in range(3):
+        seen = scene.sensors[steepest]
+        ground = seen.ground([(seen.lines - 1) / 2], [(seen.samples - 1) / 2], 0.0)[0]
+        lat += lat_deg - float(np.degrees(np.arctan2(ground[2], np.hypot(ground[0], ground[1]))))
+        lon += lon_deg - float(np.degrees(np.arctan2(ground[1], ground[0])))
+        lon = (lon + 180.0) % 360.0 - 180.0
+        scene = overpass(sensor, lat, lon, roll_deg)
+    return scene
+
+
 def _yaw_along_track(orbit: CircularOrbit) -> float:
     """Yaw at time 0, rad, that brings the body's x axis from the inertial velocity to that over the turning Earth."""
     (position,), (velocity,) = orbit.at(0.0)

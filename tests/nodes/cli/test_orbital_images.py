@@ -15,8 +15,17 @@ def processed(tmp_path_factory):
     made, out = folder / "pair.mcap", folder / "out.mcap"
     assert main(["simulate", "-q", "-o", str(made), "--satellite", "spot5-hrs-small", "--images", "--seed", "2"]) == 0
     (folder / "dgr.toml").write_text('[adjuster]\nmodel = "dgr"\n')
-    assert main(["process", "-q", str(made), "--config", str(folder / "dgr.toml"), "-o", str(out)]) == 0
+    nodes = ["--nodes", "matcher,adjuster"]
+    assert main(["process", "-q", str(made), "--config", str(folder / "dgr.toml"), *nodes, "-o", str(out)]) == 0
     return out
+
+
+def test_ties_between_the_lenses(processed, tmp_path):
+    """The matcher's are among the adjusted points."""
+    table = tmp_path / "points.csv"
+    assert main(["export", str(processed), "--points", str(table)]) == 0
+    names = [row.split(",")[0] for row in table.read_text().splitlines()[1:]]
+    assert sum("-M" in name for name in names) > 40
 
 
 def overlap(first, second):

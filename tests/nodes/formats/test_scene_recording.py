@@ -16,6 +16,7 @@ from triline.nodes.formats.scene_block import read_scene_block
 from triline.nodes.formats.scene_recording import local_block
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
+from triline.solver.adjustment.snooping import snoop
 from triline.solver.models.dgr import DgrOptions
 
 
@@ -31,6 +32,14 @@ def on_line(messages, **options):
     return points, node
 
 
+def batch_of(messages):
+    """Points of the batch of the same messages, name -> xyz; its network and solution."""
+    block = block_from_messages(messages, "recording")
+    network = network_from_block(block)
+    solution = adjust(network, DgrOptions.from_settings(block.apriori.trajectory))
+    return dict(zip(network.point_ids, solution.state.points_l, strict=True)), network, solution
+
+
 def truth_of(messages):
     return {m.body.point: np.array([m.body.x, m.body.y, m.body.z]) for m in messages if m.topic == "truth/point"}
 
@@ -43,20 +52,44 @@ def nees_of(messages, points):
     return [(e := points[id][0] - truth[id]) @ np.linalg.solve(points[id][1], e) / 3 for id in free]
 
 
-@pytest.mark.parametrize("satellite", ["alos-prism", "spot5-hrs", "aster-vnir"])
-def test_on_line_is_as_the_batch(satellite):
-    """Lenses minutes apart, a strip each: all points, within hundredths of a sigma of the batch."""
-    messages, _ = simulated_recording(SceneSimulation(satellite, points=60, check=10))
+@pytest.mark.parametrize(
+    ("satellite", "overpasses"),
+    [("alos-prism", 1), ("spot5-hrs", 1), ("aster-vnir", 1), ("moms-02", 1), ("eros-a1", 2)],
+)
+def test_on_line_is_as_the_batch(satellite, overpasses):
+    """Lenses minutes apart, overpasses days apart, a strip each: all points, within hundredths of a sigma of the batch.
+
+    EROS-A1 turns back while it images, more slowly than the ground goes by.
+    """
+    messages, _ = simulated_recording(SceneSimulation(satellite, points=60, check=10, overpasses=overpasses))
     points, node = on_line(messages, model="dgr")
     assert not node.counters["failed"] and len(points) == 60
-    block = block_from_messages(messages, "recording")
-    network = network_from_block(block)
-    solution = adjust(network, DgrOptions.from_settings(block.apriori.trajectory))
-    batch = dict(zip(network.point_ids, solution.state.points_l, strict=True))
+    batch = batch_of(messages)[0]
     off = np.array([np.abs(xyz - batch[id]) / np.sqrt(np.diag(C)) for id, (xyz, C) in points.items()])
     assert off.mean() < 0.01 and off.max() < 0.05
     # the true orientation is far from the measured one: without corrections points are tens of metres off
     assert 0.5 < np.mean(nees_of(messages, points)) < 2.0
+
+
+def test_one_lens_in_one_overpass():
+    """EROS-A1: what nobody else sees has no place; control has, as in the batch, and orients the strip."""
+    messages, _ = simulated_recording(SceneSimulation("eros-a1", points=40, check=10))
+    points, node = on_line(messages, model="dgr")
+    assert set(points) == {f"P{k}" for k in range(9)} and node.counters["too few looks"] == 31
+    batch = batch_of(messages)[0]
+    assert max(np.abs(xyz - batch[id]).max() / np.sqrt(np.diag(C)).min() for id, (xyz, C) in points.items()) < 0.01
+
+
+@pytest.mark.study
+def test_nine_lenses_leave_out_the_looks_that_the_batch_leaves_out():
+    """MISR: two looks at the limit of the test. The batch with data snooping refuses both, and agrees in all points."""
+    messages, _ = simulated_recording(SceneSimulation("misr"))
+    points, _ = on_line(messages, model="dgr")
+    _, network, solution = batch_of(messages)
+    snooped = snoop(solution)
+    assert len(snooped.rejected) == 2 and all(abs(rejected.w) < 3.6 for rejected in snooped.rejected)
+    batch = dict(zip(network.point_ids, snooped.solution.state.points_l, strict=True))
+    assert max((np.abs(xyz - batch[id]) / np.sqrt(np.diag(C))).max() for id, (xyz, C) in points.items()) < 0.02
 
 
 @pytest.mark.parametrize("options", [{"model": "ppm"}, {"model": "lim"}, {"model": "dgr", "self_calibration": "lens"}],

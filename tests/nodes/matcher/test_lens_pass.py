@@ -1,0 +1,156 @@
+"""Tie points between lenses whose strips come one after another: against the truth, the batch, and bad input."""
+
+from __future__ import annotations
+
+from functools import cache
+from heapq import merge
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording, write_with_sensors
+from triline.nodes.formats.block_recording import block_from_messages
+from triline.nodes.formats.scene_block import read_scene_block
+from triline.nodes.formats.scene_recording import local_block
+from triline.nodes.matcher.matcher import Matcher
+from triline.schemas.topics import rank
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.block_data import network_from_block
+from triline.solver.camera.sensors import preset
+from triline.solver.matching.lens_pass import LensPassMatcher
+from triline.solver.models.dgr import DgrOptions
+
+SATELLITES = ("spot5-hrs-small", "alos-prism-small", "aster-vnir-small")
+
+
+def order(message):
+    return message.stamp_ns, rank(message.topic)
+
+
+def through(node, messages):
+    """What a node says to the messages that it takes."""
+    topics = tuple(topic.removesuffix("*") for topic in node.inputs)
+    found = [out for message in messages if message.topic.startswith(topics) for out in node.step(message)]
+    return [*found, *node.finish()]
+
+
+@cache
+def recorded(satellite, seed):
+    """Messages of a simulated recording with image lines, the true sensor of each strip, and the local frame."""
+    what = SceneSimulation(satellite, images=True, seed=seed)
+    messages, _ = simulated_recording(what)
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "scene"
+        _, sensors = write_with_sensors(folder, what)
+        block = local_block(read_scene_block(folder))
+    return messages, dict(zip((strip.id for strip in block.strips), sensors, strict=True)), block.frame
+
+
+def matched(satellite, seed=2, **options):
+    """Messages of the recording, those of the matcher's ties, the matcher, true places of its points, and by how much
+    looks miss them."""
+    messages, sensor, frame = recorded(satellite, seed)
+    node = Matcher(**options)
+    ties = [out for out in through(node, messages) if out.topic == "observation/tie"]
+    truth = {}
+    for tie in ties:
+        first = tie.body.images[0]
+        if tie.body.point not in truth:
+            ground = sensor[first.strip].ground([first.line], [first.sample], frame.height_m)[0]
+            truth[tie.body.point] = ground
+    missed = [
+        [image.line, image.sample] - sensor[image.strip].ground_to_pixel(truth[tie.body.point][None])[0]
+        for tie in ties
+        for image in tie.body.images
+    ]
+    local = {id: frame.R_el.T @ (ground - frame.origin_e) for id, ground in truth.items()}
+    return messages, ties, node, local, np.array(missed)
+
+
+def on_line(messages, ties):
+    """Points of the adjuster, name -> (xyz, covariance), and all that it was given."""
+    given = list(merge(messages, sorted(ties, key=order), key=order))
+    points = {}
+    for out in through(Adjuster(model="dgr"), given):
+        if out.topic == "point/object":
+            body = out.body
+            points[body.point] = np.array([body.x, body.y, body.z]), np.reshape(body.covariance, (3, 3))
+    return points, given
+
+
+def nees_of(points, truth):
+    """Mean squared error by the covariance, a coordinate."""
+    return np.mean([(e := points[id][0] - xyz) @ np.linalg.solve(points[id][1], e) / 3 for id, xyz in truth.items()])
+
+
+@pytest.mark.parametrize("satellite", SATELLITES)
+def test_ties_between_strips_of_lenses(satellite):
+    """Each lens is a strip of its own, minutes apart: ties of all lenses, as exact as the images, adjusted on line."""
+    messages, ties, node, truth, missed = matched(satellite)
+    assert len(truth) > 60 and not node.counters["contradiction"] > 0.1 * len(truth)
+    assert (np.median(np.abs(missed), axis=0) < 0.03).all()
+    assert (np.abs(missed).max(axis=1) < 0.2).mean() > 0.97
+    lenses = {image.strip for tie in ties for image in tie.body.images}
+    assert lenses == {m.body.id for m in messages if m.topic == "configuration/strip"}
+    points, given = on_line(messages, ties)
+    assert truth.keys() <= points.keys()
+    assert 0.1 < nees_of(points, truth) < 3.0  # a few values of the datum in all of them: exact over seeds, below
+    block = block_from_messages(given, "recording")
+    network = network_from_block(block)
+    solution = adjust(network, DgrOptions.from_settings(block.apriori.trajectory))
+    batch = dict(zip(network.point_ids, solution.state.points_l, strict=True))
+    off = np.array([np.abs(xyz - batch[id]) / np.sqrt(np.diag(C)) for id, (xyz, C) in points.items()])
+    assert off.mean() < 0.03 and off.max() < 0.15
+
+
+@pytest.mark.study
+def test_errors_are_as_large_as_their_sigmas():
+    found = []
+    for satellite in SATELLITES:
+        for seed in range(10):
+            messages, ties, _, truth, _ = matched(satellite, seed)
+            found.append(nees_of(on_line(messages, ties)[0], truth))
+    assert 0.6 < np.mean(found) < 1.6
+
+
+def test_later_looks_have_the_name_of_their_point():
+    """PRISM: the second strip's lens looks down, so that places are chosen in it; the third one's looks come alone."""
+    _, ties, node, _, _ = matched("alos-prism-small")
+    first = [tie for tie in ties if len(tie.body.images) == 2]
+    later = [tie for tie in ties if len(tie.body.images) == 1]
+    assert {image.ccd for tie in first for image in tie.body.images} == {"N", "F"}
+    assert {image.ccd for tie in later for image in tie.body.images} == {"B"}
+    names = {tie.body.point for tie in first}
+    assert len(names) == len(first) and {tie.body.point for tie in later} <= names
+    assert len(later) > 0.8 * len(first) and node.counters["later looks"] == len(later)
+    # ties are known when the strip that completes them is over
+    assert max(tie.stamp_ns for tie in first) < min(tie.stamp_ns for tie in later)
+
+
+def test_ground_that_is_not_where_it_is_said_to_be():
+    """It is looked for at other heights: 12 km are 46 pixels of parallax, and the first search reaches 40."""
+    _, _, _, truth, missed = matched("alos-prism-small", ground_m=12_000.0)
+    assert len(truth) > 60
+    assert (np.median(np.abs(missed), axis=0) < 0.03).all()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="wants a camera with several, ads40 has one"):
+        LensPassMatcher(preset("ads40"))
+    matcher = LensPassMatcher(preset("spot5-hrs"))
+    with pytest.raises(ValueError, match=r"strip 'S1': the camera has several lenses, wanted a name that ends with"):
+        matcher.begin_strip("S1", 0.0, 100.0)
+    with pytest.raises(ValueError, match="with nan lines a second"):
+        matcher.begin_strip("S/F", 0.0, float("nan"))
+    with pytest.raises(ValueError, match="lines of F before their strip"):
+        matcher.add_lines("F", 0, np.zeros((2, 12000), np.uint16))
+    matcher.begin_strip("S/F", 0.0, 100.0)
+    with pytest.raises(ValueError, match="unknown CCD line 'B'"):
+        matcher.add_lines("B", 0, np.zeros((2, 12000), np.uint16))
+    matcher.add_lines("F", 0, np.zeros((2, 12000), np.uint16))  # lines without any pose
+    assert matcher.end_strip("S/F") == [] and matcher.end_strip("never begun") == []
+    matcher.begin_strip("S/B", 20.0, 100.0)
+    assert matcher.finish() == []
