@@ -10,9 +10,9 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES, find
-from ...solver.matching.lens_pass import LensPassMatcher
 from ...solver.matching.options import MatchedTie, MatchingOptions
 from ...solver.matching.round_earth import above_sphere
+from ...solver.matching.strip_matcher import StripMatcher
 from ...solver.matching.tie_matcher import TieMatcher
 from .. import convert
 from ..governor import Announced, Governor
@@ -35,7 +35,7 @@ PROGRESS_NS = 40_000_000
 
 
 class Matcher(Node):
-    """Runs a `TieMatcher`.
+    """Runs a `TieMatcher`, or a `StripMatcher` for cameras with several lenses or with one line.
 
     A tie point is completed by a message: the block of lines with its last look, or the pose that told where that look
     was taken from. A strip that nobody has announced is found from its image lines, and announced. Signalised control
@@ -108,7 +108,7 @@ class Matcher(Node):
         self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._delay_ns = round(delay_s * convert.SECOND_NS)
-        self._matcher: TieMatcher | LensPassMatcher | None = None
+        self._matcher: TieMatcher | StripMatcher | None = None
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
         self._found = FoundStrips()
@@ -212,8 +212,9 @@ class Matcher(Node):
         camera = convert.camera_from(body)
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
-        several = len(camera.lenses) > 1
-        self._matcher = LensPassMatcher(camera, self.options) if several else TieMatcher(camera, self.options)
+        # lines of one lens see the ground in the same strip; several lenses, or one line, in one strip after another
+        in_strip = len(camera.lenses) == 1 and len(camera.lines) > 1
+        self._matcher = TieMatcher(camera, self.options) if in_strip else StripMatcher(camera, self.options)
         self._matcher.keep(self._pace.share)
         self._set_ground()
         self._targets.configure(camera, self._matcher.orientation)
@@ -228,7 +229,7 @@ class Matcher(Node):
             self._matcher.set_mean_height(self._ground_m)
         elif self._heights:
             known = np.array(list(self._heights.values()))
-            round_earth = isinstance(self._matcher, LensPassMatcher)
+            round_earth = isinstance(self._matcher, StripMatcher)
             heights = [above_sphere(xyz) for xyz in known] if round_earth else known[:, 2]
             self._matcher.set_mean_height(float(np.median(heights)))
 

@@ -75,12 +75,14 @@ class LineScan:
     view : the CCD line
     first_line : number of the first line
     position_l, R_lc : (n, 3), (n, 3, 3) orientation of each line
+    ground_share : way of the view on the ground as a share of the platform's; a satellite may turn while it images
     """
 
     view: View
     first_line: int
     position_l: Array
     R_lc: Array
+    ground_share: float = 1.0
 
     def to_plane(self, line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:
         """Ground points (n, 3) of pixels at given heights, and the rays' slopes dX/dZ, dY/dZ (n, 2).
@@ -112,6 +114,7 @@ class LineScan:
         last = len(self.position_l) - 2
         u = np.clip(np.asarray(line, dtype=float) - self.first_line, 0, last + 1)
         travel = max(float(np.linalg.norm(self.position_l[-1] - self.position_l[0])) / (last + 1), 1e-9)
+        travel *= self.ground_share
         before, ahead_before = u, np.zeros(len(u))
         pixel = np.ones(len(u))
         for turn in range(rounds):

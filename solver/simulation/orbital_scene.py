@@ -75,7 +75,7 @@ def _presets() -> dict[str, OrbitalSensor]:
     eros = multi_lens_camera("eros-a1", 3450.0, {"P": 7043}, 0.013)
     views_of = {name: lens_views_deg(name) for name in ("alos-prism", "spot5-hrs", "aster-vnir")}
     known = {name: (preset(name), views) for name, views in views_of.items()}
-    # the same fields in pixels of 100 to 400 m: image lines that are soon rendered
+    # the same fields in pixels of 40 to 400 m: image lines that are soon rendered
     prism = multi_lens_camera("alos-prism-300", 1939.0, dict.fromkeys("FNB", 300), 0.007 * 14_496 / 300)
     aster = multi_lens_camera("aster-vnir-300", 329.0, {"3N": 300, "3B": 366}, 0.007 * 4100 / 300)
     hrs = with_pixels(preset("spot5-hrs"), 300)
@@ -89,6 +89,7 @@ def _presets() -> dict[str, OrbitalSensor]:
         "aster-vnir-small": OrbitalSensor(aster, views_of["aster-vnir"], 705_000.0, 98.2, 0.0301, 307),
         "aster-vnir": OrbitalSensor(*known["aster-vnir"], 705_000.0, 98.2, 2.199e-3, 4200),
         "eros-a1": OrbitalSensor(eros, {"P": 0.0}, 480_000.0, 97.3, 1.4e-3, 6600, -0.63),
+        "eros-a1-small": OrbitalSensor(with_pixels(eros, 300), {"P": 0.0}, 480_000.0, 97.3, 0.0308, 300, -0.63),
         "moms-02": OrbitalSensor(moms, {"F": 21.4, "B": -21.4}, 296_000.0, 28.5, 1.8e-3, 8000),
         "misr": OrbitalSensor(misr, misr_views, _MISR_HEIGHT_M, 98.2, 40.8e-3, 512),
     }

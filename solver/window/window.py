@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..adjustment.pose_noise import ray_information
 from ..adjustment.surface_control import SurfaceControl
-from ..camera.lens_strips import lens_of
 from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import SelfCalibration
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
@@ -36,6 +35,7 @@ from .screening.consensus import ConsensusSchedule, consensus_weights
 from .screening.sigma_check import SigmaCheck
 from .screening.snooping import reweigh, snoop
 from .state.batch import Batch
+from .state.lens_sets import lens_of
 from .state.network import LiveNetwork
 from .state.points import ControlPoint
 from .state.relinearisation import Relinearisation

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ...camera.lens_strips import lens_of
 from ...camera.line_camera import LineCamera
 from .strip import WindowStrip
 
 #: A strip waits for those of the other lenses so long, s. Derived: the nine lenses of MISR see a place within 420 s.
 LONGEST_S = 600.0
+
+
+def lens_of(camera: LineCamera, strip: str) -> str:
+    """The lens that a strip named ``scene/lens`` was taken through, "" where its name says of none."""
+    scene, _, lens = strip.rpartition("/")
+    several = len(camera.lenses) > 1
+    return lens if scene and several and any(lens == other.id for other in camera.lenses) else ""
 
 
 def stays_to(strip: WindowStrip, strips: Iterable[WindowStrip], camera: LineCamera, now_s: float) -> float:
