@@ -22,11 +22,16 @@ _SECOND = 1_000_000_000
 _DAY = 86_400 * _SECOND
 _UNIX_EPOCH_MJD = 40587
 _MJD0 = 2400000.5
-_ISO = re.compile(r"\s*(\d{4})-(\d\d?)-(\d\d?)[T ](\d\d?):(\d\d?):(\d\d?)(?:[.,](\d*))?\s*(Z|UTC)?\s*$")
+_ISO = re.compile(
+    r"\s*(?P<year>\d{4})-(?:(?P<month>\d\d?)-(?P<day>\d\d?)|(?P<ordinal>\d{3}))"
+    r"[T ]\s*(?P<hour>\d\d?):(?P<minute>\d\d?):(?P<second>\d\d?)(?:[.,](?P<fraction>\d*))?"
+    r"\s*(?:Z|UTC|(?P<sign>[-+])(?P<hours>\d\d):?(?P<minutes>\d\d))?\s*$"
+)
 
 
 def parse_time(text: str, scale: str = "UTC") -> int:
-    """``tai_ns`` of an ISO 8601 text (``2018-12-26T10:48:55.4490000Z``) in a scale.
+    """``tai_ns`` of an ISO 8601 text in a scale: ``2018-12-26T10:48:55.4490000Z``, ``2018-360T10:48:55``, with a zone
+    ``+01:00``.
 
     Raises
     ------
@@ -35,18 +40,31 @@ def parse_time(text: str, scale: str = "UTC") -> int:
     found = _ISO.match(text)
     if found is None:
         raise ValueError(f"{text!r} is not a time, wanted YYYY-MM-DDThh:mm:ss.s")
-    year, month, day, hour, minute, second = (int(group) for group in found.groups()[:6])
-    fraction = (found[7] or "")[:9].ljust(9, "0")
-    try:
-        mjd = int(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "D").astype(np.int64)) + _UNIX_EPOCH_MJD
-    except ValueError:
-        raise ValueError(f"{text!r} is not a day of the calendar") from None
+    year, hour, minute, second = (int(found[name]) for name in ("year", "hour", "minute", "second"))
+    fraction = (found["fraction"] or "")[:9].ljust(9, "0")
     if not 1900 <= year <= 2200:
         raise ValueError(f"{text!r} lies outside the years 1900 to 2200")
+    try:
+        if found["ordinal"]:
+            first, day = np.datetime64(f"{year:04d}-01-01", "D"), int(found["ordinal"])
+            date = first + (day - 1)
+            if not day >= 1 or date >= np.datetime64(f"{year + 1:04d}-01-01", "D"):
+                raise ValueError
+        else:
+            date = np.datetime64(f"{year:04d}-{int(found['month']):02d}-{int(found['day']):02d}", "D")
+    except ValueError:
+        raise ValueError(f"{text!r} is not a day of the calendar") from None
     if hour > 23 or minute > 59 or second > 60:
         raise ValueError(f"{text!r} is not a time of day")
+    mjd = int(date.astype(np.int64)) + _UNIX_EPOCH_MJD
     ns = ((hour * 60 + minute) * 60 + second) * _SECOND + int(fraction)
-    return tai_from_day(mjd, ns, scale)
+    if not found["sign"]:
+        return tai_from_day(mjd, ns, scale)
+    if int(found["hours"]) > 14 or int(found["minutes"]) > 59:
+        raise ValueError(f"{text!r} has no zone that there is")
+    ahead = (int(found["hours"]) * 60 + int(found["minutes"])) * 60 * _SECOND * (-1 if found["sign"] == "-" else 1)
+    days, ns = divmod(ns - ahead, _DAY)
+    return tai_from_day(mjd + days, ns, scale)
 
 
 def tai_from_day(mjd: int, ns_of_day: int, scale: str = "UTC") -> int:

@@ -139,14 +139,15 @@ def _inertial(file: Keys, centre_s: float, notes: list[str]) -> Callable[[], Mot
             )
     place, pointing, body = (file.table(n) for n in ("instrument_position", "instrument_pointing", "body_rotation"))
     scale = _unit(place, "km")
-    P, V = _array(place, "positions", 3) * scale, _array(place, "velocities", 3) * scale
+    P = _array(place, "positions", 3) * scale
+    V = _array(place, "velocities", 3) * scale if place.has("velocities") else None
     t = _times(place, len(P)) - centre_s
     q, qb = _array(pointing, "quaternions", 4), _array(body, "quaternions", 4)
     tq, tb = _times(pointing, len(q)) - centre_s, _times(body, len(qb)) - centre_s
     _refuse_gap(pointing, tq)
-    if len(V) != len(P):
+    if V is not None and len(V) != len(P):
         raise place.refuse("velocities", f"{len(P)} rows, as many as positions")
-    apart = velocity_misfit(t, P, V) > SAME_VELOCITY_M_S
+    apart = V is not None and velocity_misfit(t, P, V) > SAME_VELOCITY_M_S
     if apart:
         notes.append(f"{file.path.name}: velocities are not the slope of the positions and were not used")
     fixed = [np.array(keys.numbers("constant_rotation", 9, tuple(np.eye(3).ravel()))).reshape(3, 3)

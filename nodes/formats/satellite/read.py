@@ -11,7 +11,7 @@ from .dimap2 import read_dimap2
 from .folder import is_scene_folder, read_scene_folder
 from .rpc_files import has_dimap_rpc, read_dimap_rpc, read_rpb, read_rpc_tags, read_rpc_text
 from .scene import SatelliteScene
-from .xml_file import Element, read_xml
+from .xml_file import Element, read_xml, text_start
 
 #: What is read: name -> words.
 KINDS = {
@@ -41,16 +41,16 @@ def read_scene(path: Path) -> SatelliteScene:
         raise UserError(f"{path}: empty, wanted one of: {'; '.join(KINDS.values())}")
     suffix = path.suffix.lower()
     with open(path, "rb") as file:
-        head = file.read(512).lstrip()
-    if head.startswith((b"<", b"\xef\xbb\xbf<")):
+        head = text_start(file.read(512))
+    if head.startswith("<"):
         return _read_xml_scene(read_xml(path))
     if suffix in _IMAGES:
         return SatelliteScene("rpc", None, read_rpc_tags(path))
     if suffix == ".rpb":
         return SatelliteScene("rpc", None, read_rpb(path))
-    if suffix == ".geom" or path.name.upper().endswith("_RPC.TXT") or b"LINE_OFF" in head.upper():
+    if suffix == ".geom" or path.name.upper().endswith("_RPC.TXT") or "LINE_OFF" in head.upper():
         return SatelliteScene("rpc", None, read_rpc_text(path))
-    if suffix in (".json", ".isd"):
+    if suffix in (".json", ".isd") or head.startswith("{"):
         return read_isd(path)
     raise UserError(f"{path}: of no known kind, wanted one of: {'; '.join(KINDS.values())}")
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ....solver.location.rpc import RationalFunctions, Rpc
 from ...errors import UserError
 from ..new_file import new_file
-from .xml_file import Element
+from .xml_file import Element, float_of
 
 #: RPC00B names of offsets and scales, in the order longitude, latitude, height, sample, line.
 _NAMES = ("LONG", "LAT", "HEIGHT", "SAMP", "LINE")
@@ -105,7 +105,7 @@ def read_rpb(path: Path) -> Rpc:
     """
     text = _text(path)
     found: dict[str, str] = {}
-    for name, value in re.findall(r"(\w+)\s*=\s*(\([^)]*\)|[^;]*);", text):
+    for name, value in re.findall(r"(\w+)[ \t]*=[ \t]*(\([^)]*\)|[^;\r\n]*)", text):
         found.setdefault(name.lower(), value)
     values: dict[str, float] = {}
     for name in _NAMES:
@@ -120,9 +120,9 @@ def read_rpb(path: Path) -> Rpc:
         key = f"{_RPB[axis]}{part.title()}Coef"
         if key.lower() not in found:
             raise UserError(f"{path}: {key}: missing, wanted 20 numbers")
-        numbers = [_float(word) for word in re.findall(_NUMBER, found[key.lower()])]
+        numbers = [float_of(word) for word in re.findall(_NUMBER, found[key.lower()])]
         if len(numbers) != 20:
-            raise UserError(f"{path}: {key}: {len(numbers)} numbers, wanted 20")
+            raise UserError(f"{path}: {key}: {len(numbers)}, wanted 20 numbers")
         lists[name] = np.array(numbers)
     return _rpc(path, values, lists, 0, 0)
 
@@ -131,16 +131,12 @@ def _value(path: Path, found: dict[str, str], key: str) -> float:
     if key.lower() not in found:
         raise UserError(f"{path}: {key}: missing, wanted a number")
     try:
-        value = _float(found[key.lower()].strip())
+        value = float_of(found[key.lower()].strip())
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
         raise UserError(f"{path}: {key}: {found[key.lower()]!r}, wanted a number")
     return value
-
-
-def _float(word: str) -> float:
-    return float(re.sub("[dD]", "e", word))
 
 
 def read_rpc_text(path: Path) -> Rpc:
@@ -152,9 +148,9 @@ def read_rpc_text(path: Path) -> Rpc:
     """
     found: dict[str, str] = {}
     for line in _text(path).splitlines():
-        key, colon, value = line.partition(":")
-        if colon:
-            found.setdefault(key.strip().lower(), value.strip())
+        key, *value = re.split("[:=]", line, maxsplit=1)
+        if value:
+            found.setdefault(key.strip().lower(), value[0].strip())
     first = found.get("polynomial_format", "B").upper()
     if first != "B":
         raise UserError(f"{path}: polynomial_format: {first!r}, wanted B (the order of terms of RPC00B)")
@@ -164,7 +160,7 @@ def read_rpc_text(path: Path) -> Rpc:
             if key in found:
                 word = found[key].split()
                 try:
-                    value = _float(word[0])
+                    value = float_of(word[0])
                 except (ValueError, IndexError):
                     value = float("nan")
                 if not np.isfinite(value):

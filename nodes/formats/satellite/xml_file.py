@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -96,7 +98,7 @@ class Element:
             raise self.refuse(place, "a number")
         text = (element.node.text or "").strip()
         try:
-            value = float(text)
+            value = float_of(text)
         except ValueError:
             value = float("nan")
         if not np.isfinite(value):
@@ -119,7 +121,7 @@ class Element:
         element = self if not place else self.need(place, f"{count or ''} numbers".strip(), *others)
         text = (element.node.text or "").strip()
         try:
-            values = np.array([float(word) for word in text.replace(",", " ").split()])
+            values = np.array([float_of(word) for word in re.split(r"[\s,;]+", text.strip(",; "))])
         except ValueError:
             values = np.empty(0)
         if not len(values) or not np.isfinite(values).all() or (count is not None and len(values) != count):
@@ -148,17 +150,37 @@ def read_xml(path: Path) -> Element:
     ------
     UserError : not XML, or broken off, with the line
     """
+    data = path.read_bytes()
+    before = len(data) - len(
+        data.lstrip()
+    )  # a declaration must come first; some programs write an empty line before it
     try:
-        root = ET.parse(path).getroot()
+        root = ET.fromstring(data[before:])
     except LookupError as error:  # an encoding that there is not
         raise UserError(f"{path}:1: {error}, wanted XML in UTF-8 or another that is known") from None
     except ET.ParseError as error:
-        line = error.position[0]
+        line = error.position[0] + data[:before].count(b"\n")
         raise UserError(f"{path}:{line}: not whole XML: {error.msg.split(':')[0]}, wanted a whole document") from None
     for node in root.iter():  # names of elements without their namespace
         if isinstance(node.tag, str) and node.tag.startswith("{"):
             node.tag = node.tag.split("}", 1)[1]
     return Element(path, root, root.tag)
+
+
+def float_of(word: str) -> float:
+    """A number, with an exponent as Fortran writes it (``1.5D+03``) too.
+
+    Raises
+    ------
+    ValueError : not a number
+    """
+    return float(re.sub(r"(?<=[\d.])[dD](?=[-+\d])", "e", word))
+
+
+def text_start(head: bytes) -> str:
+    """How a text begins, without the mark of its encoding and blanks; empty for bytes that are none."""
+    encoding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    return head.decode(encoding, errors="ignore").lstrip().lstrip("\ufeff").lstrip()
 
 
 def times_of(elements: Sequence[Element], place: str, *others: str, scale: str = "UTC") -> list[int]:
