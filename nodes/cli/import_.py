@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     images.add_argument(
         "--lines", action="append", default=[], metavar="VIEW=FILE,..",
         help="images (ENVI, TIFF, raw) of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for "
-        "a band of it; of a ROS 2 bag topics (N=/camera/nadir)",
+        "a band of it; of a ROS 2 bag topics (N=/camera/nadir); of satellite scenes one a scene (scene/F=f.tif)",
     )  # fmt: skip
     images.add_argument("--strip", default="", metavar="ID", help="of the images (default: name of the first file)")
     images.add_argument(

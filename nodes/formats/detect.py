@@ -29,6 +29,7 @@ from .ros2 import ros2_messages
 from .ros2_images import ImageTopics
 from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
+from .scene_images import with_scene_images
 from .scene_recording import local_block
 from .sensor_recording import sensor_messages
 from .tie_points import statistics, tie_point_messages
@@ -198,11 +199,14 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     options = Options() if options is None else options
     if options.day is not None and kind in ("block", "scenes", "ties"):
         raise UserError(f"{path}: --date does not go with a {KINDS[kind]}: its times stand for themselves")
-    if options.lines is not None and kind in ("block", "scenes", "ties"):
+    if options.lines is not None and kind in ("block", "ties"):
         raise UserError(f"{path}: --lines do not go with a {KINDS[kind]}, wanted poses or sensors of the flight")
     if kind in ("block", "scenes"):
         block = read_block(path) if kind == "block" else local_block(read_scene_block(path))
-        return Imported(kind, block_messages(block), [*block.notes, *not_carried(block)])
+        notes, messages = [*block.notes, *not_carried(block)], block_messages(block)
+        if options.lines is not None:
+            messages = with_scene_images(block, messages, options.lines, notes)
+        return Imported(kind, messages, notes)
     if kind == "ties":
         ties = read_tie_points(path)
         return Imported(kind, tie_point_messages(ties, path.stem), statistics=statistics(ties))

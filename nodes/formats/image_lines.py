@@ -96,10 +96,14 @@ class ImageStrip:
         """
         begin, end = int(self.time_ns[0]), int(self.time_ns[-1]) + CLOSING_NS
         yield Message("configuration/strip", begin, self._strip(ended=False), source)
-        yield from merge(*(self._blocks(ccd, source) for ccd in self.views), key=_order)
+        yield from self.blocks(source)
         yield Message("configuration/strip", end, self._strip(ended=True), source)
         for image in self.views.values():
             notes.extend(image.notes())
+
+    def blocks(self, source: str = "import") -> Iterator[Message]:
+        """``sensor/lines/*`` alone, by stamp and rank."""
+        yield from merge(*(self._blocks(ccd, source) for ccd in self.views), key=_order)
 
     def _strip(self, *, ended: bool) -> Any:
         return m.Strip(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 
 import numpy as np
 import pytest
+import rasterio
 
 from triline.nodes.adjuster.adjuster import Adjuster
-from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording
+from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording, write_with_sensors
 from triline.nodes.cli import main
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.scene_block import read_scene_block
@@ -18,6 +20,7 @@ from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.adjustment.snooping import snoop
 from triline.solver.models.dgr import DgrOptions
+from triline.solver.simulation.orbital_imagery import render, texture_of
 
 
 def on_line(messages, **options):
@@ -158,3 +161,59 @@ def test_bad_input(tmp_path, capsys):
         assert main(["import", *arguments, "-o", out]) != 0
         error = capsys.readouterr().err
         assert match in error and error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """A folder of scenes of two lenses, and their images as TIFF beside it."""
+    folder = tmp_path_factory.mktemp("pictures")
+    _, sensors = write_with_sensors(folder / "pair", SceneSimulation("spot5-hrs-small", seed=2))
+    frame = local_block(read_scene_block(folder / "pair")).frame
+    texture = texture_of(sensors[0], 2)
+    for name, sensor in zip("FB", sensors, strict=True):
+        pixels = render(sensor, frame, texture, frame.height_m, np.random.default_rng(3))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            shape = {"width": pixels.shape[1], "height": pixels.shape[0], "count": 1, "dtype": "uint16"}
+            with rasterio.open(folder / f"{name}.tif", "w", driver="GTiff", **shape) as image:
+                image.write(pixels, 1)
+    return folder
+
+
+def test_pictures_of_scenes(pictures, tmp_path, capsys):
+    """A user's scenes with their images: imported, matched between the lenses, adjusted, rectified."""
+    made, out = tmp_path / "pair.mcap", tmp_path / "out.mcap"
+    lines = f"scene/F={pictures / 'F.tif'},scene/B={pictures / 'B.tif'}"
+    assert main(["import", str(pictures / "pair"), "--lines", lines, "-o", str(made)]) == 0
+    (tmp_path / "dgr.toml").write_text('[adjuster]\nmodel = "dgr"\n')
+    nodes = ["--nodes", "matcher,adjuster", "--config", str(tmp_path / "dgr.toml")]
+    assert main(["process", "-q", str(made), *nodes, "-o", str(out)]) == 0
+    assert main(["export", str(out), "--points", str(tmp_path / "points.csv")]) == 0
+    rows = (tmp_path / "points.csv").read_text().splitlines()
+    assert sum("-M" in row.split(",")[0] for row in rows) > 40
+    ortho = ["--ccd", "F", "--strip", "scene/F", "--gsd", "400", "-q", "-o", str(tmp_path / "f.tif")]
+    assert main(["rectify", str(out), *ortho]) == 0
+    with rasterio.open(tmp_path / "f.tif") as image:
+        assert (image.read(1) > 0).sum() > 25_000
+
+
+@pytest.mark.parametrize(
+    ("lines", "more", "match"),
+    [
+        ("scene/N={F}", [], "scene 'scene/N' is not one of scene/F, scene/B, wanted SCENE=FILE for each"),
+        ("scene={F}", [], "scene 'scene' is not one of scene/F, scene/B"),
+        ("scene/F={small}", [], "3 lines of 4 samples, wanted 150 of 300 as scene scene/F has"),
+        ("scene/F=nothing.tif", [], "nothing.tif: no such file"),
+        ("scene/F={F}", ["--strip", "S"], "wanted no --line-times, --first-time, --strip"),
+    ],
+)
+def test_pictures_that_do_not_fit(lines, more, match, pictures, tmp_path, capsys):
+    small = tmp_path / "small.tif"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with rasterio.open(small, "w", driver="GTiff", width=4, height=3, count=1, dtype="uint16") as image:
+            image.write(np.ones((3, 4), np.uint16), 1)
+    given = lines.format(F=pictures / "F.tif", small=small)
+    assert main(["import", str(pictures / "pair"), "--lines", given, *more, "-o", str(tmp_path / "x.mcap")]) != 0
+    error = capsys.readouterr().err
+    assert match in error and error.count("\n") == 1 and not (tmp_path / "x.mcap").exists()
