@@ -177,9 +177,9 @@ class _Predicting(Matcher):
         super().__init__()
         self.noted: list[tuple[int, float]] = []
 
-    def _tie(self, strip: Any, tie: MatchedTie) -> Message:
+    def _tie(self, strip_id: str, tie: MatchedTie) -> Message:
         self.noted.append((self._stamp_ns, tie.prediction_px))
-        return super()._tie(strip, tie)
+        return super()._tie(strip_id, tie)
 
 
 def lines(rows: list[dict[str, Any]]) -> list[str]:

@@ -87,6 +87,12 @@ class SlowDisagreement:
         """A new strip begins."""
         self._past, self._fit, self._scale = [], None, None
 
+    def suppose(self, shift: Array, scale_px: float) -> None:
+        """The same shifts (views, 2), px, everywhere, and how wrong they may be, until points tell how they are."""
+        self.forget()
+        self._fit = np.stack([shift, np.zeros_like(shift), np.zeros_like(shift)])
+        self._scale = np.full(shift.shape, scale_px)
+
     @property
     def known(self) -> bool:
         return self._fit is not None

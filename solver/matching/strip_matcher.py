@@ -170,6 +170,28 @@ class _PairPrediction(Prediction):
         whole = self.whole[index]
         return np.asarray(line, dtype=float) if whole is None else _located(whole, point_l)[0]
 
+    def beside(self, along_too: bool) -> list[Array]:
+        """Shifts (2,) across the parallax, and along it too, px, at which a view is looked for: the nearest first, so
+        that searches cover three sigma of the orientation."""
+        here, there = self.whole
+        assert here is not None and there is not None
+        half = 0.5 * len(here.position_l)
+        middle, _ = here.to_plane(
+            np.array([here.first_line + half]), np.array([0.5 * (here.view.pixels - 1)]), np.array([self.nadir_m])
+        )
+        ground = self.ground(here, middle)
+        a, b = (v.middle()[1] for v in self._pair)
+        way = np.stack([ground.along, ground.across]) @ (a[:2] / a[2] - b[:2] / b[2])
+        along = way / max(float(np.linalg.norm(way)), 1e-9)
+        across = np.array([-along[1], along[0]])
+        reach = self.options.largest_reach_px
+        step = 2 * (1 - OVERLAP) * reach
+        n = int(np.ceil(max(self._three_sigma_px() - reach, 0.0) / step))
+        far = np.arange(-n, n + 1)
+        steps = np.stack(np.meshgrid(far if along_too else np.zeros(1), far, indexing="ij"), axis=-1).reshape(-1, 2)
+        nearest = steps[np.argsort(np.hypot(*steps.T), kind="stable")]
+        return list(step * nearest @ np.stack([along, across]))
+
     def seen(self, places: list[Place]) -> NDArray[np.bool_]:
         """Which places lie in the lines of the other view, about."""
         here, there = self.whole
@@ -182,9 +204,17 @@ class _PairPrediction(Prediction):
         point, _ = here.to_plane(line, sample, height)
         u, v = _located(there, point)
         first, last = there.first_line, there.first_line + len(there.position_l)
-        reach = self.options.largest_reach_px
-        inside = (u > first - reach) & (u < last + reach) & (v > 0) & (v < there.view.pixels - 1)
+        three_sigma, most = self._three_sigma_px(), self.options.largest_reach_px
+        reach = max(three_sigma, most)
+        inside = (u > first - reach) & (u < last + reach)
+        if three_sigma <= most:  # else the view may lie beside where it is expected
+            inside &= (v > 0) & (v < there.view.pixels - 1)
         return np.asarray(inside)
+
+    def _three_sigma_px(self) -> float:
+        """How far a look may lie from where the orientations put it, px."""
+        return self._orientation_reach(self.views[1], self.height_and_travel()[0] * self.views[0].pitch_mm
+                                       / self.views[0].focal_length_mm)  # fmt: skip
 
 
 def _located(scan: LineScan, point_l: Array) -> tuple[Array, Array]:
@@ -427,7 +457,7 @@ class StripMatcher:
         looks = LookMatcher(p, lambda index, scan, travel: pair[index].image(scan, travel / share), 0)
         numbers = np.flatnonzero(p.seen(master.places))
         tracks = {number: Track(master.places[number], 1) for number in numbers.tolist()}
-        if not self._heights.some and not self._find_ground(looks, pair, list(tracks.values())):
+        if not self._found(looks, p, pair, list(tracks.values())):
             self.counters["ground not found"] += len(tracks)
             return []
         out: list[MatchedTie] = []
@@ -443,16 +473,43 @@ class StripMatcher:
         self.counters.update(looks.counters)
         return out
 
-    def _find_ground(self, looks: LookMatcher, pair: tuple[_StripView, _StripView], tracks: list[Track]) -> bool:
-        """Match some places as if the ground were at one height after another; whether it was found."""
-        p = looks.prediction
+    def _found(
+        self, looks: LookMatcher, p: _PairPrediction, pair: tuple[_StripView, _StripView], tracks: list[Track]
+    ) -> bool:
+        """Whether it is known how high the ground is, and where the view lies as far as searches reach; else look."""
+        if not self._heights.some:
+            return self._find_ground(looks, p, pair, tracks)
+        shifts = p.beside(along_too=True)
+        if len(shifts) == 1:
+            return True
+        some = _some(tracks)
+        for shift in shifts:
+            p.slow.suppose(shift[None], self.options.largest_reach_px / 3)
+            points = looks.try_height(some, 0, p.heights.prior_m)
+            if points is not None and len(points) >= max(LEAST_FOUND, SHARE * len(some)):
+                return True
+        p.slow.forget()
+        return False
+
+    def _find_ground(
+        self, looks: LookMatcher, p: _PairPrediction, pair: tuple[_StripView, _StripView], tracks: list[Track]
+    ) -> bool:
+        """Match some places as if the ground were at one height after another; whether it was found.
+
+        Attitudes may be so uncertain that a view lies beside where it is looked for by more than a search reaches: that
+        is tried too. Along the parallax it looks like a height.
+        """
         if len(tracks) < LEAST_FOUND:
             return False
-        some = [tracks[i] for i in np.linspace(0, len(tracks) - 1, min(TOGETHER, len(tracks))).astype(int)]
+        some = _some(tracks)
         prior, o = p.heights.prior_m, self.options
-        tried = [(height, o.largest_reach_px) for height in self._heights_tried(p, pair).tolist()]
+        heights = self._heights_tried(p, pair).tolist()
+        tried = [(height, beside, o.largest_reach_px) for beside in p.beside(along_too=False) for height in heights]
         # a narrow search finds the ground in short strips too, where it is as high as it is thought to be
-        for height, reach in [(prior, o.least_reach_px), *tried]:
+        for height, beside, reach in [(prior, np.zeros(2), o.least_reach_px), *tried]:
+            p.slow.forget()
+            if beside.any():
+                p.slow.suppose(beside[None], reach / 3)
             points = looks.try_height(some, 0, height, reach)
             if points is None or len(points) < max(LEAST_FOUND, SHARE * len(some)):
                 continue
@@ -462,6 +519,7 @@ class StripMatcher:
                 found = f"the ground was found at about {p.heights.prior_m:.0f} m above the origin"
                 self._events.append(f"{found}, not at {prior:.0f} m")
             return True
+        p.slow.forget()
         return False
 
     def _heights_tried(self, p: Prediction, pair: tuple[_StripView, _StripView]) -> Array:
@@ -502,6 +560,12 @@ class StripMatcher:
         self.counters["later looks"] += sum(tie.again for tie in out)
         waiting.clear()
         return out
+
+
+def _some(tracks: list[Track]) -> list[Track]:
+    """A few of the places, evenly; those at the ends, about which lines may be missing, are left out."""
+    inner = tracks[len(tracks) // 5 : len(tracks) - len(tracks) // 5]
+    return [inner[i] for i in np.linspace(0, len(inner) - 1, min(TOGETHER, len(inner))).astype(int)]
 
 
 def _batches(line: Array, number: NDArray[np.intp]) -> list[list[int]]:

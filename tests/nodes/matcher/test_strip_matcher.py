@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from heapq import merge
 from pathlib import Path
@@ -9,9 +10,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording, write_with_sensors
+from triline.nodes.convert import pose_message, pose_sample
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.scene_block import read_scene_block
 from triline.nodes.formats.scene_recording import local_block
@@ -20,6 +23,7 @@ from triline.schemas.topics import rank
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.camera.sensors import preset
+from triline.solver.geometry.rotation import angles_from_matrix
 from triline.solver.matching.strip_matcher import StripMatcher
 from triline.solver.models.dgr import DgrOptions
 
@@ -139,6 +143,25 @@ def test_ground_that_is_not_where_it_is_said_to_be():
     _, _, _, truth, missed = matched("alos-prism-small", ground_m=12_000.0)
     assert len(truth) > 60
     assert (np.median(np.abs(missed), axis=0) < 0.03).all()
+
+
+def test_attitudes_that_are_further_off_than_a_search_reaches():
+    """The second lens is turned by 1.3 deg about the track: 15 km, 130 pixels across; the covariance says so."""
+    messages, _, _ = recorded("alos-prism-small", 2)
+    turn, C = Rotation.from_rotvec([np.radians(1.3), 0.0, 0.0]), np.diag([5.0] * 3 + [np.radians(0.6)] * 3) ** 2
+    node, out, begun = Matcher(), [], ""
+    for message in messages:
+        if message.topic == "trajectory/smoothed":
+            sample = pose_sample(message.body)
+            R = Rotation.from_quat(sample.quaternion) * (turn if begun == "scene/B" else Rotation.identity())
+            position, angles, q = sample.position_l, angles_from_matrix(R.as_matrix()), R.as_quat()
+            message = replace(message, body=pose_message(message.stamp_ns, position, angles, C, quaternion=q))
+        elif message.topic == "configuration/strip":
+            begun = message.body.id
+        if message.topic.startswith(tuple(topic.removesuffix("*") for topic in node.inputs)):
+            out += node.step(message)
+    later = [tie.body for tie in out if tie.topic == "observation/tie" and tie.body.images[-1].strip == "scene/B"]
+    assert len(later) > 20
 
 
 def test_overpasses_of_one_lens():
