@@ -375,7 +375,7 @@ def test_options_that_do_not_go(options, match, made, capsys):
         (["--satellite", "moms-02", "--place", "60", "0"], "wanted one that an orbit of 28.5 deg reaches"),
         (["--satellite", "spot5-hrs", "--points", "5"], "wanted no more of these than there are points"),
         (["--satellite", "spot5-hrs", "--strips", "2"], "--strips does not go with --satellite"),
-        (["--points", "5"], "--place and --points go with --satellite"),
+        (["--points", "5"], "--place, --points and --overpasses go with --satellite"),
     ],
 )
 def test_simulations_that_do_not_go(options, match, tmp_path, capsys):
