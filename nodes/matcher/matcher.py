@@ -25,8 +25,9 @@ DEFAULTS = MatchingOptions()
 PACES = ("load", "normal")
 #: Observations are stamped so long after what completed them, s: time to make them while the adjuster already goes on.
 DELAY_S = 0.8
-#: So many places of a strip that came to nothing, without any tie point, are told; the counters of those places.
-PLACES_WITHOUT_TIES = 60
+#: So many places of a strip that came to nothing, without any tie point, are told, and so many when it is over; the
+#: counters of those places. Tuned.
+PLACES_WITHOUT_TIES, PLACES_AT_END = 60, 20
 FAILED = ("too few looks", "looks never came", "contradiction", "ground not found")
 #: No ground is lower above the ellipsoid, m, than the shore of the Dead Sea.
 LOWEST_GROUND_M = -450.0
@@ -107,6 +108,7 @@ class Matcher(Node):
         self._heights: dict[str, tuple[float, float, float]] = {}  # control and check points with a height
         self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
+        self._ground_unknown = False  # when they were counted
         self._delay_ns = round(delay_s * convert.SECOND_NS)
         self._matcher: TieMatcher | StripMatcher | None = None
         self._camera: Any = None
@@ -138,8 +140,10 @@ class Matcher(Node):
         return out
 
     def finish(self) -> Iterable[Message]:
-        ended = self._ended(self._found.finish())
-        return ended if self._matcher is None else [*ended, *self._ties(self._matcher.finish(), "")]
+        out = self._ended(self._found.finish())
+        if self._matcher is not None:
+            out += self._ties(self._matcher.finish(), "")
+        return out + [self._log(text, warning=True) for text in self._strip_over()]
 
     def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
         if self._matcher is None or not self._by_load:
@@ -233,17 +237,39 @@ class Matcher(Node):
             heights = [above_sphere(xyz) for xyz in known] if round_earth else known[:, 2]
             self._matcher.set_mean_height(float(np.median(heights)))
 
-    def _without_ties(self, failed: int, ties: int, strip: str) -> list[str]:
-        """A line for the operator where a strip gives no tie points though many places were tried; once a strip."""
+    def _without_ties(self, failed: int, ties: int) -> list[str]:
+        """A line for the operator where a strip gives no tie points though many places were tried; once a strip.
+
+        While the ground is looked for there are none yet: the line waits until all heights have been tried.
+        """
+        assert self._matcher is not None
+        if ties:
+            self._failed = -1
         if self._failed < 0:
             return []
+        ground_m = self._matcher.ground_m
+        if self._ground_unknown and ground_m is not None:
+            self._failed = 0  # just found: places that were given up before tell nothing of it
+        self._ground_unknown = ground_m is None
         self._failed += failed
-        if not ties and self._failed < PLACES_WITHOUT_TIES:
+        if ground_m is None and not self._matcher.ground_missing:
             return []
-        tried, self._failed = self._failed, -1
-        if ties:
+        return self._told_without_ties(ground_m)
+
+    def _strip_over(self) -> list[str]:
+        """The same for a strip that has ended."""
+        return [] if self._matcher is None else self._told_without_ties(self._matcher.ground_m, PLACES_AT_END)
+
+    def _told_without_ties(self, ground_m: float | None, places: int = PLACES_WITHOUT_TIES) -> list[str]:
+        if self._failed < places:
             return []
-        ground_m = None if self._matcher is None else self._matcher.ground_m
+        assert self._matcher is not None
+        strip, tried, self._failed = self._matcher.strip, self._failed, -1
+        if ground_m is None and not self._matcher.ground_missing:
+            return [
+                f"{strip}: no tie point at {tried} places; the strip ended before the ground was looked for at all "
+                "heights. If its height is known, give ground_m in [matcher]"
+            ]
         if ground_m is None:
             where = "the ground was looked for at all heights and not found: wrong camera, orientation or line times? "
             return [
@@ -286,16 +312,18 @@ class Matcher(Node):
         if block.ccd and block.ccd != ccd:
             raise ValueError(f"a block of CCD line {block.ccd!r}")
         strip = self._strips[block.strip]
+        out: list[Message] = []
         if matcher.strip != strip.id:
+            out += [self._log(text, warning=True) for text in self._strip_over()]
             first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
             matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
             self._targets.begin_strip(strip, first_s, matcher.orientation)
-            self._failed = 0
+            self._failed, self._ground_unknown = 0, matcher.ground_m is None
         if self._pace.blind:
             self.counters["lines gone by"] += len(block.pixels)
-            return []
+            return out
         usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
-        out = self._ties(matcher.match(), strip.id)
+        out += self._ties(matcher.match(), strip.id)
         targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
         out += targets
         out += [self._log(f"{strip.id}: {text}", warning=True) for text in words]
@@ -309,7 +337,7 @@ class Matcher(Node):
         out = [self._tie(strip, tie) for tie in ties]
         out += [self._log(f"{strip}: {text}", warning=True) for text in matcher.take_events()]
         failed = sum(matcher.counters[name] for name in FAILED)
-        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties), strip)]
+        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties))]
         self.counters.update(matcher.counters)
         matcher.counters.clear()
         return out

@@ -9,12 +9,14 @@ from __future__ import annotations
 import queue
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
@@ -35,6 +37,17 @@ if TYPE_CHECKING:
 KEYS = ("endpoint", "domain", "imu", "fix", "images", "line_rate_hz", "strip")
 #: Samples that wait to be decoded; then ROS publishers are slowed down.
 _DEPTH = 2000
+#: A strip begins when all topics of images have, or one of them is so far ahead, s: publishers that start together.
+BEGIN_S = 1.0
+
+
+@dataclass(frozen=True)
+class _Image:
+    """An image of a CCD line: stamp of its first row, rows (n, samples)."""
+
+    ccd: str
+    time_ns: int
+    pixels: NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -68,6 +81,10 @@ class Ros2Settings:
         for name in (imu, fix, *images.values()):
             if name and (not name.strip("/") or any(c in name for c in "*$?#% ")):
                 raise UserError(f"{keys.path}: {keys.where}: {name!r}, wanted a ROS topic as /imu/data")
+        twice = [name for name, n in Counter(name.strip("/") for name in images.values()).items() if n > 1]
+        if twice:
+            both = ", ".join(ccd for ccd, name in images.items() if name.strip("/") in twice)
+            raise UserError(f"{keys.path}: {keys.where}: one topic for {both}, wanted a topic for each CCD line")
         rate_hz = keys.number("line_rate_hz", positive=True) if images else 0.0
         return cls(
             keys.text("id", "ros2"), keys.text("endpoint", "tcp/127.0.0.1:7447"), keys.integer("domain", 0),
@@ -92,28 +109,78 @@ def key_expression(domain: int, topic: str, kind: str) -> str:
     return f"{domain}/{topic.strip('/')}/{package}::msg::dds_::{name}_/*"
 
 
-def image_messages(
-    payloads: Iterable[bytes], ccd: str, settings: Ros2Settings, left_out: Counter[str]
-) -> Iterator[Message]:
-    """``sensor/lines`` of each Image in CDR: its rows are image lines, its stamp is the time of the first one.
+class LiveStrips:
+    """Numbers the rows of images of one camera, whose topics are its CCD lines: one count a strip, by their stamps.
 
-    Rows count on from image to image, over images that are lost as well. A silence begins another strip, which is named
+    The stamp of an image is the time of its first row. Line 0 is the earliest row of a strip, whichever CCD line it is
+    of: what comes first is held back until all topics have begun, or one is `BEGIN_S` ahead. Rows of a topic count on
+    from image to image, over images that are lost as well. A topic that begins later, or begins anew, takes its number
+    from the others. When no topic has brought an image for `SILENT_S` the next one begins another strip, which is named
     by the time of its first line.
+
+    Parameters
+    ----------
+    settings : with the topics, the line rate, and what the name of a strip begins with
+    left_out : by topic, where is counted what could not be used
     """
-    period_ns = round(SECOND_NS / settings.rate_hz)
-    strip, line, next_ns = "", 0, 0
-    for time_ns, pixels in image_rows(payloads, left_out):
-        utc_ns = settings.clock.utc(time_ns)
-        if not strip or time_ns - next_ns > SILENT_S * SECOND_NS:
-            strip, line = settings.strip + strip_name(utc_ns), 0
-        else:
-            missing = lines_missing(time_ns, next_ns, period_ns, len(pixels))
+
+    def __init__(self, settings: Ros2Settings, left_out: Mapping[str, Counter[str]]) -> None:
+        self._settings = settings
+        self._left_out = {ccd: left_out[topic] for ccd, topic in settings.images.items()}
+        self._period_ns = round(SECOND_NS / settings.rate_hz)
+        self._held: list[_Image] = []
+        self._strip, self._first_ns = "", 0
+        self._next: dict[str, tuple[int, int]] = {}  # time and number of the row that each CCD line gives next
+
+    def add(self, ccd: str, time_ns: int, pixels: NDArray[Any]) -> list[Message]:
+        """``sensor/lines`` of an image, or of those that were held back.
+
+        Parameters
+        ----------
+        time_ns : stamp on the clock of ROS, later than that of the CCD line's image before
+        pixels : rows (n, samples)
+        """
+        begin_ns = round(BEGIN_S * SECOND_NS)
+        silent = not self._next or time_ns - max(self._next.values())[0] > SILENT_S * SECOND_NS
+        if not (silent or (self._held and time_ns > self._held[0].time_ns - begin_ns)):
+            return self._numbered(_Image(ccd, time_ns, pixels))
+        self._held.append(_Image(ccd, time_ns, pixels))
+        all_here = {image.ccd for image in self._held} >= self._settings.images.keys()
+        stamps = [image.time_ns for image in self._held]
+        return self.begin() if all_here or max(stamps) - min(stamps) > begin_ns else []
+
+    def begin(self) -> list[Message]:
+        """Begin a strip with what was held back."""
+        held, self._held = self._held, []
+        if not held:
+            return []
+        self._first_ns = min(image.time_ns for image in held)
+        self._strip = self._settings.strip + strip_name(self._settings.clock.utc(self._first_ns))
+        self._next = {}
+        return [message for image in held for message in self._numbered(image, (self._first_ns, 0))]
+
+    def _numbered(self, image: _Image, known: tuple[int, int] | None = None) -> list[Message]:
+        """``known`` is the time and number of a row that a CCD line new to the strip goes by; else the newest one."""
+        left_out = self._left_out[image.ccd]
+        if image.ccd in self._next:
+            next_ns, line = self._next[image.ccd]
+            missing = lines_missing(image.time_ns, next_ns, self._period_ns, len(image.pixels))
             if missing:
                 left_out["image lines missing"] += missing
                 line += missing
-        yield block_message(settings.clock, LineBlock(pixels, ccd, strip, line, utc_ns, period_ns))
-        line += len(pixels)
-        next_ns = time_ns + len(pixels) * period_ns
+        else:
+            known_ns, line = known or max(self._next.values())
+            line += round((image.time_ns - known_ns) / self._period_ns)
+        if line < 0:
+            left_out["images before their strip"] += 1
+            return []
+        self._next[image.ccd] = image.time_ns + len(image.pixels) * self._period_ns, line + len(image.pixels)
+        clock = self._settings.clock
+        utc_ns = clock.utc(image.time_ns)
+        return [block_message(clock, LineBlock(image.pixels, image.ccd, self._strip, line, utc_ns, self._period_ns))]
+
+
+_Convert = Callable[[Iterable[bytes], Counter[str]], Iterator["Message | _Image"]]
 
 
 class Ros2(Sensor):
@@ -129,13 +196,15 @@ class Ros2(Sensor):
 
     def messages(self, stop: Event) -> Iterator[Message | None]:
         s = self._settings
-        made: queue.Queue[Message] = queue.Queue(_DEPTH)
+        made: queue.Queue[Message | _Image] = queue.Queue(_DEPTH)
         waiting: dict[str, queue.Queue[bytes | None]] = {}
         threads = []
+        self._left_out = {topic: Counter() for topic in (s.fix, s.imu, *s.images.values()) if topic}
+        strips = LiveStrips(s, self._left_out) if s.images else None
         for topic, kind, convert in self._topics():
             key = key_expression(s.domain, topic, kind)
             waiting[key.removesuffix("*")] = come = queue.Queue(_DEPTH)
-            left_out = self._left_out.setdefault(topic, Counter())
+            left_out = self._left_out[topic]
 
             def work(come: Any = come, convert: Any = convert, left_out: Any = left_out) -> None:
                 for message in convert(iter(come.get, None), left_out):
@@ -162,11 +231,17 @@ class Ros2(Sensor):
             with listen_elsewhere(s.endpoint, [key + "*" for key in waiting], receive):
                 while not stop.is_set():
                     try:
-                        message: Message | None = self._on_our_clock(made.get(timeout=LOOK_S))
+                        come_in: Message | _Image | None = made.get(timeout=LOOK_S)
                     except queue.Empty:
-                        message = None
+                        come_in = None
+                    out: list[Message | None]
+                    if isinstance(come_in, _Image):
+                        assert strips is not None
+                        out = [*strips.add(come_in.ccd, come_in.time_ns, come_in.pixels)]
+                    else:
+                        out = [None if come_in is None else self._on_our_clock(come_in)]
                     self._tell()
-                    yield message
+                    yield from out or [None]
         finally:
             stop.set()
             for come in waiting.values():
@@ -175,22 +250,26 @@ class Ros2(Sensor):
                     come.put_nowait(None)
             for thread in threads:
                 thread.join()
+        if strips is not None:
+            yield from strips.begin()
         self._tell()
 
-    def _topics(self) -> Iterator[tuple[str, str, Callable[[Iterable[bytes], Counter[str]], Iterator[Message]]]]:
+    def _topics(self) -> Iterator[tuple[str, str, _Convert]]:
         s = self._settings
         if s.fix:
             yield s.fix, FIX, lambda come, left_out: fix_messages(come, s.fix, [], "", left_out)
         if s.imu:
             yield s.imu, IMU, lambda come, left_out: inertial_messages(come, s.imu, [], "", left_out, at_once=1)
         for ccd, topic in s.images.items():
-            yield topic, IMAGE, lambda come, left_out, ccd=ccd: image_messages(come, ccd, s, left_out)
+            yield (
+                topic,
+                IMAGE,
+                lambda come, left_out, ccd=ccd: (_Image(ccd, *found) for found in image_rows(come, left_out)),
+            )
 
     def _on_our_clock(self, message: Message) -> Message | None:
         """The message with its times in UTC; None for the first inertial sample, whose interval is not known."""
         clock, body = self._settings.clock, message.body
-        if message.topic.startswith("sensor/lines/"):  # is so already
-            return message
         utc_ns = clock.utc(message.stamp_ns)
         if message.topic == "sensor/gnss":
             set_time(body.timestamp, utc_ns)

@@ -17,6 +17,7 @@ from .line_store import LineStore
 from .looks import LookMatcher, Track
 from .prediction import PAD, Prediction
 from .search import COARSEST, CORRELATION_HALF
+from .waiting import PATIENCE_S
 
 Array = NDArray[np.floating]
 
@@ -41,6 +42,10 @@ class GroundSearch:
     ----------
     prediction : of the strip
     looks : matches places
+
+    Attributes
+    ----------
+    in_vain : all heights have had places that both views saw, and the ground was at none of them
     """
 
     def __init__(self, prediction: Prediction, looks: LookMatcher) -> None:
@@ -51,7 +56,8 @@ class GroundSearch:
         """Lines begin anew."""
         self._next = 0.0
         self._number = 0
-        self._begun = False
+        self._begun = self.in_vain = False
+        self._first = np.inf
 
     def search(self, tracks: Sequence[Track], order: Sequence[int], store: LineStore) -> bool:
         """Match places (that have not been looked for) at many heights; whether the ground was found.
@@ -72,6 +78,9 @@ class GroundSearch:
         if len(fresh) < FEWEST or view < 0:
             return False
         self._next = end + EVERY_S * p.rate
+        # the lines that see the lowest ground are the furthest from those of the master
+        away = abs(float(p.lines_later(p.others[view], np.array([p.heights.lowest_m]))[0])) + 2 * AROUND
+        self._first = min(self._first, end)
         heights = self._heights(view)
         if self._begun:
             turn = np.arange(self._number, self._number + min(LATER, len(heights))) % len(heights)
@@ -82,7 +91,9 @@ class GroundSearch:
             found = self._found_at(height, fresh, view, store)
             if found is not None:
                 p.heights.found(found)
+                self._first = np.inf
                 return True
+        self.in_vain = end - self._first > away + PATIENCE_S * p.rate
         return False
 
     def lines_to_last_look(self, order: Sequence[int]) -> float:

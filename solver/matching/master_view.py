@@ -73,6 +73,11 @@ class MasterView:
         """Whether nothing more is to be expected."""
         return np.isfinite(self.until) and not self.waiting.tracks
 
+    @property
+    def ground_missing(self) -> bool:
+        """Whether the ground was looked for at all heights in vain, and is not known yet."""
+        return self.prediction.heights.unknown and self._ground.in_vain
+
     def begin_strip(self, strip: str, first_line: int = 0) -> None:
         """Places are chosen from a line on; what waited is given up. The prediction is up to who made it."""
         self._strip = strip

@@ -275,6 +275,11 @@ class StripMatcher:
         None while it is looked for."""
         return None if self._heights.unknown else self._heights.prior_m
 
+    @property
+    def ground_missing(self) -> bool:
+        """Whether the ground has not been found at any height: strips that overlap are searched at all of them."""
+        return self._heights.unknown
+
     def set_mean_height(self, height_m: float) -> None:
         """What the ground's height is taken for before anything is known."""
         self._heights.say(height_m)

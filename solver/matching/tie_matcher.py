@@ -126,6 +126,11 @@ class TieMatcher:
         heights = self.prediction.heights
         return None if heights.unknown else heights.prior_m
 
+    @property
+    def ground_missing(self) -> bool:
+        """Whether the ground was looked for at all heights in this strip, and found at none."""
+        return self._master.ground_missing
+
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds, to give it more or less."""
         for view in self._at_work:

@@ -16,7 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 from triline.nodes.convert import time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.keys import Keys
-from triline.nodes.sensors.ros2 import Ros2, Ros2Settings, image_messages, key_expression
+from triline.nodes.formats.ros2_images import image_rows
+from triline.nodes.sensors.ros2 import LiveStrips, Ros2, Ros2Settings, key_expression
 
 T = 1_795_339_670_000_000_000
 #: Of ROS 2 Jazzy's sensor_msgs/msg/Imu; any hash is taken.
@@ -128,15 +129,118 @@ def test_images_with_padding_other_byte_order_and_gaps():
         image(T + 4 * step)[:-9],
         image(T + 10 * 10**9),
     ]
-    messages = list(image_messages(come, "N", given, left_out))
+    strips = LiveStrips(given, {"/c": left_out})
+    messages = [message for image in image_rows(come, left_out) for message in strips.add("N", *image)]
     np.testing.assert_array_equal(messages[0].body.pixels, PIXELS)
     assert [(m.body.strip, m.body.first_line) for m in messages] == [("A092750", 0), ("A092750", 8), ("A092800", 0)]
     assert left_out == {"image lines missing": 4, "images that are not grey": 1, "not decodable": 1}
 
 
+STEP = 40_000_000  # from image to image of four rows at 100 lines a second
+CAMERA = {"F": "/camera/forward", "N": "/camera/nadir", "B": "/camera/backward"}
+
+
+def numbered(come, **table):
+    """Strip, CCD line and number of the first row of each image; ``come`` are CCD lines and stamps. And the counts."""
+    given = settings(images=CAMERA, line_rate_hz=100.0, **table)
+    left_out = {topic: Counter() for topic in CAMERA.values()}
+    strips = LiveStrips(given, left_out)
+    out = [message for ccd, t in come for message in strips.add(ccd, t, PIXELS)] + strips.begin()
+    for message in out:  # numbers go with times, whichever CCD line it is
+        assert message.topic == f"sensor/lines/{message.body.ccd}"
+    return [(m.body.strip, m.body.ccd, m.body.first_line) for m in out], left_out, out
+
+
+def test_topics_of_one_camera_have_one_strip_and_one_count_of_lines_though_they_begin_apart():
+    t = T + 10**9 - STEP // 2  # the backward line begins in the next second
+    come = [("N", t), ("N", t + STEP), ("F", t - 30_000_000), ("N", t + 2 * STEP), ("F", t + 10_000_000)]
+    come += [("B", t + 3 * STEP + 4_000_000), ("F", t + 50_000_000), ("B", t + 4 * STEP + 4_000_000)]
+    found, left_out, out = numbered(come)
+    assert {strip for strip, _, _ in found} == {"092750"} and not sum(left_out.values(), Counter())
+    assert sorted(line for _, ccd, line in found if ccd == "F") == [0, 4, 8]
+    assert sorted(line for _, ccd, line in found if ccd == "N") == [3, 7, 11]
+    assert sorted(line for _, ccd, line in found if ccd == "B") == [15, 19]
+    for message in out:
+        off = (message.body.time_ns - (t - 30_000_000)) / 10_000_000 - message.body.first_line
+        assert abs(off) <= 0.5
+
+
+def test_a_publisher_that_begins_anew_goes_on_in_the_strip_of_the_others():
+    run = [(ccd, T + i * STEP) for i in range(250) for ccd in "FNB"]  # ten seconds
+    gone = [(ccd, t) for ccd, t in run if ccd != "N" or not 2 * 10**9 < t - T < 9 * 10**9]
+    found, left_out, _ = numbered(gone)
+    whole, _, _ = numbered(run)
+    assert found == [row for row, (ccd, t) in zip(whole, run, strict=True) if (ccd, t) in set(gone)]
+    assert left_out["/camera/nadir"] == {"image lines missing": 4 * (len(run) - len(gone))}
+    # all of them silent for more than five seconds: another strip, whoever is the first
+    again = [(ccd, T + 20 * 10**9 + k) for k, ccd in ((2 * STEP, "B"), (STEP, "F"), (0, "N"))]
+    found, _, _ = numbered(run[:30] + again)
+    assert found[30:] == [("092810", "B", 8), ("092810", "F", 4), ("092810", "N", 0)]
+
+
+def test_two_cameras_over_zenoh_one_of_which_begins_anew_and_loses_images():
+    port, stop, n = free_port(), threading.Event(), 30
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    images = {ccd: CAMERA[ccd] for ccd in "FN"}
+    sensor = Ros2(settings(endpoint=f"tcp/127.0.0.1:{port}", images=images, line_rate_hz=100.0, id="cameras"))
+    key = {ccd: f"0{topic}/sensor_msgs::msg::dds_::Image_/{HASH}" for ccd, topic in images.items()}
+    found = []
+
+    def take():
+        message = next(come)
+        found.extend([] if message is None else [message.body])
+
+    def declared(ccd):
+        publisher = ros.declare_publisher(key[ccd])
+        while not publisher.matching_status.matching:
+            take()
+        return publisher
+
+    with zenoh.open(config) as ros:
+        come = sensor.messages(stop)
+        forward, nadir = declared("F"), declared("N")
+        for i in range(n):
+            if i == 10:
+                while len(found) < 19:
+                    take()
+                nadir.undeclare()  # the node of this camera ends; six seconds later it is here again
+            late = 0 if i < 10 else 6 * 10**9
+            if i == 20:
+                nadir = declared("N")
+            if i != 5:  # lost on its way
+                forward.put(image(T + i * STEP + late))
+            if not 10 <= i < 20:
+                nadir.put(image(T + i * STEP + late, PIXELS + 1))
+        nadir.put(image(T + (n - 1) * STEP + 6 * 10**9))  # twice
+        while len(found) < 2 * n - 11 or len(sensor.counters) < 2:
+            take()
+        stop.set()
+        assert [message for message in come if message is not None] == []
+    assert all((block.pixels[0, 0] == 1) == (block.ccd == "N") for block in found)
+    strips = list(dict.fromkeys(block.strip for block in found))
+    assert strips == ["092750", "092756"]
+    for ccd, there in (("F", [*range(5), *range(6, 10)]), ("N", range(10))):
+        assert [b.first_line for b in found if b.ccd == ccd and b.strip == strips[0]] == [4 * i for i in there]
+    for ccd, there in (("F", range(10, 30)), ("N", range(20, 30))):
+        assert [b.first_line for b in found if b.ccd == ccd and b.strip == strips[1]] == [4 * (i - 10) for i in there]
+    assert sensor.counters == {"image lines missing": 4, "not later than the one before": 1}
+
+
+def test_a_ccd_line_that_never_comes_holds_the_others_back_for_a_second_only():
+    # what comes too late for it is counted, and what comes then has the number that its time says
+    come = [("F", T + i * STEP) for i in range(40)]
+    found, left_out, _ = numbered([*come[:35], ("N", T - 10**8), *come[35:], ("N", T + 36 * STEP)])
+    assert [line for _, ccd, line in found if ccd == "F"] == list(range(0, 160, 4))
+    assert [line for _, ccd, line in found if ccd == "N"] == [144]
+    assert left_out["/camera/nadir"] == {"images before their strip": 1}
+
+
 @pytest.mark.parametrize(
     ("table", "wanted"),
     [
+        ({"images": {"N": "/c", "F": "c/"}, "line_rate_hz": 1.0}, "sensor[0]: one topic for N, F, wanted a topic for"),
         ({}, "sensor[0]: no topic, wanted imu"),
         ({"imu": "/a/*"}, "sensor[0]: '/a/*', wanted a ROS topic as /imu/data"),
         ({"images": {"N": "/c"}}, "sensor[0].line_rate_hz: missing, wanted a number above 0"),
