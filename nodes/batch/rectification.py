@@ -26,7 +26,7 @@ from ...solver.orthoimage.surface import HeightField, Surface
 from ...solver.simulation.flight import Flight
 from .. import convert
 from ..errors import UserError
-from ..formats.camera_json import read_camera
+from ..formats.camera_json import read_camera_instead
 from ..formats.geotiff import Heights
 from ..formats.line_orientation import OrientedLines
 from ..formats.projection import refuse_missing_grids
@@ -182,12 +182,7 @@ def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Pat
     path = trajectory.parent / "camera.json"
     if not path.exists():
         return camera, None
-    beside = read_camera(path)
-    lines, wanted = ({line.id: line.pixels for line in c.lines} for c in (beside, camera))
-    if lines != wanted:
-        words = ", ".join(f"{id} with {pixels} pixels" for id, pixels in wanted.items())
-        raise UserError(f"{path}: stands beside {trajectory.name} and has other lines, wanted {words}")
-    return beside, path
+    return read_camera_instead(path, camera, f"stands beside {trajectory.name} and "), path
 
 
 def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines]]:

@@ -36,7 +36,7 @@ from ..batch.two_steps import OWNERS, UNUSED, step_settings
 from ..errors import UserError
 from ..formats.block_folder import is_block_folder, read_block
 from ..formats.block_recording import TOPICS, block_from_messages
-from ..formats.camera_json import write_camera
+from ..formats.camera_json import read_camera_instead, write_camera
 from ..formats.dem import surface_control
 from ..formats.importable import refuse_importable
 from ..formats.line_orientation import write_oriented_lines
@@ -51,6 +51,7 @@ from .locate import refraction_of
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result
+  triline adjust flight.mcap --camera result/camera.json -o again
   triline adjust flight.mcap --dem ground.tif --dem-sigma 0.5 --dem-crs EPSG:5773 --per-line -o result"""
 
 #: An adjustment that has not converged is refused if its sigma0 is larger than this.
@@ -78,6 +79,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     selfcal = ["none", *SELF_CALIBRATIONS]
     group.add_argument("--selfcal", choices=selfcal, default="none", help="additional parameters of the camera (none)")
+    group.add_argument(
+        "--camera", type=Path, metavar="FILE",
+        help="camera.json in place of that of the input: one that an adjustment with --selfcal wrote",
+    )  # fmt: skip
     group.add_argument("--free", action="store_true", help="additional parameters without a-priori weight")
     group.add_argument(
         "--keep",
@@ -121,10 +126,15 @@ def run(args: argparse.Namespace) -> int:
     if is_scene_block(Path(args.input)):
         if args.clock_sigma:
             raise UserError("--clock-sigma does not go with satellite scenes")
+        if args.camera is not None:
+            raise UserError("--camera does not go with satellite scenes")
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
     block = read_input(Path(args.input))
+    if args.camera is not None:
+        note = f"camera of {args.camera}"
+        block = replace(block, camera=read_camera_instead(args.camera, block.camera), notes=(*block.notes, note))
     surface = None
     if dem:
         path, crs = Path(dem["dem"]), dem.get("dem_crs")
@@ -138,7 +148,9 @@ def run(args: argparse.Namespace) -> int:
     adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface, air)
     content = result_of(adjustment)
     if args.output:
-        write_result(adjustment, content, Path(args.output), plots=args.plots, per_line=args.per_line)
+        write_result(
+            adjustment, content, Path(args.output), plots=args.plots, per_line=args.per_line, camera=args.camera
+        )
     if args.json:
         print(json.dumps(content, indent=2))
     else:
@@ -293,9 +305,13 @@ def adjust_block(
 
 
 def write_result(
-    adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False, per_line: bool = False
-) -> None:
-    """Write ``result.json``, the tables and the calibrated camera; pictures and the table of lines on request."""
+    adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False, per_line: bool = False,
+    camera: Path | None = None,
+) -> None:  # fmt: skip
+    """Write ``result.json``, the tables and the calibrated camera; pictures and the table of lines on request.
+
+    A ``camera`` that the user gave goes with the tables, calibrated anew or as it is.
+    """
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     # files of an earlier run, which do not belong to this result
@@ -303,9 +319,9 @@ def write_result(
         (folder / name).unlink(missing_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
-    camera = adjustment.camera()
-    if camera is not None:
-        write_camera(folder / CAMERA, camera)
+    used = adjustment.camera() or (None if camera is None else adjustment.block.camera)
+    if used is not None:
+        write_camera(folder / CAMERA, used)
     if per_line:
         write_oriented_lines(folder / PER_LINE, oriented_lines(adjustment), adjustment.block.frame)
     if plots:

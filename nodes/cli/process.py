@@ -9,9 +9,12 @@ import textwrap
 import time
 from pathlib import Path
 
+from ...schemas import codec
 from .. import registry
 from ..config import Tables, build, load
+from ..convert import camera_from, camera_message
 from ..errors import UserError
+from ..formats.camera_json import read_camera_instead
 from ..formats.importable import refuse_importable
 from ..formats.new_file import refuse_unless_file
 from ..garbage_collection import RareCollections
@@ -28,6 +31,7 @@ EXAMPLE = "triline process flight.mcap -o out.mcap"
 FILTERED_S = 0.2
 #: Interval at which smoothed poses are handed to the adjuster at that pace, s.
 SMOOTH_EVERY_S = 2.0
+CAMERA = "configuration/camera"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="throughput: larger batches and filtered poses at 5 Hz, for long flights; as accurate, but results come "
         "later (default: load, the pace of a live flight with its recorded changes under load)",
     )  # fmt: skip
+    parser.add_argument(
+        "--camera", type=Path, metavar="FILE",
+        help="camera.json in place of the recording's, as 'triline adjust --selfcal' writes it; the output has it",
+    )  # fmt: skip
     add_dem_options(parser.add_argument_group("heights"))
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the output (default: none)")
     parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
@@ -56,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_importable(args.recording)
     reader = RecordingReader(args.recording)
     _check(reader, args)
+    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera)}
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
     nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
@@ -72,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 if told is not None:
                     told(fraction)
 
-            summary = process(reader, nodes, writer.write_raw, progressed, apart=True)
+            summary = process(reader, nodes, writer.write_raw, progressed, apart=True, instead=instead)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
         if not summary.outputs:
@@ -110,6 +119,14 @@ def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
     if args.strict and (reader.damage or not reader.complete):
         what = str(reader.damage[0]) if reader.damage else "the file has no end"
         raise UserError(f"{args.recording}: damaged: {what}")
+
+
+def _camera(reader: RecordingReader, path: Path) -> bytes:
+    """The message of a camera in place of that of the recording."""
+    body = reader.first(CAMERA)
+    if body is None:
+        raise UserError(f"{reader.path}: no {CAMERA} in it, so --camera has nothing to stand for")
+    return codec.encode(camera_message(read_camera_instead(path, camera_from(body))))
 
 
 def _held(reader: RecordingReader) -> str:

@@ -37,6 +37,7 @@ from ..batch.rectification import (
 )
 from ..config import raster_of_heights
 from ..errors import UserError
+from ..formats.camera_json import read_camera_instead
 from ..formats.dem import dem_in_frame
 from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
@@ -66,6 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trajectory", type=Path, metavar="FILE",
         help="refined orientation from a table instead: trajectory_refined.csv of `triline adjust`",
+    )  # fmt: skip
+    parser.add_argument(
+        "--camera", type=Path, metavar="FILE",
+        help="calibrated camera.json in place of that of the recording (default: the one beside --trajectory; with a "
+        "refined orientation the parameters that were estimated with it)",
     )  # fmt: skip
     parser.add_argument("--ccd", metavar="ID", help="CCD line (default: the one that looks down most steeply)")
     parser.add_argument("--strip", action="append", metavar="ID", help="only this strip (may be given again)")
@@ -101,11 +107,14 @@ def run(args: argparse.Namespace) -> int:
     if args.trajectory is not None:
         name = args.trajectory.name
         orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
-        camera, of_camera = camera_beside(args.trajectory, camera)
+        if args.camera is None:
+            camera, of_camera = camera_beside(args.trajectory, camera)
     else:
         name, orientation, reference_ns = orientation_of(recording, args.orientation)
     estimated = 0
-    if name in REFINED:
+    if args.camera is not None:
+        camera, of_camera = read_camera_instead(args.camera, camera), args.camera
+    elif name in REFINED:
         camera, estimated = estimated_camera(recording, camera)
     frame = project_frame(recording)
     target = frame_for(frame, args.crs or _crs(frame))

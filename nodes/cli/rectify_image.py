@@ -162,7 +162,7 @@ def _check(args: argparse.Namespace) -> None:
     named = [str(Path(p).resolve()) for p in (args.output, args.mask, args.sigma) if p is not None]
     if len(set(named)) < len(named):
         raise UserError("-o, --mask, --sigma: wanted different files")
-    for name in ("orientation", "trajectory", "ccd", "strip"):
+    for name in ("orientation", "trajectory", "camera", "ccd", "strip"):
         if name != "ccd" and getattr(args, name):
             raise UserError(f"--{name}: goes with a recording, not with --sensor")
     if args.gsd is not None and not (np.isfinite(args.gsd) and args.gsd > 0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,37 @@ def read_camera(path: Path, notes: list[str] | None = None) -> LineCamera:
         notes.extend(f"{path.name}: key {key} is not known and was ignored" for key in keys.unread())
     notes.extend(f"{path.name}: key {key} is not known and was ignored" for key in file.unread())
     return LineCamera(name, tuple(lenses.values()), tuple(lines.values()))
+
+
+def read_camera_instead(path: Path, camera: LineCamera, told: str = "") -> LineCamera:
+    """The camera of a ``camera.json`` that stands for another one: a calibrated one in place of that of a recording.
+
+    Its CCD lines come in the order of the other's.
+
+    Parameters
+    ----------
+    camera : for which it stands
+    told : of the file in the error, where it was not named by the user
+
+    Raises
+    ------
+    UserError : a camera that cannot be read, or with other CCD lines
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file, wanted a camera.json")
+    found = read_camera(path)
+
+    def lines_of(c: LineCamera) -> dict[str, tuple[int, str]]:
+        lenses = len(camera.lenses) > 1 or len(c.lenses) > 1
+        return {line.id: (line.pixels, line.lens if lenses else "") for line in c.lines}
+
+    if lines_of(found) != lines_of(camera):
+        words = ", ".join(
+            f"{id} with {pixels} pixels" + (f" behind {lens}" if lens else "")
+            for id, (pixels, lens) in lines_of(camera).items()
+        )
+        raise UserError(f"{path}: {told}has other lines, wanted {words}")
+    return replace(found, lines=tuple(found.lines[found.line_index[line.id]] for line in camera.lines))
 
 
 def _lens(keys: Keys) -> Lens:

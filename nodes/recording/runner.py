@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -120,6 +120,7 @@ def process(
     write: Callable[[RawMessage], None],
     progress: Callable[[float], None] | None = None,
     apart: bool = False,
+    instead: Mapping[str, bytes] | None = None,
 ) -> ProcessSummary:
     """Run nodes over a recording, as fast as it goes.
 
@@ -129,7 +130,9 @@ def process(
     nodes : the nodes; those with nothing to work on stay out
     write : takes inputs and outputs, in the order of `order_key`; receive time = stamp
     progress : told the fraction that is done, now and then
-    apart : the last node may run in a process of its own, if no other needs its outputs; what comes out is the same
+    apart : the nodes before the last may run in a process of their own, if they need nothing of it; what comes out is
+        the same
+    instead : payload in place of the recorded one, by topic
     """
     summary = ProcessSummary()
     held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
@@ -138,21 +141,22 @@ def process(
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
     drivers = [StepDriver(node) for node in running]
+    recording = _Recorded(reader, instead or {})
     numbers = _usable(reader, made, summary)
     told = _Progress(progress, len(numbers))
     if apart and Ahead.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
         line = _Line(drivers[-1:], write, summary)
-        ahead = Ahead(lambda: _handed_on(reader, numbers, drivers[:-1]), " and ".join(summary.nodes[:-1]))
+        ahead = Ahead(lambda: _handed_on(recording, numbers, drivers[:-1]), " and ".join(summary.nodes[:-1]))
         try:
             for batch in ahead:
-                told.add(_take(batch, reader, line, summary))
+                told.add(_take(batch, recording, line, summary))
         finally:
             ahead.close()
         summary.counters = {name: summary.counters.get(name, {}) for name in summary.nodes[:-1]} | summary.counters
     else:
         line = _Line(drivers, write, summary)
-        for recorded_message in reader.raws(numbers):
-            line.take(_at_its_stamp(recorded_message))
+        for raw in recording.raws(numbers):
+            line.take(raw)
             told.add(1)
     line.finish()
     return summary
@@ -165,13 +169,12 @@ Flat = tuple[str, int, str, int, bytes]
 Item = int | Flat | ProcessSummary | None
 
 
-def _handed_on(reader: RecordingReader, numbers: NDArray[np.int64], drivers: Sequence[StepDriver]) -> Iterator[Item]:
+def _handed_on(recording: _Recorded, numbers: NDArray[np.int64], drivers: Sequence[StepDriver]) -> Iterator[Item]:
     """The first nodes over the recording: what they hand on to the last one, in order."""
     summary = ProcessSummary()
     handed: list[RawMessage] = []
     line = _Line(drivers, handed.append, summary)
-    for number, recorded in zip(numbers.tolist(), reader.raws(numbers), strict=True):
-        raw = _at_its_stamp(recorded)
+    for number, raw in zip(numbers.tolist(), recording.raws(numbers), strict=True):
         line.take(raw)
         for one in handed:
             yield number if one is raw else _flat(one)
@@ -185,13 +188,13 @@ def _handed_on(reader: RecordingReader, numbers: NDArray[np.int64], drivers: Seq
     yield summary
 
 
-def _take(batch: list[Item], reader: RecordingReader, line: _Line, summary: ProcessSummary) -> int:
+def _take(batch: list[Item], recording: _Recorded, line: _Line, summary: ProcessSummary) -> int:
     """The last node's part of a batch; returns how many recorded messages were in it."""
     numbers = [item for item in batch if isinstance(item, int)]
-    recorded = reader.raws(np.array(numbers, dtype=np.int64))
+    recorded = recording.raws(np.array(numbers, dtype=np.int64))
     for item in batch:
         if isinstance(item, int):
-            line.take(_at_its_stamp(next(recorded)))
+            line.take(next(recorded))
         elif isinstance(item, tuple):
             topic, stamp_ns, source, sequence, data = item
             line.take_made(RawMessage(topic, Envelope(stamp_ns, source, sequence), data, stamp_ns))
@@ -206,9 +209,17 @@ def _flat(raw: RawMessage) -> Flat:
     return raw.topic, raw.envelope.stamp_ns, raw.envelope.source, raw.envelope.sequence, bytes(raw.data)
 
 
-def _at_its_stamp(recorded: RawMessage) -> RawMessage:
-    """Received when it was stamped, as a node has it."""
-    return RawMessage(recorded.topic, recorded.envelope, recorded.data, recorded.envelope.stamp_ns)
+@dataclass
+class _Recorded:
+    """The messages of a recording as nodes have them: received when they were stamped, some with another payload."""
+
+    reader: RecordingReader
+    instead: Mapping[str, bytes]
+
+    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """Messages by their numbers."""
+        for topic, envelope, data, _ in self.reader.raws(numbers):
+            yield RawMessage(topic, envelope, self.instead.get(topic, data), envelope.stamp_ns)
 
 
 class _Progress:

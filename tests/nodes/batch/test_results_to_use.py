@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,7 +12,9 @@ import rasterio
 from test_adjust_command import AXES, write_block
 
 from triline.nodes.cli import main
+from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geotiff import Heights, write_heights
+from triline.nodes.recording.access import Recording
 
 ERRORS = {"dc": 0.05, "k1": 3e-6, "xp_F": 0.012, "yp_B": -0.01, "sy_F": 2e-4, "th_B": 2e-4}
 
@@ -42,6 +46,87 @@ def test_calibrated_camera_gives_the_same_points_without_parameters(block, tmp_p
     # and without either, the block does not fit at all
     bent, _ = adjusted(folder, tmp_path / "three")
     assert bent["sigma0"] > 1.5 * without["sigma0"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A block whose camera is off by some pixels, as a recording and as a folder; and what was adjusted in it."""
+    folder = tmp_path_factory.mktemp("recording")
+    write_block(folder / "b", points=70, control=12, check=20, parameters={**ERRORS, "k1": 3e-7})
+    path = folder / "b.mcap"
+    assert main(["import", str(folder / "b"), "-o", str(path), "-q"]) == 0
+    result, points = adjusted(path, folder / "calibrated", "--selfcal", "tls18", "--keep", "all")
+    return path, folder / "calibrated", result, points
+
+
+def apart(points, others):
+    """Distances of coordinates from those of the same points, in sigmas of the first."""
+    both = points.merge(others, on="point", suffixes=("", "_other"))
+    assert len(both) == len(points) == len(others)
+    other = both[[f"{axis}_other" for axis in AXES]].to_numpy()
+    return np.abs(both[AXES].to_numpy() - other) / both[[f"sigma_{axis}" for axis in AXES]].to_numpy()
+
+
+@pytest.mark.parametrize("kind", ["recording", "block folder"])
+def test_a_calibrated_camera_given_back_gives_the_same_points_without_parameters(recording, tmp_path, kind):
+    path, calibrated, with_parameters, points = recording
+    path = path if kind == "recording" else path.with_suffix("")
+    camera = calibrated / "camera.json"
+    without, same = adjusted(path, tmp_path / "again", "--camera", camera)
+    assert without["additional_parameters"] == {} and without["n_unknowns"] < with_parameters["n_unknowns"]
+    assert f"camera of {camera}" in without["notes"]
+    # points.csv is rounded to 0.01 mm, and weights go with the pitch of the pixels, which k1 stretches by 0.1 %
+    assert apart(points, same).max() < 2e-3
+    bent, others = adjusted(path, tmp_path / "bent")
+    assert bent["sigma0"] > 1.5 * without["sigma0"] and apart(points, others).max() > 1.0
+    # the camera that goes with these tables lies beside them, for whoever takes them
+    for file in calibrated.glob("camera*"):
+        assert (tmp_path / "again" / file.name).read_text() == file.read_text()
+    # adjusted once more with parameters there is nothing left for them
+    left, _ = adjusted(path, tmp_path / "left", "--camera", camera, "--selfcal", "tls18", "--keep", "all")
+    assert max(abs(p["t"]) for p in left["additional_parameters"].values()) < 0.1
+
+
+def test_process_takes_a_calibrated_camera_and_hands_it_on(tmp_path):
+    flight = tmp_path / "flight.mcap"
+    flown = ["--seconds", "12", "--ties", "12", "--attitude-rate", "100", "--lead-in", "2", "--sensor", "ads40-small"]
+    assert main(["simulate", "-o", str(flight), "-q", *flown]) == 0
+    camera = Recording(flight).camera()
+    bent = replace(camera, lines=tuple(
+        replace(l, xy_mm=l.xy_mm + np.array([0.03 * (l.id == "F"), 0.0])) for l in camera.lines))  # fmt: skip
+    for name, given in (("right", camera), ("bent", bent)):
+        (tmp_path / name).mkdir()
+        write_camera(tmp_path / name / "camera.json", given)
+
+    def processed(recording, name):
+        out = tmp_path / f"{recording.stem} {name}.mcap"
+        camera = str(tmp_path / name / "camera.json")
+        assert main(["process", str(recording), "-o", str(out), "--camera", camera]) == 0
+        for line, wanted in zip(Recording(out).camera().lines, read_camera(Path(camera)).lines, strict=True):
+            np.testing.assert_array_equal(line.xy_mm, wanted.xy_mm)
+        return out
+
+    right, wrong = processed(flight, "right"), processed(flight, "bent")
+    again = processed(wrong, "right")  # what was processed with another camera is made anew
+    told = [[(m.topic, m.stamp_ns, m.body) for m in Recording(path).messages()] for path in (right, again, wrong)]
+    assert told[0] == told[1] != told[2]
+    _, points = adjusted(right, tmp_path / "a")
+    _, same = adjusted(wrong, tmp_path / "b", "--camera", tmp_path / "right" / "camera.json")
+    assert apart(points, same).max() == 0.0
+
+
+@pytest.mark.parametrize("command", ["adjust", "process"])
+def test_cameras_that_do_not_go_with_the_recording_are_refused_in_one_line(recording, tmp_path, capsys, command):
+    path, calibrated, _, _ = recording
+    other = tmp_path / "other.json"
+    other.write_text((calibrated / "camera.json").read_text().replace('"id": "N"', '"id": "M"'))
+    for table in calibrated.glob("camera_*.csv"):
+        shutil.copy(table, tmp_path)
+    for file, said in ((other, "has other lines, wanted F with"), (tmp_path / "no.json", "no such file")):
+        assert main([command, str(path), "--camera", str(file), "-o", str(tmp_path / "out")]) == 1
+        err = capsys.readouterr().err
+        assert f"{file}: {said}" in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_orientation_of_every_line_is_that_of_the_refined_trajectory(block, tmp_path):

@@ -148,6 +148,17 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
         assert told["camera"] == str(path) and told["orientation"] == name
         with rasterio.open(folder / "calibrated.tif") as image:
             whole[name] = image.read(1), image.transform
+    # the same camera named, for a table that lies elsewhere
+    alone = folder / "alone"
+    alone.mkdir()
+    (alone / "lines.csv").write_text((out / "orientation_lines.csv").read_text())
+    named = ["--trajectory", alone / "lines.csv", "--camera", out / "camera.json"]
+    told = _rectify(capsys, flown, folder / "named.tif", *named, *options)
+    assert told["camera"] == str(out / "camera.json")
+    with rasterio.open(folder / "named.tif") as image:
+        np.testing.assert_array_equal(image.read(1), whole["orientation_lines.csv"][0])
+    told = _rectify(capsys, flown, folder / "named.tif", "--camera", out / "camera.json", "--height", 0)
+    assert told["camera"] == str(out / "camera.json") and not told["camera_parameters"]
     # a camera that is 40 pixels off across the track takes the orthoimage along
     table = out / "camera_N.csv"
     rows = np.loadtxt(table, delimiter=",", skiprows=1)
