@@ -154,8 +154,3 @@ def _find_fault(body: Any) -> None:
         elif kind == field.CPPTYPE_MESSAGE:
             for part in (value,) if hasattr(value, "ListFields") else value:
                 _find_fault(part)
-
-
-def vector_sizes(type_name: str) -> dict[str, int]:
-    """Number fields of a message type that hold a vector, and how many values each has where it has any."""
-    return dict(_SIZES.get(type_name, {}))

@@ -27,7 +27,7 @@ from ..formats.gps_time import gps_from_utc_ns
 from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import new_file
 from ..formats.projection import refuse_missing_grids
-from ..formats.rows import RowLayout, repeated_messages, spread_by_default
+from ..formats.rows import ElementLayout, RowLayout, repeated_messages
 from ..formats.sbet import write_sbet
 from ..node import Message
 from ..recording.access import Recording
@@ -47,8 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", metavar="RECORDING")
     parser.add_argument("--topic", help="one of: " + ", ".join(row.name for row in topics.TOPICS))
     target = parser.add_mutually_exclusive_group(required=True)
-    target.add_argument("--csv", metavar="FILE", help="one row a message, or one an element of a repeated sub-message")
-    target.add_argument("--parquet", metavar="FILE", help="the same table as Parquet")
+    target.add_argument(
+        "--csv", metavar="FILE",
+        help="one row a message, columns named with their units; repeated sub-messages go to FILE_NAME.csv beside it",
+    )  # fmt: skip
+    target.add_argument("--parquet", metavar="FILE", help="the same tables as Parquet")
     target.add_argument("--geojson", metavar="FILE", help="points and lines in WGS 84, with sigmas")
     target.add_argument("--gpkg", metavar="FILE", help="the same as GeoPackage")
     target.add_argument(
@@ -68,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rows", metavar="FIELD",
-        help="repeated sub-message whose elements become rows ('none': one row a message); by default the only one",
+        help="one table, with a row for each element of this repeated sub-message ('none': a row for each message)",
     )  # fmt: skip
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th message (default 1)")
 
@@ -98,11 +101,13 @@ def run(args: argparse.Namespace) -> int:
     if target.exists() and target.samefile(path):
         raise UserError(f"{target}: is the recording itself")
     with new_file(target) as part:
-        count = _WRITERS[kind](reader, args, part)
+        count: dict[str, Any] = {**_WRITERS[kind](reader, args, part)}
+    # read anew: what this reader skipped is counted once
+    beside = _element_tables(RecordingReader(path), args, kind, target) if kind in _TABLES else {}
     skipped = sum(reader.problems.values())
     result = {
         "recording": str(path), "topic": args.topic, "type": row.type_name, "file": str(target), **count,
-        "skipped": skipped, "damaged_stretches": len(reader.damage),
+        **({"beside": beside} if beside else {}), "skipped": skipped, "damaged_stretches": len(reader.damage),
         "damage": damage_lines(reader),
     }  # fmt: skip
     if args.json:
@@ -111,6 +116,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         what = ", ".join(f"{number} {name}" for name, number in count.items())
         print(f"{args.topic} -> {target}: {what}")
+        for name, rows in beside.items():
+            print(f"  {name}: {rows} rows")
     tell_damage("export", reader)
     return 0
 
@@ -149,34 +156,49 @@ def _messages(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Mes
     return islice(reader.sorted_messages([args.topic]), 0, None, args.every)
 
 
-def _batches(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Any]:
-    """Tables of the messages, at least one."""
-    type_name = topics.find(args.topic).type_name
-    spread = args.rows if args.rows else spread_by_default(type_name)
+def _layout(args: argparse.Namespace) -> RowLayout:
     try:
-        layout = RowLayout(args.topic, None if spread == "none" else spread)
+        return RowLayout(args.topic, None if args.rows in (None, "none") else args.rows)
     except ValueError:
-        known = ", ".join((*repeated_messages(type_name), "none"))
+        known = ", ".join((*repeated_messages(topics.find(args.topic).type_name), "none"))
         raise UserError(f"--rows {args.rows}: {args.topic} has no such field, wanted one of {known}") from None
+
+
+def _batches(reader: RecordingReader, args: argparse.Namespace, layout: RowLayout | ElementLayout) -> Iterator[Any]:
+    """Tables of the messages, at least one."""
     messages = _messages(reader, args)
-    table = layout.frame(islice(messages, BATCH))
-    while True:
-        yield table
-        table = layout.frame(islice(messages, BATCH))
-        if not len(table):
-            return
+    yield layout.frame(islice(messages, BATCH))
+    while some := list(islice(messages, BATCH)):
+        yield layout.frame(some)
 
 
-def _write_csv(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+def _element_tables(reader: RecordingReader, args: argparse.Namespace, kind: str, target: Path) -> dict[str, int]:
+    """Write ``target_NAME`` for each repeated sub-message that has elements; rows by file name."""
+    found = {}
+    for field in () if args.rows else repeated_messages(topics.find(args.topic).type_name):
+        if any(len(getattr(message.body, field)) for message in _messages(reader, args)):
+            beside = target.with_name(f"{target.stem}_{field}{target.suffix}")
+            if beside.exists() and beside.samefile(reader.path):
+                raise UserError(f"{beside}: is the recording itself")
+            with new_file(beside) as part:
+                found[str(beside)] = _TABLES[kind](reader, args, part, ElementLayout(args.topic, field))["rows"]
+    return found
+
+
+def _write_csv(
+    reader: RecordingReader, args: argparse.Namespace, target: Path, layout: RowLayout | ElementLayout | None = None
+) -> dict[str, int]:
     count = 0
     with open(target, "w", newline="", encoding="utf-8") as file:
-        for number, table in enumerate(_batches(reader, args)):
+        for number, table in enumerate(_batches(reader, args, layout or _layout(args))):
             table.to_csv(file, index=False, header=number == 0, lineterminator="\n")
             count += len(table)
     return {"rows": count}
 
 
-def _write_parquet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+def _write_parquet(
+    reader: RecordingReader, args: argparse.Namespace, target: Path, layout: RowLayout | ElementLayout | None = None
+) -> dict[str, int]:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -184,7 +206,7 @@ def _write_parquet(reader: RecordingReader, args: argparse.Namespace, target: Pa
         raise UserError("--parquet needs the package pyarrow; install it, or use --csv") from None
     count, writer = 0, None
     try:
-        for table in _batches(reader, args):
+        for table in _batches(reader, args, layout or _layout(args)):
             arrow = pyarrow.Table.from_pandas(table, preserve_index=False)
             writer = writer or pyarrow.parquet.ParquetWriter(target, arrow.schema)
             writer.write_table(arrow)
@@ -240,6 +262,8 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
     return {"records": len(time_ns)}
 
 
+#: Those that write tables.
+_TABLES = {"csv": _write_csv, "parquet": _write_parquet}
 _WRITERS: dict[str, Callable[[RecordingReader, argparse.Namespace, Path], dict[str, int]]] = {
     "csv": _write_csv,
     "parquet": _write_parquet,

@@ -17,13 +17,15 @@ from triline.nodes.cli import main
 from triline.nodes.convert import gnss_message, ground_point_message, pose_message
 from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.formats.detect import Options, read_any
-from triline.nodes.formats.rows import RowLayout, repeated_messages, spread_by_default
+from triline.nodes.formats.rows import ElementLayout, RowLayout, repeated_messages
 from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages
 from triline.nodes.node import Message
 from triline.nodes.recording.writer import RecordingWriter
+from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
 from triline.schemas.topics import TOPICS
+from triline.schemas.units import UNITS
 from triline.solver.geometry.frames import LocalFrame
 
 FRAME = LocalFrame(47.5, 10.6, 0.0)
@@ -85,27 +87,55 @@ def _csv(recording, tmp_path, topic: str, *more: str) -> pd.DataFrame:
 
 def test_one_row_a_message_with_columns_named_as_the_fields(recording, tmp_path):
     table = _csv(recording, tmp_path, "orientation/final")
-    assert list(table.columns[:5]) == ["stamp_ns", "sequence", "source", "timestamp.seconds", "timestamp.nanos"]
+    assert list(table.columns[:5]) == ["stamp_ns", "sequence", "source", "timestamp_ns", "frame_id"]
+    assert table["timestamp_ns"].tolist() == table["stamp_ns"].tolist()
     assert len(table) == 20 and (table.source == "adjuster").all()
     assert table["stamp_ns"].tolist() == [START + i * 10**8 for i in range(20)]
     assert table["sequence"].tolist() == list(range(20))
-    np.testing.assert_allclose(table["pose.position.x"], 10.0 * np.arange(20))
-    np.testing.assert_allclose(table[["angles_0", "angles_1", "angles_2"]], np.tile([0.01, -0.02, 0.3], (20, 1)))
+    np.testing.assert_allclose(table["pose.position.x_m"], 10.0 * np.arange(20))
+    np.testing.assert_allclose(
+        table[["angles_omega_rad", "angles_phi_rad", "angles_kappa_rad"]], np.tile([0.01, -0.02, 0.3], (20, 1))
+    )
     # a vector that was not sent is empty, not zero
-    assert table["covariance_35"].isna().tolist() == [True] + [False] * 19
-    np.testing.assert_allclose(table["covariance_7"][1:], 0.04)
-    np.testing.assert_allclose(table[[f"correction_{i}" for i in range(6)]].iloc[1], np.arange(6))
+    assert table["covariance_kappa_kappa_rad2"].isna().tolist() == [True] + [False] * 19
+    np.testing.assert_allclose(table["covariance_Y_Y_m2"][1:], 0.04)
+    np.testing.assert_allclose(table.filter(like="correction_").iloc[1], np.arange(6))
     assert table["strip"].tolist() == ["S1"] * 12 + ["S2"] * 8
-    assert table["velocity.x"].isna().all()  # a sub-message that was not sent
+    assert table["velocity.x_m_s"].isna().all()  # a sub-message that was not sent
+
+
+def test_elements_of_a_repeated_message_go_to_a_file_of_their_own(recording, tmp_path, capsys):
+    table = _csv(recording, tmp_path, "point/object")
+    assert table["point"].tolist() == ["P1", "P1", "P2"] and table["residuals.count"].tolist() == [2, 2, 0]
+    assert not any(name.startswith("residuals.v") for name in table.columns)
+    assert {"x_m", "y_m", "z_m", "covariance_X_Z_m2"} <= set(table.columns)
+    beside = pd.read_csv(tmp_path / "out_residuals.csv")
+    assert list(beside.columns[:6]) == ["stamp_ns", "sequence", "source", "point", "strip", "ccd"]
+    assert beside["point"].tolist() == ["P1"] * 4 and beside["strip"].tolist() == ["S1", "S2"] * 2
+    np.testing.assert_allclose(beside["v_line_px"], [0.1, 0.2, 0.1, 0.2])
+    assert set(zip(beside.stamp_ns, beside.source, strict=True)) <= set(zip(table.stamp_ns, table.source, strict=True))
+    _csv(recording, tmp_path, "adjustment/report")  # of several, those that have elements
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "out.csv", "out_parameters.csv", "out_rejected.csv", "out_residuals.csv"
+    ]  # fmt: skip
+    assert pd.read_csv(tmp_path / "out_parameters.csv")["name"].tolist() == ["dX", "dY"]
+    target = tmp_path / "told.csv"
+    assert main(["export", str(recording), "--topic", "point/object", "--csv", str(target)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"point/object -> {target}: 3 rows", f"  {tmp_path / 'told_residuals.csv'}: 4 rows"
+    ]  # fmt: skip
 
 
 def test_one_row_an_element(recording, tmp_path):
-    table = _csv(recording, tmp_path, "point/object")
+    table = _csv(recording, tmp_path, "point/object", "--rows", "residuals")
+    assert not (tmp_path / "out_residuals.csv").exists()
     assert table["point"].tolist() == ["P1", "P1", "P1", "P1", "P2"]
     assert table["residuals.strip"].tolist()[:4] == ["S1", "S2", "S1", "S2"]
-    np.testing.assert_allclose(table["residuals.v_line"][:4], [0.1, 0.2, 0.1, 0.2])
+    np.testing.assert_allclose(table["residuals.v_line_px"][:4], [0.1, 0.2, 0.1, 0.2])
     assert table["status"].tolist() == ["live", "live", "final", "final", "live"]
-    assert np.isnan(table["residuals.v_line"][4]) and table["x"][4] == 1.0  # no element: one row, element columns empty
+    assert (
+        np.isnan(table["residuals.v_line_px"][4]) and table["x_m"][4] == 1.0
+    )  # no element: one row, element columns empty
     whole = _csv(recording, tmp_path, "point/object", "--rows", "none")
     assert len(whole) == 3 and whole["residuals.count"].tolist() == [2, 2, 0]
 
@@ -136,7 +166,7 @@ def test_every_topic_of_the_table_has_rows(topic):
     """Default messages, and the columns fit the rows for every way of spreading."""
     row = next(row for row in TOPICS if row.name == topic)
     name = topic.replace("*", "X")
-    for spread in (None, spread_by_default(row.type_name), *repeated_messages(row.type_name)):
+    for spread in (None, *repeated_messages(row.type_name)):
         layout = RowLayout(topic, spread)
         body = row.type()
         if spread is not None:
@@ -144,6 +174,26 @@ def test_every_topic_of_the_table_has_rows(topic):
         table = layout.frame([Message(name, 5, body, "s", 3)])
         assert len(table) == 1 and len(set(table.columns)) == len(table.columns)
         assert table.loc[0, "stamp_ns"] == 5 and table.loc[0, "sequence"] == 3
+        if spread is not None:
+            table = ElementLayout(topic, spread).frame([Message(name, 5, body, "s", 3)])
+            assert len(table) == 1 and len(set(table.columns)) == len(table.columns)
+
+
+def test_every_unit_belongs_to_a_field():
+    """The test above refuses a field without unit; here: no unit of what is not there, and sizes are the codec's."""
+    for type_name, fields in UNITS.items():
+        descriptor = m.message_class(type_name).DESCRIPTOR
+        for name, unit in fields.items():
+            at = descriptor
+            for part in name.split("."):
+                field = at.fields_by_name[part]
+                at = field.message_type
+            assert isinstance(unit, str) or field.is_repeated
+            size = codec._SIZES.get(type_name, {}).get(name)
+            assert size is None or (isinstance(unit, tuple) and len(unit) == size), (type_name, name)
+            for tail in ("ns", "mm", "m", "px", "deg", "s", "hz"):
+                if isinstance(unit, str) and unit and name.endswith(f"_{tail}"):
+                    assert unit == tail, name
 
 
 def test_parquet_has_the_same_table(recording, tmp_path):
@@ -153,16 +203,16 @@ def test_parquet_has_the_same_table(recording, tmp_path):
     table, text = pd.read_parquet(target), _csv(recording, tmp_path, "orientation/final")
     assert list(table.columns) == list(text.columns) and table["stamp_ns"].dtype == "Int64"
     np.testing.assert_array_equal(table["stamp_ns"], text["stamp_ns"])
-    np.testing.assert_array_equal(table["covariance_14"].to_numpy(), text["covariance_14"].to_numpy())
+    np.testing.assert_array_equal(table["covariance_Z_Z_m2"].to_numpy(), text["covariance_Z_Z_m2"].to_numpy())
 
 
 def test_csv_gives_the_numbers_back_to_the_last_bit(tmp_path):
     block = simulated_block()
     path = tmp_path / "b.mcap"
     write_recording(path, block_messages(block))
-    table = _csv(path, tmp_path, "observation/tie")
+    table = _csv(path, tmp_path, "observation/tie", "--rows", "images")
     assert len(table) == len(block.image)
-    got = sorted(zip(table["point"], table["images.strip"], table["images.ccd"], table["images.line"], strict=True))
+    got = sorted(zip(table["point"], table["images.strip"], table["images.ccd"], table["images.line_px"], strict=True))
     wanted = sorted((*block.image_name(i), float(block.image.line[i])) for i in range(len(block.image)))
     assert got == wanted
 
@@ -313,7 +363,8 @@ def test_machine_readable_result(recording, tmp_path, capsys):
     args = ["export", str(recording), "--topic", "point/object", "--csv", str(tmp_path / "o.csv"), "--json"]
     assert main(args) == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["rows"] == 5 and result["type"] == "triline.ObjectPoint" and result["skipped"] == 0
+    assert result["rows"] == 3 and result["beside"] == {str(tmp_path / "o_residuals.csv"): 4}
+    assert result["type"] == "triline.ObjectPoint" and result["skipped"] == 0
 
 
 def test_what_a_damaged_recording_lacks_is_named(recording, tmp_path, capsys):
