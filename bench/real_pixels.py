@@ -16,7 +16,7 @@ differently. The figures:
 - *wrong*: of the matches, those further across than 0.5 px, and those whose height is 15 m off the median of their ten
   neighbours (a wrong place along the line); neither counts in what follows;
 - *across*: standard deviation, px of the left look, and the same from the median of the absolute values;
-- *stated*: root mean square of what least squares states, without and with the matcher's floor (``image_sigma_px``);
+- *stated*: root mean square of what least squares states, without and with the floor of simulated pixels;
 - *NEES*: mean square of across over its stated variance, by the floor, with the 95 % band of a bootstrap over tiles of
   80 px, whose matches share errors. 1 is right;
 - *floor*: what has to be added (in squares) for a NEES of 1, with its band; and the same in the three thirds of the
@@ -43,7 +43,7 @@ from triline.solver.location.rpc import Rpc
 from triline.solver.matching.interest_points import interest_point
 from triline.solver.matching.line_store import LineRing
 from triline.solver.matching.looks import verdict
-from triline.solver.matching.options import MatchingOptions
+from triline.solver.matching.options import REAL_FLOOR_PX, MatchingOptions
 from triline.solver.matching.patches import Windows
 from triline.solver.matching.search import LEAST_SQUARES_HALF, Found, Ground, Patches, find
 
@@ -248,7 +248,7 @@ def figures(apart: int, largest_sigma_px: float) -> dict:
         "stated, px: least squares alone": float(np.sqrt(variance.mean())),
         f"stated, px: with the floor of {stated:g}": float(np.sqrt((variance + stated**2).mean())),
     }  # fmt: skip
-    for floor in (0.0, stated, 0.05):
+    for floor in (0.0, stated, REAL_FLOOR_PX):
 
         def nees(r: Array, v: Array, floor: float = floor) -> float:
             return float(np.mean(r**2 / (v + floor**2)))

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from ..solver.matching.options import REAL_FLOOR_PX
 from .errors import UserError
 
 Tables = dict[str, dict[str, Any]]
@@ -28,7 +29,8 @@ _ELEVATION: dict[str, tuple[str, Any, str]] = {
 
 def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     """The tables of a configuration file, none without a file; of a ``flight.toml`` those in ``[nodes]``, and the
-    elevation model of its ``[dem]`` as settings of the adjuster.
+    elevation model of its ``[dem]`` as settings of the adjuster. A flight folder is of a real camera: where nothing
+    else is said the matcher has the floor of real pixels.
 
     Parameters
     ----------
@@ -55,6 +57,8 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
         tables = tables.get("nodes", {})
         if dem and isinstance(tables.get("adjuster", {}), dict):
             tables = tables | {"adjuster": dem | tables.get("adjuster", {})}
+        if isinstance(tables.get("matcher", {}), dict):
+            tables = tables | {"matcher": {"image_sigma_px": REAL_FLOOR_PX} | tables.get("matcher", {})}
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise UserError(f"{path}: {name} stands outside a table, wanted [node] tables")

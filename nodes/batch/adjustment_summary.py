@@ -71,7 +71,8 @@ def _accuracy(c: Content) -> Iterator[str]:
         d = c["dem"]
         yield (
             f"  heights of the raster {d['n']:5d} points with sigma {d['sigma_m']:g} m; "
-            f"differences {_number(d['rmse_m'])} m RMS without {d['half_weight_or_less']} that count half or less"
+            f"differences {_number(d['rmse_m'])} m RMS"
+            + (f" without {d['half_weight_or_less']} that count half or less" if d["half_weight_or_less"] else "")
         )
         yield (
             f"  {'':22s}{'':5s} raster minus all else {d['shift_m']:+.3f} +- {d['shift_sigma_m']:.3f} m "

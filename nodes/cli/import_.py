@@ -282,7 +282,7 @@ def _print_summary(result: dict[str, Any]) -> None:
     for topic, count in result.get("messages", {}).items():
         print(f"  {topic:24s} {count:8d}")
     if "seconds" in result:
-        print(f"  {result['seconds']:.3f} s")
+        print(f"  {result['seconds']:.3f} s of flight")
     if "rows" in result:
         print(f"  {result['rows']} image points")
     for id, pixels in result.get("lines", {}).items():

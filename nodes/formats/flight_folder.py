@@ -628,6 +628,7 @@ imu = "MEMS"                      # tactical or MEMS: slow errors of the attitud
 #delay_s = 0.0                    # from the measurement until it is here
 
 #[nodes.matcher]                  # settings of nodes: triline process --config DIR/flight.toml
+#image_sigma_px = 0.04            # floor of the sigma of a match, px
 """
 
 

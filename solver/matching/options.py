@@ -11,6 +11,13 @@ from ..ranges import check_ranges
 
 Array = NDArray[np.floating]
 
+#: What is added to the sigma of a match for what its residuals do not show, px, of simulated pixels: they average the
+#: ground over their area, and nothing finer shows in them. Tuned: ties of simulated flights then have a NEES of 0.9.
+SIMULATED_FLOOR_PX = 0.017
+#: The same of real pixels, in which detail finer than themselves aliases, and which two looks see differently. Tuned: two
+#: real pushbroom looks have a NEES of 1 (95 %: 0.02 to 0.06 px); `bench/real_pixels.py`.
+REAL_FLOOR_PX = 0.04
+
 
 @dataclass(frozen=True)
 class MatchingOptions:
@@ -26,7 +33,8 @@ class MatchingOptions:
     largest_closing_px : by which matching back may miss
     least_reach_px, largest_reach_px : of the search, before anything is known and at all
     relief_sigma_m : of the ground about its mean height, before anything is known
-    image_sigma_px : what is added to the sigma of a match for what its residuals do not show
+    image_sigma_px : what is added to the sigma of a match for what its residuals do not show: `SIMULATED_FLOOR_PX`, or
+        for a flight folder `REAL_FLOOR_PX`
     least_rays : of a tie point
     budget_mb : megabytes (10^6 bytes) for image lines
     chips_mb : megabytes for patches of earlier strips, 0 for none: no ties from strip to strip
@@ -46,7 +54,7 @@ class MatchingOptions:
     least_reach_px: float = 40.0
     largest_reach_px: float = 80.0
     relief_sigma_m: float = 60.0
-    image_sigma_px: float = 0.017
+    image_sigma_px: float = SIMULATED_FLOOR_PX
     least_rays: int = 3
     budget_mb: float = 1024.0
     chips_mb: float = 64.0

@@ -113,7 +113,7 @@ def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
     ]  # fmt: skip
     blocks = [message.body for message in reader.messages(["sensor/lines/N"])]
     assert blocks[-1].strip == "S2" and blocks[-1].pixels.dtype == np.uint16
-    assert load(folder / "flight.toml", ["matcher"]) == {"matcher": {"ground_m": 5.0}}
+    assert load(folder / "flight.toml", ["matcher"]) == {"matcher": {"image_sigma_px": 0.04, "ground_m": 5.0}}
 
 
 def test_the_origin_lies_on_the_ground_by_raster_or_height_above_it(folder, tmp_path, capsys):
