@@ -137,11 +137,12 @@ def _totals(flight: Flight) -> dict[str, Any]:
 
 def missing(flight: Flight) -> list[str]:
     """Topics that a full evaluation needs and the recording does not hold, a line each."""
+    why = "the adjuster gave none" if flight.reports else "the recording has not been through the adjuster"
     wanted = [
         (flight.project is not None, "configuration/project"),
         (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
         (bool(flight.measured), "trajectory/filtered or trajectory/smoothed: no direct georeferencing"),
-        ("final" in flight.poses, "orientation/final: the recording has not been through the adjuster"),
+        ("final" in flight.poses, f"orientation/final: {why}"),
         ("truth" in flight.poses, "truth/trajectory: no error of the orientation (truth is known in simulations only)"),
         (bool(flight.truth_points), "truth/point: no error of the object points"),
         (bool(flight.reports), "adjustment/report"),

@@ -14,8 +14,8 @@ Array = NDArray[np.floating]
 #: What is added to the sigma of a match for what its residuals do not show, px, of simulated pixels: they average the
 #: ground over their area, and nothing finer shows in them. Tuned: ties of simulated flights then have a NEES of 0.9.
 SIMULATED_FLOOR_PX = 0.017
-#: The same of real pixels, in which detail finer than themselves aliases, and which two looks see differently. Tuned: two
-#: real pushbroom looks have a NEES of 1 (95 %: 0.02 to 0.06 px); `bench/real_pixels.py`.
+#: The same of real pixels, in which detail finer than themselves aliases, and which two looks see differently. Tuned:
+#: two real pushbroom looks have a NEES of 1 (95 %: 0.02 to 0.06 px); `bench/real_pixels.py`.
 REAL_FLOOR_PX = 0.04
 
 
