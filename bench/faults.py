@@ -8,8 +8,8 @@ adjuster, in processes of their own, fed by `triline replay`) come in mid-strip.
 messages of the flight, which `process` works off: the exact sequence, whatever the machine.
 
 - *lost*: time of the strip without final orientation, s, less what the flight lacks without a fault
-- *right*: from the fault (the end of a freeze) until live orientation came again, s by the recorder's clock (of data: s of
-  flight); "-" where it never stopped for more than a second
+- *right*: from the fault (the end of a freeze) until live orientation came again, s by the recorder's clock (of data: s
+  of flight); "-" where it never stopped for more than a second
 - *beyond*: live orientations under a green light whose error is beyond the protection level in X, Y or Z, of how many
 - *told*: alarms, and lines of the event log that the flight without a fault does not have, the first of them
 """

@@ -29,12 +29,22 @@ AGAIN_S, ALARM_S = 10.0, 30.0
 
 @dataclass
 class _Voice:
-    """Who speaks on a topic (for control: of a point)."""
+    """Who speaks on a topic (for control: of a point).
+
+    Attributes
+    ----------
+    source, start : program, and the run of it
+    latest_ns : newest stamp
+    body : what it said, where that counts
+    rival, rival_ns : a later run with earlier stamps that has spoken since this one did, and the first of these stamps
+    """
 
     source: str
     start: int
     latest_ns: int
     body: Any = None
+    rival: int = 0
+    rival_ns: int = 0
 
 
 @dataclass
@@ -118,20 +128,32 @@ class Voices:
             return self._refuse(key, message, f"two programs speak as {voice.source!r}")
         if message.topic in FIXED and self._flying:
             return self._hold_change(key, message)
-        voice.start = message.start
-        voice.latest_ns = message.stamp_ns if message.start != voice.start else max(voice.latest_ns, message.stamp_ns)
+        if message.start != voice.start:
+            self._held.pop((message.topic, message.source), None)
+        same = message.start == voice.start
+        voice.latest_ns = max(voice.latest_ns, message.stamp_ns) if same else message.stamp_ns
+        voice.start, voice.rival = message.start, 0
         if keeps:
             voice.body = message.body
         return Heard((message,))
 
     @staticmethod
     def _takes_over(message: Message, voice: _Voice, keeps: bool) -> bool:
-        """Whether a program that was started again goes on where the run before it fell silent."""
+        """Whether a program that was started again goes on where the run before it fell silent.
+
+        A run with earlier stamps begins another flight if it speaks for so long and the one before says nothing.
+        """
         if message.start < voice.start:
             return False
+        if keeps:
+            return True
         rate_hz = topics.find(message.topic).rate_hz
-        silent_s = SILENT_S + (SILENT_PERIODS / rate_hz if rate_hz else 0.0)
-        return keeps or abs(message.stamp_ns - voice.latest_ns) > silent_s * _SECOND_NS
+        silent_ns = round((SILENT_S + (SILENT_PERIODS / rate_hz if rate_hz else 0.0)) * _SECOND_NS)
+        if message.stamp_ns > voice.latest_ns:
+            return message.stamp_ns - voice.latest_ns > silent_ns
+        if voice.rival != message.start:
+            voice.rival, voice.rival_ns = message.start, message.stamp_ns
+        return message.stamp_ns - voice.rival_ns > silent_ns
 
     def _refuse(self, key: tuple[str, str], message: Message, why: str) -> Heard:
         what = f" of {key[1]}" if key[1] else ""
@@ -155,7 +177,8 @@ class Voices:
 
     def _note(self, key: tuple[str, str], message: Message, text: str, *, stays: bool, again: bool = False) -> Heard:
         self.refused[message.topic] = self.refused.get(message.topic, 0) + 1
-        now, held = message.stamp_ns, self._held.get(key)
+        voices = (voice.latest_ns for (topic, _), voice in self._voices.items() if topic == message.topic)
+        now, held = max(message.stamp_ns, *voices, 0), self._held.get(key)
         if held is None:
             self._held[key] = _Refused(text, now, now, message, stays=stays)
             return Heard(alarms=(text,))

@@ -90,7 +90,7 @@ def _nobody(bus: Bus, patience_s: float = 0.5) -> str:
     until = time.monotonic() + patience_s
     while not bus.alive():
         if time.monotonic() > until:
-            return f"no node lives on platform {bus.platform} yet; who comes later gets the last minute of what was played"
+            return f"no node lives on platform {bus.platform} yet; who comes later gets the last minute"
         time.sleep(0.05)
     return ""
 

@@ -102,6 +102,20 @@ def test_a_program_that_was_started_again_takes_over_and_one_beside_it_does_not(
     assert rig.count("sensor/gnss") == 30
 
 
+def test_the_same_flight_played_once_more_beside_itself_is_not_used_and_after_it_is():
+    rig = Rig()
+    for i in range(2000):  # 10 s of both, the second from the start of the flight
+        rig.hear("sensor/attitude", 30.0 + 0.005 * i)
+        rig.hear("sensor/attitude", 0.005 * i, start=2)
+    assert rig.count("sensor/attitude") == 2000 and all(given.start == 1 for given in rig.node.given)
+    assert "two programs speak as 'a'" in rig.node.alarm
+    for i in range(2000, 3000):  # the first has ended
+        rig.hear("sensor/attitude", 0.005 * i, start=2)
+    later = [given for given in rig.node.given if given.start == 2]
+    assert 880 <= len(later) <= 900  # half a second passes until it is believed
+    assert rig.node.alarm == ""
+
+
 def test_another_camera_before_the_flight_is_taken_and_in_flight_only_on_the_operators_word():
     camera = sample.body("configuration/camera")
     better, forged = copy.deepcopy(camera), copy.deepcopy(camera)
