@@ -27,6 +27,8 @@ ISO = ("time", "time_utc", "utc", "timestamp", "datetime")
 #: Names of columns with GPS seconds, of the week or since 1980-01-06.
 GPS = ("gps_s", "gps_time_s", "gps_seconds", "sow_s", "tow_s")
 WEEKS = ("week", "gps_week")
+#: Times of which ns do not fit into 64 bits, s: of the year 2262.
+LATEST_S = 9.2e9
 #: What a file may hold.
 WANTED = "time_s (UTC, since 1970), time (ISO 8601), or gps_s (of the week, with week or --date)"
 
@@ -62,7 +64,10 @@ def times_of(table: Table, columns: list[Column], day: date | None, notes: list[
     """
     name = columns[0].name
     if name == "time_s":
-        time_ns = _ns(table[name])
+        seconds = table[name]
+        bad = ~(np.abs(seconds) < LATEST_S)
+        table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, wanted seconds since 1970-01-01 UTC")
+        time_ns = _ns(seconds)
     elif name in GPS:
         time_ns, given = _from_gps(table, columns, day, notes)
         if not given:

@@ -407,13 +407,13 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     recall.come_round()
     while not options.stop.is_set():
         recorder.take(recall.complete(backlog.take(0.05)))
-        recall.come_round()
         recorder.tend()
         if recorder.last_problem != problem:
             problem = recorder.last_problem
             options.report(f"recorder: {problem}")
         if status.due():
             status.publish(recorder.state(), dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
+        recall.come_round()
     _take_last_words(recorder, backlog)
     backlog.close()
     recorder.take(backlog.take(0.0))  # a disk that is slow has left some

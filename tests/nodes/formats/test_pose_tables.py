@@ -116,6 +116,14 @@ BAD = {
         None,
         "p.csv:1: yaw_deg: heading comes twice",
     ),
+    "no such year": (
+        "time_s",
+        [*UNIX[:-1], "1e19"],
+        COLUMNS,
+        TAIL,
+        None,
+        f"p.csv:{N + 1}: time_s: 1e+19, wanted seconds since 1970-01-01 UTC",
+    ),
     "no time": ("when", UNIX, COLUMNS, TAIL, None, "p.csv:1: time_s: column missing, wanted time_s (UTC, since 1970)"),
     "a word": (
         "time",
