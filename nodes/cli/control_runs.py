@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Protocol
+from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from ..formats.scene_block import SceneBlockData
 from .adjust import adjust_block, models_of, wanders
 
 Array = NDArray[np.floating]
+D = TypeVar("D", BlockData, SceneBlockData)
 Indices = NDArray[np.int64]
 Tell = Callable[[float], None] | None
 
@@ -173,11 +174,10 @@ class Block(Protocol):
 
 
 @dataclass(frozen=True)
-class AirborneBlock:
-    """A block folder or recording."""
+class _OfData(Generic[D]):
+    """What both kinds say of themselves."""
 
-    data: BlockData
-    axes: tuple[str, str, str] = ("X", "Y", "Z")
+    data: D
 
     @property
     def name(self) -> str:
@@ -191,8 +191,15 @@ class AirborneBlock:
     def ground(self) -> KnownPoints:
         return self.data.ground
 
-    def with_ground(self, ground: KnownPoints) -> AirborneBlock:
+    def with_ground(self, ground: KnownPoints) -> Self:
         return replace(self, data=replace(self.data, ground=ground))
+
+
+@dataclass(frozen=True)
+class AirborneBlock(_OfData[BlockData]):
+    """A block folder or recording."""
+
+    axes: tuple[str, str, str] = ("X", "Y", "Z")
 
     def measured(self) -> dict[str, int]:
         image = self.data.image
@@ -240,26 +247,10 @@ class AirborneBlock:
 
 
 @dataclass(frozen=True)
-class SceneBlock:
+class SceneBlock(_OfData[SceneBlockData]):
     """A block of satellite scenes."""
 
-    data: SceneBlockData
     axes: tuple[str, str, str] = ("east", "north", "up")
-
-    @property
-    def name(self) -> str:
-        return self.data.name
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.data.notes
-
-    @property
-    def ground(self) -> KnownPoints:
-        return self.data.ground
-
-    def with_ground(self, ground: KnownPoints) -> SceneBlock:
-        return replace(self, data=replace(self.data, ground=ground))
 
     def measured(self) -> dict[str, int]:
         counts = np.bincount(self.data.rays.point, minlength=len(self.data.point_ids))
