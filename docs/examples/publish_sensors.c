@@ -1,19 +1,19 @@
-/* Hand a camera's image lines, inertial data and GNSS to triline from a driver in C, over TCP.
+/* Hand a camera's image lines, attitude or inertial data, and GNSS to triline from a driver in C, over TCP.
  *
- *     cc -O2 -o publish_sensors publish_sensors.c -lm && ./publish_sensors 127.0.0.1 5555 10
+ *     cc -O2 -o publish_sensors publish_sensors.c && ./publish_sensors 127.0.0.1 5555 < measured
  *
  * The other side is a sensor of the flight folder: [[sensor]] kind = "stream", address = "listen://127.0.0.1:5555".
+ * Standard input stands for the devices, a row for each thing in the order in which they are known (t: ns from now on):
+ *     gnss t lat_deg lon_deg height_m sigma_m          imu t interval_ns fx fy fz wx wy wz
+ *     attitude t roll pitch heading sigma_rad          lines t ccd first_line period_ns lines samples bits, then pixels
  * A record is a line of text; after LINES come the pixels, little-endian. Times are UTC in ns since the Unix epoch. */
-#include <math.h>
+#include <inttypes.h>
 #include <netdb.h>
-#include <stdint.h>
 #include <stdio.h>
-#include <stdlib.h>
+#include <string.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
-
-enum { SAMPLES = 64, BLOCK = 20, RATE = 200 }; /* pixels of a line, lines of a block, lines a second */
 
 static int64_t now_ns(void) {
     struct timespec t;
@@ -29,25 +29,36 @@ static FILE *join(const char *host, const char *port) {
 }
 
 int main(int argc, char **argv) {
-    FILE *out = argc == 4 ? join(argv[1], argv[2]) : NULL;
-    if (!out) return fprintf(stderr, "%s HOST PORT SECONDS: nobody listens there\n", argv[0]), 1;
-    uint16_t pixels[BLOCK][SAMPLES];
-    const int64_t period = 1000000000 / RATE, start = now_ns();
-    for (long n = 0; n < atof(argv[3]) * RATE; n++) { /* a turn for each image line */
-        const int64_t t = start + n * period;
-        while (now_ns() < t) usleep(200);
-        /* forward, right, down: specific force in m/s^2, angular rate in rad/s, over the interval that ends at t */
-        fprintf(out, "IMU %lld %lld %.9f %.9f %.9f %.9f %.9f %.9f\n", (long long)t, (long long)period,
-                0.1 * sin(n * 0.01), 0.0, -9.81, 0.0, 0.0, 0.001 * cos(n * 0.01));
-        if (n % (RATE / 5) == 0) /* latitude and longitude in degrees, height above the ellipsoid; sigmas in m */
-            fprintf(out, "GNSS %lld %.10f %.10f %.4f 0.02 0.02 0.04\n", (long long)t, 47.9 + n * 3e-6, 11.1, 1500.0);
-        for (int i = 0; i < SAMPLES; i++) pixels[n % BLOCK][i] = (uint16_t)(n * 7 + i); /* as the camera gives them */
-        if (n % BLOCK == BLOCK - 1) { /* CCD line, strip, its first line here, time of that, period, lines, samples, bits */
-            fprintf(out, "LINES N S%lld %ld %lld %lld %d %d 16\n", (long long)(start / 1000000000), n - BLOCK + 1,
-                    (long long)(t - (BLOCK - 1) * period), (long long)period, BLOCK, SAMPLES);
-            fwrite(pixels, sizeof pixels, 1, out);
-        }
+    FILE *out = argc == 3 ? join(argv[1], argv[2]) : NULL;
+    if (!out) return fprintf(stderr, "%s HOST PORT: nobody listens there\n", argv[0]), 1;
+    static char pixels[1 << 24], kind[16], ccd[16], strip[16];
+    const int64_t start = now_ns() + 1000000000;
+    strftime(strip, sizeof strip, "S%H%M%S", gmtime(&(time_t){start / 1000000000})); /* a name for each strip */
+    int64_t t, period, first, records = 0;
+    int lines, samples, bits, read;
+    double v[6];
+    for (; (read = scanf("%15s %" SCNd64, kind, &t)) == 2; records++) { /* a turn for each thing measured */
+        size_t size = 0;
+        lines = 1, period = 0, t += start;
+        if (!strcmp(kind, "gnss") && scanf("%lf %lf %lf %lf", v, v + 1, v + 2, v + 3) == 4) {
+            fprintf(out, "GNSS %" PRId64 " %.10f %.10f %.6f %g %g %g\n", t, v[0], v[1], v[2], v[3], v[3], v[3]);
+        } else if (!strcmp(kind, "imu") && /* forward, right, down: m/s^2, rad/s, over the interval that ends at t */
+                   scanf("%" SCNd64 "%lf %lf %lf %lf %lf %lf", &period, v, v + 1, v + 2, v + 3, v + 4, v + 5) == 7) {
+            fprintf(out, "IMU %" PRId64 " %" PRId64 " %.9f %.9f %.9f %.9f %.9f %.9f\n", t, period, v[0], v[1], v[2],
+                    v[3], v[4], v[5]);
+        } else if (!strcmp(kind, "attitude") && scanf("%lf %lf %lf %lf", v, v + 1, v + 2, v + 3) == 4) {
+            fprintf(out, "ATTITUDE %" PRId64 " %.10f %.10f %.10f %g %g %g\n", t, v[0], v[1], v[2], v[3], v[3], v[3]);
+        } else if (!strcmp(kind, "lines") && scanf("%15s %" SCNd64 "%" SCNd64 "%d %d %d%*1[\n]", ccd, &first, &period,
+                                                   &lines, &samples, &bits) == 6 &&
+                   (size = (size_t)lines * samples * bits / 8) <= sizeof pixels && fread(pixels, size, 1, stdin)) {
+            fprintf(out, "LINES %s %s %" PRId64 " %" PRId64 " %" PRId64 " %d %d %d\n", ccd, strip, first, t, period,
+                    lines, samples, bits);
+        } else break;
+        while (now_ns() < t + (lines - 1) * period) usleep(200); /* until the last line has been read */
+        fwrite(pixels, size, 1, out);
         fflush(out); /* or every 20 ms, where the processor is small */
     }
-    return fclose(out) ? 1 : 0;
+    if (read != EOF) fprintf(stderr, "row %" PRId64 " of %s: cannot be read\n", records + 1, kind);
+    printf("%" PRId64 " records\n", records);
+    return fclose(out) || read != EOF;
 }

@@ -88,3 +88,26 @@ def write_flight(folder: Path, **settings) -> dict[str, int]:
         lines.append(f"{point},{x:.4f},{y:.4f},{z:.4f},0.05,0.05,0.08,control")
     (flight / "control.csv").write_text("\n".join(lines) + "\n")
     return {**counts, "blocks": json.loads(json.dumps({ccd: len(parts) for ccd, parts in blocks.items()}))}  # type: ignore[dict-item]
+
+
+def write_rows(drivers: Path, path: Path) -> int:
+    """The folder ``drivers`` as rows for the standard input of publish_sensors.c; the number of rows."""
+    rows: list[tuple[int, str, bytes]] = []  # when it is known, ns; text; pixels
+    for kind in ("gnss", "imu", "attitude"):
+        if (drivers / f"{kind}.csv").exists():
+            for time_s, *values in np.loadtxt(drivers / f"{kind}.csv", delimiter=",", ndmin=2).tolist():
+                t = round(time_s * 1e9)
+                whole = [str(round(values.pop(0) * 1e9))] if kind == "imu" else []
+                rows.append((t, " ".join([kind, str(t), *whole, *map(repr, values)]), b""))
+    first_s, rate = np.loadtxt(drivers / "lines.csv", delimiter=",", skiprows=1).tolist()
+    period, size = round(1e9 / rate), max(round(rate / 10), 1)
+    for image in sorted(drivers.glob("lines_*.npy")):
+        pixels = np.load(image)
+        for n in range(0, len(pixels), size):
+            block = pixels[n : n + size]
+            t = round(first_s * 1e9) + n * period
+            text = f"lines {t} {image.stem[6:]} {n} {period} {len(block)} {block.shape[1]} {8 * block.itemsize}"
+            rows.append((t + (len(block) - 1) * period, text, block.tobytes()))
+    rows.sort(key=lambda row: row[0])
+    path.write_bytes(b"".join(f"{text}\n".encode() + data for _, text, data in rows))
+    return len(rows)

@@ -93,39 +93,81 @@ def test_address():
         next(Stream(settings).messages(threading.Event()))
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_the_program_in_c(tmp_path):
-    program, port, stop = tmp_path / "publish_sensors", free_port(), threading.Event()
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The C program of the documentation, compiled."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    path = tmp_path_factory.mktemp("c") / "publish_sensors"
     source = ROOT / "docs" / "examples" / "publish_sensors.c"
     compiled = subprocess.run(
-        ["cc", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-o", program, source, "-lm"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        ["cc", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-o", path, source], capture_output=True, text=True
+    )
     assert compiled.returncode == 0, compiled.stderr
+    return path
+
+
+#: What the devices give: two rows, 8 lines of 16 bits as two blocks, inertial data in between.
+GREY = (np.arange(8 * 5) * 1500 + 10).astype("<u2").reshape(8, 5)
+ROWS = (
+    b"gnss 0 47.9 11.1 1500.25 0.02\nattitude 0 0.01 -0.02 1.5 0.001\n"
+    + b"lines 0 N 0 5000000 4 5 16\n" + GREY[:4].tobytes()
+    + b"imu 15000000 5000000 0.1 0 -9.81 0 0 0.001\n"
+    + b"lines 20000000 N 4 5000000 4 5 16\n" + GREY[4:].tobytes()
+)  # fmt: skip
+
+
+def run_c(program: Path, rows: bytes, awaited: int):
+    """Run it into a stream: the messages that came, the stream's counters, the finished process."""
+    port, stop = free_port(), threading.Event()
     sensor = Stream(StreamSettings("camera", f"listen://127.0.0.1:{port}", 115200, Clock()))
     come = sensor.messages(stop)
     assert next(come) is None  # it listens
-    driver = subprocess.Popen([program, "127.0.0.1", str(port), "1"])
+    done: list[subprocess.CompletedProcess[bytes]] = []
+    command = [str(program), "127.0.0.1", str(port)]
+    driver = threading.Thread(target=lambda: done.append(subprocess.run(command, input=rows, capture_output=True)))
+    driver.start()
     messages = []
-    while len(messages) < 200 + 5 + 10:
+    while len(messages) < awaited:
         message = next(come)
         messages += [] if message is None else [message]
-    assert driver.wait(60) == 0 and not sensor.counters
+    driver.join(60)
     stop.set()
-    counts = Counter(message.topic for message in messages)
-    assert counts == {"sensor/imu": 200, "sensor/gnss": 5, "sensor/lines/N": 10}
-    blocks = [message.body for message in messages if message.topic == "sensor/lines/N"]
-    assert [block.first_line for block in blocks] == list(range(0, 200, 20))
-    np.testing.assert_array_equal(blocks[1].pixels[0], 20 * 7 + np.arange(64))
-    steps = np.diff([message.stamp_ns for message in messages if message.topic == "sensor/imu"])
-    assert set(steps.tolist()) == {5_000_000}
-    assert np.ptp(np.diff(np.concatenate([block.times_ns() for block in blocks]))) == 0
+    return messages, sensor.counters, done[0]
 
 
-def test_the_program_in_c_says_when_nobody_listens(tmp_path):
-    if shutil.which("cc") is None:
-        pytest.skip("no C compiler")
-    source = ROOT / "docs" / "examples" / "publish_sensors.c"
-    subprocess.run(["cc", "-std=gnu11", "-o", tmp_path / "p", source, "-lm"], check=True)
-    done = subprocess.run([tmp_path / "p", "127.0.0.1", str(free_port()), "1"], capture_output=True, text=True)
+def test_the_program_in_c(program):
+    messages, counters, done = run_c(program, ROWS, 5)
+    assert done.returncode == 0 and done.stdout == b"5 records\n" and not counters
+    gnss, attitude, first, imu, second = messages
+    assert [m.topic[7:] for m in messages] == ["gnss", "attitude", "lines/N", "imu", "lines/N"]
+    t = gnss.stamp_ns
+    assert [m.stamp_ns - t for m in messages] == [0, 0, 15_000_000, 15_000_000, 35_000_000]
+    assert (gnss.body.latitude, gnss.body.longitude, gnss.body.altitude) == (47.9, 11.1, 1500.25)
+    assert (attitude.body.roll, attitude.body.pitch, attitude.body.heading) == (0.01, -0.02, 1.5)
+    assert (imu.body.force_x, imu.body.force_z, imu.body.rate_z) == (0.1, -9.81, 0.001)
+    assert imu.body.interval_ns == 5_000_000
+    np.testing.assert_array_equal(np.concatenate([first.body.pixels, second.body.pixels]), GREY)
+    assert (first.body.first_line, second.body.first_line) == (0, 4) and first.body.strip == second.body.strip
+    assert first.body.strip.startswith("S") and first.body.time_ns == t
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"odometer 1 2 3\n",
+        b"gnss 0 47.9 north\n",
+        b"lines 0 N 0 5000000 4 5 16\n12",
+        b"lines 0 N 0 1 -1 9 16\n",
+        b"gnss",
+    ],
+)
+def test_the_program_in_c_names_a_row_that_it_cannot_read(program, bad):
+    messages, _, done = run_c(program, ROWS + bad, 5)
+    assert len(messages) == 5 and done.returncode == 1 and done.stdout == b"5 records\n"
+    assert done.stderr == b"row 6 of %s: cannot be read\n" % bad.split()[0]
+
+
+def test_the_program_in_c_says_when_nobody_listens(program):
+    done = subprocess.run([program, "127.0.0.1", str(free_port())], input="", capture_output=True, text=True)
     assert done.returncode == 1 and "nobody listens" in done.stderr
