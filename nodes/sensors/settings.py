@@ -8,7 +8,7 @@ from datetime import date, datetime
 from typing import Any
 
 from ..errors import UserError
-from ..formats.flight_folder import Flight
+from ..formats.flight_folder import FILE, Flight
 from ..formats.keys import Keys
 from .line_camera import LineCameraSettings
 from .nmea import NmeaSettings
@@ -45,7 +45,10 @@ class SensorProgram:
 
 
 def read_sensors(flight: Flight) -> list[SensorProgram]:
-    """The programs that a flight folder names; what is wrong with a table goes to the problems of the flight."""
+    """The programs that a flight folder names; what is wrong with a table goes to the problems of the flight.
+
+    ROS topics of images in several tables, which make strips of their own, are noted.
+    """
     programs: list[SensorProgram] = []
     for keys in flight.sensors:
         program = flight.attempt(lambda keys=keys: _program(flight, keys))
@@ -54,6 +57,12 @@ def read_sensors(flight: Flight) -> list[SensorProgram]:
         if program.id in [other.id for other in programs]:
             flight.problems.append(str(keys.refuse("id", "another name for each sensor")))
         programs.append(program)
+    cameras = [program.id for program in programs if program.node == "ros2" and program.settings.get("images")]
+    if len(cameras) > 1:
+        flight.notes.append(
+            f"{FILE}: [[sensor]] {', '.join(cameras)}: image topics in {len(cameras)} tables make separate strips; "
+            "those of one camera belong in one table"
+        )
     return programs
 
 

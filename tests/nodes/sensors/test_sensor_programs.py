@@ -83,6 +83,20 @@ def test_a_folder_of_a_live_flight(folder, capsys):
     assert lines.settings["images"] == {"N": f"{(folder / 'n.bil').resolve()}@2"}
 
 
+def test_image_topics_in_several_tables_are_told(folder, capsys):
+    ros = '[[sensor]]\nkind = "ros2"\nid = "ros-{0}"\nline_rate_hz = 100\nimages = {{{0} = "/camera/{0}"}}\n'
+    (folder / "flight.toml").write_text(TOML.partition("[nodes")[0] + ros.format("F"))
+    assert main(["check", str(folder)]) == 0
+    assert "separate strips" not in capsys.readouterr().out
+    (folder / "flight.toml").write_text(TOML.partition("[nodes")[0] + ros.format("F") + ros.format("N"))
+    assert main(["check", str(folder)]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "separate strips" in line]
+    assert said == [
+        "  note: flight.toml: [[sensor]] ros-F, ros-N: image topics in 2 tables make separate strips; "
+        "those of one camera belong in one table"
+    ]
+
+
 def test_what_is_published_before_a_live_flight(folder):
     flight = read_flight(folder)
     messages = live_configuration(flight, (48.0, 9.0), T, "flight")
