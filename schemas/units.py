@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 #: Coordinates and angles of a pose, with their units.
 POSE = (("X", "m"), ("Y", "m"), ("Z", "m"), ("omega", "rad"), ("phi", "rad"), ("kappa", "rad"))
 _XYZ, _RPY = ("X", "Y", "Z"), ("roll", "pitch", "heading")
+
+#: Units that coordinates of a place may have in a CRS.
+PLACE_UNITS = ("m", "deg", "grad", "ft", "ft_us", "crs_unit")
+
+
+def place_columns(units: Iterable[str] = ("m", "m", "m")) -> tuple[str, ...]:
+    """Columns of the coordinates of a place, by their units: ``X_m, Y_m, Z_m``, or ``X_deg, Y_deg, Z_m``."""
+    return tuple(f"{axis}_{unit}" for axis, unit in zip(_XYZ, units, strict=True))
 
 
 def _square(axes: Sequence[tuple[str, str]]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.units import place_columns
 from ...solver.adjustment.adjustment import Solution
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.refined_orientation import design_at
@@ -38,7 +39,10 @@ def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
 
 
 def points_table(adjustment: Adjustment) -> pd.DataFrame:
-    """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined."""
+    """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined.
+
+    Columns of coordinates state the unit of the CRS (``X_m`` or ``X_deg``); sigmas are in metres.
+    """
     import pandas as pd
 
     block, result = adjustment.block, adjustment.result
@@ -56,7 +60,7 @@ def points_table(adjustment: Adjustment) -> pd.DataFrame:
     in_use = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points).astype(int)
     decimals = 9 if frame.is_geographic else 5
     columns: dict[str, object] = {"point": [network.point_ids[i] for i in order]}
-    columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+    columns |= {a: np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(place_columns(frame.units))}
     columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
     doubtful = np.isin(order, [d.point for d in result.doubtful]).astype(int)
     role = network.role()
@@ -112,7 +116,9 @@ def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
         angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
         decimals = 9 if frame.is_geographic else 5
         columns: dict[str, object] = {"strip": set_name(adjustment, item), "time_s": _seconds(time, reference)}
-        columns |= {f"{a}_m": np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(_AXES)}
+        columns |= {
+            a: np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(place_columns(frame.units))
+        }
         columns |= {f"{a}_deg": np.round(angles[:, k], 9) for k, a in enumerate(_ANGLES)}
         columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
         columns |= {f"sigma_{a}_deg": np.round(np.degrees(sigma[:, 3 + k]), 9) for k, a in enumerate(_ANGLES)}

@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
+from ...schemas.units import place_columns
 from .. import convert
 from ..errors import UserError
 from ..recording.reader import RecordingReader
 
-_AXES = ("X_m", "Y_m", "Z_m")
+_SIGMAS = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 
 
 def write_points(reader: RecordingReader, path: Path, *, covariance: bool = False) -> int:
     """Write ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,rays,role,status`` in the project's CRS.
+
+    A CRS in another unit has it in the names of the coordinates (``X_deg,Y_deg,Z_m``); sigmas are in metres.
 
     The best answer for a point is that of the whole strip, else the final one, else the first; of several of a kind the
     last. Returns the number of points.
@@ -50,7 +53,7 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
     flat = ".9f" if frame.is_geographic else ".4f"
     more = ("cov_XY_m2", "cov_XZ_m2", "cov_YZ_m2") if covariance else ()
     with open(path, "w", encoding="utf-8", newline="") as file:
-        file.write(",".join(("point", *_AXES, *(f"sigma_{a}" for a in _AXES), *more, "rays", "role", "status")) + "\n")
+        file.write(",".join(("point", *place_columns(frame.units), *_SIGMAS, *more, "rays", "role", "status")) + "\n")
         for i, p in enumerate(best.values()):
             values = [format(v, f) for v, f in zip(place[i], (flat, flat, ".4f"), strict=True)]
             values += ["" if np.isnan(s) else f"{s:.4f}" for s in sigma[i]]

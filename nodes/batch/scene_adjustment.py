@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.units import place_columns
 from ...solver.adjustment.reliability import CRITICAL_W, reliability
 from ...solver.adjustment.statistics import GlobalTest, global_test, mean_sigma, point_accuracy, strongest_correlations
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, unit_of
@@ -474,10 +475,11 @@ def _write_points(a: SceneAdjustment, path: Path) -> None:
     role[a.problem.block.known.point] = a.problem.block.known.role
     flat = ".10f" if frame.is_geographic else ".5f"
     columns: dict[str, Any] = {"point": data.point_ids}
-    columns |= {f"{axis}_m": places[:, k] for k, axis in enumerate("XYZ")}
+    axes = place_columns(frame.units)
+    columns |= {axis: places[:, k] for k, axis in enumerate(axes)}
     columns |= {f"sigma_{axis}_m": sigma[:, k] for k, axis in enumerate("XYZ")}
     columns |= {"rays": rays, "role": role}
-    formats = {"X_m": flat, "Y_m": flat, "Z_m": ".5f"} | {f"sigma_{axis}_m": ".6f" for axis in "XYZ"}
+    formats = dict(zip(axes, (flat, flat, ".5f"), strict=True)) | {f"sigma_{axis}_m": ".6f" for axis in "XYZ"}
     write_table(path, columns, formats)
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...schemas import topics
-from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
+from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import matrix_from_quaternion
 from ...solver.geometry.trajectory import Trajectory
 from ..batch.point_table import write_points
@@ -23,12 +24,11 @@ from ..errors import UserError
 from ..formats.features import features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
-from ..formats.gps_time import gps_from_utc_ns
-from ..formats.line_orientation import write_oriented_lines
+from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
 from ..formats.new_file import new_file
 from ..formats.projection import refuse_missing_grids
 from ..formats.rows import ElementLayout, RowLayout, repeated_messages
-from ..formats.sbet import write_sbet
+from ..formats.sbet import write_sbet_poses
 from ..node import Message
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
@@ -37,10 +37,12 @@ from .damage import tell_damage
 
 EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientation.csv
   triline export flight.mcap --points points.csv
-  triline export flight.mcap --per-line orientation_lines.csv"""
+  triline export flight.mcap --per-line orientation_lines.csv
+  triline export flight.mcap --per-line orientation.sbet --format sbet"""
 
 #: Messages turned into rows at a time.
 BATCH = 20_000
+_LINE_FORMATS = ("csv", "patb", "sbet")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,8 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="CSV of object points, one row a point by its best answer, in the project's CRS",
     )
     target.add_argument(
-        "--per-line", metavar="FILE", help="CSV of the refined orientation of every image line, in the project's CRS"
+        "--per-line", metavar="FILE", help="the refined orientation of every image line, in the project's CRS"
     )
+    parser.add_argument(
+        "--format", choices=_LINE_FORMATS,
+        help="with --per-line: CSV with sigmas (default), PATB-like rows of position and rotation matrix, or SBET",
+    )  # fmt: skip
     parser.add_argument("--covariance", action="store_true", help="of the points, with --points")
     parser.add_argument(
         "--orientation", choices=tuple(ORIENTATIONS), help="with --per-line (default: the best there is, in this order)"
@@ -84,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         return _run_table(path, args)
     if args.topic is None:
         raise UserError("--topic: wanted with --csv, --parquet, --geojson, --gpkg and --sbet")
-    for name in ("covariance", "orientation"):
+    for name in ("covariance", "orientation", "format"):
         if getattr(args, name):
             raise UserError(f"--{name}: wanted with --{'points' if name == 'covariance' else 'per-line'} only")
     reader = RecordingReader(path)
@@ -126,6 +132,8 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     """Points, or the orientation of all lines: tables that are no topic."""
     if args.topic is not None:
         raise UserError(f"--topic {args.topic}: does not go with --points and --per-line")
+    if args.points and args.format:
+        raise UserError("--format: wanted with --per-line only")
     target = Path(args.points or args.per_line)
     if path.exists() and target.exists() and target.samefile(path):
         raise UserError(f"{target}: is the recording itself")
@@ -142,7 +150,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
             name, lines = lines_of_recording(recording, args.orientation)
             frame, project = project_frame(recording), recording.project()
             refuse_missing_grids(frame.crs, path)
-            result |= {"orientation": name, "lines": write_oriented_lines(part, lines, frame, R_bc_of(project))}
+            result |= {"orientation": name, "lines": _write_lines(args.format, part, lines, frame, R_bc_of(project))}
     if args.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -150,6 +158,15 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
         print(f"{path} -> {target}: " + ", ".join(f"{v} {k}" for k, v in list(result.items())[2:]))
     tell_damage("export", reader)
     return 0
+
+
+def _write_lines(
+    format: str | None, path: Path, lines: Iterator[OrientedLines], frame: LocalFrame, R_bc: NDArray[Any]
+) -> int:
+    if format == "patb":
+        return write_patb_lines(path, lines, frame)
+    write = write_sbet_lines if format == "sbet" else write_oriented_lines
+    return write(path, lines, frame, R_bc)
 
 
 def _messages(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Message]:
@@ -254,11 +271,9 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
         raise UserError(f"{reader.path}: {len(time_ns)} poses on {args.topic}, wanted at least 2")
     position = np.array([samples[i].position_l for i in first])
     quaternion = np.array([samples[i].quaternion for i in first])
-    rpy = navigation_from_R_lc(frame, position, matrix_from_quaternion(quaternion), R_bc_of(project))
     seconds = (time_ns - time_ns[0]) * 1e-9
     velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
-    velocity_ned = np.einsum("nji,nj->ni", frame.R_ln(position), velocity_l)
-    write_sbet(target, gps_from_utc_ns(time_ns)[1], frame.to_geodetic(position), rpy, velocity_ned)
+    write_sbet_poses(target, time_ns, position, matrix_from_quaternion(quaternion), velocity_l, frame, R_bc_of(project))
     return {"records": len(time_ns)}
 
 

@@ -17,6 +17,7 @@ from ...solver.geometry.trajectory import Trajectory
 from ..errors import UserError
 from .camera_json import read_camera
 from .keys import Keys, read_toml
+from .place_columns import PLACE, check_place_units, place_column
 from .projection import missing_grids
 from .table import Column, Table, one_line, read_table
 
@@ -32,16 +33,17 @@ _STRIPS = (
     Column("line_times", "text", optional=True, blank=True),
 )
 _LINE_TIMES = (Column("line", "integer", low=0), Column("time_s"))
-_POSE = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+_POSE = (*PLACE, "omega_deg", "phi_deg", "kappa_deg")
 _TRAJECTORY = (
     Column("strip", "text"),
     Column("time_s"),
-    *(Column(name) for name in _POSE),
+    *(place_column(name) for name in PLACE),
+    *(Column(name) for name in _POSE[3:]),
     Column("lens", "text", optional=True, blank=True),
 )
 GROUND = (
     Column("point", "text"),
-    *(Column(name, blank=True) for name in ("X_m", "Y_m", "Z_m")),
+    *(place_column(name, blank=True) for name in PLACE),
     *(Column(name, blank=True, low=0.0) for name in ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")),
     Column("role", "text", choices=ROLES),
     Column("target_radius_m", optional=True, blank=True, low=0.0),
@@ -198,12 +200,13 @@ def _to_local(table: Table, xyz: NDArray[np.float64], frame: Frame) -> NDArray[n
             try:
                 frame.from_crs(xyz[row : row + 1])
             except CrsError:
-                where = f"{table.path}:{table.line_of(row)}: X_m"
+                where = f"{table.path}:{table.line_of(row)}: {table.headed.get('X_m', 'X_m')}"
                 raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}") from None
         raise UserError(f"{table.path}: {error}") from None
 
 
 def _trajectories(table: Table, frame: LocalFrame, notes: list[str]) -> dict[Key, Trajectory]:
+    check_place_units(table.path, table.headed, frame)
     xyz, angles = table.stack(*_POSE[:3]), np.radians(table.stack(*_POSE[3:]))
     time = table["time_s"]
     position = _to_local(table, xyz, frame)
@@ -318,6 +321,7 @@ def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
     if not n:
         notes.append("ground_points.csv: no points: the block stands on its trajectories alone")
         return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
+    check_place_units(table.path, table.headed, frame)
     ids, role = table["point"], table["role"].astype(str)
     repeated = np.ones(n, dtype=bool)
     repeated[np.unique(ids.astype(str), return_index=True)[1]] = False

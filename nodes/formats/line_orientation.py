@@ -10,13 +10,16 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas.units import place_columns
 from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
 from ...solver.geometry.rotation import R_BC_NOMINAL, angles_from_matrix
+from ..errors import UserError
+from .sbet import write_sbet_poses
 
 Array = NDArray[np.floating]
 
-_PLACES = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
-_SIGMAS = tuple(f"sigma_{name}" for name in _PLACES)
+_ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+_SIGMAS = tuple(f"sigma_{name}" for name in (*place_columns(), *_ANGLES))
 _GEODETIC = ("lat_deg", "lon_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
 #: Lines written at a time.
 CHUNK = 5000
@@ -49,7 +52,8 @@ def write_oriented_lines(
 ) -> int:
     """Write a table with one row an image line, and return the number of rows.
 
-    ``strip,line,time_s``, ``X_m`` .. ``kappa_deg`` in the project's CRS and its axes, their sigmas; where the place of
+    ``strip,line,time_s``, ``X_m`` .. ``kappa_deg`` in the project's CRS and its axes (``X_deg, Y_deg`` where it is
+    geographic), their sigmas in m and deg; where the place of
     the local frame is known also latitude, longitude (WGS 84), height above the ellipsoid, and roll, pitch and heading
     of the body (without boresight).
 
@@ -57,8 +61,8 @@ def write_oriented_lines(
     ----------
     R_bc : image to body
     """
-    placed = not frame.lat_deg == frame.lon_deg == frame.height_m == 0.0
-    names = ("strip", "line", "time_s", *_PLACES, *_SIGMAS, *(_GEODETIC if placed else ()))
+    placed = _placed(frame)
+    names = ("strip", "line", "time_s", *place_columns(frame.units), *_ANGLES, *_SIGMAS, *(_GEODETIC if placed else ()))
     count = 0
     with open(path, "w", encoding="utf-8", newline="") as file:
         file.write(",".join(names) + "\n")
@@ -69,11 +73,73 @@ def write_oriented_lines(
     return count
 
 
+def write_patb_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFrame) -> int:
+    """Write lines as photos of a PATB table, and return their number.
+
+    A row is ``id X Y Z r11 r12 r13 r21 r22 r23 r31 r32 r33`` between blanks, without a header: ``id`` is strip and
+    line (``S1_120``, blanks of the strip as ``_``), X, Y, Z the perspective centre in the project's CRS, ``r`` the
+    matrix from the image frame (x along flight, y to the left, z up) to the axes of the CRS, row by row.
+    """
+    count = 0
+    flat = "%.9f" if frame.is_geographic else "%.4f"
+    form = " ".join([flat, flat, "%.4f", *["%.12f"] * 9]) + "\n"
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        for part in parts:
+            strip = "_".join(part.strip.split())
+            for i in range(0, len(part.line), CHUNK):
+                place, R = _in_crs(part.position_l[i : i + CHUNK], part.R_lc[i : i + CHUNK], frame)
+                values = np.concatenate([place, R.reshape(-1, 9)], axis=1).tolist()
+                numbers = part.line[i : i + CHUNK].tolist()
+                file.writelines(f"{strip}_{n} " + form % tuple(row) for n, row in zip(numbers, values, strict=True))
+            count += len(part.line)
+    return count
+
+
+def write_sbet_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFrame, R_bc: Array = R_BC_NOMINAL) -> int:
+    """Write lines as SBET records in order of time, and return their number; a time comes once.
+
+    Position is the perspective centre, attitude that of the body (without boresight), velocity that of the strip's
+    lines (0 where a strip has one line alone).
+
+    Raises
+    ------
+    UserError : the place of the local frame is not known; no line
+    """
+    if not _placed(frame):
+        raise UserError(
+            "SBET has latitude and longitude, wanted the origin of the local frame in configuration/project"
+        )
+    times, positions, rotations, velocities = [], [], [], []
+    for part in parts:
+        time_ns, first = np.unique(part.time_ns, return_index=True)
+        position = part.position_l[first]
+        times.append(time_ns), positions.append(position), rotations.append(part.R_lc[first])
+        time_s = (time_ns - time_ns[0]) * 1e-9
+        velocities.append(np.gradient(position, time_s, axis=0) if len(time_s) > 1 else np.zeros((1, 3)))
+    if not times:
+        raise UserError("no image line with an orientation, wanted at least one")
+    time_ns, first = np.unique(np.concatenate(times), return_index=True)
+    position, R, velocity = (np.concatenate(some)[first] for some in (positions, rotations, velocities))
+    write_sbet_poses(path, time_ns, position, R, velocity, frame, R_bc)
+    return len(time_ns)
+
+
+def _placed(frame: LocalFrame) -> bool:
+    """Whether it is known where on the Earth the local frame lies."""
+    return not frame.lat_deg == frame.lon_deg == frame.height_m == 0.0
+
+
+def _in_crs(position_l: Array, R_lc: Array, frame: LocalFrame) -> tuple[Array, Array]:
+    """Places (n, 3) in the CRS, and rotations (n, 3, 3) from image to its axes."""
+    place = frame.to_crs(position_l)
+    if frame.crs == "local":
+        return place, R_lc
+    return place, np.swapaxes(frame.R_l_crs(place), 1, 2) @ R_lc
+
+
 def _rows(file: TextIO, part: OrientedLines, rows: slice, frame: LocalFrame, R_bc: Array, placed: bool) -> None:
     position, R = part.position_l[rows], part.R_lc[rows]
-    place, R_crs = frame.to_crs(position), R
-    if frame.crs != "local":
-        R_crs = np.swapaxes(frame.R_l_crs(place), 1, 2) @ R
+    place, R_crs = _in_crs(position, R, frame)
     angles = np.degrees(angles_from_matrix(R_crs))
     angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
     sigma = part.sigma[rows] * np.repeat([1.0, 180.0 / np.pi], 3)

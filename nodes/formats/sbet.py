@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
 from ..errors import UserError
-from .gps_time import DAY_S
+from .gps_time import DAY_S, gps_from_utc_ns
 from .track import NavigationTrack, checked, times_from_gps
 
 #: Fields of a record: seconds; radians; metres; m/s and m/s^2 in the wander frame; rad/s in the body.
@@ -89,3 +90,27 @@ def write_sbet(
     values[:, 4:7] = velocity_ned
     values[:, 7:10] = rpy
     values.tofile(path)
+
+
+def write_sbet_poses(
+    path: Path,
+    time_ns: NDArray[np.int64],
+    position_l: NDArray[np.floating],
+    R_lc: NDArray[np.floating],
+    velocity_l: NDArray[np.floating],
+    frame: LocalFrame,
+    R_bc: NDArray[np.floating],
+) -> None:
+    """Write poses of an image as SBET of the body, at the perspective centre.
+
+    Parameters
+    ----------
+    time_ns : (n,) UTC
+    position_l, velocity_l : (n, 3) of the perspective centre, local frame, m and m/s
+    R_lc : (n, 3, 3) image to local
+    frame : the local frame
+    R_bc : image to body
+    """
+    rpy = navigation_from_R_lc(frame, position_l, R_lc, R_bc)
+    velocity_ned = np.einsum("nji,nj->ni", frame.R_ln(position_l), velocity_l)
+    write_sbet(path, gps_from_utc_ns(time_ns)[1], frame.to_geodetic(position_l), rpy, velocity_ned)

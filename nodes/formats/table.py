@@ -32,6 +32,7 @@ class Column:
     low : smallest value allowed
     above : values must be larger than this
     choices : allowed words of a text column; empty = any
+    other_names : under which a header may have it instead; the table has it under ``name``
     """
 
     name: str
@@ -41,6 +42,11 @@ class Column:
     low: float | None = None
     above: float | None = None
     choices: tuple[str, ...] = ()
+    other_names: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name, *self.other_names)
 
     @property
     def wanted(self) -> str:
@@ -85,10 +91,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a file: numbers as float64 (NaN where blank), words as objects; absent optional ones are not there."""
+    """Columns of a file: numbers as float64 (NaN where blank), words as objects; absent optional ones are not there.
+
+    Attributes
+    ----------
+    path : file
+    values : by name of the `Column`
+    headed : what the file calls a column that has another name there
+    """
 
     path: Path
     values: Mapping[str, NDArray[Any]] = field(repr=False)
+    headed: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
@@ -114,6 +128,7 @@ class Table:
     def refuse(self, bad: ArrayLike, column: str, what: Callable[[int], str]) -> None:
         """Raise UserError for the first row where ``bad`` holds, with the count of the others."""
         rows = np.flatnonzero(np.asarray(bad))
+        column = self.headed.get(column, column)
         if len(rows):
             row = int(rows[0])
             raise UserError(one_line([f"{self.path}:{self.line_of(row)}: {column}: {what(row)}"], len(rows) - 1))
@@ -147,7 +162,7 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     exact: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
     header = _header(path, columns, notes)
     separator, decimal = separator_of(path)
-    known = {column.name: column for column in columns if column.name in header}
+    known = {name: column for column in columns for name in column.names if name in header}
     try:
         frame = pd.read_csv(
             path,
@@ -175,14 +190,15 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             # few different names in many rows: each name is cleaned once
             codes, names = pd.factorize(frame[name], use_na_sentinel=False)
             clean = np.array([str(word).strip() if isinstance(word, str) else "" for word in names], dtype=object)
-            values[name] = clean[codes] if len(clean) else np.empty(0, dtype=object)
+            read: NDArray[Any] = clean[codes] if len(clean) else np.empty(0, dtype=object)
         else:
-            values[name] = frame[name].to_numpy(dtype=float)
-        if not column.fits(values[name]).all():
+            read = frame[name].to_numpy(dtype=float)
+        values[column.name] = read
+        if not column.fits(read).all():
             raise UserError(one_line(_problems(path, known) or [f"{path}: {name}: unreadable value"]))
     if not len(frame) and not may_be_empty:
         raise UserError(f"{path}: no rows below the header, wanted at least one")
-    return Table(path, values)
+    return Table(path, values, {column.name: name for name, column in known.items() if name != column.name})
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]], formats: Mapping[str, str]) -> None:
@@ -241,11 +257,14 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
     repeated = {name for name in header if header.count(name) > 1}
     if repeated:
         raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
-    missing = [column.name for column in columns if not column.optional and column.name not in header]
+    for column in columns:
+        if len(twice := [name for name in column.names if name in header]) > 1:
+            raise UserError(f"{path}:1: {twice[1]}: this column comes twice, also as {twice[0]}")
+    missing = [column.name for column in columns if not column.optional and not set(column.names) & set(header)]
     if missing:
         hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
         raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{hint}")
-    known = {column.name for column in columns}
+    known = {name for column in columns for name in column.names}
     notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in header if name not in known)
     return header
 

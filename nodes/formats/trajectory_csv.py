@@ -12,6 +12,7 @@ import numpy as np
 from ...solver.geometry.frames import CrsError, LocalFrame, navigation_from_R_lc
 from ...solver.geometry.rotation import matrix_from_angles
 from ..errors import UserError
+from .place_columns import PLACE, check_place_units, place_column
 from .plausible import check_units
 from .table import Column, Table, read_table, separator_of
 from .time_columns import WANTED, time_columns, times_of
@@ -27,7 +28,8 @@ _NAMES = {
     "heading": ("heading", "true_heading", "yaw"),
 }
 _NAVIGATION = ("lat_deg", "lon_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
-_PHOTOGRAMMETRIC = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+_OPK = ("omega_deg", "phi_deg", "kappa_deg")
+_PHOTOGRAMMETRIC = (*(place_column(name) for name in PLACE), *(Column(name) for name in _OPK))
 _NED = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
 _RPY = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
 _UNITS = {"deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad", "m": "m"}
@@ -38,7 +40,7 @@ def is_trajectory_csv(path: Path) -> bool:
     names = _header(path)
     if not time_columns(names):
         return False
-    return set(_PHOTOGRAMMETRIC) <= set(names) or {"lat", "lon", "roll"} <= {_quantity(name)[0] for name in names}
+    return _is_photogrammetric(names) or {"lat", "lon", "roll"} <= {_quantity(name)[0] for name in names}
 
 
 def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = None) -> NavigationTrack:
@@ -46,7 +48,7 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
 
     Columns are ``lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg`` (or ``lat_rad``, ``Roll [rad]``: names state
     the unit) with optional sigmas as ``triline navigate`` writes them, or ``X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg``
-    in the CRS given.
+    in the CRS given, where its units may stand in the names (``X_deg``).
 
     Parameters
     ----------
@@ -63,10 +65,10 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     time = time_columns(header)
     if not time:
         raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
-    photogrammetric = set(_PHOTOGRAMMETRIC) <= set(header)
+    photogrammetric = _is_photogrammetric(header)
     names = {} if photogrammetric else _columns(path, header)
-    wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(names.values())
-    columns = [*time, *(Column(name) for name in wanted)]
+    wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
+    columns = [*time, *wanted]
     sigmas = (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
     columns += [Column(name, low=0.0) for name in sigmas if name in header]
     table = read_table(path, columns, notes)
@@ -101,17 +103,21 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     time = time_columns(_header(path))
     if not time:
         raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
-    table = read_table(path, [*time, *(Column(name) for name in _PHOTOGRAMMETRIC)], notes)
+    table = read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC)], notes)
     time_ns, first = np.unique(times_of(table, time, None, notes), return_index=True)
     if len(time_ns) < 2:
         raise UserError(f"{path}: {len(time_ns)} poses, wanted at least 2")
-    R = matrix_from_angles(*np.radians(table.stack(*_PHOTOGRAMMETRIC[3:])).T)
-    return table.stack(*_PHOTOGRAMMETRIC[:3])[first], R[first], time_ns
+    R = matrix_from_angles(*np.radians(table.stack(*_OPK)).T)
+    return table.stack(*PLACE)[first], R[first], time_ns
 
 
 def _header(path: Path) -> list[str]:
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         return [name.strip() for name in file.readline(4096).split(separator_of(path)[0])]
+
+
+def _is_photogrammetric(header: Sequence[str]) -> bool:
+    return all(set(column.names) & set(header) for column in _PHOTOGRAMMETRIC)
 
 
 def _quantity(name: str) -> tuple[str, str]:
@@ -154,11 +160,12 @@ def _in_degrees(table: Table, name: str) -> np.ndarray:
 def _from_crs(path: Path, table: Table, crs: str | None) -> tuple[np.ndarray, np.ndarray]:
     if not crs or crs == "local":
         raise UserError(f"{path}: X_m, Y_m, Z_m of an unknown CRS, wanted --crs (for example EPSG:32632)")
-    xyz = table.stack(*_PHOTOGRAMMETRIC[:3])
+    xyz = table.stack(*PLACE)
     try:
         frame = LocalFrame.around(xyz, crs)
+        check_place_units(path, table.headed, frame)
         position = frame.from_crs(xyz)
-        R_lc = frame.R_l_crs(xyz) @ matrix_from_angles(*np.radians(table.stack(*_PHOTOGRAMMETRIC[3:])).T)
+        R_lc = frame.R_l_crs(xyz) @ matrix_from_angles(*np.radians(table.stack(*_OPK)).T)
     except CrsError as error:
         raise UserError(f"{path}: {error}") from None
     return frame.to_geodetic(position), navigation_from_R_lc(frame, position, R_lc)

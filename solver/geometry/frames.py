@@ -23,6 +23,7 @@ Array = NDArray[np.floating]
 
 #: Coordinates that need no PROJ, see `BodyFrame`.
 GEOGRAPHIC = "geographic"
+_UNITS = {"metre": "m", "degree": "deg", "grad": "grad", "foot": "ft", "US survey foot": "ft_us"}
 
 
 class CrsError(ValueError):
@@ -114,6 +115,14 @@ class LocalFrame:
     def is_geographic(self) -> bool:
         return self.crs != "local" and self._crs.is_geographic
 
+    @property
+    def units(self) -> tuple[str, str, str]:
+        """Units of the coordinates in the project CRS: m, deg, grad, ft, ft_us; crs_unit for all others."""
+        if self.crs == "local":
+            return "m", "m", "m"
+        names = [_UNITS.get(axis.unit_name, "crs_unit") for axis in self._crs.axis_info]
+        return names[0], names[1], names[2] if len(names) > 2 else "m"
+
     @cached_property
     def _crs(self):
         return _parse_crs(self.crs)
@@ -146,6 +155,7 @@ class BodyFrame:
     ellipsoid: Ellipsoid
     crs: str = GEOGRAPHIC
     is_geographic: bool = True
+    units: tuple[str, str, str] = ("deg", "deg", "m")
 
     @property
     def origin_e(self) -> Array:

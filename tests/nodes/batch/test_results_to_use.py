@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from test_adjust_command import AXES, write_block
 from triline.nodes.cli import main
 from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geotiff import Heights, write_heights
+from triline.nodes.formats.sbet import read_sbet
 from triline.nodes.recording.access import Recording
+from triline.solver.geometry.rotation import matrix_from_angles
 
 ERRORS = {"dc": 0.05, "k1": 3e-6, "xp_F": 0.012, "yp_B": -0.01, "sy_F": 2e-4, "th_B": 2e-4}
 
@@ -144,6 +147,72 @@ def test_orientation_of_every_line_is_that_of_the_refined_trajectory(block, tmp_
         for name in ("X_m", "sigma_Z_m", "phi_deg"):
             between = np.interp(inside.time_s, track.time_s, track[name])
             assert inside[name].to_numpy() == pytest.approx(between, abs=2e-4), name
+
+
+@pytest.fixture(scope="module")
+def oriented(tmp_path_factory):
+    """A flight in UTM, processed, with a boresight, and the CSV of its lines."""
+    folder = tmp_path_factory.mktemp("oriented")
+    words = ["--seconds", "6", "--ties", "12", "--attitude-rate", "100", "--lead-in", "2", "--sensor", "ads40-small"]
+    assert main(["simulate", "-o", str(folder / "flight.mcap"), "-q", "--strips", "2", *words]) == 0
+    assert main(["process", str(folder / "flight.mcap"), "-o", str(folder / "oriented.mcap"), "-q"]) == 0
+    assert main(["export", str(folder / "oriented.mcap"), "--per-line", str(folder / "lines.csv"), "-q"]) == 0
+    return folder / "oriented.mcap", pd.read_csv(folder / "lines.csv")
+
+
+def test_lines_as_patb_are_those_of_the_csv(oriented, tmp_path, capsys):
+    recording, lines = oriented
+    out = tmp_path / "lines.ori"
+    assert main(["export", str(recording), "--per-line", str(out), "--format", "patb"]) == 0
+    assert f"{len(lines)} lines" in capsys.readouterr().out
+    rows = [row.split(" ") for row in out.read_text().splitlines()]
+    assert [row[0] for row in rows] == [f"{strip}_{line}" for strip, line in zip(lines.strip, lines.line, strict=True)]
+    values = np.array([row[1:] for row in rows], dtype=float)
+    np.testing.assert_array_equal(values[:, :3], lines[AXES].to_numpy())
+    R = values[:, 3:].reshape(-1, 3, 3)
+    wanted = matrix_from_angles(*np.radians(lines[["omega_deg", "phi_deg", "kappa_deg"]].to_numpy()).T)
+    np.testing.assert_allclose(R, wanted, atol=2e-9)
+    for strip in set(lines.strip):  # x of the image points along the flight
+        own = (lines.strip == strip).to_numpy()
+        along = np.diff(values[own, :3], axis=0)
+        assert (np.einsum("ni,ni->n", along, R[own][:-1, :, 0]) > 0.95 * np.linalg.norm(along, axis=1)).all()
+
+
+def test_lines_as_sbet_are_those_of_the_csv(oriented, tmp_path, capsys):
+    recording, lines = oriented
+    out = tmp_path / "lines.sbet"
+    assert main(["export", str(recording), "--per-line", str(out), "--format", "sbet"]) == 0
+    assert f"{len(lines)} lines" in capsys.readouterr().out
+    utc_ns = np.array([round(float(t) * 1e6) for t in lines.time_s]) * 1000  # as far as the table's floats tell it
+    day = datetime.fromtimestamp(utc_ns[0] // 10**9, UTC).date()
+    track = read_sbet(out, day)
+    assert len(track.time_ns) == len(lines)
+    np.testing.assert_allclose((track.time_ns - utc_ns) * 1e-9, 0.0, atol=2e-6)
+    np.testing.assert_allclose(track.geodetic, lines[["lat_deg", "lon_deg", "height_m"]], atol=1e-4, rtol=0)
+    np.testing.assert_allclose(track.geodetic[:, :2], lines[["lat_deg", "lon_deg"]], atol=1e-10, rtol=0)
+    rpy = np.degrees(track.rpy) - lines[["roll_deg", "pitch_deg", "heading_deg"]].to_numpy()
+    np.testing.assert_allclose((rpy + 180.0) % 360.0 - 180.0, 0.0, atol=2e-7)
+    # velocities are those of the places, line by line within a strip
+    values = np.fromfile(out, "<f8").reshape(-1, 17)
+    one = lines.strip.to_numpy() == lines.strip.iloc[0]
+    north_m = np.radians(np.gradient(track.geodetic[one, 0], track.time_ns[one] * 1e-9)) * 6.37e6
+    np.testing.assert_allclose(values[one, 4], north_m, atol=0.5)
+    assert np.linalg.norm(values[:, 4:7], axis=1).min() > 10.0
+
+
+def test_formats_of_lines_are_refused_in_one_line(oriented, block, tmp_path, capsys):
+    recording, _ = oriented
+    folder, _ = block
+    assert main(["import", str(folder), "-o", str(tmp_path / "b.mcap"), "-q"]) == 0  # local: nowhere on the Earth
+    for source, words, said in (
+        (tmp_path / "b.mcap", ["--per-line", "x", "--format", "sbet"], "wanted the origin of the local frame"),
+        (recording, ["--points", "x", "--format", "patb"], "--format: wanted with --per-line only"),
+        (recording, ["--topic", "orientation/final", "--csv", "x", "--format", "csv"], "--format: wanted with --per"),
+    ):
+        assert main(["export", str(source), *(str(tmp_path / "x") if w == "x" else w for w in words)]) == 1
+        err = capsys.readouterr().err
+        assert said in err and err.count("\n") == 1
+        assert not (tmp_path / "x").exists()
 
 
 def surface_with_houses(folder, path, rng):

@@ -21,6 +21,9 @@ from triline.solver.location.refraction import Refraction
 from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
 
+#: Columns of places in tables of results: these scenes have longitude and latitude.
+PLACE = ("X_deg", "Y_deg", "Z_m")
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
@@ -64,9 +67,9 @@ def test_result_and_tables(block, tmp_path, capsys):
     assert set(points) == set(truth)
     scale = np.array([111_000.0 * np.cos(np.radians(36.0)), 111_000.0, 1.0])
     off = [
-        np.array([(float(p[k]) - float(truth[id][k])) for k in ("X_m", "Y_m", "Z_m")])
+        np.array([(float(p[k]) - float(truth[id][f"{k[0]}_m"])) for k in PLACE])
         * scale
-        / np.array([float(p[f"sigma_{k}"]) for k in ("X_m", "Y_m", "Z_m")])
+        / np.array([float(p[f"sigma_{axis}_m"]) for axis in "XYZ"])
         for id, p in points.items()
         if p["role"] == "tie" and p["rays"] == "2"
     ]
@@ -89,8 +92,8 @@ def test_refined_orientation_and_rpc_locate_the_adjusted_points(block, tmp_path)
     points = {row["point"]: row for row in rows(out / "points.csv")}
     for ccd in "FB":
         rpc = read_scene(out / "rpc" / f"scene_{ccd}.RPB").rpc
-        mine = [r for r in rows(out / "residuals.csv") if r["ccd"] == ccd and points[r["point"]]["X_m"]]
-        lon, lat, h = np.array([[float(points[r["point"]][k]) for k in ("X_m", "Y_m", "Z_m")] for r in mine]).T
+        mine = [r for r in rows(out / "residuals.csv") if r["ccd"] == ccd and points[r["point"]]["X_deg"]]
+        lon, lat, h = np.array([[float(points[r["point"]][k]) for k in PLACE] for r in mine]).T
         pixel = rpc.inverse(np.radians(lat), np.radians(lon), h)
         measured, v = (
             np.array([[float(r[k]) for k in keys] for r in mine])
@@ -236,7 +239,7 @@ def test_images_taken_through_the_air(block, tmp_path, capsys):
         result = json.loads((out / "result.json").read_text())
         assert ("refraction in the models of 2 images" in result["notes"]) == bool(words)
         shifts.append(np.array([result["strips"][f"scene/{ccd}"]["shift_deg"] for ccd in "FB"]))
-        known = [[float(row[k] or "nan") for k in ("X_m", "Y_m", "Z_m")] for row in rows(out / "points.csv")]
+        known = [[float(row[k] or "nan") for k in PLACE] for row in rows(out / "points.csv")]
         points.append(np.array(known) * [91e3, 111e3, 1.0])
     # a hundredth of the turn that the correction has to make for the air where nobody takes it off
     wrong = np.abs(shifts[2] - shifts[0]).max()
