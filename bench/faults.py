@@ -1,48 +1,60 @@
 """Fault campaign: what is lost, how long until all is right again, what the operator is told, and whether the error
 stays within the protection level.
 
-    python bench/faults.py [--kind data|processes] [--only WORD] [--rate 1]
+    python bench/faults.py [--kind data|images|processes|link] [--only WORD] [--rate 1]
+    python bench/faults.py --long [--seconds 3600] [--rate 10]
 
 Each fault hits a flight of one strip with control, tie points and truth. Faults of *processes* (recorder, navigator,
-adjuster, in processes of their own, fed by `triline replay`) come in mid-strip. Faults of *data* are put into the
-messages of the flight, which `process` works off: the exact sequence, whatever the machine.
+adjuster, in processes of their own, fed by `triline replay`) come in mid-strip, and so do those of the *link* between
+the sensors (the replay) and the nodes: a program in between hands on what comes when its time is due. Faults of *data*
+are put into the messages of the flight, which `process` works off: the exact sequence, whatever the machine. Those of
+*images* are the same on a flight with image lines, from which the matcher measures the tie points.
 
 - *lost*: time of the strip without final orientation, s, less what the flight lacks without a fault
 - *right*: from the fault (the end of a freeze) until live orientation came again, s by the recorder's clock (of data: s
   of flight); "-" where it never stopped for more than a second
 - *beyond*: live orientations under a green light whose error is beyond the protection level in X, Y or Z, of how many
 - *told*: alarms, and lines of the event log that the flight without a fault does not have, the first of them
+
+With ``--long`` a flight of an hour goes through recorder, navigator and adjuster at ten times real time, and what is
+printed is the time without final orientation, and of each node memory and open files at a tenth of the time and at the
+end.
 """
 
 from __future__ import annotations
 
-import shutil
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import frame
 import numpy as np
+from fault_flights import (
+    FAULT_S,
+    NODES,
+    Flown,
+    LinkedRig,
+    LongRig,
+    Rig,
+    disk_full,
+    of_processes,
+    of_the_link,
+    readable,
+)
 
 from triline.nodes import convert
-from triline.nodes.bus.processes import NodeGroup
-from triline.nodes.bus.session import Bus
 from triline.nodes.node import Message
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.report.integrity import levels
 from triline.nodes.report.source import read
-from triline.schemas import codec
 
-SECONDS, LEAD_S, FAULT_S = 36, 10.0, 26.0  # of the strip, before it, and of the fault from the start of the flight
-NODES = ("recorder", "navigator", "adjuster")
+LONG_STRIP_S, LONG_TURN_S = 331.0, 93.0  # of the long flight: a strip with its turn, and the turn
 Messages = list[Message]
 
 
@@ -81,15 +93,13 @@ class Outcome:
         final, live, heard, lines, beyond, green = [], [], [], list(alarms), 0, 0
         for path in paths:
             reader = RecordingReader(path)
-            start = reader.index.stamp_ns.min() if len(reader.index.stamp_ns) else 0
             for topic, times in (("orientation/final", final), ("orientation/live", live)):
                 times += [convert.time_ns(m.body.timestamp) for m in reader.sorted_messages([topic]) if m.body.valid]
             heard += reader.index.receive_ns[reader.select(["orientation/live"])].tolist()
             for m in reader.sorted_messages(["event/log"]):
                 lines.append(f"{m.body.name}: {m.body.message}")
-            if start:
-                a, b = _under_green(path)
-                beyond, green = beyond + a, green + b
+            a, b = _under_green(path)
+            beyond, green = beyond + a, green + b
         return cls(np.unique(final), np.unique(live), np.unique(heard), beyond, green, lines)
 
 
@@ -141,13 +151,13 @@ def _kind(line: str) -> str:
 # ---- data
 
 
-def process(messages: Iterable[Message], folder: Path) -> list[Path]:
+def process(messages: Iterable[Message], folder: Path, *options: str) -> list[Path]:
     source, out = folder / "in.mcap", folder / "out.mcap"
     writer = RecordingWriter(source)
     for message in sorted(messages, key=lambda m: m.stamp_ns):
         writer.write(message)
     writer.close()
-    frame.triline("process", str(source), "-o", str(out), "-q")
+    frame.triline("process", str(source), "-o", str(out), "-q", *options)
     return [out]
 
 
@@ -224,174 +234,174 @@ def of_data(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
     }
 
 
-# ---- processes
-
-
-class Rig:
-    """A flight over the bus, as it is flown."""
-
-    def __init__(self, flight: Path, folder: Path, rate: float, recorder_output: Path | None = None) -> None:
-        self.folder, self.rate = folder, rate
-        self.output = recorder_output or folder / "live.mcap"
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self.group = NodeGroup(folder / "log", "demo", self.port)
-        self.flight = flight
-        self.alarms: list[str] = []
-        self.fault_ns = 0  # when it came, by the clock of this machine
-
-    def start(self, name: str, **named: str) -> None:
-        more = ["-o", str(self.output)] if name == "recorder" else []
-        self.group.start(name, *more, **named)
-
-    def fly(self, fault: Callable[[Rig], None] | None, at_s: float = FAULT_S) -> list[Path]:
-        with self.group, Bus(source="campaign", port=self.port) as bus:
-            newest = [0]
-            bus.subscribe("sensor/attitude", lambda raw: newest.__setitem__(0, max(newest[0], raw.envelope.stamp_ns)))
-            bus.subscribe("status/*", self._hear)
-            for name in NODES:
-                self.start(name)
-            until = time.monotonic() + 60
-            while not bus.alive() >= set(NODES) and time.monotonic() < until:
-                time.sleep(0.1)
-            command = [*frame.TRILINE, "replay", str(self.flight), "--rate", str(self.rate), "-q"]
-            command += ["--wait-for", "navigator,adjuster", "--port", str(self.port)]
-            replay = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            first = 0
-            try:
-                while fault is not None and replay.poll() is None:
-                    first = first or newest[0]
-                    if first and (newest[0] - first) * 1e-9 > at_s:
-                        self.fault_ns = time.time_ns()
-                        fault(self)
-                        break
-                    time.sleep(0.02)
-                replay.wait(300)
-            finally:
-                if replay.poll() is None:
-                    replay.kill()
-            time.sleep(3.0)
-            for name in ("navigator", "adjuster", "recorder"):
-                process = self.group.processes.get(name)
-                if process is not None:
-                    process.stop(20.0)
-        return sorted(self.output.parent.glob(f"{self.output.stem}*.mcap"))
-
-    def _hear(self, raw: Any) -> None:
-        alarm = codec.decode(raw.topic, raw.data).alarm
-        if alarm and alarm not in self.alarms:
-            self.alarms.append(alarm)
-
-    def killed(self, name: str) -> None:
-        self.group.processes[name].process.kill()
-        self.group.processes[name].process.wait()
-        self.start(name)
-
-    def stopped(self, seconds: float, *names: str) -> None:
-        processes = [self.group.processes[name].process for name in names]
-        for process in processes:
-            process.send_signal(signal.SIGSTOP)
-        time.sleep(seconds)
-        for process in processes:
-            process.send_signal(signal.SIGCONT)
-        self.fault_ns = time.time_ns()
-
-
-def of_processes() -> dict[str, Callable[[Rig], None]]:
-    """Faults of processes, by name."""
-    out: dict[str, Callable[[Rig], None]] = {}
-    for name in NODES:
-        out[f"SIGKILL and restart: {name}"] = lambda rig, name=name: rig.killed(name)
-    for name in NODES:
-        for seconds in (1.0, 5.0):
-            out[f"SIGSTOP {seconds:g} s: {name}"] = lambda rig, name=name, seconds=seconds: rig.stopped(seconds, name)
-    out["SIGSTOP 15 s: navigator, adjuster, recorder"] = lambda rig: rig.stopped(15.0, *NODES)
-    out["a second program in the sensors' name, 5 s"] = second_replay
-    out["two navigators"] = lambda rig: rig.start("navigator", id="second")
-    return out
-
-
-def second_replay(rig: Rig) -> None:
-    """The same flight once more from the start, in the name of the first, for 5 s."""
-    command = [*frame.TRILINE, "replay", str(rig.flight), "--rate", str(rig.rate), "-q", "--port", str(rig.port)]
-    second = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    time.sleep(5.0)
-    second.kill()
-    second.wait()
-
-
-def disk_full(flight: Path, folder: Path, rate: float) -> tuple[list[Path], list[str]] | None:
-    """The recorder on a disk that is too small; None where none can be mounted."""
-    disk = folder / "disk"
-    disk.mkdir()
-    size = f"size={max(1, flight.stat().st_size // 3)}"
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(disk)], capture_output=True).returncode:
-        return None
-    try:
-        rig = Rig(flight, folder, rate, disk / "live.mcap")
-        paths = rig.fly(None)
-        kept = [Path(shutil.copy(path, folder / f"kept_{path.name}")) for path in paths]
-        return kept, rig.alarms
-    finally:
-        subprocess.run(["umount", "-l", str(disk)], capture_output=True)
-
-
-def readable(paths: Iterable[Path], folder: Path) -> list[Path]:
-    """Recordings as they are, or what `recover` saves of them."""
+def numbered(messages: Iterable[Message]) -> Messages:
+    """The same with the numbers of a publisher that said exactly this."""
+    counts: dict[tuple[str, str, int], int] = {}
     out = []
-    for path in paths:
-        whole = folder / f"whole_{path.name}"
-        done = subprocess.run([*frame.TRILINE, "recover", str(path), "-o", str(whole), "-q"], capture_output=True)
-        out.append(whole if done.returncode == 0 and whole.exists() else path)
+    for m in messages:
+        stream = m.topic, m.source, m.start
+        counts[stream] = counts.get(stream, -1) + 1
+        out.append(replace(m, sequence=counts[stream]))
     return out
+
+
+def of_images(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
+    """Faults of the camera, by name; each hits all of its CCD lines."""
+
+    def during(m: Message, length: float) -> bool:
+        return m.topic.startswith("sensor/lines/") and FAULT_S <= (m.stamp_ns - start_ns) * 1e-9 < FAULT_S + length
+
+    def repeated(messages: Messages) -> Messages:
+        """The pixels of the last block before the fault under the numbers of those that come."""
+        out, last = [], {}
+        for m in messages:
+            if during(m, 3.0):
+                held = last[m.topic]
+                m = replace(m, body=replace(m.body, pixels=np.resize(held, m.body.pixels.shape)))
+            elif m.topic.startswith("sensor/lines/"):
+                last[m.topic] = m.body.pixels
+            out.append(m)
+        return out
+
+    def again(messages: Messages) -> Messages:
+        """Each block is sent once more, as a message of its own with the same line numbers and times."""
+        return numbered(x for m in messages for x in ([m, m] if during(m, 3.0) else [m]))
+
+    def stuck(messages: Messages) -> Messages:
+        """The last block before the fault again and again with its numbers and times, instead of those to come."""
+        out, last = [], {}
+        for m in messages:
+            if during(m, 3.0):
+                m = replace(m, body=last[m.topic])
+            elif m.topic.startswith("sensor/lines/"):
+                last[m.topic] = m.body
+            out.append(m)
+        return out
+
+    def tenth(messages: Messages) -> Messages:
+        """Every tenth block of each CCD line never comes."""
+        return [m for m in messages if not (during(m, 20.0) and m.sequence % 10 == 0)]
+
+    return {
+        "image lines repeated, new numbers, 3 s": repeated,
+        "image lines repeated, same numbers, 3 s": stuck,
+        "image lines sent twice, 3 s": again,
+        "image lines lost, every tenth block, 20 s": tenth,
+    }
+
+
+# ---- a long flight
+
+
+def long_flight(folder: Path, seconds: float, rate: float) -> int:
+    """A block of strips with few tie points: final orientation that is missing, memory and open files of the nodes."""
+    path = folder / "long.mcap"
+    strips = max(1, round(seconds / LONG_STRIP_S))
+    plan = ("--strips", str(strips), "--seconds", str(min(seconds, LONG_STRIP_S) - LONG_TURN_S), "--ties", "1")
+    frame.triline("simulate", "-o", str(path), *plan, "--attitude-rate", "50", "--seed", "3", "-q")
+    rig = LongRig(path, _folder(folder, "long"), rate)
+    begun = time.monotonic()
+    paths = readable(rig.fly(LongRig.watch, 0.0), folder)
+    took_s = time.monotonic() - begun
+    times = np.unique(np.concatenate([Outcome.of([p]).final_s for p in paths]))
+    lost = [missing_s(times, strip) for strip in strips_of(path)]
+    span_s = rig.seen[-1][0]
+    print(f"{span_s:.0f} s of flight, {len(lost)} strips, at {rate:g} times real time in {took_s:.0f} s; "
+          f"without final orientation {sum(lost):.1f} s")  # fmt: skip
+    print(f"{'node':<12}{'at 10 %':>14}{'at 50 %':>14}{'at the end':>14}")
+    places = [next(i for i, (s, _) in enumerate(rig.seen) if s >= share * span_s) for share in (0.1, 0.5, 1.0)]
+    for name in NODES:
+        cells = [rig.seen[i][1][name] for i in places]
+        print(f"{name:<12}" + "".join(f"{mb:>6.0f} MB {files:>4d}" for mb, files in cells), flush=True)
+    for text in rig.alarms:
+        print(f"told: {text}")
+    return frame.verdict(sum(lost) < 0.5)
+
+
+def strips_of(path: Path) -> list[tuple[int, int]]:
+    """Begin and end of the strips of a recording, ns."""
+    begun: dict[str, int] = {}
+    found = []
+    for m in RecordingReader(path).sorted_messages(["configuration/strip"]):
+        if m.body.ended:
+            found.append((begun[m.body.id], m.stamp_ns))
+        else:
+            begun[m.body.id] = m.stamp_ns
+    return found
+
+
+KINDS = ("data", "images", "processes", "link")
 
 
 def main() -> int:
     parser = frame.parser(__doc__)
     parser.add_argument("--only", default="", help="faults whose name has this word")
-    parser.add_argument("--kind", choices=("all", "data", "processes"), default="all", help="of faults")
-    parser.add_argument("--rate", type=float, default=1.0, help="of the replays, times real time")
+    parser.add_argument("--kind", choices=("all", *KINDS), default="all", help="of faults")
+    parser.add_argument("--rate", type=float, help="of the replays, times real time (1; of --long 10)")
+    parser.add_argument("--long", action="store_true", help="a flight of an hour instead of faults")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="of the flight of --long (3600)")
     args = parser.parse_args()
-    rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="triline-faults-") as name:
         folder = Path(name)
-        flight = folder / "flight.mcap"
-        frame.triline("simulate", "-o", str(flight), "--seconds", str(SECONDS), "--control", "9", "--seed", "3", "-q")
-        messages = list(RecordingReader(flight).sorted_messages())
-        start_ns = next(m.stamp_ns for m in messages if m.topic == "sensor/attitude")
-        at_ns = start_ns + round(FAULT_S * 1e9)
-        strip = start_ns + round(LEAD_S * 1e9), start_ns + round((LEAD_S + SECONDS) * 1e9)
-        print(f"{'fault':<44}{'lost s':>7}{'right':>7}{'beyond':>12}  told", flush=True)
+        if args.long:
+            return long_flight(folder, args.seconds, args.rate or 10.0)
+        return campaign(folder, KINDS if args.kind == "all" else (args.kind,), args.only, args.rate or 1.0)
 
-        def done(fault: str, got: Outcome, usual: Outcome, heard_from_ns: int = 0) -> None:
-            rows.append(row(fault, got, usual, strip, at_ns, heard_from_ns))
-            print(rows[-1], flush=True)
 
-        if args.kind != "processes":
-            usual = Outcome.of(process(messages, _folder(folder, "usual")))
-            done("none (process)", usual, usual)
-            for fault, change in of_data(start_ns).items():
-                if args.only in fault:
-                    done(fault, Outcome.of(process(change(messages), _folder(folder, fault))), usual)
-        if args.kind != "data":
-            live = Outcome.of(Rig(flight, _folder(folder, "live"), args.rate).fly(None))
-            done("none (live)", live, live)
-            for fault, do in of_processes().items():
-                if args.only in fault:
-                    place = _folder(folder, fault)
-                    rig = Rig(flight, place, args.rate)
-                    paths = readable(rig.fly(do), place)
-                    done(fault, Outcome.of(paths, rig.alarms), live, rig.fault_ns)
-            if args.only in "disk full":
-                place = _folder(folder, "disk full")
-                found = disk_full(flight, place, args.rate)
-                if found is None:
-                    print("disk full: no tmpfs can be mounted here")
-                else:
-                    done("disk full", Outcome.of(readable(found[0], place), found[1]), live)
+def campaign(folder: Path, kinds: tuple[str, ...], only: str, rate: float) -> int:
+    rows: list[Row] = []
+    print(f"{'fault':<44}{'lost s':>7}{'right':>7}{'beyond':>12}  told", flush=True)
+
+    def done(flight: Flown, fault: str, got: Outcome, usual: Outcome, heard_from_ns: int = 0) -> None:
+        rows.append(row(fault, got, usual, flight.strip, flight.at_ns, heard_from_ns))
+        print(rows[-1], flush=True)
+
+    def processed(flight: Flown, name: str, faults: dict[str, Callable[[Messages], Messages]], *options: str) -> None:
+        usual = Outcome.of(process(flight.messages, _folder(folder, name), *options))
+        done(flight, f"none ({name})", usual, usual)
+        for fault, change in faults.items():
+            if only in fault:
+                paths = process(change(flight.messages), _folder(folder, fault), *options)
+                done(flight, fault, Outcome.of(paths), usual)
+
+    if "images" in kinds:
+        flight = Flown.simulated(folder / "images.mcap", "--images", "--sensor", "ads40-small", "--height", "800")
+        processed(flight, "images", of_images(flight.start_ns), "--nodes", "navigator,matcher,adjuster")
+    flight = Flown.simulated(folder / "flight.mcap")
+    if "data" in kinds:
+        processed(flight, "process", of_data(flight.start_ns))
+    if not {"processes", "link"} & set(kinds):
+        return _verdict(rows)
+
+    live = Outcome.of(Rig(flight.path, _folder(folder, "live"), rate).fly(None))
+    done(flight, "none (live)", live, live)
+
+    def flown(fault: str, rig: Rig, happens: Callable[[Any], None] | None) -> None:
+        paths = readable(rig.fly(happens), rig.folder)
+        done(flight, fault, Outcome.of(paths, rig.alarms), live, rig.fault_ns)
+
+    if "processes" in kinds:
+        for name, do in of_processes().items():
+            if only in name:
+                flown(name, Rig(flight.path, _folder(folder, name), rate), do)
+        if only in "disk full":
+            place = _folder(folder, "disk full")
+            found = disk_full(flight.path, place, rate)
+            if found is None:
+                print("disk full: no tmpfs can be mounted here")
+            else:
+                done(flight, "disk full", Outcome.of(readable(found[0], place), found[1]), live)
+    if "link" in kinds:
+        for name, (delay_s, happens) in of_the_link().items():
+            if only in name:
+                with ExitStack() as stack:
+                    flown(name, LinkedRig(flight.path, _folder(folder, name), rate, delay_s, stack), happens)
+    return _verdict(rows)
+
+
+def _verdict(rows: list[Row]) -> int:
     beyond = sum(r.beyond for r in rows)
-    silent = [r.fault for r in rows[1:] if r.told == "nothing" and r.lost_s > 0.5]
+    silent = [r.fault for r in rows if r.told == "nothing" and r.lost_s > 0.5]
     print(f"{len(rows)} flights; {beyond} errors beyond the protection level under a green light; "
           f"lost more than 0.5 s and not told: {', '.join(silent) or 'none'}")  # fmt: skip
     return frame.verdict(not beyond and not silent)
