@@ -216,7 +216,7 @@ def of_the_link() -> dict[str, tuple[float, Callable[[Any], None] | None]]:
     return {
         "link of 500 ms": (0.5, None),
         "link silent for 3 s": (0.0, lambda rig: rig.silent(3.0)),
-        "link silent for 6 s": (0.0, lambda rig: rig.silent(6.0)),
+        "link silent for 10 s": (0.0, lambda rig: rig.silent(10.0)),
         "link closed for 3 s": (0.0, lambda rig: rig.closed(3.0)),
         "link of 500 ms closed for 3 s": (0.5, lambda rig: rig.closed(3.0)),
     }

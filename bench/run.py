@@ -334,6 +334,24 @@ BENCHMARKS = (
         3,
     ),
     Benchmark(
+        "faults-images",
+        "The same of a camera that repeats image lines, or whose lines are lost",
+        ("python bench/faults.py --kind images",),
+        3,
+    ),
+    Benchmark(
+        "faults-link",
+        "The same of the link between the sensors and the nodes: slow, silent, closed",
+        ("python bench/faults.py --kind link",),
+        7,
+    ),
+    Benchmark(
+        "faults-long",
+        "What do recorder, navigator and adjuster lose in an hour at ten times real time, and does their memory grow?",
+        ("python bench/faults.py --long",),
+        9,
+    ),
+    Benchmark(
         "fuzz",
         "Do readers and nodes stand hostile files and messages whose checksums are right?",
         ("python bench/fuzz.py --cases 4000 --seconds 40",),
