@@ -84,7 +84,8 @@ def test_each_node_killed_in_turn(tmp_path):
         wait_for(lambda: listener.since("adjustment/report", moment) > 2, 10, "reports of the restarted adjuster")
         assert listener.since("trajectory/filtered", moment) > 50
 
-        # frozen: sensors go on, and it catches up
+        # frozen: sensors go on, and it catches up; before that the replay waits for nobody any more
+        wait_for(lambda: listener.since("sensor/attitude", time.monotonic() - 0.5) > 100, 60, "the flight at its pace")
         nodes["navigator"].send_signal(signal.SIGSTOP)
         moment = time.monotonic()
         time.sleep(1.0)
