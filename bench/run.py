@@ -347,7 +347,7 @@ BENCHMARKS = (
     ),
     Benchmark(
         "faults-long",
-        "What do recorder, navigator and adjuster lose in half an hour at ten times real time, and how does memory grow?",
+        "What do live nodes lose in half an hour at ten times real time, and how does their memory grow?",
         ("python bench/faults.py --long --seconds 1655",),
         5,
     ),
