@@ -309,6 +309,7 @@ def run_files(campaign: Campaign, target: FileTarget, cases: int, number: int, u
         target.path.write_bytes(data)
         campaign.run(target.name, data, target.read, len(target.good))
 
+    target.read()  # what a reader imports is not the memory of a file
     try:
         with suppress(_Over):
             case()
