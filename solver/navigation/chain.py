@@ -69,7 +69,9 @@ class Span:
 
 
 @dataclass(slots=True)
-class Node:
+class FilterNode:
+    """A time at which the filter stops: the estimate before and after what was observed there, and the way onward."""
+
     time_s: float
     prior: Estimate
     P_prior: Array
@@ -98,7 +100,7 @@ class NavigationChain:
         self.settings, self.step_s = settings, step_s
         self._filter = f = ErrorStateFilter(settings, start)
         e, n = start.estimate, settings.layout.n
-        first = Node(
+        first = FilterNode(
             e.time_s, e, f.P, np.eye(n), Span(e.gyro, e.accel), e, f.P, np.zeros(n), f.memory, f.memory, []
         )  # fmt: skip
         self.nodes = [first]
@@ -183,10 +185,10 @@ class NavigationChain:
         if old > 1:
             del self.nodes[: old - 1]
 
-    def _blank(self, time_s: float) -> Node:
+    def _blank(self, time_s: float) -> FilterNode:
         last, n = self.nodes[-1], self.settings.layout.n
         e, P = last.posterior, last.P_posterior
-        return Node(
+        return FilterNode(
             time_s, e, P, np.eye(n), Span(e.gyro, e.accel), e, P, np.zeros(n), last.memory, last.memory, []
         )  # fmt: skip
 
@@ -242,7 +244,7 @@ class NavigationChain:
             node.posterior, node.P_posterior, node.memory = f.estimate, f.P, f.memory
 
 
-def _carried(nodes: list[Node]) -> Carried:
+def _carried(nodes: list[FilterNode]) -> Carried:
     """Running integrals of the closed spans, a row for each chunk."""
     ends, block, runs = [], [], []
     for k, node in enumerate(nodes[:-1]):
