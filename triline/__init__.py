@@ -4,12 +4,21 @@
 programs that join them. `triline.open` gives a recording as NumPy arrays and pandas tables.
 """
 
-from importlib.metadata import PackageNotFoundError, version
+__version__: str
 
-try:
-    __version__ = version("triline")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0"
+
+def __getattr__(name):
+    """The version, looked up when somebody asks for it: that takes as long as half of a command's start."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        found = version("triline")
+    except PackageNotFoundError:  # a source tree that was never installed
+        found = "0"
+    globals()["__version__"] = found
+    return found
 
 
 def open(path):

@@ -93,9 +93,9 @@ def orientation_noise(rays: Rays, d_orientation: Array) -> Array | float:
     """What the white noise of the measured orientation adds to the covariance (3, n) of the residuals."""
     if rays.orientation_noise is None:
         return 0.0
-    through = np.einsum("akn,nkl->anl", d_orientation, rays.orientation_noise)
-    xx, xy, yy = (np.einsum("nk,kn->n", through[a], d_orientation[b]) for a, b in ((0, 0), (0, 1), (1, 1)))
-    return np.stack([xx, xy, yy])
+    of_ray = d_orientation.transpose(2, 0, 1)
+    noise = of_ray @ rays.orientation_noise @ of_ray.transpose(0, 2, 1)
+    return np.stack([noise[:, 0, 0], noise[:, 0, 1], noise[:, 1, 1]])
 
 
 def pitch_covariance(rays: Rays) -> Array:
@@ -212,7 +212,7 @@ def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layou
         share = 1.0 / np.maximum(far, 1.0)
         change = later_s[:, None] * np.hstack([own.velocity_l, own.angle_rate])
         if own.orientation_noise is not None:
-            change += np.einsum("nkl,cln,cn->nk", own.orientation_noise, d_orientation, multiplier, optimize=True)
+            change += (own.orientation_noise @ np.einsum("cln,cn->nl", d_orientation, multiplier)[:, :, None])[:, :, 0]
         moved[part] = share[:, None] * change
         image[:, part] = np.einsum("ckn,nk->cn", d_orientation, moved[part])
         fitted[:, part] = own.xy_mm.T - share * samples * pitch

@@ -147,17 +147,14 @@ def skew(v: ArrayLike) -> Array:
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Product of scalar-last quaternions, (..., 4): the rotation ``q`` first, then ``p``."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
-    x1, y1, z1, w1 = np.moveaxis(p, -1, 0)
-    x2, y2, z2, w2 = np.moveaxis(q, -1, 0)
-    return np.stack(
-        [
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-        ],
-        axis=-1,
-    )
+    x1, y1, z1, w1 = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    x2, y2, z2, w2 = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out = np.empty(np.broadcast_shapes(p.shape, q.shape))
+    out[..., 0] = w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
+    out[..., 1] = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2
+    out[..., 2] = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
+    out[..., 3] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
+    return out
 
 
 def quaternion_conjugate(q: ArrayLike) -> Array:

@@ -117,9 +117,11 @@ class Trajectory:
         """
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
         i, h, s = self._places(t)
-        p0, p1 = self.position_l[i], self.position_l[i + 1]
-        position, velocity = _hermite(s, h, p1 - p0, self._velocity[i], self._velocity[i + 1])
-        theta, theta_rate = _hermite(s, h, self._turn[i], self._rate[i], self._rate[i + 1])
+        p0 = self.position_l[i]
+        change = np.concatenate([self.position_l[i + 1] - p0, self._turn[i]], axis=1)
+        slope0, slope1 = (np.concatenate([self._velocity[k], self._rate[k]], axis=1) for k in (i, i + 1))
+        value, rate = _hermite(s, h, change, slope0, slope1)
+        position, velocity, theta, theta_rate = value[:, :3], rate[:, :3], value[:, 3:], rate[:, 3:]
         R = matrix_from_quaternion(self._turned(i, theta))
         angles = angles_from_matrix(R)
         # angles between two samples are small, so theta_rate is the body rate to first order; one more term is kept
@@ -160,7 +162,8 @@ def slopes(step: Array, change: Array) -> Array:
 def _hermite(s: Array, h: Array, change: Array, slope0: Array, slope1: Array) -> tuple[Array, Array]:
     """Cubic from 0 to ``change`` with the slopes given: value and time derivative at share ``s`` of step ``h``."""
     s2, s3 = s * s, s * s * s
-    value = (3 * s2 - 2 * s3) * change + h * ((s3 - 2 * s2 + s) * slope0 + (s3 - s2) * slope1)
+    w = 3 * s2 - 2 * s3
+    value = w * change + h * ((s3 - 2 * s2 + s) * slope0 + (s3 - s2) * slope1)
     rate = (6 * (s - s2) / h) * change + (3 * s2 - 4 * s + 1) * slope0 + (3 * s2 - 2 * s) * slope1
     return value, rate
 
@@ -171,11 +174,11 @@ def noise_between(time_s: Array, covariance: Array, at_s: Array) -> Array:
     The white noise of the attitude shrinks between samples, since the interpolation averages; that of the position does
     not, it is correlated over many samples.
     """
-    i = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
+    i = np.minimum(np.maximum(time_s.searchsorted(at_s, side="right") - 1, 0), len(time_s) - 2)
     s = (at_s - time_s[i]) / (time_s[i + 1] - time_s[i])
     factor = np.ones((len(s), 6))
     factor[:, 3:] = np.sqrt(hermite_noise(s))[:, None]
-    return covariance[np.where(s < 0.5, i, i + 1)] * factor[:, :, None] * factor[:, None, :]
+    return covariance[i + (s >= 0.5)] * factor[:, :, None] * factor[:, None, :]
 
 
 def hermite_noise(s: Array) -> Array:

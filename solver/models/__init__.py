@@ -10,12 +10,17 @@ from .base import COMPONENTS, CorrectionModel, Design, Extent, ModelOptions, Pse
 __all__ = ["COMPONENTS", "MODELS", "CorrectionModel", "Design", "Extent", "ModelOptions", "PseudoObservations"]
 
 
-def _find() -> dict[str, type[ModelOptions]]:
+#: Options class of each model, by the name the command line uses; found when it is first asked for, since all models
+#: take a tenth of a second to import.
+MODELS: dict[str, type[ModelOptions]]
+
+
+def __getattr__(name: str) -> dict[str, type[ModelOptions]]:
+    if name != "MODELS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
     ours = [options for options in ModelOptions.__subclasses__() if options.__module__.startswith(f"{__name__}.")]
-    return {options.name: options for options in sorted(ours, key=lambda o: o.name)}
-
-
-#: Options class of each model, by the name the command line uses.
-MODELS: dict[str, type[ModelOptions]] = _find()
+    found = {options.name: options for options in sorted(ours, key=lambda o: o.name)}
+    globals()["MODELS"] = found
+    return found

@@ -191,6 +191,10 @@ class CorrectionModel(ABC):
         """Variance (n, 6) of what the model cannot follow at times (n,), m^2 and rad^2; 0 where it does not know."""
         return np.zeros((np.size(time_s), 6))
 
+    def design_and_left_out(self, time_s: ArrayLike) -> tuple[Design, Array]:
+        """`design` and `left_out_variance` of times (n,), which have work in common."""
+        return self.design(time_s), self.left_out_variance(time_s)
+
 
 class ModelOptions(ABC):
     """Settings of a model; builds one `CorrectionModel` per correction set.

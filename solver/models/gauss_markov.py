@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammainc
 
 Array = NDArray[np.floating]
 
@@ -57,21 +56,30 @@ def second_order_gauss_markov(sigma: float, time_s: float, step_s: ArrayLike) ->
     h = np.asarray(step_s, dtype=float)
     if (h < 0).any():
         raise ValueError(f"step must not be negative, got {h.min()} s")
-    x = b * h
+    F, Q = np.empty((*h.shape, 2, 2)), np.empty((*h.shape, 2, 2))
+    F[..., 0, 0], F[..., 0, 1], F[..., 1, 0], F[..., 1, 1], q00, q01, q11 = over_step(b, h)
+    Q[..., 0, 0], Q[..., 0, 1], Q[..., 1, 0], Q[..., 1, 1] = q00, q01, q01, q11
+    return F, sigma * sigma * Q, np.diag([sigma * sigma, (b * sigma) ** 2])
+
+
+def over_step(rate: float, step_s: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """Elements F00, F01, F10, F11, Q00, Q01, Q11, each (...), of `second_order_gauss_markov` for a sigma of 1.
+
+    Parameters
+    ----------
+    rate : damping rate, 1/s
+    step_s : (...) steps, >= 0
+    """
+    from scipy.special import gammainc  # takes as long to import as half of what `triline info` needs
+
+    x = rate * step_s
     decay = np.exp(-x)
-    F = np.empty((*h.shape, 2, 2))
-    F[..., 0, 0] = decay * (1.0 + x)
-    F[..., 0, 1] = decay * h
-    F[..., 1, 0] = -decay * b * x
-    F[..., 1, 1] = decay * (1.0 - x)
     # 1 - exp(-2x) (1 + 2x + 2x^2) is the incomplete gamma function: no cancellation for small steps
     grown = gammainc(3.0, 2.0 * x)
     decay2 = decay * decay
-    Q = np.empty((*h.shape, 2, 2))
-    Q[..., 0, 0] = grown
-    Q[..., 0, 1] = Q[..., 1, 0] = 2.0 * b * x * x * decay2
-    Q[..., 1, 1] = b * b * (grown + 4.0 * x * decay2)
-    return F, sigma * sigma * Q, np.diag([sigma * sigma, (b * sigma) ** 2])
+    cross = 2.0 * rate * x * x * decay2
+    slope = rate * rate * (grown + 4.0 * x * decay2)
+    return decay * (1.0 + x), decay * step_s, -decay * rate * x, decay * (1.0 - x), grown, cross, slope
 
 
 def autocorrelation(time_s: float, lag_s: ArrayLike) -> Array:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
@@ -33,7 +34,7 @@ from .base import (
     join_observations,
     three,
 )
-from .gauss_markov import damping_rate, second_order_gauss_markov
+from .gauss_markov import damping_rate, over_step, second_order_gauss_markov
 from .slow_errors import SlowErrors
 
 Array = NDArray[np.float64]
@@ -122,42 +123,51 @@ class Wander(CorrectionModel):
         self._time_s = np.tile(slow.wander_times_s, (segments + 1, 1))
         self._another = np.zeros(segments + 1, dtype=bool)
         self.used = self._spaced(0, self._sigma[0], self._time_s[0])
+        self._grouped()
         self._observations = self._stated()
 
     def design(self, time_s: ArrayLike) -> Design:
-        t = np.asarray(time_s, dtype=float)
-        alike = self._alike()
-        share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
-        columns = np.full((len(t), 2 + 4 * len(alike), 6), -1, dtype=np.int32)
-        columns[:, 0] = np.arange(6)
-        columns[:, 1] = [-1, -1, -1, 6, 7, 8]
-        coefficients = np.empty(columns.shape[:2])
-        coefficients[:, 0], coefficients[:, 1] = 1.0, share
-        value_and_slope = GLOBALS + 6 * np.arange(2)[:, None]
-        first = [int(components[0]) for components in alike]
-        begin, end, after = (np.stack(e, axis=1) for e in zip(*(self._inside(t, c) for c in first), strict=True))
-        _, part = self._between(after, self.options.slow.wander_times_s[first], end - begin)
-        coefficients[:, 2:] = part.reshape(len(t), -1)
-        for g, components in enumerate(alike):
-            place, own = 2 + 4 * g, value_and_slope + components
-            columns[:, place : place + 2, components] = 12 * begin[:, g, None, None] + own
-            columns[:, place + 2 : place + 4, components] = 12 * end[:, g, None, None] + own
-        return Design(columns, coefficients)
+        return self._design(*self._located(time_s))
 
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
+        return self._left_out(*self._located(time_s)[1:])
+
+    def design_and_left_out(self, time_s: ArrayLike) -> tuple[Design, Array]:
+        located = self._located(time_s)
+        return self._design(*located), self._left_out(*located[1:])
+
+    def _located(self, time_s: ArrayLike) -> tuple[Array, IntArray, IntArray, Array]:
+        """Times (n,); for each group of `_alike` the borders in use around them, (n, g) each, and the time (n, g) since
+        the first of both."""
         t = np.asarray(time_s, dtype=float)
-        out, alike = np.empty((len(t), 6)), self._alike()
-        first = [int(components[0]) for components in alike]
-        begin, end, inside = (np.stack(e, axis=1) for e in zip(*(self._inside(t, c) for c in first), strict=True))
-        variance, _ = self._between(inside, self._time_s[end, first], end - begin)
+        place = np.floor((t - self.borders[0]) / self.step_s)
+        k = [np.minimum(np.maximum(used.searchsorted(place, side="right") - 1, 0), len(used) - 2) for used in self._use]
+        begin = np.stack([used[i] for used, i in zip(self._use, k, strict=True)], axis=1)
+        end = np.stack([used[i + 1] for used, i in zip(self._use, k, strict=True)], axis=1)
+        inside = np.minimum(np.maximum(t[:, None] - self.borders[begin], 0.0), self.step_s * (end - begin))
+        return t, begin, end, inside
+
+    def _design(self, t: Array, begin: IntArray, end: IntArray, inside: Array) -> Design:
+        n, groups = begin.shape
+        _, part = self._between(inside, self.options.slow.wander_times_s[self._first], end - begin)
+        coefficients = np.empty((n, 2 + 4 * groups))
+        coefficients[:, 0] = 1.0
+        coefficients[:, 1] = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
+        coefficients[:, 2:] = part.reshape(n, -1)
+        border = np.zeros((n, 2 + 4 * groups, 1), dtype=np.int32)
+        border[:, 2::4, 0] = border[:, 3::4, 0] = begin
+        border[:, 4::4, 0] = border[:, 5::4, 0] = end
+        return Design(np.where(self._column >= 0, self._column + 12 * border, np.int32(-1)), coefficients)
+
+    def _left_out(self, begin: IntArray, end: IntArray, inside: Array) -> Array:
+        variance, _ = self._between(inside, self._time_s[end, self._first], end - begin)
         part = inside / (self.step_s * (end - begin))
-        jump = np.clip(part * (1.0 - part), 0.0, 0.25)  # where a wander becomes another can be anywhere between
-        for g, components in enumerate(alike):
-            before, after = (self._sigma[place[:, g, None], components] for place in (begin, end))
-            size = np.where(self._another[end[:, g]][:, None], before**2 + after**2, (after - before) ** 2)
-            out[:, components] = variance[:, g, None] * np.maximum(before, after) ** 2 + jump[:, g, None] * size
-        return out
+        jump = np.minimum(np.maximum(part * (1.0 - part), 0.0), 0.25)  # where a wander becomes another is unknown
+        g, components = self._group, np.arange(6)
+        before, after = self._sigma[begin[:, g], components], self._sigma[end[:, g], components]
+        size = np.where(self._another[end[:, g]], before**2 + after**2, (after - before) ** 2)
+        return variance[:, g] * np.maximum(before, after) ** 2 + jump[:, g] * size
 
     def restate(self, from_s: float, sigma: ArrayLike, time_s: ArrayLike, another: bool = False) -> float:
         """Another wander from a border on, the second one after a time, so that the segment there and its borders stay.
@@ -193,6 +203,7 @@ class Wander(CorrectionModel):
         self._sigma[first:] = sigma
         self._time_s[first:] = time_s
         self._another[first] = another
+        self._grouped()
         changed = self._stated()
         self._observations.columns[...] = changed.columns
         self._observations.coefficients[...] = changed.coefficients
@@ -217,38 +228,48 @@ class Wander(CorrectionModel):
             found.setdefault(used.tobytes() + stated[component].tobytes() + time_s.tobytes(), []).append(component)
         return [np.array(components) for components in found.values()]
 
-    def _inside(self, t: Array, component: int) -> tuple[IntArray, IntArray, Array]:
-        """Places (n,) of the borders in use around times, and the time (n,) since the first of both."""
-        place, used = np.floor((t - self.borders[0]) / self.step_s), self.used[component]
-        k = np.clip(np.searchsorted(used, place, side="right") - 1, 0, len(used) - 2)
-        begin, end = used[k], used[k + 1]
-        return begin, end, np.clip(t - self.borders[begin], 0.0, self.step_s * (end - begin))
+    def _grouped(self) -> None:
+        """Look up what depends on the groups of `_alike` only."""
+        alike = self._alike()
+        self._first = np.array([components[0] for components in alike])
+        self._use = [self.used[component] for component in self._first]
+        self._group = np.empty(6, dtype=np.int64)
+        # (k, 6) columns of a time's coefficients, of its two borders as if both were the first one
+        self._column = np.full((2 + 4 * len(alike), 6), -1, dtype=np.int32)
+        self._column[0] = np.arange(6)
+        self._column[1, 3:] = [6, 7, 8]
+        for g, components in enumerate(alike):
+            self._group[components] = g
+            for row, slope in enumerate((0, 6, 0, 6)):
+                self._column[2 + 4 * g + row, components] = GLOBALS + slope + components
 
     def _between(self, after: Array, time_s: ArrayLike, length: IntArray) -> tuple[Array, Array]:
         """Variance (...) of what is left out for sigma 1, and coefficients (..., 4), at times after a border."""
-        variance, coefficients = np.empty(after.shape), np.empty((*after.shape, 4))
         correlated_s = np.broadcast_to(time_s, after.shape)
-        for each in set(correlated_s.ravel().tolist()):
+        different = set(correlated_s.ravel().tolist()) or {1.0}  # any, of no times
+        if len(different) == 1:
+            return self._interpolated(after, different.pop(), length)
+        variance, coefficients = np.empty(after.shape), np.empty((*after.shape, 4))
+        for each in different:
             mine = correlated_s == each
-            # the process over a segment as a whole, from its beginning, and to its end; the value, without the slope
-            lengths, of_length = np.unique(length[mine], return_inverse=True)
-            whole_s = self.step_s * lengths
-            F, Q, _ = second_order_gauss_markov(1.0, each, whole_s)
-            (F00, F01), (F10, F11) = np.moveaxis(F[of_length], 0, -1)
-            (W00, W01), (_, W11) = np.moveaxis(np.linalg.inv(Q)[of_length], 0, -1)
-            parts = np.stack([after[mine], whole_s[of_length] - after[mine]])
-            F, Q, _ = second_order_gauss_markov(1.0, each, parts)
-            from_value, from_slope = F[0, :, 0].T
-            to, q, cross = F[1], Q[0, :, 0, 0], Q[0, :, 0, 1]
-            back_value = q * to[:, 0, 0] + cross * to[:, 0, 1]
-            back_slope = q * to[:, 1, 0] + cross * to[:, 1, 1]
-            right_value = back_value * W00 + back_slope * W01
-            right_slope = back_value * W01 + back_slope * W11
-            left_value = from_value - right_value * F00 - right_slope * F10
-            left_slope = from_slope - right_value * F01 - right_slope * F11
-            variance[mine] = np.maximum(q - right_value * back_value - right_slope * back_slope, 0.0)
-            coefficients[mine] = np.stack([left_value, left_slope, right_value, right_slope], axis=1)
+            variance[mine], coefficients[mine] = self._interpolated(after[mine], each, length[mine])
         return variance, coefficients
+
+    def _interpolated(self, after: Array, time_s: float, length: IntArray) -> tuple[Array, Array]:
+        """The same for one correlation time."""
+        rate, whole_s = damping_rate(time_s), self.step_s * length
+        F00, F01, F10, F11, W00, W01, W11 = _over_segments(rate, self.step_s, int(length.max(initial=1)))[:, length]
+        # from the beginning of the segment to the time, and from there to its end; the value, without the slope
+        from_value, from_slope, _, _, q, cross, _ = over_step(rate, after)
+        to00, to01, to10, to11, *_ = over_step(rate, whole_s - after)
+        back_value = q * to00 + cross * to01
+        back_slope = q * to10 + cross * to11
+        right_value = back_value * W00 + back_slope * W01
+        right_slope = back_value * W01 + back_slope * W11
+        left_value = from_value - right_value * F00 - right_slope * F10
+        left_slope = from_slope - right_value * F01 - right_slope * F11
+        variance = np.maximum(q - right_value * back_value - right_slope * back_slope, 0.0)
+        return variance, np.stack([left_value, left_slope, right_value, right_slope], axis=-1)
 
     def pseudo_observations(self) -> PseudoObservations:
         return self._observations
@@ -329,3 +350,13 @@ class Wander(CorrectionModel):
 
 def _damping_rates(time_s: NDArray[np.floating]) -> Array:
     return np.array([damping_rate(t) for t in time_s.tolist()])
+
+
+@lru_cache(maxsize=64)
+def _over_segments(rate: float, step_s: float, most: int) -> Array:
+    """Elements F00, F01, F10, F11 of the transition and W00, W01, W11 of the inverse covariance, sigma 1, over segments
+    of 0 to ``most`` steps: (7, most + 1), NaN for 0."""
+    F00, F01, F10, F11, Q00, Q01, Q11 = over_step(rate, step_s * np.arange(1, most + 1))
+    W = np.linalg.inv(np.stack([Q00, Q01, Q01, Q11], axis=1).reshape(-1, 2, 2))
+    table = np.stack([F00, F01, F10, F11, W[:, 0, 0], W[:, 0, 1], W[:, 1, 1]])
+    return np.hstack([np.full((7, 1), np.nan), table])

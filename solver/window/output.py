@@ -129,12 +129,13 @@ class OrientationOutput:
 
     def _chunk(self, strip: WindowStrip, times: Array, poses: Poses) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""
-        columns, A = strip.design(times, poses).functions()
+        design, left_out = strip.design_and_left_out(times, poses)
+        columns, A = design.functions()
         if self._cofactors is None or not np.array_equal(columns, self._columns):
             self._cofactors, self._columns = self._network.state.covariance(columns), columns
         through = (A.reshape(-1, len(columns)) @ self._cofactors).reshape(A.shape)
         covariance = through @ np.swapaxes(A, 1, 2)
-        covariance += strip.left_out_variance(times)[:, :, None] * np.eye(6)
+        covariance += left_out[:, :, None] * np.eye(6)
         correction = A @ self._network.state.values(columns)
         if self.drift is not None:
             change, of_drift = self.drift.change(A, self._network.state.places(columns))

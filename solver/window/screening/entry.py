@@ -9,6 +9,7 @@ which makes the test sharp even before anything has been adjusted.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ SUSPECTED = 1e-5
 DECISIVE = 10.8
 #: Variance, in units of the observation's, that leaves an observation out.
 LEFT_OUT = 1e10
+#: Ratio of its two variances below which a covariance of line and sample is singular. Numerical: far above rounding.
+SINGULAR = 1e-6
 
 
 def entry_weight(
@@ -51,7 +54,8 @@ def entry_weight(
     limits = wider**2 * np.append(np.inf, chi2.isf(suspected, np.arange(1, 2 * active.shape[1] + 1)))  # by redundancy
     w = np.zeros(active.shape)
     for _ in range(active.shape[1]):
-        square, loss, now_w = equations.test(active, control)
+        first = not control.any() and (active == equations.present).all()
+        square, loss, now_w = equations.by_themselves if first else equations.test(active, control)
         w = np.where(active, now_w, w)
         looks = active.sum(axis=1)
         fails = open_ & (square > limits[np.maximum(2 * looks + given - 3, 0)])
@@ -79,7 +83,7 @@ def disagreement(equations: EntryEquations) -> list[tuple[float, int]]:
     """Of each point with three rays or more, not in the state: weighted squares of its looks about their best place,
     without the look whose loss makes them smallest, with all that is known of the orientation without them; and their
     redundancy. So a single gross error at a point does not show."""
-    square, loss, _ = equations.test(equations.present, np.zeros_like(equations.off))
+    square, loss, _ = equations.by_themselves
     looks = equations.present.sum(axis=1)
     best = np.maximum(square - loss.max(axis=1), 0.0)
     return [(float(s), 2 * int(n) - 5) for s, n in zip(best, looks, strict=True) if n > 2]
@@ -127,6 +131,11 @@ class EntryEquations:
         residual, point = e.reshape(p, 2 * k), J.reshape(p, 2 * k, 3)
         return cls(slot, present, residual, point, covariance, off)
 
+    @cached_property
+    def by_themselves(self) -> tuple[Array, Array, Array]:
+        """`test` of all looks, without known coordinates."""
+        return self.test(self.present, np.zeros_like(self.off))
+
     def test(self, active: Bools, control: Array) -> tuple[Array, Array, Array]:
         """Weighted square sum (p,) of active rays about their best points, with weights (p, 3) of known coordinates;
         what it loses without each ray (p, k); the larger |w| of each ray (p, k)."""
@@ -146,5 +155,26 @@ class EntryEquations:
         own = S.reshape(p, k, 2, k, 2)[:, each, :, each].transpose(1, 0, 2, 3)
         own = np.where(active[:, :, None, None], own, np.eye(2))
         h = np.where(active[:, :, None], h.reshape(p, k, 2), 0.0)
-        loss = np.einsum("pka,pkab,pkb->pk", h, np.linalg.pinv(own, rcond=1e-6, hermitian=True), h)
+        loss = np.einsum("pka,pkab,pkb->pk", h, _inverses(own), h)
         return square, loss, np.abs(normalised_residuals(h, np.einsum("pkaa->pka", own))).max(axis=2)
+
+
+def _inverses(C: Array) -> Array:
+    """Inverses (..., 2, 2) of symmetric matrices; of those that are nearly singular the pseudo-inverse.
+
+    In closed form, since that of NumPy takes ten times as long for the few looks of a point.
+    """
+    a, b, d = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
+    half, root = 0.5 * (a + d), np.sqrt(0.25 * (a - d) ** 2 + b * b)
+    larger, det = half + root, a * d - b * b
+    regular = det > SINGULAR * larger * larger
+    out = np.empty(C.shape)
+    out[..., 0, 0], out[..., 1, 1], out[..., 0, 1] = d, a, -b
+    out[..., 1, 0] = -b
+    out /= np.where(regular, det, 1.0)[..., None, None]
+    if not regular.all():  # along the larger axis only: C - smaller I is that axis times the difference of both
+        axis = C - (half - root)[..., None, None] * np.eye(2)
+        weight = np.where(larger > 0, 2.0 * root * larger, np.inf)
+        single = axis / np.where(weight > 0, weight, np.inf)[..., None, None]
+        out = np.where(regular[..., None, None], out, single)
+    return out

@@ -171,7 +171,14 @@ class WindowStrip:
         ----------
         poses : measured orientation at the times, if the caller has it
         """
-        d = self.model.design(time_s)
+        return self._numbered(self.model.design(time_s), time_s, poses)
+
+    def design_and_left_out(self, time_s: ArrayLike, poses: Poses | None = None) -> tuple[Design, Array]:
+        """`design` and `left_out_variance` (n, 6) of times (n,), which have work in common."""
+        design, variance = self.model.design_and_left_out(time_s)
+        return self._numbered(design, time_s, poses), variance
+
+    def _numbered(self, d: Design, time_s: ArrayLike, poses: Poses | None) -> Design:
         d = Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
         return d if self._platform is None else self._platform.joined(d, np.asarray(time_s, dtype=float), poses)
 
