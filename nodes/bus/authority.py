@@ -1,9 +1,11 @@
-"""An authority of one's own: certificates for aircraft and desks, and what each of them needs as a folder (a bundle).
+"""An authority of one's own: certificates for aircraft, routers and desks, and what each of them needs as a folder (a
+bundle).
 
 An authority is a folder with its key, its certificate and a list of whom it has certified. Every bundle holds a Zenoh
 configuration with encryption (both ends show a certificate) and an access list: an aircraft publishes on its own
-platform alone, a desk reads, and publishes its verdicts. The access list names all who are certified and not revoked,
-so bundles are written anew when somebody is added or revoked.
+platform alone, a router on the ground hands on what others may say, a desk reads, and publishes its verdicts. The
+access list names all who are certified and not revoked, so bundles are written anew when somebody is added or revoked.
+An aircraft that calls routers has a second configuration, for that link alone.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from ..errors import UserError
 
 #: Kinds of whom is certified.
-AIRCRAFT, DESK = "aircraft", "desk"
+AIRCRAFT, DESK, ROUTER = "aircraft", "desk", "router"
 #: Port on which a secure platform meets.
 SECURE_PORT = 7447
 #: How long certificates hold: of the authority, and of others unless another time is asked for, days.
@@ -35,6 +37,8 @@ AUTHORITY_DAYS, DAYS = 3650, 730
 KEY, CERTIFICATE, AUTHORITY, CONFIGURATION, FACTS = (
     "key.pem", "certificate.pem", "authority.pem", "zenoh.json5", "bundle.json",
 )  # fmt: skip
+#: The second configuration of an aircraft that calls routers: of its link to the ground.
+GROUND_LINK = "ground.json5"
 #: What certificates are for: every peer listens and calls.
 USES = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
 _MESSAGES = (
@@ -43,8 +47,17 @@ _MESSAGES = (
 )  # fmt: skip
 _READING = ("query", "declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
 #: What a desk may publish, of any platform: verdicts, and that its own onlookers live.
-DESK_TOPICS = ("observation/verdict", "status/monitor", "status/viewer")
-_DESK_TOKENS = ("alive/monitor", "alive/viewer")
+DESK_TOPICS = ("observation/verdict", "status/monitor", "status/viewer", "status/ground")
+_DESK_TOKENS = ("alive/monitor", "alive/viewer", "alive/ground")
+#: What an aircraft takes from the ground as a publication; all else that it takes are questions.
+UPLINK_TOPICS = ("observation/verdict",)
+_ASKING = ("query", "declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
+_SAYING = ("put", "delete", "reply", "liveliness_token")
+#: Of links to the ground: an end that is silent for so long is gone, ms; a publisher waits so long for a slow link, us,
+#: before it counts as cut; and so many bytes wait in the socket, so that what is urgent does not wait behind them.
+LEASE_MS, SLOW_US, SOCKET_BYTES = 8000, 20_000_000, 65_536
+#: A router that does not answer for so long is not there, ms.
+CALL_MS = 4000
 
 
 @dataclass
@@ -53,12 +66,13 @@ class Certified:
 
     Attributes
     ----------
-    name, kind : of an aircraft (its platform) or a desk
+    name, kind : of an aircraft (its platform), a router or a desk
     serial : of the certificate, hexadecimal
     until : last day, ISO
-    hosts : addresses and host names at which it listens (aircraft) or which it calls (desk)
-    port : on which the platform meets
+    hosts : addresses and host names at which it listens (aircraft, router) or which it calls (desk)
+    port : on which the platform meets, or the router listens
     revoked : day, "" if not
+    routers : the routers that it calls, ``host:port``
     """
 
     name: str
@@ -68,6 +82,7 @@ class Certified:
     hosts: list[str] = field(default_factory=list)
     port: int = SECURE_PORT
     revoked: str = ""
+    routers: list[str] = field(default_factory=list)
 
 
 class Authority:
@@ -134,28 +149,35 @@ class Authority:
         port: int = SECURE_PORT,
         days: int = DAYS,
         now: datetime.datetime | None = None,
+        routers: list[str] | None = None,
     ) -> Path:
-        """Certify an aircraft or a desk; returns its bundle.
+        """Certify an aircraft, a router or a desk; returns its bundle.
 
         Parameters
         ----------
         name : of the aircraft (its platform) or the desk
-        kind : `AIRCRAFT` or `DESK`
-        hosts : where an aircraft listens, or which aircraft a desk calls: addresses or host names
-        port : on which the platform meets
+        kind : `AIRCRAFT`, `ROUTER` or `DESK`
+        hosts : where an aircraft or a router listens, or which aircraft a desk calls: addresses or host names
+        port : on which the platform meets, or the router listens
         days : for which the certificate holds
         now : time of certification; None = that of this machine's clock
+        routers : which routers it calls, ``host`` or ``host:port``
 
         Raises
         ------
-        UserError : a name that is taken or cannot be one
+        UserError : a name that is taken or cannot be one, a router without an address, or hosts and routers of a desk
         """
         _named(name)
+        called = [_host_and_port(router) for router in routers or []]
+        if kind == ROUTER and not hosts:
+            raise UserError(f"{name}: wanted --host, the address at which the router listens")
+        if kind == DESK and hosts and called:
+            raise UserError(f"{name}: --host and --router: wanted one of them, a desk calls aircraft or routers")
         if name == self.name or any(member.name == name and not member.revoked for member in self.members):
             raise UserError(f"{name}: this name is taken in {self.folder}; revoke it first, or choose another")
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        listens = ["127.0.0.1", "localhost", *(hosts if kind == AIRCRAFT else [])]
+        listens = ["127.0.0.1", "localhost", *(hosts if kind != DESK else [])]
         use = x509.KeyUsage(
             digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
             key_agreement=False, key_cert_sign=False, crl_sign=False, encipher_only=False, decipher_only=False,
@@ -178,7 +200,7 @@ class Authority:
         (bundle / AUTHORITY).write_bytes((self.folder / CERTIFICATE).read_bytes())
         until = certificate.not_valid_after_utc.date().isoformat()
         self.members = [member for member in self.members if member.name != name or member.revoked]
-        self.members.append(Certified(name, kind, f"{certificate.serial_number:x}", until, hosts, port))
+        self.members.append(Certified(name, kind, f"{certificate.serial_number:x}", until, hosts, port, "", called))
         self._save()
         return bundle
 
@@ -214,19 +236,17 @@ class Authority:
         revoked = {entry.serial: entry.name for entry in self.members if entry.revoked}
         facts = {**asdict(member), "authority": self.name, "revoked_serials": revoked}
         (bundle / FACTS).write_text(json.dumps(facts, indent=2) + "\n")
-        settings = zenoh_settings(bundle, member) | {"access_control": self._access_list()}
-        tree: dict[str, Any] = {}
-        for path, value in settings.items():
-            *parents, last = path.split("/")
-            place = tree
-            for parent in parents:
-                place = place.setdefault(parent, {})
-            place[last] = value
-        head = f"// Zenoh for {member.kind} {member.name}, by `triline keys`. It holds a private key: keep it secret.\n"
-        write_private(bundle / CONFIGURATION, (head + json.dumps(tree, indent=2) + "\n").encode())
+        lists = self._access_list(member) if member.kind != ROUTER else self._router_access_list()
+        settings = zenoh_settings(bundle, member) | {"access_control": lists}
+        _write_configuration(bundle / CONFIGURATION, member, settings)
+        if member.kind == AIRCRAFT and member.routers:
+            settings = ground_link_settings(bundle, member) | {"access_control": self._link_access_list(member)}
+            _write_configuration(bundle / GROUND_LINK, member, settings)
+        else:
+            (bundle / GROUND_LINK).unlink(missing_ok=True)
 
-    def _access_list(self) -> dict[str, Any]:
-        """Who may send what to whoever uses this list: all that is not allowed is dropped."""
+    def _access_list(self, member: Certified) -> dict[str, Any]:
+        """Who may send what to this member: all that is not allowed is dropped."""
         rules: list[dict[str, Any]] = [_rule("out", "egress", _MESSAGES, ["triline/**"])]
         subjects: list[dict[str, Any]] = [{"id": "everybody"}]
         policies = [{"rules": ["out"], "subjects": ["everybody"]}]
@@ -236,6 +256,21 @@ class Authority:
                 rules.append(_rule(id, "ingress", _MESSAGES, [f"triline/{member.name}/**"]))
                 subjects.append({"id": id, "cert_common_names": [member.name]})
                 policies.append({"rules": [id], "subjects": [id]})
+        self._let_desks(rules, subjects, policies)
+        if member.kind == DESK and member.routers:
+            self._let_routers(rules, subjects, policies)
+        return _access(rules, subjects, policies)
+
+    def _let_routers(self, rules: list[Any], subjects: list[Any], policies: list[Any], *more: str) -> None:
+        """Let routers say what they have let in."""
+        routers = [member.name for member in self.valid if member.kind == ROUTER]
+        if routers:
+            rules.append(_rule("routers", "ingress", _MESSAGES, ["triline/**"]))
+            subjects.append({"id": "routers", "cert_common_names": routers})
+            policies.append({"rules": ["routers", *more], "subjects": ["routers"]})
+
+    def _let_desks(self, rules: list[Any], subjects: list[Any], policies: list[Any]) -> None:
+        """Let desks read, and say what desks say."""
         desks = [member.name for member in self.valid if member.kind == DESK]
         if desks:
             rules.append(_rule("desk-reads", "ingress", _READING, ["triline/**"]))
@@ -245,35 +280,90 @@ class Authority:
             )
             subjects.append({"id": "desks", "cert_common_names": desks})
             policies.append({"rules": ["desk-reads", "desk-says", "desk-lives"], "subjects": ["desks"]})
-        return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
-                "policies": policies}  # fmt: skip
+
+    def _router_access_list(self) -> dict[str, Any]:
+        """Who may send what to a router, and what the router sends to whom.
+
+        An aircraft speaks for its platform and hears nothing of the others; routers hand on what they have let in.
+        """
+        rules = [_rule("asks", "egress", _ASKING, ["triline/**"]), _rule("tells", "egress", _SAYING, ["triline/**"])]
+        subjects: list[dict[str, Any]] = [{"id": "everybody"}]
+        policies = [{"rules": ["asks"], "subjects": ["everybody"]}]
+        for member in self.valid:
+            if member.kind == AIRCRAFT:
+                id, own = f"aircraft-{member.name}", [f"triline/{member.name}/**"]
+                rules += [_rule(id, "ingress", _MESSAGES, own), _rule(f"{id}-hears", "egress", _SAYING, own)]
+                subjects.append({"id": id, "cert_common_names": [member.name]})
+                policies.append({"rules": [id, f"{id}-hears"], "subjects": [id]})
+        self._let_routers(rules, subjects, policies, "tells")
+        self._let_desks(rules, subjects, policies)
+        if any(member.kind == DESK for member in self.valid):
+            policies.append({"rules": ["tells"], "subjects": ["desks"]})
+        return _access(rules, subjects, policies)
+
+    def _link_access_list(self, member: Certified) -> dict[str, Any]:
+        """What an aircraft takes on its link to the ground: questions, and verdicts."""
+        own = f"triline/{member.name}"
+        routers = [other.name for other in self.valid if other.kind == ROUTER]
+        rules = [_rule("out", "egress", _MESSAGES, ["triline/**"])]
+        subjects: list[dict[str, Any]] = [{"id": "everybody"}]
+        policies = [{"rules": ["out"], "subjects": ["everybody"]}]
+        if routers:
+            rules.append(_rule("ground-asks", "ingress", _ASKING, ["triline/**"]))
+            rules.append(_rule("ground-says", "ingress", ("put",), [f"{own}/{topic}" for topic in UPLINK_TOPICS]))
+            subjects.append({"id": "routers", "cert_common_names": routers})
+            policies.append({"rules": ["ground-asks", "ground-says"], "subjects": ["routers"]})
+        return _access(rules, subjects, policies)
 
 
 def zenoh_settings(bundle: Path, member: Certified) -> dict[str, Any]:
     """Settings of Zenoh for encryption and where to listen and call, by their paths."""
-
-    def file(name: str) -> str:
-        return base64.b64encode((bundle / name).read_bytes()).decode()
-
     here = f"tls/127.0.0.1:{member.port}"
+    routers = [f"tls/{router}" for router in member.routers]
     if member.kind == AIRCRAFT:
         listen = [here, *(f"tls/{_endpoint(host)}:{member.port}" for host in member.hosts)]
         listen += ["tls/127.0.0.1:0", *(f"tls/{_endpoint(host)}:0" for host in member.hosts)]
-        connect = [here]
-    else:
-        listen = ["tls/127.0.0.1:0"]
-        connect = [f"tls/{_endpoint(host)}:{member.port}" for host in member.hosts] or [here]
+        return _settings(bundle, "peer", listen, [here])
+    if member.kind == ROUTER:
+        listen = [f"tls/{_endpoint(host)}:{member.port}" for host in dict.fromkeys((*member.hosts, "127.0.0.1"))]
+        # an address of a link that is down comes later
+        retry = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 1.5}
+        own = {"listen/timeout_ms": -1, "listen/retry": retry, "transport/link/tx/lease": LEASE_MS}
+        return _settings(bundle, "router", listen, routers) | own
+    if routers:
+        return _settings(bundle, "client", [], routers) | {"transport/link/tx/lease": LEASE_MS}
+    return _settings(
+        bundle, "peer", ["tls/127.0.0.1:0"], [f"tls/{_endpoint(host)}:{member.port}" for host in member.hosts] or [here]
+    )
+
+
+def ground_link_settings(bundle: Path, member: Certified) -> dict[str, Any]:
+    """Settings of Zenoh for an aircraft's link to the routers on the ground: it calls, and nobody can call it."""
+    return _settings(bundle, "client", [], [f"tls/{router}" for router in member.routers]) | {
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": SLOW_US,
+        "transport/link/tls/so_sndbuf": SOCKET_BYTES,
+    }
+
+
+def _settings(bundle: Path, mode: str, listen: list[str], connect: list[str]) -> dict[str, Any]:
+    def file(name: str) -> str:
+        return base64.b64encode((bundle / name).read_bytes()).decode()
+
     tls = "transport/link/tls"
+    client = mode == "client"
     return {
-        "mode": "peer",
+        "mode": mode,
         "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
+        # who is told where others listen links with them directly, past the access list of the router
+        "scouting/gossip/enabled": mode == "peer",
         "listen/endpoints": listen,
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": False,
         "connect/endpoints": connect,
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
+        # a client is not opened without a router; once it was linked, it calls again for ever
+        "connect/timeout_ms": CALL_MS if client else -1,
+        "connect/exit_on_failure": client,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
         "transport/shared_memory/enabled": False,
         "transport/link/protocols": ["tls"],
@@ -289,6 +379,24 @@ def zenoh_settings(bundle: Path, member: Certified) -> dict[str, Any]:
         f"{tls}/connect_private_key_base64": file(KEY),
         "timestamping/enabled": True,
     }
+
+
+def _write_configuration(path: Path, member: Certified, settings: dict[str, Any]) -> None:
+    """Write settings by their paths as a Zenoh configuration."""
+    tree: dict[str, Any] = {}
+    for key, value in settings.items():
+        *parents, last = key.split("/")
+        place = tree
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    head = f"// Zenoh for {member.kind} {member.name}, by `triline keys`. It holds a private key: keep it secret.\n"
+    write_private(path, (head + json.dumps(tree, indent=2) + "\n").encode())
+
+
+def _access(rules: list[Any], subjects: list[Any], policies: list[Any]) -> dict[str, Any]:
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects,
+            "policies": policies}  # fmt: skip
 
 
 def _rule(id: str, flow: str, messages: tuple[str, ...], keys: list[str]) -> dict[str, Any]:
@@ -323,6 +431,19 @@ def _alternative(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
+
+
+def _host_and_port(router: str) -> str:
+    """``host:port`` of a router, an IPv6 address in brackets.
+
+    Raises
+    ------
+    UserError : neither ``host`` nor ``host:port``
+    """
+    found = re.fullmatch(r"(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(?::(\d{1,5}))?", router)
+    if not found or not 0 < int(found[2] or SECURE_PORT) < 65536:
+        raise UserError(f"--router {router!r}: wanted HOST or HOST:PORT")
+    return f"{found[1]}:{found[2] or SECURE_PORT}"
 
 
 def _endpoint(host: str) -> str:

@@ -21,7 +21,19 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import NameOID
 
 from ..errors import UserError
-from .authority import AIRCRAFT, AUTHORITY, CERTIFICATE, CONFIGURATION, DESK, DESK_TOPICS, FACTS, KEY, USES
+from .authority import (
+    AIRCRAFT,
+    AUTHORITY,
+    CERTIFICATE,
+    CONFIGURATION,
+    DESK,
+    DESK_TOPICS,
+    FACTS,
+    GROUND_LINK,
+    KEY,
+    ROUTER,
+    USES,
+)
 
 #: How long the other end is given to answer, s.
 PROBE_S = 2.0
@@ -34,7 +46,7 @@ class Bundle:
     Attributes
     ----------
     folder : its folder
-    name, kind : whose it is: an aircraft's or a desk's
+    name, kind : whose it is: an aircraft's, a router's or a desk's
     authority : name of who certified it
     port : on which the platform meets
     revoked : serial (hexadecimal) -> name of certificates that no longer count
@@ -52,10 +64,18 @@ class Bundle:
         """The Zenoh configuration."""
         return self.folder / CONFIGURATION
 
+    @property
+    def ground_link(self) -> Path | None:
+        """The Zenoh configuration of an aircraft's link to routers on the ground; None where it calls none."""
+        path = self.folder / GROUND_LINK
+        return path if self.kind == AIRCRAFT and path.is_file() else None
+
     def refuses(self, platform: str, topic: str) -> str:
         """Why its owner cannot publish a topic of a platform; "" if it may."""
         if self.kind == AIRCRAFT:
             return "" if platform == self.name else f"aircraft {self.name!r} cannot publish for platform {platform!r}"
+        if self.kind == ROUTER:
+            return f"router {self.name!r} cannot publish {topic}: a router hands on what others publish"
         if topic in DESK_TOPICS:
             return ""
         return f"desk {self.name!r} cannot publish {topic}: a desk reads, and publishes {', '.join(DESK_TOPICS)}"
@@ -148,7 +168,7 @@ def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:
         the uses it needs, or does not go with its key
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such bundle, `triline keys aircraft` or `triline keys desk` makes one")
+        raise UserError(f"{folder}: no such bundle, `triline keys aircraft`, `router` or `desk` makes one")
     for name in (CERTIFICATE, KEY, AUTHORITY, CONFIGURATION, FACTS):
         if not (folder / name).is_file():
             what = {CERTIFICATE: "no certificate", KEY: "no private key"}.get(name, "not whole")
@@ -180,7 +200,7 @@ def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:
             raise UserError(f"{folder}: {whose} is valid from {when} UTC on: is the clock of this machine right?")
     if f"{certificate.serial_number:x}" in bundle.revoked:
         raise UserError(f"{folder}: the certificate of {common!r} was revoked by {bundle.authority!r}")
-    if common != bundle.name or bundle.kind not in (AIRCRAFT, DESK):
+    if common != bundle.name or bundle.kind not in (AIRCRAFT, DESK, ROUTER):
         raise UserError(f"{folder}: the certificate is of {common!r}, the bundle of {bundle.kind} {bundle.name!r}")
     if not set(USES) <= uses:
         raise UserError(f"{folder}: the certificate is for other uses, wanted server and client")

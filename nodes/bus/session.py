@@ -40,6 +40,8 @@ KEPT_S, LEAST_KEPT = 60.0, 20_000
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 Receive = Callable[[RawMessage], None]
+ReceiveOf = Callable[[str, RawMessage], None]
+AnswerRaw = Callable[[dict[str, str]], Iterable[RawMessage]]
 Malformed = Callable[[str, str], None]
 Answer = Callable[[dict[str, str]], Any]
 Recipe = Callable[[Any, int], Any]
@@ -117,6 +119,11 @@ class Bus:
     port : meeting port on loopback; None = TRILINE_PORT or 17447
     file : a Zenoh configuration file instead
     secure : a bundle of certificates and access lists; with a port it meets there instead of where the bundle says
+    keep : whether what is said is kept for those who missed it; what is latched always is
+
+    Raises
+    ------
+    UserError : a name that cannot be a platform's, a configuration that is none, or no router where one is called
     """
 
     def __init__(
@@ -127,6 +134,7 @@ class Bus:
         port: int | None = None,
         file: str | Path | None = None,
         secure: Bundle | None = None,
+        keep: bool = True,
     ) -> None:
         if not platform or any(c in platform for c in "/*$?#@ "):
             raise UserError(f"platform {platform!r}, wanted a name without blanks and any of / * $ ? # @")
@@ -135,17 +143,18 @@ class Bus:
         self.source = source
         self.start = time.time_ns()
         self._secure = secure
+        self._keep = keep
         if secure is not None:
             file = secure.configuration
             self._port = port
         else:
             self._port = None if file is not None else port or default_port()
-        held = secure is None and self._port is not None and port_is_held(self._port)
         self._file = file
+        held = secure is None and self._port is not None and port_is_held(self._port)
         try:
             self._session = zenoh.open(configuration(self._port, file))
         except zenoh.ZError as error:
-            raise UserError(f"cannot open the bus: {_one_line(error)}") from None
+            raise UserError(f"cannot open the bus: {self._why_closed() or _one_line(error)}") from None
         self._publishers: dict[str, Any] = {}
         self._recipes: list[Recipe] = []  # how all that is declared is declared again
         self._declared: list[Any] = []
@@ -220,7 +229,7 @@ class Bus:
             "encoding": zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name),
             "congestion_control": zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK,
         }
-        kept = _kept(row)
+        kept = _kept(row) if self._keep or row.latched else 0
         if not kept:
             return session.declare_publisher(self.key(topic), **options)
         cache = zenoh.ext.CacheConfig(max_samples=kept)
@@ -238,14 +247,20 @@ class Bus:
         It is called in the thread that takes messages off the wire: while it waits, the publisher waits. For a latched
         topic it also gets what was sent before. What has no readable envelope goes to ``malformed(topic, why)``.
         """
-        prefix = len(self.key(""))
+        return self._subscribe(self.key(name), name, lambda _, raw: receive(raw), malformed)
 
+    def hear(self, name: str, receive: ReceiveOf, malformed: Malformed | None = None) -> Callable[[], None]:
+        """`subscribe` to a topic of all platforms: ``receive(platform, message)``."""
+        return self._subscribe(topics.key_expression("*", name), name, receive, malformed)
+
+    def _subscribe(self, key: str, name: str, receive: ReceiveOf, malformed: Malformed | None) -> Callable[[], None]:
         def take(sample: Any, generation: int) -> None:
             receive_ns = time.time_ns()
-            topic = str(sample.key_expr)[prefix:]
+            _, platform, topic = str(sample.key_expr).split("/", 2)
             if sample.kind != zenoh.SampleKind.PUT or generation != self._generation:
                 return
-            self._links.heard(topic, time.monotonic())
+            if platform == self.platform:
+                self._links.heard(topic, time.monotonic())
             try:
                 if sample.attachment is None:
                     raise ValueError("message without an envelope")
@@ -254,18 +269,18 @@ class Bus:
                 if malformed is not None:
                     malformed(topic, str(error))
                 return
-            receive(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
+            receive(platform, RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
 
         def declare(session: Any, generation: int) -> Any:
             handler = zenoh.handlers.Callback(lambda sample: take(sample, generation), indirect=False)
             if topics.find(name).latched:
                 return zenoh.ext.declare_advanced_subscriber(
                     session,
-                    self.key(name),
+                    key,
                     handler,
                     history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_KEPT),
                 )
-            return session.declare_subscriber(self.key(name), handler)
+            return session.declare_subscriber(key, handler)
 
         return self._declare(declare)
 
@@ -307,12 +322,20 @@ class Bus:
     def watch(self, changed: Callable[[str, bool], None]) -> None:
         """Call ``changed(node, alive)`` for the nodes that live now and whenever one comes or goes."""
 
+        self._watch(self.key("alive/*"), lambda _, node, alive: changed(node, alive))
+
+    def watch_fleet(self, changed: Callable[[str, str, bool], None]) -> None:
+        """The same for the nodes of all platforms: ``changed(platform, node, alive)``."""
+        self._watch(topics.key_expression("*", "alive/*"), changed)
+
+    def _watch(self, key: str, changed: Callable[[str, str, bool], None]) -> None:
         def take(sample: Any) -> None:
-            changed(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
+            _, platform, _, node = str(sample.key_expr).split("/", 3)
+            changed(platform, node, sample.kind == zenoh.SampleKind.PUT)
 
         def declare(session: Any, _: int) -> Any:
             handler = zenoh.handlers.Callback(take, indirect=False)
-            return session.liveliness().declare_subscriber(self.key("alive/*"), handler, history=True)
+            return session.liveliness().declare_subscriber(key, handler, history=True)
 
         self._declare(declare)
 
@@ -350,10 +373,66 @@ class Bus:
             bodies.append(codec.decode(topic, reply.ok.payload.to_bytes()))
         return bodies
 
+    def answer_messages(self, name: str, answer: AnswerRaw) -> None:
+        """Answer queries ``query/<name>?key=value;..`` with messages as they were said; see `ask`.
+
+        ``answer`` is called in a thread of its own kind of query, one query at a time; it may take its time between two
+        messages. Where it raises ValueError, that is the answer.
+        """
+        key = self.key(f"query/{name}")
+
+        def take(query: Any) -> None:
+            with query:
+                try:
+                    for raw in answer(dict(_parameters(str(query.parameters)))):
+                        query.reply(self.key(raw.topic), bytes(raw.data), attachment=pack(raw.envelope))
+                except ValueError as error:
+                    query.reply_err(str(error).encode(), encoding="text/plain")
+                except zenoh.ZError:  # who asked is gone
+                    return
+
+        self._declare(lambda session, _: session.declare_queryable(key, zenoh.handlers.Callback(take)))
+
+    def ask(self, name: str, timeout_s: float = 2.0, platform: str = "", **parameters: object) -> Iterator[RawMessage]:
+        """Messages that answer a query, of this platform or another one, as they come.
+
+        Raises
+        ------
+        ValueError : the reason of a refusal; or the time was over before the answer was whole
+        """
+        prefix = topics.key_expression(platform or self.platform, "")
+        selector = f"{prefix}query/{name}"
+        if parameters:
+            selector += "?" + ";".join(f"{key}={value}" for key, value in parameters.items())
+        replies = self._session.get(
+            selector,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=timeout_s,
+        )
+        for reply in replies:
+            if reply.ok is None:
+                raise ValueError(reply.err.payload.to_string() if reply.err is not None else "no reason given")
+            sample = reply.ok
+            if sample.attachment is not None:
+                envelope, topic = unpack(sample.attachment.to_bytes()), str(sample.key_expr)[len(prefix) :]
+                yield RawMessage(topic, envelope, sample.payload.to_bytes(), time.time_ns())
+
     def peers(self) -> int:
         """How many sessions this one is linked with."""
         info = self._session.info
         return len(info.peers_zid()) + len(info.routers_zid())
+
+    def _why_closed(self) -> str:
+        """Why a session that calls routers cannot be opened; "" if nothing is seen."""
+        if self._secure is None or self._file is None:
+            return ""
+        config = configuration(self._port, self._file)
+        if json.loads(config.get_json("mode")) != "client":
+            return ""
+        why = self._secure.why_nobody(json.loads(config.get_json("connect/endpoints")))
+        return f"nobody can be met: {why or 'no router answers'}"
 
     def why_alone(self, patience_s: float = 3.0) -> str:
         """Why this session meets nobody: a program that is none of ours holds the meeting port; "" if none does."""
@@ -530,6 +609,26 @@ def listen_elsewhere(
             raise UserError(f"{endpoint}: {_one_line(error)}") from None
 
     return open_session()
+
+
+@contextlib.contextmanager
+def routing(file: Path) -> Iterator[Callable[[], int]]:
+    """A Zenoh router by a configuration file, as long as the context; gives a function that counts who is linked.
+
+    Raises
+    ------
+    UserError : a file that is no configuration of a router, or an address at which it cannot listen
+    """
+    zenoh.init_log_from_env_or("off")
+    config = configuration(file=file)
+    if json.loads(config.get_json("mode")) != "router":
+        raise UserError(f"{file}: not the configuration of a router")
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise UserError(f"the router cannot listen: {_one_line(error)}") from None
+    with session:
+        yield lambda: len(session.info.peers_zid()) + len(session.info.routers_zid())
 
 
 def _parameters(text: str) -> list[tuple[str, str]]:

@@ -10,6 +10,8 @@ from pathlib import Path
 EXAMPLE = """triline keys new survey                                   # an authority, in the folder survey
   triline keys aircraft aircraft1 --authority survey --host 10.77.0.1
   triline keys desk ann --authority survey --host 10.77.0.1
+  triline keys router ground --authority survey --host 192.0.2.1    # of a fleet: docs/fleet.md
+  triline keys aircraft aircraft2 --authority survey --router 192.0.2.1
   triline keys list --authority survey
   triline keys revoke ann --authority survey"""
 
@@ -20,12 +22,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     new.add_argument("name", metavar="AUTHORITY", help="folder of the authority, and its name")
     for kind, text, host in (
         ("aircraft", "certify an aircraft: it publishes on the platform of its name", "address at which it listens"),
+        ("router", "certify a router on the ground: aircraft and desks call it", "address at which it listens"),
         ("desk", "certify a desk: it reads, and publishes verdicts", "address of an aircraft that it calls"),
     ):
         one = actions.add_parser(kind, help=text)
         one.add_argument("name", metavar="NAME")
         one.add_argument("--host", action="append", default=[], metavar="HOST", help=f"{host} (repeatable)")
-        one.add_argument("--port", type=int, default=7447, metavar="N", help="where the platform meets (default 7447)")
+        where = "where the router listens" if kind == "router" else "where the platform meets"
+        one.add_argument("--port", type=int, default=7447, metavar="N", help=f"{where} (default 7447)")
+        calls = "a router on the ground that it calls, port 7447 unless another is named (repeatable)"
+        one.add_argument("--router", action="append", default=[], metavar="HOST[:PORT]", help=calls)
         one.add_argument("--days", type=int, default=730, metavar="N", help="for which it holds (default 730)")
     revoke = actions.add_parser("revoke", help="strike somebody off all access lists")
     revoke.add_argument("name", metavar="NAME")
@@ -56,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
                 from ..errors import UserError
 
                 raise UserError(f"--days {args.days}: wanted 1 or more")
-            bundle = authority.certify(args.name, args.action, args.host, args.port, args.days)
+            bundle = authority.certify(args.name, args.action, args.host, args.port, args.days, routers=args.router)
             others = [member.name for member in authority.valid if member.name != args.name]
             result = {"bundle": str(bundle), "copy": [str(authority.folder / name) for name in others]}
             text = f"{bundle}: bundle of {args.action} {args.name}, for --secure" + _copy(authority.folder, others)
@@ -72,8 +78,9 @@ def _copy(folder: Path, names: list[str]) -> str:
 
 
 def _table(members) -> str:
-    lines = [f"{'name':<24} {'kind':<9} {'until':<11} {'state':<20} hosts"]
+    lines = [f"{'name':<24} {'kind':<9} {'until':<11} {'state':<20} hosts, > calls"]
     for member in members:
         state = f"revoked {member.revoked}" if member.revoked else "valid"
-        lines.append(f"{member.name:<24} {member.kind:<9} {member.until:<11} {state:<20} {', '.join(member.hosts)}")
+        where = ", ".join(member.hosts) + "".join(f" > {router}" for router in member.routers)
+        lines.append(f"{member.name:<24} {member.kind:<9} {member.until:<11} {state:<20} {where}")
     return "\n".join(lines)
