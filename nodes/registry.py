@@ -18,6 +18,8 @@ STEP_NODES: dict[str, tuple[str, str]] = {
 PROGRAMS: dict[str, tuple[str, str]] = {
     "simulator": ("simulator.simulator", "run"),
     "recorder": ("recorder.recorder", "run"),
+    "ground": ("recorder.ground", "run"),
+    "router": ("router.router", "run"),
     "player": ("player.player", "run"),
     "monitor": ("monitor.monitor", "run"),
     "nmea": ("sensors.nmea", "run"),
@@ -37,7 +39,7 @@ ESTIMATING = ("navigator", "adjuster")
 
 def names() -> list[str]:
     """All names, in the order of the flow."""
-    return ["simulator", *SENSORS, *STEP_NODES, "recorder", "player", *ONLOOKERS, "monitor"]
+    return ["simulator", *SENSORS, *STEP_NODES, "recorder", "player", *ONLOOKERS, "monitor", "router", "ground"]
 
 
 def node_class(name: str) -> Any:

@@ -11,11 +11,12 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from ...schemas import codec, topics
 from ...schemas import messages as m
-from ...schemas import topics
-from ...schemas.envelope import RawMessage
+from ...schemas.envelope import Envelope, RawMessage
 from ..bus.authority import AUTHORITY, CERTIFICATE, KEY
 from ..bus.bundle import Bundle, load_bundle
+from ..bus.downlink import INVENTORY, asked
 from ..bus.program import ProgramOptions
 from ..bus.recall import Recall
 from ..bus.session import Bus
@@ -23,6 +24,7 @@ from ..bus.status import StatusPublisher
 from ..errors import UserError
 from ..node import Node
 from ..ordering import StreamCheck, order_key
+from ..recording.reread import Reread, Stream
 from ..recording.seal import Seal
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 
@@ -131,6 +133,8 @@ class Recorder(Node):
         self._lost = 0
         self._measured_s = 0.0  # when the disk was looked at, and what had been written by then
         self._written = self._bytes_before = 0
+        self._reread = Reread()
+        self._closed_to = 0  # all that stands before this byte of the open file can be found again
 
     @property
     def statistics(self) -> Any:
@@ -180,6 +184,26 @@ class Recorder(Node):
         said_ns = self._heard_ns.get(parameters.get("source", ""))
         return None if said_ns is None else m.Progress(time_ns=said_ns)
 
+    def inventory(self, parameters: dict[str, str]) -> list[RawMessage]:
+        """``query/inventory``: which messages are on the disk, by stream (an `m.Inventory`)."""
+        body = m.Inventory()
+        for stream, (lowest, highest) in sorted(self._reread.streams().items()):
+            body.streams.add(topic=stream.topic, source=stream.source, start=stream.start, first=lowest, last=highest)
+        return [RawMessage(INVENTORY, Envelope(self.newest_ns, self.name, 0), codec.encode(body))]
+
+    def recorded(self, parameters: dict[str, str]) -> list[RawMessage]:
+        """``query/recorded?topic=..;source=..;start=..;first=..;last=..;every=..``: messages by their numbers.
+
+        An empty inventory behind them says that these are all.
+
+        Raises
+        ------
+        ValueError : parameters that are missing or no numbers
+        """
+        topic, source, start, first, last, every = asked(parameters)
+        end = RawMessage(INVENTORY, Envelope(self.newest_ns, self.name, 0), b"")
+        return [*self._reread.read(Stream(topic, source, start), first, last, every), end]
+
     def tend(self) -> None:
         """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""
         now = time.monotonic()
@@ -197,6 +221,7 @@ class Recorder(Node):
                 if self._file is not None:
                     self._file.sign()
                 self._unflushed = 0
+                self._note_closed()
                 if self._rotate_bytes and self._writer.size > self._rotate_bytes:
                     self._close()
                     self._open()
@@ -230,6 +255,13 @@ class Recorder(Node):
         self.files.append(path)
         self._flushed_s = time.monotonic()
         self._unflushed = 0
+        self._closed_to = self._file.tell()
+
+    def _note_closed(self) -> None:
+        """What was written since the last time can be found again."""
+        if self._file is not None and self._writer is not None and self._file.tell() > self._closed_to:
+            self._reread.closed(self._file.path, self._closed_to, self._file.tell(), self._writer)
+            self._closed_to = self._file.tell()
 
     def _next_path(self) -> Path:
         """The path asked for, or the next number after it: a recording is never written over."""
@@ -243,6 +275,8 @@ class Recorder(Node):
     def _close(self) -> None:
         if self._writer is not None and self._file is not None:
             self._bytes_before += self._writer.size
+            self._writer.flush()
+            self._note_closed()
             self._writer.close()
             self._file.close(whole=True)
             self._writer = self._file = None
@@ -254,6 +288,7 @@ class Recorder(Node):
         self._unflushed += 1
         try:
             self._writer.write_raw(raw)
+            self._reread.note(raw)
         except OSError as error:
             self._fail(error)
 
@@ -288,6 +323,7 @@ class Recorder(Node):
         self._file.close()
         path = self._file.path
         self._writer = self._file = None
+        self._reread.forget_open()
         self._lose(self._unflushed)  # at most: some of them may be in chunks that were written
         self._unflushed = 0
         self._retry_s = time.monotonic() + RETRY_S
@@ -404,6 +440,8 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     recall = recorder.recall(bus)
     recorder.take(recall.joined([raw for raw in head if not topics.find(raw.topic).latched], BEFORE_S))
     bus.answer("heard", recorder.heard)
+    bus.answer_messages("inventory", recorder.inventory)
+    bus.answer_messages("recorded", recorder.recorded)
     recall.come_round()
     while not options.stop.is_set():
         recorder.take(recall.complete(backlog.take(0.05)))

@@ -126,6 +126,10 @@ class RecordingWriter:
         self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})
         return channel
 
+    def channel_of(self, topic: str, source: str, start: int) -> int | None:
+        """Id of the channel of a run of a publisher on a topic; None before its first message."""
+        return self._channels.get((topic, source, start, self._platform, False))
+
     def flush(self) -> None:
         """Close the open chunk and hand everything to the operating system."""
         self._writer.flush()

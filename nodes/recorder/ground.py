@@ -1,0 +1,346 @@
+"""The recorder on the ground: one recording for each aircraft of a fleet, of all that came down.
+
+What did not come while a link was gone, or was too slow, is asked for: the recorder on board says which numbers it has
+of each stream (`query/inventory`), and gives those that are missing here (`query/recorded`), in portions, as fast as
+the aircraft's router allows.
+"""
+
+from __future__ import annotations
+
+import bisect
+import re
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from google.protobuf.message import DecodeError
+
+from ...schemas import messages as m
+from ...schemas import topics
+from ...schemas.envelope import RawMessage
+from ..bus.downlink import INVENTORY, SHARES, Share, share_of
+from ..bus.program import ProgramOptions
+from ..bus.session import Bus
+from ..bus.status import StatusPublisher
+from ..config import build
+from ..errors import UserError
+from ..node import Node
+from ..recording.reread import Stream
+from .recorder import Recorder
+
+#: The platform under which the ground speaks of itself.
+FLEET = "fleet"
+#: An aircraft is asked for its inventory so often, s; what it had then and is not here the next time is missing.
+INVENTORY_S = 5.0
+#: Messages of one question, at most; an aircraft cuts long answers, and is asked on.
+PORTION = 400
+#: An answer takes so long at most, s.
+ANSWER_S = 30.0
+#: Who answers for an aircraft.
+ANSWERS = frozenset({"router", "recorder"})
+#: Aircraft that are recorded, at most: names come over the link.
+MOST_AIRCRAFT = 200
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+class Numbers:
+    """A set of whole numbers, kept as runs."""
+
+    def __init__(self) -> None:
+        self._first: list[int] = []
+        self._last: list[int] = []
+
+    def add(self, number: int) -> bool:
+        """Take a number; False where it is there already."""
+        return self.add_run(number, number) > 0
+
+    def add_run(self, first: int, last: int) -> int:
+        """Take all numbers from first to last; returns how many are new."""
+        missing = self.missing(first, last)
+        i = bisect.bisect_left(self._last, first - 1)
+        j = bisect.bisect_right(self._first, last + 1)
+        if i < j:
+            first, last = min(first, self._first[i]), max(last, self._last[j - 1])
+        self._first[i:j], self._last[i:j] = [first], [last]
+        return sum(b - a + 1 for a, b in missing)
+
+    def missing(self, first: int, last: int) -> list[tuple[int, int]]:
+        """Runs between first and last, both included, that are not in the set."""
+        runs = []
+        for k in range(bisect.bisect_left(self._last, first), len(self._first)):
+            if self._first[k] > last:
+                break
+            if self._first[k] > first:
+                runs.append((first, self._first[k] - 1))
+            first = max(first, self._last[k] + 1)
+        if first <= last:
+            runs.append((first, last))
+        return runs
+
+
+class AircraftRecorder(Recorder):
+    """Records what comes from one aircraft, live or asked for, each message once.
+
+    Parameters
+    ----------
+    platform : the aircraft
+    output : path of the recording
+    whole : topics of which all messages are asked for, beside those of `bus.downlink.SHARES`
+    compression, rotate_mb, sign : see `Recorder`
+    """
+
+    def __init__(
+        self, platform: str, output: str, whole: tuple[str, ...] = (), compression: str = "none",
+        rotate_mb: float = 0, sign: str = "",
+    ) -> None:  # fmt: skip
+        super().__init__(output, compression, rotate_mb, sign)
+        self.platform = platform
+        self._whole = whole
+        self._here = threading.Lock()
+        self._held: dict[Stream, Numbers] = {}  # of thinned topics the multiples of their divisor
+        self._absent: dict[Stream, Numbers] = {}  # asked for, and not on board either
+        self._before: dict[Stream, int] = {}  # highest number of each stream in the inventory before
+        self._lacking = 0
+        self.filled = 0
+        self.heard_s = time.monotonic()
+
+    @property
+    def missing(self) -> int:
+        return self._lacking
+
+    def receive(self, raw: RawMessage) -> bool:
+        """Record a message if it is new."""
+        with self._here:
+            share, number = self._share(raw.topic), raw.envelope.sequence
+            stream = Stream(raw.topic, raw.envelope.source, raw.envelope.start)
+            every = 1 if share is None else share.every
+            if number % every == 0 and not self._held.setdefault(stream, Numbers()).add(number // every):
+                return False
+            self.take([raw])
+            return True
+
+    def tend(self) -> None:
+        with self._here:
+            super().tend()
+
+    def lacks(self, inventory: Any) -> list[tuple[Stream, Share, int, int]]:
+        """What the aircraft has for some time and is not here: stream, share, and lowest and highest multiple.
+
+        Parameters
+        ----------
+        inventory : an `m.Inventory` of its recorder
+        """
+        found = []
+        with self._here:
+            for entry in inventory.streams:
+                stream, share = Stream(entry.topic, entry.source, entry.start), self._share(entry.topic)
+                last = self._before.get(stream)
+                self._before[stream] = entry.last
+                if share is None or not share.filled or last is None:
+                    continue
+                first, last = -(-entry.first // share.every), last // share.every
+                absent = self._absent.setdefault(stream, Numbers())
+                for a, b in self._held.setdefault(stream, Numbers()).missing(first, last):
+                    found += [(stream, share, *run) for run in absent.missing(a, b)]
+            self._lacking = sum(b - a + 1 for _, _, a, b in found)
+        found.sort(key=lambda gap: (gap[1].turn, topics.rank(gap[0].topic)))
+        return found
+
+    def fill(self, raws: list[RawMessage], gap: tuple[Stream, Share, int, int], whole: bool) -> int:
+        """Take the answer to a question for a gap; returns the multiple from which to ask on.
+
+        Parameters
+        ----------
+        raws : messages, by number
+        gap : what was asked for: multiples of ``share.every`` from lowest to highest
+        whole : whether all came that its recorder has; the link or the aircraft's router may have cut the answer
+        """
+        stream, share, first, last = gap
+        came = [raw for raw in raws if raw.topic == stream.topic and raw.envelope.sequence % share.every == 0]
+        new = sum(self.receive(raw) for raw in came)
+        self.filled += new
+        upto = came[-1].envelope.sequence // share.every if came else last if whole else first - 1
+        with self._here:
+            self._lacking = max(self._lacking - new, 0)
+            if upto >= first:  # what lies before and did not come is not on board either
+                gone = self._held[stream].missing(first, upto)
+                self._lacking = max(self._lacking - sum(b - a + 1 for a, b in gone), 0)
+                for a, b in gone:
+                    self._absent[stream].add_run(a, b)
+        return upto + 1
+
+    def _share(self, topic: str) -> Share | None:
+        if topic in self._whole:
+            return Share(topic, SHARES[-1].turn)
+        return share_of(topic)
+
+
+class Ground(Node):
+    """Settings and state of the recorder on the ground.
+
+    Parameters
+    ----------
+    output : folder of the recordings, ``<aircraft>.mcap``
+    whole : topics that are asked for besides, every message, with commas between them; they come when nothing else does
+    compression, rotate_mb, sign : see `Recorder`
+    """
+
+    name = "ground"
+    inputs = tuple(share.topic for share in SHARES)
+    outputs = ()
+
+    def __init__(
+        self, output: str = "fleet", whole: str = "", compression: str = "none", rotate_mb: float = 0, sign: str = ""
+    ) -> None:
+        super().__init__()
+        self._output = Path(output)
+        self._whole = tuple(name.strip() for name in whole.split(",") if name.strip())
+        for topic in self._whole:
+            try:
+                row = topics.find(topic)
+            except KeyError:
+                raise ValueError(f"whole: unknown topic {topic!r}") from None
+            if not row.recorded:
+                raise ValueError(f"whole: {topic} is not recorded on board")
+        self._options = compression, rotate_mb, sign
+        self.aircraft: dict[str, AircraftRecorder] = {}
+        self._lock = threading.Lock()
+
+    def recorder_of(self, platform: str) -> AircraftRecorder | None:
+        """The recorder of an aircraft, made when it is heard first; None for what cannot be one."""
+        with self._lock:
+            found = self.aircraft.get(platform)
+            if found is not None or platform == FLEET:
+                return found
+            if not _NAME.fullmatch(platform) or len(self.aircraft) >= MOST_AIRCRAFT:
+                self.problem("refused", f"no recording of platform {platform[:64]!r}")
+                return None
+            made = AircraftRecorder(platform, str(self._output / f"{platform}.mcap"), self._whole, *self._options)
+            made.start()
+            self.aircraft[platform] = made
+            return made
+
+    def state(self) -> str:
+        missing = sum(aircraft.missing for aircraft in self.aircraft.values())
+        return f"{len(self.aircraft)} aircraft, " + (f"{missing} messages to come" if missing else "nothing missing")
+
+    def note(self) -> None:
+        """Bring counters and alarms up to date."""
+        for platform, aircraft in list(self.aircraft.items()):
+            self.counters[f"{platform} missing"] = aircraft.missing
+            self.counters[f"{platform} filled"] = aircraft.filled
+            self.alarms[platform] = f"{platform}: {aircraft.alarms['disk']}" if aircraft.alarms.get("disk") else ""
+
+
+def run(options: ProgramOptions) -> int:
+    """Record a fleet until told to stop."""
+    ground = build(Ground, options.tables, "ground")
+    folder = Path(ground._output)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made: {(error.strerror or str(error)).lower()}") from None
+    with Bus(FLEET, source="ground", port=options.port, file=options.bus_file, secure=options.secure) as bus:
+        if alone := bus.why_alone():
+            options.report(alone)
+        _record(ground, bus, options)
+    for platform, aircraft in sorted(ground.aircraft.items()):
+        aircraft.close()
+        total = sum(c.received for c in aircraft.statistics.values())
+        files = ", ".join(map(str, aircraft.files))
+        options.report(f"{platform}: {total} messages in {files}, {aircraft.filled} of them asked for; "
+                       f"{aircraft.missing} missing")  # fmt: skip
+    return 0
+
+
+def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
+    alive: set[tuple[str, str]] = set()
+    filling: dict[str, threading.Thread] = {}
+
+    def changed(platform: str, node: str, there: bool) -> None:
+        if node in ANSWERS:
+            (alive.add if there else alive.discard)((platform, node))
+
+    def receive(platform: str, raw: RawMessage) -> None:
+        aircraft = ground.recorder_of(platform) if share_of_known(raw.topic) else None
+        if aircraft is not None:
+            aircraft.heard_s = time.monotonic()
+            aircraft.receive(raw)
+
+    def malformed(topic: str, why: str) -> None:
+        ground.problem("malformed", f"{topic}: {why}")
+
+    for name in ground.inputs:
+        bus.hear(name, receive, malformed)
+    bus.watch_fleet(changed)
+    bus.announce("ground")
+    status = StatusPublisher(bus, "ground")
+    while not options.stop.wait(0.1):
+        for platform, aircraft in list(ground.aircraft.items()):
+            aircraft.tend()
+            if platform not in filling:
+                options.report(f"{platform}: recording to {aircraft.files[-1]}")
+                arguments = (aircraft, bus, options, lambda platform=platform: any(p == platform for p, _ in alive))
+                filling[platform] = threading.Thread(target=_fill, args=arguments, name=f"fill {platform}")
+                filling[platform].start()
+        ground.note()
+        if status.due():
+            status.publish(ground.state(), {}, ground, 0.0, 0, 0)
+    for thread in filling.values():
+        thread.join()
+
+
+def share_of_known(topic: str) -> bool:
+    """Whether a topic is in the table of topics."""
+    try:
+        topics.find(topic)
+    except KeyError:
+        return False
+    return True
+
+
+def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked: Any) -> None:
+    """Ask an aircraft for what is missing, as long as there is a link."""
+    told = 0
+    while not options.stop.wait(INVENTORY_S):
+        if not linked():
+            continue
+        try:
+            answers = list(bus.ask("inventory", ANSWER_S, aircraft.platform))
+            inventory = next((m.Inventory.FromString(raw.data) for raw in answers if raw.topic == INVENTORY), None)
+        except (ValueError, DecodeError):
+            continue
+        if inventory is None:
+            continue
+        gaps = aircraft.lacks(inventory)
+        if gaps and not told:
+            options.report(f"{aircraft.platform}: {aircraft.missing} messages are missing, and asked for")
+        told += len(gaps)
+        for gap in gaps:
+            if not _fill_gap(aircraft, bus, gap, options):
+                break
+        if told and not aircraft.missing:
+            options.report(f"{aircraft.platform}: nothing is missing, {aircraft.filled} messages were asked for")
+            told = 0
+
+
+def _fill_gap(aircraft: AircraftRecorder, bus: Bus, gap: tuple[Stream, Share, int, int], options: Any) -> bool:
+    """Ask for one gap; False where the link is gone again."""
+    stream, share, first, end = gap
+    while first <= end and not options.stop.is_set():
+        last = min(first + PORTION - 1, end)
+        raws: list[RawMessage] = []
+        try:
+            question = {"first": first * share.every, "last": last * share.every, "every": share.every}
+            for raw in bus.ask("recorded", ANSWER_S, aircraft.platform, **stream._asdict(), **question):
+                raws.append(raw)
+                aircraft.heard_s = time.monotonic()
+        except ValueError:  # what came counts
+            pass
+        whole = bool(raws) and raws[-1].topic == INVENTORY
+        on = aircraft.fill(raws, (stream, share, first, last), whole)
+        if on == first:
+            return False
+        first = on
+    return True

@@ -1,0 +1,222 @@
+"""``triline node router``: by its bundle the router of an aircraft, or one on the ground.
+
+On the ground it is a Zenoh router with the access list of the bundle. On board it stands between two sessions: one
+among the nodes of the aircraft, one that calls the ground. From board to ground it hands on what `bus.downlink` names,
+in its order, at so many bytes a second; from the ground it takes verdicts and questions. Neither a slow link nor one
+that is gone ever makes a node on board wait, and nothing on board can be reached from the ground past it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+from ...schemas import topics
+from ...schemas.envelope import RawMessage
+from ..bus.authority import AIRCRAFT, ROUTER, UPLINK_TOPICS
+from ..bus.downlink import (
+    GAPS,
+    PORTION_BYTES,
+    QUESTIONS,
+    SHARES,
+    Meter,
+    Waiting,
+    asked,
+    cost,
+    for_the_link,
+    share_of,
+)
+from ..bus.program import ProgramOptions
+from ..bus.session import Bus, routing
+from ..bus.status import StatusPublisher
+from ..config import build
+from ..errors import UserError
+from ..node import Node
+from ..ordering import TopicCounts
+
+#: The ground is called again after so long where it does not answer, s.
+CALL_AGAIN_S = 1.0
+#: Answers of nodes on board take so long at most, s.
+ANSWER_S = 10.0
+
+
+class OnBoardRouter(Node):
+    """What an on-board router does between two sessions.
+
+    Parameters
+    ----------
+    bytes_s : bytes a second that go down at most, all that the link carries counted; 0 = no limit
+    """
+
+    name = "router"
+    inputs = tuple(share.topic for share in SHARES)
+    outputs = ()
+
+    def __init__(self, bytes_s: float = 64_000) -> None:
+        super().__init__()
+        if bytes_s < 0:
+            raise ValueError(f"bytes_s is {bytes_s}, wanted 0 or more")
+        self.waiting = Waiting()
+        self.meter = Meter(bytes_s)
+        self.sent: Counter[str] = Counter()
+        self.newest_ns = 0
+        self.linked = False
+        self._stop = threading.Event()
+
+    def state(self) -> str:
+        sent = f"{self.meter.passed / 1e6:.1f} MB down"
+        return f"linked, {sent}" if self.linked else f"no link to the ground, {sent}"
+
+    def take(self, raw: RawMessage) -> None:
+        """A message of a node on board; never waits."""
+        share = share_of(raw.topic)
+        if share is None or raw.envelope.sequence % share.every:
+            return
+        if not raw.topic.startswith("status/"):
+            self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
+        if not self.linked and not topics.find(raw.topic).latched:
+            return  # the ground asks for it when it is back
+        try:
+            self.waiting.put(for_the_link(raw), share.turn)
+        except ValueError as error:
+            self.problem("malformed", f"{raw.topic}: {error}")
+
+    def send(self, ground: Bus, timeout_s: float) -> None:
+        """Send the next message that waits, at its turn."""
+        found = self.waiting.take(timeout_s)
+        if found is None:
+            return
+        raw, turn = found
+        if not self.linked and not topics.find(raw.topic).latched:
+            return
+        if self.meter.let_pass(cost(raw), turn, self._stop.is_set):
+            ground.publish_raw(raw)
+            self.sent[raw.topic] += 1
+
+    def answer(self, board: Bus, name: str, parameters: dict[str, str]) -> Iterator[RawMessage]:
+        """Answers of nodes on board, as fast as the link allows; a long one is cut, the ground asks on.
+
+        Raises
+        ------
+        ValueError : a question for what stays on board, or the refusal of who was asked
+        """
+        if name == "recorded":
+            topic = asked(parameters).topic
+            if topic.startswith("sensor/lines/"):
+                raise ValueError(f"{topic} stays on board")
+        spent = 0
+        for raw in board.ask(name, ANSWER_S, **parameters):
+            small = for_the_link(raw)
+            if spent > PORTION_BYTES:
+                return
+            if not self.meter.let_pass(cost(small), GAPS, self._stop.is_set):
+                raise ValueError("the router ends")
+            spent += cost(small)
+            yield small
+
+    def statistics(self) -> dict[str, TopicCounts]:
+        """Messages sent, by topic."""
+        return {topic: TopicCounts(received=n) for topic, n in self.sent.items()}
+
+    def end(self) -> None:
+        """Let go of whoever waits for the link."""
+        self._stop.set()
+
+
+def run(options: ProgramOptions) -> int:
+    """Route until told to stop."""
+    secure = options.secure
+    if secure is None:
+        raise UserError("wanted --secure BUNDLE: of a router on the ground, or of an aircraft that calls one")
+    if secure.kind == ROUTER:
+        return _on_the_ground(options)
+    if secure.kind != AIRCRAFT:
+        raise UserError(f"--secure {secure.folder}: is of a {secure.kind}, wanted that of a router or an aircraft")
+    if secure.ground_link is None:
+        raise UserError(
+            f"--secure {secure.folder}: this aircraft calls no router; certify it with `triline keys aircraft "
+            f"{secure.name} --router HOST`"
+        )
+    return _on_board(options)
+
+
+def _on_the_ground(options: ProgramOptions) -> int:
+    assert options.secure is not None
+    with routing(options.secure.configuration) as linked:
+        options.report(f"router {options.secure.name} on port {options.secure.port}")
+        before = 0
+        while not options.stop.wait(1.0):
+            now = linked()
+            if now != before:
+                options.report(f"router {options.secure.name}: {now} linked")
+                before = now
+    options.report(f"router {options.secure.name} stopped")
+    return 0
+
+
+def _on_board(options: ProgramOptions) -> int:
+    router = build(OnBoardRouter, options.tables, "router")
+    with options.open_bus() as board:
+        ground = _call(options)
+        if ground is None:
+            return 0
+        with ground:
+            _between(router, board, ground, options)
+    left = f", {router.waiting.left_out} left out (the ground asks for them)" if router.waiting.left_out else ""
+    options.report(f"router stopped; {router.meter.passed / 1e6:.1f} MB down{left}")
+    return 0
+
+
+def _call(options: ProgramOptions) -> Bus | None:
+    """The session to the ground, as soon as a router answers there; None when told to stop before."""
+    assert options.secure is not None
+    told = ""
+    while not options.stop.is_set():
+        try:
+            return Bus(options.platform, source="router", file=options.secure.ground_link, keep=False)
+        except UserError as error:
+            why = f"no link to the ground: {error}"
+            if why != told:
+                options.report(why)
+                told = why
+        options.stop.wait(CALL_AGAIN_S)
+    return None
+
+
+def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOptions) -> None:
+    """Hand on between two sessions until told to stop."""
+
+    def questions(name: str) -> None:
+        ground.answer_messages(name, lambda parameters: router.answer(board, name, parameters))
+
+    def sender() -> None:
+        while not options.stop.is_set():
+            router.send(ground, 0.1)
+
+    ground.announce("router")
+    for name in QUESTIONS:
+        questions(name)
+    for topic in UPLINK_TOPICS:
+        ground.subscribe(topic, board.publish_raw)
+    for name in router.inputs:
+        board.subscribe(name, router.take)
+    board.announce("router")
+    sending = threading.Thread(target=sender, name="downlink")
+    sending.start()
+    status = StatusPublisher(board, "router")
+    told = None
+    while not options.stop.wait(0.1):
+        router.linked = ground.peers() > 0
+        if router.linked != told:
+            told = router.linked
+            options.report(f"router: {router.state()}")
+        router.counters["left out"] = router.waiting.left_out
+        router.counters["bytes"] = router.meter.passed
+        if status.due():
+            queued = len(router.waiting)
+            status.publish(router.state(), router.statistics(), router, 0.0, queued, router.newest_ns)
+    router.end()
+    sending.join()
+    time.sleep(0.1)
