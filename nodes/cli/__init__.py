@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "fly": ("fly", "the live system on real sensors, from a flight folder"),
     "simulate": ("simulate", "a flight recording with truth, from a seed"),
     "node": ("node", "one node alone, for running across machines"),
+    "monitor": ("monitor", "health of a platform, or of all aircraft of a fleet"),
     "confirm": ("confirm", "confirm or reject a signalised point in a running system"),
     "keys": ("keys", "certificates and access lists for encrypted platforms"),
     "replay": ("replay", "play a recording onto the bus with its timing"),

@@ -103,6 +103,8 @@ class AircraftRecorder(Recorder):
         self._before: dict[Stream, int] = {}  # highest number of each stream in the inventory before
         self._lacking = 0
         self.filled = 0
+        #: Messages that were here neither now nor at the inventory before, and are asked for.
+        self.settled = 0
         self.heard_s = time.monotonic()
 
     @property
@@ -120,6 +122,10 @@ class AircraftRecorder(Recorder):
             self.take([raw])
             return True
 
+    def every(self, topic: str) -> int:
+        share = self._share(topic)
+        return 1 if share is None else share.every
+
     def tend(self) -> None:
         with self._here:
             super().tend()
@@ -131,19 +137,25 @@ class AircraftRecorder(Recorder):
         ----------
         inventory : an `m.Inventory` of its recorder
         """
-        found = []
+        found, lacking = [], 0
         with self._here:
             for entry in inventory.streams:
                 stream, share = Stream(entry.topic, entry.source, entry.start), self._share(entry.topic)
-                last = self._before.get(stream)
+                before = self._before.get(stream, -1)
                 self._before[stream] = entry.last
-                if share is None or not share.filled or last is None:
+                if share is None or not share.filled:
                     continue
-                first, last = -(-entry.first // share.every), last // share.every
+                first, last = -(-entry.first // share.every), entry.last // share.every
+                held = self._held.setdefault(stream, Numbers())
                 absent = self._absent.setdefault(stream, Numbers())
-                for a, b in self._held.setdefault(stream, Numbers()).missing(first, last):
-                    found += [(stream, share, *run) for run in absent.missing(a, b)]
-            self._lacking = sum(b - a + 1 for _, _, a, b in found)
+                for run in held.missing(first, last):
+                    for a, b in absent.missing(*run):
+                        lacking += b - a + 1
+                        b = min(b, before // share.every)  # what is newer may be on its way
+                        if a <= b:
+                            found.append((stream, share, a, b))
+            self._lacking = lacking
+            self.settled = sum(b - a + 1 for _, _, a, b in found)
         found.sort(key=lambda gap: (gap[1].turn, topics.rank(gap[0].topic)))
         return found
 
@@ -162,10 +174,11 @@ class AircraftRecorder(Recorder):
         self.filled += new
         upto = came[-1].envelope.sequence // share.every if came else last if whole else first - 1
         with self._here:
-            self._lacking = max(self._lacking - new, 0)
+            self._lacking, self.settled = max(self._lacking - new, 0), max(self.settled - new, 0)
             if upto >= first:  # what lies before and did not come is not on board either
                 gone = self._held[stream].missing(first, upto)
-                self._lacking = max(self._lacking - sum(b - a + 1 for a, b in gone), 0)
+                absent = sum(b - a + 1 for a, b in gone)
+                self._lacking, self.settled = max(self._lacking - absent, 0), max(self.settled - absent, 0)
                 for a, b in gone:
                     self._absent[stream].add_run(a, b)
         return upto + 1
@@ -194,7 +207,7 @@ class Ground(Node):
         self, output: str = "fleet", whole: str = "", compression: str = "none", rotate_mb: float = 0, sign: str = ""
     ) -> None:
         super().__init__()
-        self._output = Path(output)
+        self.folder = Path(output)
         self._whole = tuple(name.strip() for name in whole.split(",") if name.strip())
         for topic in self._whole:
             try:
@@ -216,7 +229,7 @@ class Ground(Node):
             if not _NAME.fullmatch(platform) or len(self.aircraft) >= MOST_AIRCRAFT:
                 self.problem("refused", f"no recording of platform {platform[:64]!r}")
                 return None
-            made = AircraftRecorder(platform, str(self._output / f"{platform}.mcap"), self._whole, *self._options)
+            made = AircraftRecorder(platform, str(self.folder / f"{platform}.mcap"), self._whole, *self._options)
             made.start()
             self.aircraft[platform] = made
             return made
@@ -236,7 +249,7 @@ class Ground(Node):
 def run(options: ProgramOptions) -> int:
     """Record a fleet until told to stop."""
     ground = build(Ground, options.tables, "ground")
-    folder = Path(ground._output)
+    folder = ground.folder
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -263,7 +276,7 @@ def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
             (alive.add if there else alive.discard)((platform, node))
 
     def receive(platform: str, raw: RawMessage) -> None:
-        aircraft = ground.recorder_of(platform) if share_of_known(raw.topic) else None
+        aircraft = ground.recorder_of(platform) if is_known(raw.topic) else None
         if aircraft is not None:
             aircraft.heard_s = time.monotonic()
             aircraft.receive(raw)
@@ -291,7 +304,7 @@ def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
         thread.join()
 
 
-def share_of_known(topic: str) -> bool:
+def is_known(topic: str) -> bool:
     """Whether a topic is in the table of topics."""
     try:
         topics.find(topic)
@@ -315,13 +328,13 @@ def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked:
             continue
         gaps = aircraft.lacks(inventory)
         if gaps and not told:
-            options.report(f"{aircraft.platform}: {aircraft.missing} messages are missing, and asked for")
+            options.report(f"{aircraft.platform}: {aircraft.settled} messages are missing, and asked for")
         told += len(gaps)
         for gap in gaps:
             if not _fill_gap(aircraft, bus, gap, options):
                 break
-        if told and not aircraft.missing:
-            options.report(f"{aircraft.platform}: nothing is missing, {aircraft.filled} messages were asked for")
+        if told and not aircraft.settled:
+            options.report(f"{aircraft.platform}: nothing is missing any more, {aircraft.filled} came when asked for")
             told = 0
 
 

@@ -150,6 +150,10 @@ class Recorder(Node):
         """Asks for what this recorder has missed."""
         return Recall(bus, self.inputs, self._check)
 
+    def every(self, topic: str) -> int:
+        """Of a topic only messages whose number this divides come."""
+        return 1
+
     def state(self) -> str:
         return "recording" if self._writer is not None else f"not recording: {self.last_problem}"
 
@@ -242,7 +246,12 @@ class Recorder(Node):
         path = self._next_path()
         self._file = RecordingFile(path, self._bundle)
         try:
-            self._writer = RecordingWriter(self._file, self._compression, platform=self.platform)  # type: ignore[arg-type]
+            self._writer = RecordingWriter(
+                self._file,  # type: ignore[arg-type]
+                self._compression,
+                platform=self.platform,
+                every=self.every,
+            )
             for raw in self._latched if number else ():
                 self._writer.write_raw(raw)
             if number:

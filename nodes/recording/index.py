@@ -14,7 +14,13 @@ CHANNEL_METADATA = "triline.channel"
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel of a recording; ``known`` where topic and type are in the topic table."""
+    """A channel of a recording.
+
+    Attributes
+    ----------
+    known : whether topic and type are in the topic table
+    every : only messages whose number this divides are meant to be there
+    """
 
     id: int
     topic: str
@@ -23,6 +29,7 @@ class Channel:
     platform: str
     start: int
     known: bool
+    every: int = 1
 
 
 #: Times beyond are taken for it: the index holds signed numbers.

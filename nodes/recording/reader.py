@@ -215,10 +215,11 @@ class RecordingReader:
         type_name = wanted if type_name is None else type_name
         if metadata.get("copy"):
             self._copies.add(number)
-        start = metadata.get("start", "0")
+        start, every = (metadata.get(name, "") for name in ("start", "every"))
         self.channels[number] = Channel(
             number, topic, type_name or "", metadata.get("source", ""), metadata.get("platform", ""),
             int(start) if start.isdigit() else 0, wanted is not None and wanted == type_name,
+            max(int(every), 1) if every.isdigit() else 1,
         )  # fmt: skip
 
     # ---- messages

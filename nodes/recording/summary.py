@@ -59,7 +59,8 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
         row.messages += len(chosen)
         if channel.known:
             distinct = np.unique(sequences)
-            row.gaps += int(distinct[-1] - distinct[0]) + 1 - len(distinct)
+            meant = distinct[distinct % channel.every == 0] // channel.every
+            row.gaps += int(meant[-1] - meant[0]) + 1 - len(meant) if len(meant) else 0
             row.duplicates += len(sequences) - len(distinct)
             if not topics.find(channel.topic).latched and topics.find(channel.topic).family is not Family.STATUS:
                 row.backwards += int((np.diff(stamps[np.argsort(sequences, kind="stable")]) < 0).sum())

@@ -9,6 +9,7 @@ the source; so a recording explains itself and keeps both times apart.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
@@ -35,6 +36,8 @@ class RecordingWriter:
     compression : ``none``, ``lz4`` or ``zstd``
     platform : name of the platform, kept with each channel
     chunk_size : bytes after which a chunk is closed
+    every : of a topic only each message whose number this divides is meant to be there (`bus.downlink`); kept with each
+        channel, so that the others are not taken for lost
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class RecordingWriter:
         *,
         platform: str = "demo",
         chunk_size: int = 1 << 20,
+        every: Callable[[str], int] = lambda topic: 1,
     ) -> None:
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
@@ -53,6 +57,7 @@ class RecordingWriter:
         )
         self._writer = Writer(self._stream, chunk_size, COMPRESSIONS[compression], enable_data_crcs=True)
         self._platform = platform
+        self._every = every
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str, int, str, bool], int] = {}
         self._configuring: dict[str, bool] = {}  # topics that were met
@@ -121,6 +126,8 @@ class RecordingWriter:
             metadata["start"] = str(start)
         if copy:
             metadata["copy"] = "yes"
+        if self._every(topic) > 1:
+            metadata["every"] = str(self._every(topic))
         channel = self._writer.register_channel(topic, MessageEncoding.Protobuf, schema, metadata)
         # A channel stands in the first chunk that uses it; written once more outside chunks it survives that chunk.
         self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})
