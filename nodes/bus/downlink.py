@@ -35,6 +35,8 @@ PATIENCE_S = 3.0
 THUMBNAIL = 32
 #: Bytes of messages in one answer of a gap, about: an answer that the link cuts is asked for again as a whole.
 PORTION_BYTES = 60_000
+#: Runs of numbers and messages in one question, at most.
+MOST_RUNS, MOST_ASKED = 60, 500
 
 
 @dataclass(frozen=True)
@@ -89,32 +91,32 @@ def share_of(topic: str) -> Share | None:
 
 
 class Asked(NamedTuple):
-    """A question for messages: those of a run of a publisher on a topic with numbers from first to last, both included,
-    that ``every`` divides."""
+    """A question for messages: those of a run of a publisher on a topic whose numbers lie in ``runs`` (first and last,
+    both included) and are divided by ``every``."""
 
     topic: str
     source: str
     start: int
-    first: int
-    last: int
+    runs: list[tuple[int, int]]
     every: int
 
 
 def asked(parameters: dict[str, str]) -> Asked:
-    """The question in the parameters of a query.
+    """The question in the parameters of a query: topic, source, start, every, runs (``5-9,12-12``).
 
     Raises
     ------
-    ValueError : one is missing or no number
+    ValueError : one is missing or makes no sense
     """
     try:
-        start, first, last, every = (int(parameters[name]) for name in ("start", "first", "last", "every"))
+        runs = [(int(a), int(b)) for a, _, b in (run.partition("-") for run in parameters["runs"].split(","))]
+        start, every = int(parameters["start"]), int(parameters["every"])
         topic, source = parameters["topic"], parameters["source"]
     except (KeyError, ValueError):
-        raise ValueError("wanted topic, source, start, first, last and every") from None
-    if every < 1 or first > last:
-        raise ValueError(f"first {first}, last {last}, every {every}: wanted first <= last and every >= 1")
-    return Asked(topic, source, start, first, last, every)
+        raise ValueError("wanted topic, source, start, every and runs") from None
+    if every < 1 or len(runs) > MOST_RUNS or sum(b - a for a, b in runs) > MOST_ASKED * every:
+        raise ValueError(f"wanted at most {MOST_RUNS} runs and {MOST_ASKED} messages")
+    return Asked(topic, source, start, runs, every)
 
 
 def for_the_link(raw: RawMessage) -> RawMessage:

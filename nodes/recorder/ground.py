@@ -11,6 +11,8 @@ import bisect
 import re
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from google.protobuf.message import DecodeError
 from ...schemas import messages as m
 from ...schemas import topics
 from ...schemas.envelope import RawMessage
-from ..bus.downlink import INVENTORY, SHARES, Share, share_of
+from ..bus.downlink import INVENTORY, MOST_ASKED, MOST_RUNS, SHARES, Share, share_of
 from ..bus.program import ProgramOptions
 from ..bus.session import Bus
 from ..bus.status import StatusPublisher
@@ -33,8 +35,6 @@ from .recorder import Recorder
 FLEET = "fleet"
 #: An aircraft is asked for its inventory so often, s; what it had then and is not here the next time is missing.
 INVENTORY_S = 5.0
-#: Messages of one question, at most; an aircraft cuts long answers, and is asked on.
-PORTION = 400
 #: An answer takes so long at most, s.
 ANSWER_S = 30.0
 #: Who answers for an aircraft.
@@ -42,6 +42,15 @@ ANSWERS = frozenset({"router", "recorder"})
 #: Aircraft that are recorded, at most: names come over the link.
 MOST_AIRCRAFT = 200
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Messages of a stream that are missing: runs of multiples of ``share.every``, first and last, in order."""
+
+    stream: Stream
+    share: Share
+    runs: list[tuple[int, int]]
 
 
 class Numbers:
@@ -130,8 +139,8 @@ class AircraftRecorder(Recorder):
         with self._here:
             super().tend()
 
-    def lacks(self, inventory: Any) -> list[tuple[Stream, Share, int, int]]:
-        """What the aircraft has for some time and is not here: stream, share, and lowest and highest multiple.
+    def lacks(self, inventory: Any) -> list[Gap]:
+        """What the aircraft has for some time and is not here, what is wanted first before the rest.
 
         Parameters
         ----------
@@ -145,43 +154,42 @@ class AircraftRecorder(Recorder):
                 self._before[stream] = entry.last
                 if share is None or not share.filled:
                     continue
-                first, last = -(-entry.first // share.every), entry.last // share.every
                 held = self._held.setdefault(stream, Numbers())
                 absent = self._absent.setdefault(stream, Numbers())
-                for run in held.missing(first, last):
-                    for a, b in absent.missing(*run):
-                        lacking += b - a + 1
-                        b = min(b, before // share.every)  # what is newer may be on its way
-                        if a <= b:
-                            found.append((stream, share, a, b))
+                first, last = -(-entry.first // share.every), entry.last // share.every
+                runs = [run for gap in held.missing(first, last) for run in absent.missing(*gap)]
+                lacking += _count(runs)
+                old = before // share.every  # what is newer may be on its way
+                runs = [(a, min(b, old)) for a, b in runs if a <= old]
+                if runs:
+                    found.append(Gap(stream, share, runs))
             self._lacking = lacking
-            self.settled = sum(b - a + 1 for _, _, a, b in found)
-        found.sort(key=lambda gap: (gap[1].turn, topics.rank(gap[0].topic)))
+            self.settled = sum(_count(gap.runs) for gap in found)
+        found.sort(key=lambda gap: (gap.share.turn, topics.rank(gap.stream.topic)))
         return found
 
-    def fill(self, raws: list[RawMessage], gap: tuple[Stream, Share, int, int], whole: bool) -> int:
-        """Take the answer to a question for a gap; returns the multiple from which to ask on.
+    def fill(self, raws: list[RawMessage], gap: Gap, whole: bool) -> list[tuple[int, int]]:
+        """Take the answer to a question for a gap; returns the runs that are still to be asked for.
 
         Parameters
         ----------
         raws : messages, by number
-        gap : what was asked for: multiples of ``share.every`` from lowest to highest
+        gap : what was asked for
         whole : whether all came that its recorder has; the link or the aircraft's router may have cut the answer
         """
-        stream, share, first, last = gap
-        came = [raw for raw in raws if raw.topic == stream.topic and raw.envelope.sequence % share.every == 0]
+        stream, every = gap.stream, gap.share.every
+        came = [raw for raw in raws if raw.topic == stream.topic and raw.envelope.sequence % every == 0]
         new = sum(self.receive(raw) for raw in came)
         self.filled += new
-        upto = came[-1].envelope.sequence // share.every if came else last if whole else first - 1
+        upto = gap.runs[-1][1] if whole else came[-1].envelope.sequence // every if came else -1
         with self._here:
-            self._lacking, self.settled = max(self._lacking - new, 0), max(self.settled - new, 0)
-            if upto >= first:  # what lies before and did not come is not on board either
-                gone = self._held[stream].missing(first, upto)
-                absent = sum(b - a + 1 for a, b in gone)
-                self._lacking, self.settled = max(self._lacking - absent, 0), max(self.settled - absent, 0)
-                for a, b in gone:
-                    self._absent[stream].add_run(a, b)
-        return upto + 1
+            # what lies before and did not come is not on board either
+            gone = [run for a, b in gap.runs if a <= upto for run in self._held[stream].missing(a, min(b, upto))]
+            for a, b in gone:
+                self._absent[stream].add_run(a, b)
+            done = new + _count(gone)
+            self._lacking, self.settled = max(self._lacking - done, 0), max(self.settled - done, 0)
+        return [(max(a, upto + 1), b) for a, b in gap.runs if b > upto]
 
     def _share(self, topic: str) -> Share | None:
         if topic in self._whole:
@@ -313,7 +321,7 @@ def is_known(topic: str) -> bool:
     return True
 
 
-def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked: Any) -> None:
+def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked: Callable[[], bool]) -> None:
     """Ask an aircraft for what is missing, as long as there is a link."""
     told = 0
     while not options.stop.wait(INVENTORY_S):
@@ -338,22 +346,42 @@ def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked:
             told = 0
 
 
-def _fill_gap(aircraft: AircraftRecorder, bus: Bus, gap: tuple[Stream, Share, int, int], options: Any) -> bool:
+def _fill_gap(aircraft: AircraftRecorder, bus: Bus, gap: Gap, options: ProgramOptions) -> bool:
     """Ask for one gap; False where the link is gone again."""
-    stream, share, first, end = gap
-    while first <= end and not options.stop.is_set():
-        last = min(first + PORTION - 1, end)
+    left = gap.runs
+    while left and not options.stop.is_set():
+        part, left = portion(left)
+        text = ",".join(f"{a * gap.share.every}-{b * gap.share.every}" for a, b in part)
         raws: list[RawMessage] = []
         try:
-            question = {"first": first * share.every, "last": last * share.every, "every": share.every}
-            for raw in bus.ask("recorded", ANSWER_S, aircraft.platform, **stream._asdict(), **question):
+            question = {**gap.stream._asdict(), "every": gap.share.every, "runs": text}
+            for raw in bus.ask("recorded", ANSWER_S, aircraft.platform, **question):
                 raws.append(raw)
                 aircraft.heard_s = time.monotonic()
         except ValueError:  # what came counts
             pass
         whole = bool(raws) and raws[-1].topic == INVENTORY
-        on = aircraft.fill(raws, (stream, share, first, last), whole)
-        if on == first:
+        rest = aircraft.fill(raws, Gap(gap.stream, gap.share, part), whole)
+        if rest == part:
             return False
-        first = on
+        left = rest + left
     return True
+
+
+def portion(runs: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Runs that fit into one question, and those that are left."""
+    part: list[tuple[int, int]] = []
+    room = MOST_ASKED
+    for k, (a, b) in enumerate(runs):
+        if not room or len(part) == MOST_RUNS:
+            return part, runs[k:]
+        end = min(b, a + room - 1)
+        part.append((a, end))
+        room -= end - a + 1
+        if end < b:
+            return part, [(end + 1, b), *runs[k + 1 :]]
+    return part, []
+
+
+def _count(runs: list[tuple[int, int]]) -> int:
+    return sum(b - a + 1 for a, b in runs)

@@ -196,7 +196,7 @@ class Recorder(Node):
         return [RawMessage(INVENTORY, Envelope(self.newest_ns, self.name, 0), codec.encode(body))]
 
     def recorded(self, parameters: dict[str, str]) -> list[RawMessage]:
-        """``query/recorded?topic=..;source=..;start=..;first=..;last=..;every=..``: messages by their numbers.
+        """``query/recorded?topic=..;source=..;start=..;runs=..;every=..``: messages by their numbers.
 
         An empty inventory behind them says that these are all.
 
@@ -204,9 +204,9 @@ class Recorder(Node):
         ------
         ValueError : parameters that are missing or no numbers
         """
-        topic, source, start, first, last, every = asked(parameters)
+        topic, source, start, runs, every = asked(parameters)
         end = RawMessage(INVENTORY, Envelope(self.newest_ns, self.name, 0), b"")
-        return [*self._reread.read(Stream(topic, source, start), first, last, every), end]
+        return [*self._reread.read(Stream(topic, source, start), runs, every), end]
 
     def tend(self) -> None:
         """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""

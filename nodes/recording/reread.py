@@ -11,6 +11,7 @@ from __future__ import annotations
 import mmap
 import threading
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -79,8 +80,8 @@ class Reread:
         with self._lock:
             return {stream: (min(marks.lowest), max(marks.highest)) for stream, marks in self._marks.items()}
 
-    def read(self, stream: Stream, first: int, last: int, every: int = 1) -> list[RawMessage]:
-        """Messages of a stream with numbers from first to last, both included, that ``every`` divides; by number.
+    def read(self, stream: Stream, runs: Sequence[tuple[int, int]], every: int = 1) -> list[RawMessage]:
+        """Messages of a stream with numbers in runs (first and last, both included) that ``every`` divides; by number.
 
         Stretches that are gone from the disk are passed over.
         """
@@ -89,14 +90,14 @@ class Reread:
             found = [
                 self._stretches[stretch]
                 for stretch, lowest, highest in zip(marks.stretch, marks.lowest, marks.highest, strict=True)
-                if lowest <= last and highest >= first
+                if any(lowest <= last and highest >= first for first, last in runs)
             ]
             channels = {path: self._channels.get((path, stream)) for path, _, _ in found}
         wanted: dict[int, RawMessage] = {}
         for path, begin, end in found:
             channel = channels[path]
             for number, log_ns, stamp_ns, data in () if channel is None else _messages(path, begin, end, channel):
-                if first <= number <= last and number % every == 0:
+                if number % every == 0 and any(first <= number <= last for first, last in runs):
                     envelope = Envelope(stamp_ns, stream.source, number, stream.start)
                     wanted[number] = RawMessage(stream.topic, envelope, data, log_ns)
         return [wanted[number] for number in sorted(wanted)]
