@@ -6,15 +6,15 @@ Two ground stations (*east* and *west*, two aircraft each by a link of their own
 which a recorder, a desk and forgers work: each place is a namespace, each link a pair of virtual interfaces, and all
 links are encrypted with bundles of `triline keys`. Each aircraft flies one strip of a block of four that overlap:
 `triline replay` of its sensors and tie points into recorder, navigator, adjuster and router. The link of *a1* is taken
-away for ``--cut`` seconds; *a2* may send a quarter of what the others may; on the links of *a3* and *a4* the kernel lets
-half of their limit through (`tc`, where it is there), so that those links are slower than their routers know.
+away for ``--cut`` seconds; *a2* may send half of what the others may; on the links of *a3* and *a4* the kernel
+lets half of their limit through (`tc`, where it is there), so that those links are slower than their routers know.
 
 - *may*, *sent*, *peak*: bytes a second that the router on board may send, and what the interface at the station
   counted, on average until all was there and in the fullest 10 s, kB/s; all headers included
 - *live*, *asked*: messages of lossless topics in the recording of the ground: those that came by themselves, and those
   that the ground asked for
 - *lost*: messages that the recorder on board has and the ground wants, and has not, or not byte for byte
-- *after*: from the end of the cut (for others: of the flight) until nothing was missing, s
+- *after*: from the end of the cut (for others: of the flight) until all that was recorded on board by then was here, s
 - *block*: sigma0 of `triline adjust` on the recording of the ground
 - *forged*: publications under the name of the next aircraft by one with this aircraft's certificate that the office
   heard, and of those by a desk; each tries 200 times. "own": as many under its own name, which must be heard.
@@ -239,7 +239,7 @@ def everything(network: Network, folder: Path, limit: float) -> Iterator[tuple[P
         running["ground"] = programs.start("office", "ground", ground)
         for aircraft in STATIONS:
             secure = ["--secure", str(keys / aircraft)]
-            may = limit / 4 if aircraft == "a2" else limit
+            may = limit / 2 if aircraft == "a2" else limit
             more = {
                 "recorder": ["-o", str(folder / f"{aircraft}.mcap")],
                 "router": ["--set", f"bytes_s={may}"],
@@ -250,20 +250,25 @@ def everything(network: Network, folder: Path, limit: float) -> Iterator[tuple[P
         yield programs, running
 
 
-def compared(board: Path, ground: Path) -> tuple[int, int]:
-    """How many messages of lossless topics the ground should have, and how many of them it has not, byte for byte."""
+def compared(board: Path, ground: Path, moment_ns: int) -> tuple[int, int, float]:
+    """How many messages of lossless topics the ground should have, how many of them it has not, byte for byte, and how
+    long after a moment the last of those came that were recorded on board before it, s."""
 
-    def messages(path: Path) -> dict[Any, bytes]:
+    def messages(path: Path) -> dict[Any, tuple[bytes, int]]:
         reader = RecordingReader(path)
         found = {}
         for raw in reader.raws(reader.select()):
             share = share_of(raw.topic)
             if share is not None and share.filled and raw.envelope.sequence % share.every == 0:
-                found[raw.topic, raw.envelope] = bytes(raw.data)
+                data = b"" if raw.topic.startswith("orthoimage/") else bytes(raw.data)  # tiles come down smaller
+                found[raw.topic, raw.envelope] = data, raw.receive_ns
         return found
 
     there, here = messages(board), messages(ground)
-    return len(there), sum(here.get(key) != data for key, data in there.items())
+    nothing = b"", 0
+    lost = sum(here.get(key, (None, 0))[0] != data for key, (data, _) in there.items())
+    came = [here.get(key, nothing)[1] for key, (_, recorded_ns) in there.items() if recorded_ns <= moment_ns]
+    return len(there), lost, (max(came, default=moment_ns) - moment_ns) / 1e9
 
 
 def snapshot(network: Network, keys: Path, seconds: float) -> dict[str, Any]:
@@ -319,9 +324,8 @@ def forgeries(network: Network, programs: Programs, keys: Path, folder: Path) ->
     """What forgers in aircraft and at a desk get through to the office."""
     here = [sys.executable, __file__]
     log = folder / "listener.log"
-    listener = programs.start(
-        "office", "listener", [*here, "--role", "listen", str(keys / "ann" / "zenoh.json5"), "25"]
-    )
+    desk_config = str(keys / "ann" / "zenoh.json5")
+    listener = programs.start("office", "listener", [*here, "--role", "listen", desk_config, "25"])
     while "listening" not in log.read_text():
         time.sleep(0.1)
     names = list(STATIONS)
@@ -355,6 +359,7 @@ def campaign(args: argparse.Namespace, folder: Path) -> int:
             replays[aircraft] = programs.start(aircraft, f"{aircraft}-replay", command)
         cut_at, cut_end, state = begun + 30.0, begun + 30.0 + args.cut, "up"
         picture: dict[str, Any] = {}
+        back_ns = 0
         pictures = _pictures(network, programs, keys, folder, args) if args.picture else None
         while any(replay.poll() is None for replay in replays.values()):
             time.sleep(0.5)
@@ -364,10 +369,11 @@ def campaign(args: argparse.Namespace, folder: Path) -> int:
             wanted = "down" if cut_at <= now < cut_end else "up"
             if wanted != state:
                 network.set_link("a1", nets["a1"], state := wanted)
+                back_ns = time.time_ns()
                 print(f"{now - begun:4.0f} s: the link of a1 is {'cut' if state == 'down' else 'back'}", flush=True)
             if not picture and now > cut_at + 0.7 * args.cut:
                 picture = snapshot(network, keys, 8.0)
-        flown = time.monotonic()
+        flown_ns = time.time_ns()
         network.set_link("a1", nets["a1"], "up")
         for node in ("navigator", "adjuster"):
             programs.stop(*(running[a, node] for a in STATIONS))
@@ -376,14 +382,14 @@ def campaign(args: argparse.Namespace, folder: Path) -> int:
             for a in STATIONS:
                 counts[a].append((time.monotonic(), network.received(STATIONS[a], nets[a]) - base[a]))
 
-        since = {a: cut_end if a == "a1" else flown for a in STATIONS}
-        filled = _wait_until_filled(network, keys, since, count)
+        _wait_until_filled(network, keys, count)
         if pictures is not None:
             programs.stop(*pictures)
         for node in ("recorder", "router"):
             programs.stop(*(running[a, node] for a in STATIONS))
         programs.stop(running["ground"])
-    return _table(args, folder, counts, forged, filled, picture)
+    moments = {a: back_ns if a == "a1" else flown_ns for a in STATIONS}
+    return _table(args, folder, counts, forged, moments, picture)
 
 
 def _pictures(network: Network, programs: Programs, keys: Path, folder: Path, args: argparse.Namespace) -> Any:
@@ -391,31 +397,19 @@ def _pictures(network: Network, programs: Programs, keys: Path, folder: Path, ar
     return (programs.start("office", "view", command),)
 
 
-def _wait_until_filled(
-    network: Network, keys: Path, since: dict[str, float], count: Callable[[], None]
-) -> dict[str, float]:
-    """Seconds after a moment at which nothing of an aircraft was missing any more."""
-    filled: dict[str, float] = {}
-    nothing: Counter[str] = Counter()
-    until = time.monotonic() + 600.0
-    while len(filled) < len(since) and time.monotonic() < until:
-        rows = {row["name"]: row for row in snapshot(network, keys, 3.0)["aircraft"]}
+def _wait_until_filled(network: Network, keys: Path, count: Callable[[], None]) -> None:
+    """Wait until nothing of any aircraft is missing, and some more inventories find no more."""
+    nothing, until = 0, time.monotonic() + 900.0
+    while nothing < 4 and time.monotonic() < until:
+        rows = snapshot(network, keys, 3.0)["aircraft"]
         count()
-        for name in since:
-            nothing[name] = nothing[name] + 1 if name in rows and rows[name]["missing"] == 0 else 0
-            if nothing[name] == 1:
-                first = time.monotonic()
-                filled.setdefault(name, first - since[name])
-            elif not nothing[name]:
-                filled.pop(name, None)
-        if all(nothing[name] >= 4 for name in since):  # inventories between see no more
-            break
-    return filled
+        here = [row["missing"] == 0 for row in rows if row["name"] in STATIONS]
+        nothing = nothing + 1 if len(here) == len(STATIONS) and all(here) else 0
 
 
 def _table(
     args: argparse.Namespace, folder: Path, counts: dict[str, list[tuple[float, int]]], forged: Counter[str],
-    filled: dict[str, float], picture: dict[str, Any],
+    moments: dict[str, int], picture: dict[str, Any],
 ) -> int:  # fmt: skip
     log = (folder / "ground.log").read_text()
     names, good = list(STATIONS), True
@@ -425,18 +419,17 @@ def _table(
     print(f"{'aircraft':<9} {'may':>6} {'sent':>6} {'peak':>6} {'live':>7} {'asked':>7} {'lost':>12} {'after':>8} "
           f"{'block':>6}  {'forged':>7} {'own':>5}")  # fmt: skip
     for i, name in enumerate(names):
-        may = args.limit / 4 if name == "a2" else args.limit
-        wanted, lost = compared(folder / f"{name}.mcap", folder / "ground" / f"{name}.mcap")
+        may = args.limit / 2 if name == "a2" else args.limit
+        wanted, lost, after = compared(folder / f"{name}.mcap", folder / "ground" / f"{name}.mcap", moments[name])
         asked = int(next(line for line in log.splitlines() if line.startswith(f"{name}: ") and "asked for; " in line)
                     .split("mcap, ")[-1].split()[0])  # fmt: skip
         (t0, _), (t1, total) = counts[name][0], counts[name][-1]
-        peak = max(b - a for s, a, b in _windows(counts[name])) / FULLEST_S
+        peak = max(_rates(counts[name]))
         result = json.loads(frame.triline("adjust", str(folder / "ground" / f"{name}.mcap"), "--json"))
         through, own = forged[f"{name} as {names[(i + 1) % len(names)]}"], forged[f"{name} as {name}"]
-        after = f"{filled[name]:.0f} s" if name in filled else "never"
-        good = good and not lost and not through and own == FORGED and peak <= 1.1 * may and name in filled
+        good = good and not lost and not through and own == FORGED and peak <= 1.1 * may
         print(f"{name:<9} {may / 1e3:>6.1f} {total / (t1 - t0) / 1e3:>6.1f} {peak / 1e3:>6.1f} {wanted - asked:>7} "
-              f"{asked:>7} {lost:>5} of {wanted:<6} {after:>6} {result['sigma0']:>6.2f}  {through:>7} "
+              f"{asked:>7} {lost:>5} of {wanted:<6} {after:>6.0f} {result['sigma0']:>6.2f}  {through:>7} "
               f"{own:>5}")  # fmt: skip
     desk = sum(n for key, n in forged.items() if key.startswith("ann as"))
     good = good and not desk
@@ -446,12 +439,12 @@ def _table(
     return frame.verdict(good)
 
 
-def _windows(counts: list[tuple[float, int]]) -> Iterator[tuple[float, int, int]]:
-    """Begin of each stretch of `FULLEST_S`, and the counts at its ends."""
+def _rates(counts: list[tuple[float, int]]) -> Iterator[float]:
+    """Bytes a second of each stretch of `FULLEST_S` or a little more."""
     for begin, first in counts:
-        last = next((n for moment, n in counts if moment >= begin + FULLEST_S), None)
-        if last is not None:
-            yield begin, first, last
+        found = next(((moment, n) for moment, n in counts if moment >= begin + FULLEST_S), None)
+        if found is not None:
+            yield (found[1] - first) / (found[0] - begin)
 
 
 def _points(path: Path) -> set[str]:

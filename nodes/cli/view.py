@@ -6,25 +6,37 @@ import argparse
 import json
 import signal
 import sys
+import threading
 from collections import Counter
 from pathlib import Path
 
 from ..errors import UserError
+from .bus_options import add_bus_arguments, bus_of, reporter
 
-EXAMPLE = "triline view flight.mcap --web"
+EXAMPLE = """triline view flight.mcap --web
+  triline view --fleet --secure survey/ann      # all aircraft in the air: docs/fleet.md"""
 _DRAW_STEP_NS = 500_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="MCAP recording")
+    parser.add_argument(
+        "recording", type=Path, nargs="*", help="MCAP recording; with --fleet several, or none for aircraft in the air"
+    )
+    parser.add_argument("--fleet", action="store_true", help="all aircraft in one view")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--native", action="store_true", help="open a window (the default)")
     where.add_argument("--web", action="store_true", help="serve a web viewer on 127.0.0.1 until interrupted")
     where.add_argument("--rrd", metavar="FILE", type=Path, help="write a Rerun file instead of showing anything")
     parser.add_argument("--no-truth", action="store_true", help="do not show the truth of a simulation")
+    add_bus_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.fleet:
+        return _fleet(args)
+    if len(args.recording) != 1:
+        raise UserError(f"{len(args.recording)} recordings, wanted one (--fleet shows several)")
+    args.recording = args.recording[0]
     from ..recording.reader import RecordingReader
 
     reader = RecordingReader(args.recording)
@@ -32,9 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from ..viewer.scene import TOPICS, TRUTH_TOPICS
 
     messages = reader.sorted_messages((*TOPICS, *TRUTH_TOPICS))
-    if args.rrd is not None and args.rrd.exists() and args.rrd.samefile(args.recording):
-        raise UserError(f"{args.rrd}: is the recording itself")
-    mode = f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"
+    mode = _mode(args, [args.recording])
     signal.signal(signal.SIGTERM, _stop)
     canvas = open_canvas(mode)
     process = canvas.process if isinstance(canvas, RerunCanvas) else None
@@ -50,6 +60,66 @@ def run(args: argparse.Namespace) -> int:
     finally:
         if process is not None:
             process.close()
+    return 0
+
+
+def _mode(args: argparse.Namespace, recordings: list[Path]) -> str:
+    """Mode of the canvas.
+
+    Raises
+    ------
+    UserError : the file to write is one of the recordings
+    """
+    if args.rrd is not None and args.rrd.exists() and any(args.rrd.samefile(path) for path in recordings):
+        raise UserError(f"{args.rrd}: is the recording itself")
+    return f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"
+
+
+def _fleet(args: argparse.Namespace) -> int:
+    """All aircraft of some recordings, or of those in the air until interrupted."""
+    if args.platform is not None:
+        raise UserError("--fleet and --platform: wanted one of them")
+    mode = _mode(args, args.recording)
+    from ..bus.program import stop_on_signals
+    from ..viewer import fleet_live
+    from ..viewer.rerun_canvas import RerunCanvas, open_canvas
+
+    readers = []
+    if args.recording:
+        from ..recording.reader import RecordingReader
+
+        readers = [RecordingReader(path) for path in args.recording]
+    stop = threading.Event()
+    stop_on_signals(stop)
+    bus = None
+    if not readers:
+        from ..bus.session import Bus
+
+        where = bus_of(args)
+        where["platform"] = "fleet"
+        bus = Bus(source="viewer", file=args.bus, **where)
+        if alone := bus.why_alone():
+            reporter(args.quiet)(alone)
+    canvas = open_canvas(mode)
+    process = canvas.process if isinstance(canvas, RerunCanvas) else None
+    try:
+        if mode == "web" and process is not None:
+            print(f"{process.web_url}\nCtrl-C stops the viewer", flush=True)
+        if bus is None:
+            used = fleet_live.show_recordings(readers, canvas)
+            if not used:
+                raise UserError(f"{args.recording[0]}: nothing in it that can be shown")
+            if process is not None:
+                process.wait()
+        else:
+            used = fleet_live.show_live(bus, canvas, stop)
+    finally:
+        if bus is not None:
+            bus.close()
+        if process is not None:
+            process.close()
+    if args.rrd is not None and not args.quiet:
+        print(f"{args.rrd}: {used} messages; open it with 'rerun {args.rrd}'", flush=True)
     return 0
 
 

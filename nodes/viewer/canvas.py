@@ -59,6 +59,24 @@ class ViewLayout:
     geographic_centre: tuple[float, float] | None = None
 
 
+@dataclass(frozen=True)
+class FleetLayout:
+    """What the views of a fleet show.
+
+    Attributes
+    ----------
+    aircraft : their names, in the order of their lights
+    corners : (n, 3) what has to be in view, m, display coordinates
+    row : distance of two lights
+    geographic_centre : latitude and longitude for the map, deg; None without a map
+    """
+
+    aircraft: tuple[str, ...]
+    corners: Array
+    row: float
+    geographic_centre: tuple[float, float] | None = None
+
+
 class Canvas(Protocol):
     """Draws in two or three dimensions, by the number of columns; an entity is replaced when drawn again.
 
@@ -107,7 +125,7 @@ class Canvas(Protocol):
 
     def document(self, entity: str, markdown: str) -> None: ...
 
-    def layout(self, layout: ViewLayout) -> None: ...
+    def layout(self, layout: ViewLayout | FleetLayout) -> None: ...
 
     def close(self) -> None: ...
 
@@ -157,7 +175,7 @@ class NullCanvas:
     def document(self, entity: str, markdown: str) -> None:
         pass
 
-    def layout(self, layout: ViewLayout) -> None:
+    def layout(self, layout: ViewLayout | FleetLayout) -> None:
         pass
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from ..errors import UserError
-from .canvas import Canvas, Color, NullCanvas, Series, ViewLayout
+from .canvas import Canvas, Color, FleetLayout, NullCanvas, Series, ViewLayout
 from .rerun_process import ViewerProcess
 
 Array = NDArray[np.floating]
@@ -126,8 +126,9 @@ class RerunCanvas:
     def document(self, entity: str, markdown: str) -> None:
         self.stream.log(entity, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), static=True)
 
-    def layout(self, layout: ViewLayout) -> None:
-        self.stream.send_blueprint(blueprint(layout))
+    def layout(self, layout: ViewLayout | FleetLayout) -> None:
+        made = fleet_blueprint(layout) if isinstance(layout, FleetLayout) else blueprint(layout)
+        self.stream.send_blueprint(made)
 
     def close(self) -> None:
         self.stream.flush(timeout_sec=_FLUSH_S)
@@ -162,8 +163,47 @@ def blueprint(layout: ViewLayout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
     tabs = [_overview(layout), *([_residuals(layout)] if layout.lines else [])]
     tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(layout), _adjustment(layout)]
+    return _arranged(rrb.Tabs(*tabs, active_tab=0))
+
+
+def fleet_blueprint(layout: FleetLayout) -> rrb.Blueprint:
+    """Arrangement of the views of a fleet: all aircraft in 3D and on the map, their lights, curves, events."""
+    low, high = layout.corners.min(axis=0), layout.corners.max(axis=0)
+    middle, reach = (low + high) / 2, float(np.linalg.norm((high - low)[:2]))
+    distance = max(reach, 200.0) / (2 * np.tan(_FIELD_OF_VIEW / 2))
+    eye = middle + distance * np.array([0.0, -0.75, 0.75])
+    flight = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /flight/**", "+ /points/**", "+ /mosaic/**"],
+        name="Thick: final; thin: live; dots: light",
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=middle, eye_up=[0.0, 0.0, 1.0]
+        ),
+    )
+    lights = rrb.Spatial2DView(
+        origin="/lights",
+        name="Lights",
+        background=_BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[-30.0, 60.0], y_range=[-layout.row, layout.row * max(len(layout.aircraft), 2)]
+        ),
+    )
+    side = [rrb.TextDocumentView(origin="/about", name="Why"), rrb.TextLogView(origin="/log", name="Events")]
+    if layout.geographic_centre is not None:
+        girth = 40_075_017.0 * np.cos(np.radians(layout.geographic_centre[0]))
+        zoom = float(np.log2(girth * _MAP_POINTS / 256 / max(reach, 100.0)))
+        side.append(rrb.MapView(origin="/map", name="Map", zoom=zoom))
+    plots = [_plot("fleet/sigma", "Sigma of the position, worst axis [m]"), _plot("fleet/sigma0", "sigma0")]
+    left = rrb.Vertical(flight, rrb.Horizontal(*plots), row_shares=[2.2, 1])
+    right = rrb.Vertical(lights, *side, row_shares=[1.0, *[1.0] * len(side)])
+    return _arranged(rrb.Horizontal(left, right, column_shares=[2.4, 1]))
+
+
+def _arranged(views: rrb.Container) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
+        views,
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
