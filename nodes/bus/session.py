@@ -612,8 +612,13 @@ def listen_elsewhere(
 
 
 @contextlib.contextmanager
-def routing(file: Path) -> Iterator[Callable[[], int]]:
+def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
     """A Zenoh router by a configuration file, as long as the context; gives a function that counts who is linked.
+
+    Parameters
+    ----------
+    file : of the configuration
+    port : listen there instead
 
     Raises
     ------
@@ -623,6 +628,11 @@ def routing(file: Path) -> Iterator[Callable[[], int]]:
     config = configuration(file=file)
     if json.loads(config.get_json("mode")) != "router":
         raise UserError(f"{file}: not the configuration of a router")
+    if port is not None:
+        listen = [
+            re.sub(r":\d+$", f":{port}", endpoint) for endpoint in json.loads(config.get_json("listen/endpoints"))
+        ]
+        config.insert_json5("listen/endpoints", json.dumps(listen))
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:

@@ -8,6 +8,7 @@ the aircraft's router allows.
 from __future__ import annotations
 
 import bisect
+import functools
 import re
 import threading
 import time
@@ -33,7 +34,8 @@ from .recorder import Recorder
 
 #: The platform under which the ground speaks of itself.
 FLEET = "fleet"
-#: An aircraft is asked for its inventory so often, s; what it had then and is not here the next time is missing.
+#: An aircraft is asked for its inventory so often unless told otherwise, s; what it had then and is not here the next
+#: time is missing.
 INVENTORY_S = 5.0
 #: An answer takes so long at most, s.
 ANSWER_S = 30.0
@@ -204,6 +206,7 @@ class Ground(Node):
     ----------
     output : folder of the recordings, ``<aircraft>.mcap``
     whole : topics that are asked for besides, every message, with commas between them; they come when nothing else does
+    ask_s : aircraft are asked for what they have so often, s
     compression, rotate_mb, sign : see `Recorder`
     """
 
@@ -212,9 +215,13 @@ class Ground(Node):
     outputs = ()
 
     def __init__(
-        self, output: str = "fleet", whole: str = "", compression: str = "none", rotate_mb: float = 0, sign: str = ""
-    ) -> None:
+        self, output: str = "fleet", whole: str = "", ask_s: float = INVENTORY_S, compression: str = "none",
+        rotate_mb: float = 0, sign: str = "",
+    ) -> None:  # fmt: skip
         super().__init__()
+        if not ask_s > 0:
+            raise ValueError(f"ask_s is {ask_s}, wanted more than 0")
+        self.ask_s = ask_s
         self.folder = Path(output)
         self._whole = tuple(name.strip() for name in whole.split(",") if name.strip())
         for topic in self._whole:
@@ -302,7 +309,8 @@ def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
             aircraft.tend()
             if platform not in filling:
                 options.report(f"{platform}: recording to {aircraft.files[-1]}")
-                arguments = (aircraft, bus, options, lambda platform=platform: any(p == platform for p, _ in alive))
+                linked = functools.partial(_answers, alive, platform)
+                arguments = (aircraft, bus, options, linked, ground.ask_s)
                 filling[platform] = threading.Thread(target=_fill, args=arguments, name=f"fill {platform}")
                 filling[platform].start()
         ground.note()
@@ -310,6 +318,11 @@ def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
             status.publish(ground.state(), {}, ground, 0.0, 0, 0)
     for thread in filling.values():
         thread.join()
+
+
+def _answers(alive: set[tuple[str, str]], platform: str) -> bool:
+    """Whether somebody lives who answers for an aircraft."""
+    return any((platform, node) in alive for node in ANSWERS)
 
 
 def is_known(topic: str) -> bool:
@@ -321,10 +334,12 @@ def is_known(topic: str) -> bool:
     return True
 
 
-def _fill(aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked: Callable[[], bool]) -> None:
+def _fill(
+    aircraft: AircraftRecorder, bus: Bus, options: ProgramOptions, linked: Callable[[], bool], ask_s: float
+) -> None:
     """Ask an aircraft for what is missing, as long as there is a link."""
     told = 0
-    while not options.stop.wait(INVENTORY_S):
+    while not options.stop.wait(ask_s):
         if not linked():
             continue
         try:

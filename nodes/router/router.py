@@ -144,8 +144,8 @@ def run(options: ProgramOptions) -> int:
 
 def _on_the_ground(options: ProgramOptions) -> int:
     assert options.secure is not None
-    with routing(options.secure.configuration) as linked:
-        options.report(f"router {options.secure.name} on port {options.secure.port}")
+    with routing(options.secure.configuration, options.port) as linked:
+        options.report(f"router {options.secure.name} on port {options.port or options.secure.port}")
         before = 0
         while not options.stop.wait(1.0):
             now = linked()

@@ -170,7 +170,7 @@ def fleet_blueprint(layout: FleetLayout) -> rrb.Blueprint:
     """Arrangement of the views of a fleet: all aircraft in 3D and on the map, their lights, curves, events."""
     low, high = layout.corners.min(axis=0), layout.corners.max(axis=0)
     middle, reach = (low + high) / 2, float(np.linalg.norm((high - low)[:2]))
-    distance = max(reach, 200.0) / (2 * np.tan(_FIELD_OF_VIEW / 2))
+    distance = 1.25 * max(reach, 200.0) / (2 * np.tan(_FIELD_OF_VIEW / 2))
     eye = middle + distance * np.array([0.0, -0.75, 0.75])
     flight = rrb.Spatial3DView(
         origin="/",
