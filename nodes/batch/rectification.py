@@ -305,12 +305,15 @@ class Rectification:
     orientation, reference_ns : of the lines
     factor : pixels that are put together to one, along and across, where cells are that much larger
     errors : besides those of the orientation; then the orthoimage has sigmas
+    mosaic : makes what the cells go into, from the data type of the lines
     """
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
         orientation: LineOrientation, reference_ns: int, factor: int = 1, errors: GroundErrors | None = None,
+        mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
     ) -> None:  # fmt: skip
+        self._mosaic = mosaic
         self.rays = rays_of(camera, ccd, factor=factor)
         self.surface, self.grid, self.resampling = surface, grid, resampling
         self.orientation, self.reference_ns, self.factor, self.errors = orientation, reference_ns, factor, errors
@@ -328,7 +331,7 @@ class Rectification:
         ValueError : lines of another length
         """
         if self.result is None:
-            self.result = Rectified(Mosaic(block.pixels.dtype))
+            self.result = Rectified(self._mosaic(block.pixels.dtype))
         if block.strip != self._strip:
             self._close()
             self._strip = block.strip

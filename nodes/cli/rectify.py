@@ -10,56 +10,30 @@ from typing import Any
 
 import numpy as np
 
-from ...solver.camera.line_camera import LineCamera
-from ...solver.geometry.ellipsoid import WGS84
-from ...solver.geometry.frames import LocalFrame
-from ...solver.orthoimage.error_band import GroundErrors
-from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
-from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.resampling import TAPS
-from ...solver.orthoimage.surface import Ellipsoid, Surface, UnderAir
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
-from ..batch.rectification import (
-    ORIENTATIONS,
-    REFINED,
-    Rectification,
-    Rectified,
-    camera_beside,
-    estimated_camera,
-    frame_for,
-    ground_of_points,
-    known_points,
-    line_blocks,
-    orientation_of,
-    pixel_on_ground,
-    project_frame,
-    trajectory_orientation,
-)
-from ..config import raster_of_heights
+from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks
 from ..errors import UserError
-from ..formats.camera_json import read_camera_instead
-from ..formats.dem import dem_in_frame
 from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
-from ..recording.access import Recording
-from . import rectify_image
-from .locate import refraction_of
+from . import rectify_image, rectify_mosaic
 from .progress import progress
+from .rectify_recording import cells_of, prepared
 
 EXAMPLE = """triline rectify flight.mcap -o ortho.tif
   triline rectify flight.mcap -o before.tif --orientation measured --dem heights.tif --gsd 0.25
-  triline rectify scene.tif --sensor DIM_PHR1A.XML --dem N44E005.hgt --dem-datum EPSG:5773 -o ortho.tif"""
+  triline rectify scene.tif --sensor DIM_PHR1A.XML --dem N44E005.hgt --dem-datum EPSG:5773 -o ortho.tif
+  triline rectify day1.mcap day2.mcap --mosaic --dem heights.tif --sigma sigma.tif --workers 4 -o block.tif"""
 
 #: Options of an image that a recording takes, too.
 _OF_BOTH = ("dem_crs", "refraction", "sigma", "pixel_sigma", "height_sigma")
-#: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
-MOST_CELLS = 4e9
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", type=Path, metavar="INPUT", help="recording with image lines, or with --sensor an image"
-    )
+        "input", type=Path, metavar="INPUT", nargs="+",
+        help="recording with image lines, or with --sensor an image; with --mosaic several, and finished orthoimages",
+    )  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="GeoTIFF to write")
     parser.add_argument(
         "--orientation", choices=tuple(ORIENTATIONS), help="of the lines (default: the best there is, in this order)"
@@ -92,47 +66,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resampling", choices=tuple(IMAGE_TAPS), default="bilinear", help="(default: %(default)s)")
     rectify_image.add_arguments(parser)
+    rectify_mosaic.add_arguments(parser)
+
+
+def _only(given: list[Any], what: str = "") -> Any:
+    """The only one."""
+    if len(given) > 1:
+        raise UserError(f"{what or given[1]}: more than one, which goes with --mosaic only")
+    return given[0]
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.mosaic:
+        return rectify_mosaic.run(args)
+    args.input = _only(args.input)
     if args.sensor is not None:
+        args.sensor = _only(args.sensor, "--sensor")
+        rectify_mosaic.refuse_options(args)
         return rectify_image.run(args)
     begun = time.perf_counter()
     _check(args)
-    recording = Recording(args.input)
-    camera = recording.camera()
-    ccd = _ccd(recording, camera, args.ccd)
-    _check_strips(recording, args.strip)
-    of_camera = None
-    if args.trajectory is not None:
-        name = args.trajectory.name
-        orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
-        if args.camera is None:
-            camera, of_camera = camera_beside(args.trajectory, camera)
-    else:
-        name, orientation, reference_ns = orientation_of(recording, args.orientation)
-    estimated = 0
-    if args.camera is not None:
-        camera, of_camera = read_camera_instead(args.camera, camera), args.camera
-    elif name in REFINED:
-        camera, estimated = estimated_camera(recording, camera)
-    frame = project_frame(recording)
-    target = frame_for(frame, args.crs or _crs(frame))
-    surface, ground_m, ground = _ground(args, recording, frame)
-    if args.refraction is not None:
-        surface = UnderAir(surface, frame, refraction_of(args.refraction, WGS84, str(args.input)))
-        ground += ", refraction taken off"
-    errors = _errors(args, camera, ccd, name, orientation)
-    above = float(np.median(orientation.measured.position_l[:, 2])) - ground_m
-    if above <= 0:
-        raise UserError(
-            f"{args.input}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem"
-        )
-    pixel = pixel_on_ground(camera, ccd, above)
-    grid = GroundGrid(target, args.gsd or float(f"{pixel:.2g}"))
-    factor = max(int(grid.gsd / pixel + 0.1), 1)
-    _check_size(recording, camera, ccd, pixel, grid)
-    work = Rectification(camera, ccd, surface, grid, args.resampling, orientation, reference_ns, factor, errors)
+    of = prepared(args, args.input)
+    recording, camera, ccd, name = of.recording, of.camera, of.ccd, of.orientation_name
+    ground, grid, factor = of.ground, *cells_of(args, of)
+    work = Rectification(
+        camera, ccd, of.surface, grid, args.resampling, of.orientation, of.reference_ns, factor, of.errors
+    )
     with progress("rectifying", args.quiet or args.json) as told:
         for block in line_blocks(recording, camera.lines[ccd].id, args.strip, told):
             try:
@@ -151,9 +110,9 @@ def run(args: argparse.Namespace) -> int:
         args.output, done.mosaic, grid, tags, sigma=None if args.sigma is None else Path(args.sigma)
     )
     result = {
-        "output": str(args.output), "orientation": name, "ccd": camera.lines[ccd].id, "crs": target.crs,
+        "output": str(args.output), "orientation": name, "ccd": camera.lines[ccd].id, "crs": grid.frame.crs,
         "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
-        "pixels_together": factor, "camera_parameters": estimated, "camera": of_camera and str(of_camera),
+        "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
@@ -195,87 +154,10 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError("--dem: given more than once, which goes with --sensor only")
     if args.resampling not in TAPS:
         raise UserError(f"--resampling {args.resampling}: goes with --sensor, wanted one of {', '.join(TAPS)}")
+    rectify_mosaic.refuse_options(args)
     for name in rectify_image.OPTIONS:
         if name not in _OF_BOTH and getattr(args, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
-
-
-def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
-    path = recording.reader.path
-    imaged = [line.id for line in camera.lines if len(recording.reader.select([f"sensor/lines/{line.id}"]))]
-    if not imaged:
-        raise UserError(f"{path}: no image lines in it (sensor/lines); 'triline simulate --images' makes some")
-    if wanted is not None:
-        if wanted not in imaged:
-            raise UserError(f"{path}: no image lines of CCD line {wanted!r}, there are: {', '.join(imaged)}")
-        return camera.line_index[wanted]
-    forward = [abs(line.centre_mm[0] - camera.principal_point_mm[k][0]) for k, line in enumerate(camera.lines)]
-    return min((camera.line_index[id] for id in imaged), key=lambda k: forward[k])
-
-
-def _check_strips(recording: Recording, wanted: list[str] | None) -> None:
-    there = list(recording.last_strips())
-    for strip in wanted or ():
-        if strip not in there:
-            raise UserError(f"{recording.reader.path}: no strip {strip!r}, there are: {', '.join(there)}")
-
-
-def _crs(frame: LocalFrame) -> str:
-    """The horizontal CRS of the project, or its UTM zone; local where the place of the project is not known."""
-    if frame.crs == "local":
-        return "local" if frame.lat_deg == frame.lon_deg == frame.height_m == 0 else utm_of(frame)
-    import pyproj
-
-    crs = pyproj.CRS.from_user_input(frame.crs)
-    flat = crs.sub_crs_list[0] if crs.is_compound else crs
-    return flat.to_string() if flat.is_projected else utm_of(frame)
-
-
-def _ground(args: argparse.Namespace, recording: Recording, frame: LocalFrame) -> tuple[Surface, float, str]:
-    """The ground, its mean height in the local frame, and its name."""
-    if args.dem == ["points"]:
-        field = ground_of_points(recording)
-        return field, float(np.median(known_points(recording)[:, 2])), "heights of object points"
-    if args.dem is not None:
-        path, crs = Path(args.dem[0]), args.dem_crs
-        if (path / "flight.toml").is_file():
-            if crs is not None:
-                raise UserError(f"--dem-crs: [dem] of {path / 'flight.toml'} says it")
-            path, crs = raster_of_heights(path / "flight.toml")
-        field = dem_in_frame(path, frame, crs)
-        if not np.isfinite(field.z_m).any():
-            raise UserError(f"{path}: lies far from the project")
-        return field, float(np.nanmedian(field.z_m)), f"heights of {path.name}"
-    if args.height is not None:
-        h = args.height
-    else:
-        points = known_points(recording)
-        h = float(np.median(frame.to_geodetic(points)[:, 2])) if len(points) else frame.height_m
-    return Ellipsoid(frame, h), h - frame.height_m, f"height {h:.1f} m above the ellipsoid"
-
-
-def _errors(
-    args: argparse.Namespace, camera: LineCamera, ccd: int, name: str, orientation: LineOrientation
-) -> GroundErrors | None:
-    """What counts for the sigmas besides the orientation; None where nobody asked for them."""
-    if args.sigma is None:
-        return None
-    if args.trajectory is not None:
-        raise UserError(f"--sigma: {name} has sigmas without their correlations, wanted --orientation of the recording")
-    if not orientation.has_covariance:
-        raise UserError(f"{args.input}: --sigma: the {name} orientation has no covariance")
-    xy = camera.lines[ccd].xy_mm
-    pitch_mm = float(np.linalg.norm(xy[-1] - xy[0])) / (len(xy) - 1)
-    return GroundErrors((args.pixel_sigma or 0.0) * pitch_mm, args.height_sigma or 0.0)
-
-
-def _check_size(recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid) -> None:
-    lines = max((int(message.body.lines) for message in recording.messages("configuration/strip")), default=0)
-    cells = lines * camera.lines[ccd].pixels * (pixel / grid.gsd) ** 2
-    if cells > MOST_CELLS:
-        raise UserError(
-            f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one"
-        )
 
 
 def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> None:

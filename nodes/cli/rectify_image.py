@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--refraction, --sigma, --pixel-sigma, --height-sigma and --dem-crs go with a recording, too",
     )
     group.add_argument(
-        "--sensor", metavar="META",
+        "--sensor", metavar="META", action="append",
         help="metadata of the image: JSON of a frame camera (docs/rectification.md); " + "; ".join(KINDS.values()),
     )  # fmt: skip
     group.add_argument("--model", choices=("rigorous", "rpc"), help="where the metadata have both (default: rigorous)")
@@ -95,7 +95,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compress", choices=("deflate", "zstd", "lzw", "none"), help="of the GeoTIFF (default: deflate)"
     )
     group.add_argument("--plain", action="store_true", help="no overviews and no compression: half the time")
-    group.add_argument("--workers", type=int, metavar="N", help="threads (default: as many as cores)")
+    group.add_argument(
+        "--workers", type=int, metavar="N", help="threads, of a mosaic processes (default: as many as cores)"
+    )
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,31 @@ class _Sensor:
 
 def run(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
+    with progress("rectifying", args.quiet or args.json) as told:
+        sensor, ground, grid, factor, cells = rectified(args, told)
+    _tell(args, sensor, ground, grid, factor, cells, time.perf_counter() - begun)
+    return 0
+
+
+def cells_of(args: argparse.Namespace) -> MapGrid:
+    """The cells that an image would be rectified to.
+
+    Raises
+    ------
+    UserError : an image, metadata or heights that do not go together
+    """
+    sensor = _sensor(args, SourceImage(Path(args.input), args.nodata))
+    ground = ground_under(args, sensor)
+    return _grid(args, sensor, ground, *edge_of(sensor.model, ground))[0]
+
+
+def rectified(args: argparse.Namespace, told: Any = None) -> tuple[_Sensor, Ground, MapGrid, int, dict[str, int]]:
+    """Rectify an image as the command line asks: sensor, ground, cells, pixels put together, cells by what is in them.
+
+    Raises
+    ------
+    UserError : options, an image, metadata or heights that do not go together
+    """
     _check(args)
     image = SourceImage(Path(args.input), args.nodata)
     sensor = _sensor(args, image)
@@ -144,13 +171,11 @@ def run(args: argparse.Namespace) -> int:
         "TIFFTAG_IMAGEDESCRIPTION": f"{Path(args.input).name} by {sensor.kind}, {ground.words}, {args.resampling}, "
         + ("pixel to ground" if args.direct else "ground to pixel")
     }
-    with progress("rectifying", args.quiet or args.json) as told:
-        counts = work.run(
-            args.output, mask=None if args.mask is None else Path(args.mask), sigma=sigma, tags=tags,
-            compress="plain" if args.plain else args.compress or "deflate", told=told,
-        )  # fmt: skip
-    _tell(args, sensor, ground, grid, factor, counts.cells, time.perf_counter() - begun)
-    return 0
+    counts = work.run(
+        args.output, mask=None if args.mask is None else Path(args.mask), sigma=sigma, tags=tags,
+        compress="plain" if args.plain else args.compress or "deflate", told=told,
+    )  # fmt: skip
+    return sensor, ground, grid, factor, counts.cells
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from .features import Features
+from .new_file import new_file
 
 
 def write_geojson(path: Path, features: Features) -> int:
@@ -31,3 +33,22 @@ def write_geojson(path: Path, features: Features) -> int:
 def _write(file: Any, geometry: dict[str, Any], properties: dict[str, Any], number: int) -> None:
     feature = {"type": "Feature", "geometry": geometry, "properties": properties}
     file.write((",\n" if number else "\n") + json.dumps(feature))
+
+
+def write_line_features(path: Path, lines: Iterable[tuple[list[list[float]], dict[str, Any]]]) -> int:
+    """Write lines, each with longitudes and latitudes (or plain coordinates) and its properties; returns their number.
+
+    The file gets its name when it is whole.
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    count = 0
+    with new_file(path) as part, open(part, "w", encoding="utf-8") as file:
+        file.write('{"type": "FeatureCollection", "features": [')
+        for places, properties in lines:
+            _write(file, {"type": "LineString", "coordinates": places}, properties, count)
+            count += 1
+        file.write("\n]}\n")
+    return count

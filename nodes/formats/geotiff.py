@@ -24,6 +24,8 @@ Array = NDArray[np.floating]
 
 #: Cells a side of the blocks in the file.
 BLOCK = 512
+#: Megabytes of blocks that GDAL holds while it makes a cloud-optimised file of tiles.
+CACHE_MB = 192
 #: A raster of heights has no more cells than this.
 MOST_HEIGHTS = 100_000_000
 #: Names of the bands of a file of sigmas.
@@ -210,6 +212,137 @@ def tiled_orthoimage(
                 )  # fmt: skip
         finally:
             draft.unlink(missing_ok=True)
+
+
+def write_tile(path: Path, raster: Raster, values: NDArray[Any], block: int = BLOCK) -> None:
+    """A small raster (bands, rows, columns) at once, compressed, which gets its name when it is whole.
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    with pieces_of_raster(path, raster, block) as target:
+        target.write(0, 0, values)
+
+
+@contextmanager
+def pieces_of_raster(path: Path, raster: Raster, block: int = BLOCK) -> Iterator[Draft]:
+    """A compressed raster without overviews, written block by block, each once; it gets its name when it is whole.
+
+    Parameters
+    ----------
+    block : cells a side of the blocks in the file
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    import rasterio
+    from rasterio.crs import CRS
+    from rasterio.errors import NotGeoreferencedWarning
+
+    predictor = 3 if np.dtype(raster.dtype).kind == "f" else 2
+    with warnings.catch_warnings(), new_file(path) as part:
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with _told(path):
+            target = rasterio.open(
+                part, "w", driver="GTiff", tiled=True, blockxsize=block, blockysize=block, bigtiff="if_safer",
+                sparse_ok=True, interleave="band", width=raster.columns, height=raster.rows, count=raster.bands,
+                dtype=raster.dtype, nodata=raster.nodata, crs=raster.crs and CRS.from_user_input(raster.crs),
+                transform=rasterio.Affine(raster.gsd, 0.0, raster.left, 0.0, -raster.gsd, raster.top),
+                compress="deflate", zlevel=1, predictor=predictor,
+            )  # fmt: skip
+        with _told(path), target:
+            for k, text in enumerate(raster.descriptions):
+                target.set_band_description(k + 1, text)
+            yield Draft(path, target)
+
+
+@dataclass(frozen=True)
+class TilePlace:
+    """A tile of a larger raster.
+
+    Attributes
+    ----------
+    path : its file
+    row, column : its first cell in the larger raster; may lie before its beginning
+    rows, columns : of the tile
+    """
+
+    path: Path
+    row: int
+    column: int
+    rows: int
+    columns: int
+
+
+def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
+    """A virtual raster (VRT of GDAL) over tiles, with paths as seen from its folder.
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    from xml.sax.saxutils import escape
+
+    from rasterio.crs import CRS
+
+    kinds = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32", "int32": "Int32",
+             "float32": "Float32", "float64": "Float64"}  # fmt: skip
+    out = [f'<VRTDataset rasterXSize="{raster.columns}" rasterYSize="{raster.rows}">']
+    if raster.crs:
+        wkt = CRS.from_user_input(raster.crs).to_wkt()
+        out.append(f'<SRS dataAxisToSRSAxisMapping="1,2">{escape(wkt)}</SRS>')
+    transform = (raster.left, raster.gsd, 0.0, raster.top, 0.0, -raster.gsd)
+    out.append("<GeoTransform>" + ", ".join(map(repr, transform)) + "</GeoTransform>")
+    if raster.tags:
+        items = "".join(f'<MDI key="{escape(k)}">{escape(v)}</MDI>' for k, v in raster.tags.items())
+        out.append(f"<Metadata>{items}</Metadata>")
+    for band in range(1, raster.bands + 1):
+        out.append(f'<VRTRasterBand dataType="{kinds[raster.dtype]}" band="{band}">')
+        if band <= len(raster.descriptions):
+            out.append(f"<Description>{escape(raster.descriptions[band - 1])}</Description>")
+        if raster.nodata is not None:
+            out.append(f"<NoDataValue>{raster.nodata:.17g}</NoDataValue>")
+        for tile in tiles:
+            top, left = max(tile.row, 0), max(tile.column, 0)
+            height = min(tile.row + tile.rows, raster.rows) - top
+            width = min(tile.column + tile.columns, raster.columns) - left
+            if height <= 0 or width <= 0:
+                continue
+            source = escape(tile.path.relative_to(path.parent).as_posix())
+            out.append(
+                f'<SimpleSource><SourceFilename relativeToVRT="1">{source}</SourceFilename>'
+                f"<SourceBand>{band}</SourceBand>"
+                f'<SourceProperties RasterXSize="{tile.columns}" RasterYSize="{tile.rows}" '
+                f'DataType="{kinds[raster.dtype]}" BlockXSize="{BLOCK}" BlockYSize="{BLOCK}"/>'
+                f'<SrcRect xOff="{left - tile.column}" yOff="{top - tile.row}" xSize="{width}" ySize="{height}"/>'
+                f'<DstRect xOff="{left}" yOff="{top}" xSize="{width}" ySize="{height}"/></SimpleSource>'
+            )
+        out.append("</VRTRasterBand>")
+    out.append("</VRTDataset>")
+    with new_file(path) as part:
+        part.write_text("\n".join(out) + "\n", encoding="utf-8")
+
+
+def cloud_optimised(path: Path, source: Path, compress: str = "deflate", overview_resampling: str = "average") -> None:
+    """Any raster as cloud-optimised GeoTIFF with overviews, in bounded memory.
+
+    Raises
+    ------
+    UserError : the file cannot be written
+    """
+    import rasterio
+    import rasterio.shutil
+    from rasterio.errors import NotGeoreferencedWarning
+
+    predictor = {} if compress == "none" else {"predictor": "yes"}
+    with warnings.catch_warnings(), new_file(path) as part, rasterio.Env(GDAL_CACHEMAX=CACHE_MB), _told(path):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        rasterio.shutil.copy(
+            source, part, driver="COG", compress=compress, blocksize=BLOCK, bigtiff="if_safer",
+            overview_resampling=overview_resampling, num_threads="all_cpus", **predictor,
+        )  # fmt: skip
 
 
 @contextmanager

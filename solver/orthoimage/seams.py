@@ -199,10 +199,16 @@ class SeamLine:
     corners: IntArray
 
 
-def seam_lines(labels: IntArray) -> list[SeamLine]:
-    """Borders between the labels of nodes (rows, columns), -1 apart; each piece ends where another one begins."""
+def seam_lines(labels: IntArray, shared: bool = False) -> list[SeamLine]:
+    """Borders between the labels of nodes (rows, columns), -1 apart; each piece ends where another one begins.
+
+    Parameters
+    ----------
+    shared : the last row and column are those of the next tiles, to which borders inside them belong
+    """
+    inner = labels[: len(labels) - shared, :], labels[:, : labels.shape[1] - shared]
     pieces: dict[tuple[int, int], list[tuple[tuple[int, int], tuple[int, int]]]] = {}
-    for one, other, down in ((labels[:, :-1], labels[:, 1:], 1), (labels[:-1], labels[1:], 0)):
+    for one, other, down in ((inner[0][:, :-1], inner[0][:, 1:], 1), (inner[1][:-1], inner[1][1:], 0)):
         r, c = np.nonzero((one != other) & (one >= 0) & (other >= 0))
         a, b = one[r, c], other[r, c]
         low, high = np.minimum(a, b).tolist(), np.maximum(a, b).tolist()

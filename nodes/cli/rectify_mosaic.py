@@ -1,0 +1,442 @@
+"""``triline rectify INPUT.. --mosaic``: the strips of recordings, images and orthoimages to one mosaic, job by job."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import os
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from ...solver.camera.line_camera import LineCamera
+from ...solver.orthoimage.ground_grid import GroundGrid
+from ..batch.block_mosaic import (
+    BALANCES,
+    SEAMS,
+    MosaicSettings,
+    Outputs,
+    check_layers,
+    layers_in,
+    make_mosaic,
+    put_together,
+    read_balance,
+)
+from ..batch.mosaic_jobs import Job, open_parts, remove_parts, run_jobs, write_json
+from ..batch.mosaic_layers import (
+    Layer,
+    SpillingMosaic,
+    forget_files,
+    layer_of_mosaic,
+    layer_of_orthoimage,
+)
+from ..batch.rectification import Rectification, line_blocks
+from ..errors import UserError
+from ..formats.height_raster import RasterFile
+from ..formats.new_file import refuse_unless_file
+from ..formats.stac import write_stac_item
+from ..recording.access import Recording
+from . import rectify_image
+from .progress import progress
+from .rectify_recording import Prepared, cells_of, check_strips, prepared
+
+#: Cells a side of a tile: least, and when nobody asks for another.
+LEAST_TILE, TILE = 128, 1024
+#: Options (as attributes) that only a mosaic takes.
+OPTIONS = ("tile", "balance", "seams", "feather", "source", "seam_lines", "input_sigma", "stac", "keep")
+#: Ends of the names of recordings; everything else is an image.
+_RECORDINGS = (".mcap",)
+#: Options of images and recordings that a mosaic of several does not take.
+_NOT_OF_MOSAIC = ("trajectory", "control", "first_pixel", "mask", "bounds", "direct", "plain")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of a mosaic."""
+    group = parser.add_argument_group("a mosaic of strips, recordings, images (--sensor for each) and orthoimages")
+    group.add_argument("--mosaic", action="store_true", help="balance, part by seams and blend what overlaps")
+    group.add_argument("--tile", type=int, metavar="N", help=f"cells a side of the tiles (default: {TILE})")
+    group.add_argument(
+        "--balance", choices=BALANCES,
+        help="gain and offset of each strip; fall-off: and the fall-off of light of each CCD line (default: fall-off)",
+    )  # fmt: skip
+    group.add_argument("--seams", choices=SEAMS, help="least cuts, or halfway between strips (default: cut)")
+    group.add_argument("--feather", type=int, metavar="N", help="cells over which strips change (default: 8)")
+    group.add_argument("--source", type=Path, metavar="FILE", help="which strip a cell is of (OUTPUT.source.tif)")
+    group.add_argument("--seam-lines", type=Path, metavar="FILE", help="GeoJSON (OUTPUT.seams.geojson)")
+    group.add_argument(
+        "--input-sigma", type=Path, action="append", metavar="FILE", help="sigmas of an orthoimage, for each in order"
+    )
+    group.add_argument("--stac", type=Path, metavar="FILE", help="also write a STAC item, JSON")
+    group.add_argument("--keep", action="store_true", help="keep the tiles and layers in OUTPUT.parts")
+
+
+def refuse_options(args: argparse.Namespace) -> None:
+    """Refuse options of a mosaic without --mosaic."""
+    for name in OPTIONS:
+        if getattr(args, name) not in (None, False):
+            raise UserError(f"--{name.replace('_', '-')}: goes with --mosaic")
+
+
+def run(args: argparse.Namespace) -> int:
+    begun = time.perf_counter()
+    outputs = _outputs(args)
+    _check(args, outputs)
+    workers = args.workers or len(os.sched_getaffinity(0))
+    kinds = _kinds(args)
+    crs, gsd = _cells(args, kinds)
+    settings = MosaicSettings(
+        None if crs == "local" else crs, gsd, args.tile or TILE, args.balance or "fall-off", args.seams or "cut",
+        8 if args.feather is None else args.feather, args.sigma is not None,
+    )  # fmt: skip
+    folder = args.output.with_name(args.output.name + ".parts")
+    forget_files()
+    continued = open_parts(folder, _plan(args, kinds, settings))
+    (folder / "layers").mkdir(exist_ok=True)
+    jobs = _layer_jobs(args, kinds, folder, settings, crs)
+    with progress("rectifying", args.quiet or args.json) as told:
+        before = run_jobs(layer_job, jobs, workers, told)
+    layers = layers_in(folder)
+    check_layers(layers)
+    with progress("mosaic", args.quiet or args.json) as told:
+        counts = make_mosaic(folder, layers, settings, workers, told)
+    tags = {"TIFFTAG_IMAGEDESCRIPTION": f"mosaic of {len(layers)} layers, balance {settings.balance}"}
+    done = put_together(folder, layers, settings, outputs, tags, args.compress or "deflate")
+    forget_files()
+    result = _result(args, outputs, settings, layers, folder, done)
+    result["continued"] = before + counts["done before"] if continued else 0
+    if args.stac is not None:
+        write_stac_item(args.stac, outputs.mosaic, crs, gsd, done, result, _assets(outputs))
+    if not args.keep and outputs.mosaic.suffix != ".vrt":
+        remove_parts(folder)
+    result["seconds"] = round(time.perf_counter() - begun, 3)
+    _tell(result, args)
+    return 0
+
+
+def _outputs(args: argparse.Namespace) -> Outputs:
+    stem = args.output.with_suffix("")
+    return Outputs(
+        args.output, args.source or Path(f"{stem}.source.tif"), args.seam_lines or Path(f"{stem}.seams.geojson"),
+        None if args.sigma is None else Path(args.sigma),
+    )  # fmt: skip
+
+
+def _check(args: argparse.Namespace, outputs: Outputs) -> None:
+    named = [p for p in (*_assets(outputs).values(), args.stac) if p is not None]
+    for path in named:
+        refuse_unless_file(path)
+        if not path.parent.is_dir():
+            raise UserError(f"{path}: no folder {path.parent}")
+        if path.resolve() in [p.resolve() for p in args.input]:
+            raise UserError(f"{path}: the mosaic would overwrite what it is made of")
+    if len({str(p.resolve()) for p in named}) < len(named):
+        raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
+    for name in _NOT_OF_MOSAIC:
+        if getattr(args, name) not in (None, False):
+            raise UserError(
+                f"--{name.replace('_', '-')}: is of one image or recording; wanted orthoimages made with it, then "
+                "--mosaic of these"
+            )
+    tile = args.tile or TILE
+    if args.tile is not None and (tile < LEAST_TILE or tile & (tile - 1)):
+        raise UserError(f"--tile {args.tile}: wanted a power of two of at least {LEAST_TILE}")
+    if args.feather is not None and not 0 <= args.feather <= tile // 4:
+        raise UserError(f"--feather {args.feather}: wanted 0 to {tile // 4} cells")
+    if args.workers is not None and args.workers < 1:
+        raise UserError(f"--workers {args.workers}: wanted at least 1")
+    if args.gsd is not None and not 0 < args.gsd < float("inf"):
+        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
+    if args.dem and args.height is not None:
+        raise UserError("--height and --dem: wanted one of them")
+
+
+def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
+    """What each input is: recording, image (with its metadata), orthoimage (with its sigmas)."""
+    inputs: list[Path] = []
+    for path in args.input:
+        if not path.exists():
+            raise UserError(f"{path}: no such file")
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _RECORDINGS)
+            if not inside:
+                raise UserError(f"{path}: no recordings in it (.mcap)")
+            inputs += inside
+        else:
+            inputs.append(path)
+    images = [p for p in inputs if p.suffix.lower() not in _RECORDINGS]
+    sensors = args.sensor or []
+    if sensors and len(sensors) != len(images):
+        raise UserError(f"--sensor: {len(sensors)} for {len(images)} images, wanted one for each, in their order")
+    sigmas = [str(p) for p in args.input_sigma or []]
+    if sigmas and (sensors or len(sigmas) != len(images)):
+        raise UserError(f"--input-sigma: {len(sigmas)} for {len(images)} orthoimages, wanted one for each, in order")
+    if images and not sensors and args.sigma is not None and not sigmas:
+        raise UserError("--sigma: wanted the sigmas of each orthoimage, --input-sigma FILE")
+    if sigmas and args.sigma is None:
+        raise UserError("--input-sigma: goes with --sigma FILE")
+    out: list[tuple[str, Path, str | None]] = []
+    for path in inputs:
+        if path not in images:
+            out.append(("recording", path, None))
+        elif sensors:
+            out.append(("image", path, sensors[images.index(path)]))
+        else:
+            out.append(("orthoimage", path, sigmas[images.index(path)] if sigmas else None))
+    if len({path.resolve() for path in inputs}) < len(inputs):
+        raise UserError("the same input twice")
+    return out
+
+
+def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) -> tuple[str, float]:
+    """CRS and size of the cells: as the command line says, or of the first orthoimage, recording or image."""
+    crs, gsd = args.crs, args.gsd
+    for kind, path, meta in sorted(kinds, key=lambda k: k[0] != "orthoimage"):
+        if crs is not None and gsd is not None:
+            break
+        if kind == "orthoimage":
+            source = RasterFile(path)
+            if source.crs is None:
+                raise UserError(f"{path}: has no coordinate reference system; wanted an orthoimage, or --sensor")
+            found = source.crs.to_string(), abs(source.transform.a)
+        elif kind == "recording":
+            of = _prepared_of(args, path)
+            found = of.target.crs, cells_of(args, of)[0].gsd
+        else:
+            grid = rectify_image.cells_of(_for_image(args, path, meta, crs, gsd, None, None))
+            found = grid.crs, grid.gsd
+        crs, gsd = crs or found[0], gsd or found[1]
+    assert crs is not None and gsd is not None
+    return crs, float(gsd)
+
+
+def _plan(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]], settings: MosaicSettings) -> dict:
+    """What the results of jobs depend on: another plan begins anew."""
+    files = [path for _, path, _ in kinds] + [Path(m) for _, _, m in kinds if m is not None]
+    files += [Path(p) for p in args.dem or () if p != "points"]
+    files += [] if args.camera is None else [args.camera]
+    of = ("orientation", "ccd", "strip", "dem", "dem_crs", "dem_datum", "height", "resampling", "refraction", "model",
+          "nodata", "occlusions", "position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma")  # fmt: skip
+    stated = [path.stat() if path.exists() else None for path in files]
+    return {
+        "inputs": [[kind, str(path.resolve()), meta] for kind, path, meta in kinds],
+        "files": [[str(p.resolve()), s and [s.st_size, s.st_mtime_ns]] for p, s in zip(files, stated, strict=True)],
+        "settings": vars(settings), "options": {name: getattr(args, name) for name in of},
+    }  # fmt: skip
+
+
+# -- layers --------------------------------------------------------------------------------------------------------
+
+
+def _layer_jobs(
+    args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]], folder: Path, settings: MosaicSettings,
+    crs: str,
+) -> list[Job]:  # fmt: skip
+    jobs = []
+    asked = set(args.strip or ())
+    found: set[str] = set()
+    for number, (kind, path, meta) in enumerate(kinds):
+        strips: list[str | None] = [None]
+        if kind == "recording":
+            there = list(Recording(path).last_strips())
+            found |= asked & set(there)
+            if len(kinds) == 1:
+                check_strips(Recording(path), args.strip)
+            strips = [s for s in there if not asked or s in asked]
+        for k, strip in enumerate(strips):
+            stem = f"{number:04d}_{k:04d}"
+            done = folder / "layers" / f"{stem}.json"
+            jobs.append(Job(done, (kind, path, meta, strip, folder, stem, settings, crs, _plain(args))))
+    if asked - found and any(kind == "recording" for kind, _, _ in kinds):
+        raise UserError(f"--strip {sorted(asked - found)[0]}: in none of the recordings")
+    return jobs
+
+
+def _plain(args: argparse.Namespace) -> argparse.Namespace:
+    """Options without what another process cannot be sent."""
+    return argparse.Namespace(**{k: v for k, v in vars(args).items() if not callable(v)})
+
+
+def layer_job(
+    kind: str, path: Path, meta: str | None, strip: str | None, folder: Path, stem: str, settings: MosaicSettings,
+    crs: str, args: argparse.Namespace,
+) -> None:  # fmt: skip
+    """One strip, image or orthoimage to a layer."""
+    inside, gsd, tile = folder / "layers", settings.gsd, settings.tile
+    if kind == "orthoimage":
+        layer = layer_of_orthoimage(path, None if meta is None else Path(meta), inside, stem, crs, gsd, tile)
+    elif kind == "image":
+        target = inside / f"{stem}.tif"
+        sigma = inside / f"{stem}.sigma.tif" if settings.sigma else None
+        of = _for_image(args, path, meta, crs, gsd, target, sigma)
+        told = rectify_image.rectified(of)[4]
+        found = layer_of_orthoimage(target, sigma, inside, stem, crs, gsd, tile)
+        layer = Layer(**{**vars(found), "name": path.stem, "told": told})
+    else:
+        assert strip is not None
+        layer = _layer_of_strip(args, path, strip, inside, stem, settings)
+    done = inside / f"{stem}.json"
+    if layer is None:
+        write_json(done, None)
+    else:
+        layer.write(done)
+
+
+def _for_image(
+    args: argparse.Namespace, path: Path, meta: str | None, crs: str | None, gsd: float | None, output: Path | None,
+    sigma: Path | None,
+) -> argparse.Namespace:  # fmt: skip
+    of = copy.copy(args)
+    of.input, of.sensor, of.crs, of.gsd, of.output = path, meta, crs, gsd, output
+    of.sigma, of.plain, of.workers, of.compress = sigma and str(sigma), True, 1, None
+    # those of recordings, which may stand beside
+    of.orientation = of.trajectory = of.camera = of.strip = None
+    return of
+
+
+def _prepared_of(args: argparse.Namespace, path: Path) -> Prepared:
+    of = copy.copy(args)
+    of.input = path
+    return prepared(of, path)
+
+
+@lru_cache(maxsize=2)
+def _prepared_once(words: str, path: Path, args: _Held) -> Prepared:
+    """The last recordings of this process: its strips are jobs one after another."""
+    return _prepared_of(args.args, path)
+
+
+class _Held:
+    """Options, all alike for a cache that goes by their words."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Held)
+
+
+def _layer_of_strip(
+    args: argparse.Namespace, path: Path, strip: str, folder: Path, stem: str, settings: MosaicSettings
+) -> Layer | None:
+    stamp = path.stat()
+    of = _prepared_once(f"{vars(args)} {stamp.st_size} {stamp.st_mtime_ns}", path, _Held(args))
+    grid = GroundGrid(of.target, settings.gsd)
+    factor = max(int(grid.gsd / of.pixel_m + 0.1), 1)
+    held: list[SpillingMosaic] = []
+
+    def mosaic(dtype: Any) -> SpillingMosaic:
+        held.append(SpillingMosaic(dtype, min(settings.tile, 512), folder / f"{stem}.spilled", settings.sigma))
+        return held[0]
+
+    work = Rectification(
+        of.camera, of.ccd, of.surface, grid, args.resampling, of.orientation, of.reference_ns, factor, of.errors, mosaic
+    )
+    ccd = of.camera.lines[of.ccd].id
+    for block in line_blocks(of.recording, ccd, [strip]):
+        try:
+            work.add(block)
+        except ValueError as error:
+            raise UserError(f"{path}: {block.ccd} line {block.first_line}: {error}") from None
+    done = work.finish()
+    if done is None or not held:
+        return None
+    try:
+        return layer_of_mosaic(
+            held[0], folder, stem, settings.crs, settings.gsd, settings.tile, settings.sigma,
+            name=f"{path.stem} {strip}", camera=_camera_name(of.camera, of.ccd),
+            told={"lines": sum(done.strips.values()), "left_out": done.left_out, "missed_rays": done.missed_rays,
+                  "orientation": of.orientation_name, "ground": of.ground},
+        )  # fmt: skip
+    finally:
+        held[0].close()
+
+
+def _camera_name(camera: LineCamera, ccd: int) -> str:
+    return f"{camera.name} {camera.lines[ccd].id}"
+
+
+# -- what is told --------------------------------------------------------------------------------------------------
+
+
+def _assets(outputs: Outputs) -> dict[str, Path | None]:
+    return {"mosaic": outputs.mosaic, "source": outputs.source, "seams": outputs.seams, "sigma": outputs.sigma}
+
+
+def _result(
+    args: argparse.Namespace, outputs: Outputs, settings: MosaicSettings, layers: list[Layer], folder: Path,
+    done: dict[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    bands, usual = read_balance(folder)
+    cameras = list(dict.fromkeys(layer.camera for layer in layers if layer.camera))
+    balanced = [
+        {
+            "sigma0": b.sigma0, "places": b.places, "refused": b.refused,
+            "layers": [
+                {"gain": float(g), "gain_sigma": float(sg), "offset": float(o), "offset_sigma": float(so),
+                 "tied": bool(t)}
+                for g, sg, o, so, t in zip(b.gain, b.gain_sigma, b.offset, b.offset_sigma, b.tied, strict=True)
+            ],
+            "fall_off": [
+                {"camera": layers[int((b.camera == k).argmax())].camera, "s2": float(c[0]), "s2_sigma": float(s[0]),
+                 "s4": float(c[1]), "s4_sigma": float(s[1])}
+                for k, (c, s) in enumerate(zip(b.fall_off, b.fall_off_sigma, strict=True))
+            ],
+        }
+        for b in bands
+    ]  # fmt: skip
+    return {
+        **{name: path and str(path) for name, path in _assets(outputs).items()}, "stac": args.stac and str(args.stac),
+        "crs": settings.crs or "local", "gsd": settings.gsd, "rows": done["rows"], "columns": done["columns"],
+        "tile": settings.tile, "balance": settings.balance, "seams_by": settings.seams, "feather": settings.feather,
+        "cameras": cameras, "usual_difference": usual,
+        "layers": [
+            {"name": layer.name, "cells": done["cells"][layer.name], **layer.told} for layer in layers
+        ],
+        "bands": balanced, "seam_lines": done["seams"], "step_across_seams": done["step_across_seams"],
+    }  # fmt: skip
+
+
+def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
+    if args.json:
+        print(json.dumps(result, indent=2))
+        return
+    again = f", {result['continued']} jobs were done already" if result["continued"] else ""
+    print(
+        f"{result['mosaic']}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} in {result['crs']}, "
+        f"{len(result['layers'])} layers, {result['seconds']:.1f} s{again}"
+    )
+    band = result["bands"][0]
+    width = max(len(layer["name"]) for layer in result["layers"])
+    print(f"  {'layer':{width}}  {'cells shown':>12}" + ("" if result["balance"] == "none" else "  gain, offset"))
+    for layer, tone in zip(result["layers"], band["layers"], strict=True):
+        text = f"  {layer['name']:{width}}  {layer['cells']:12d}"
+        if result["balance"] != "none":
+            text += (
+                f"  {tone['gain']:.4f} +- {tone['gain_sigma']:.4f}, {tone['offset']:+.1f} +- {tone['offset_sigma']:.1f}"
+                if tone["tied"]
+                else "  overlaps with no other"
+            )
+        print(text)
+    if result["balance"] == "fall-off":
+        for camera in band["fall_off"]:
+            if camera["camera"]:
+                end, ends = 1.0 + camera["s2"] + camera["s4"], "at the ends of the line"
+                print(f"  {camera['camera']}: {100 * end:.1f} % of the light {ends}")
+    if band["places"]:
+        print(
+            f"  balance by {band['places']} places, {band['refused']} refused, sigma of a place {band['sigma0']:.2f} "
+            "grey values" + (" (first band)" if len(result["bands"]) > 1 else "")
+        )
+    step = result["step_across_seams"]
+    if step["nodes"]:
+        print(
+            f"  step across {result['seam_lines']} seam lines: {step['raw_rms']:.2f} before, "
+            f"{step['balanced_rms']:.2f} grey values after the balance (RMS, before feathering)"
+        )
+    rest = [result[name] for name in ("source", "seams", "sigma", "stac") if result[name]]
+    print("  beside it: " + ", ".join(rest))
