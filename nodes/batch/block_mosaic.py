@@ -71,8 +71,16 @@ class MosaicSettings:
 
 def layers_in(folder: Path) -> list[Layer]:
     """The layers that were written, in order; those with nothing in them are left out."""
-    found = [Layer.read(path) for path in sorted((folder / "layers").glob("*.json")) if path.stat().st_size > 5]
-    return found
+    return [Layer.read(path) for path in sorted((folder / "layers").glob("*.json")) if not _is_empty(path)]
+
+
+def empty_layers(folder: Path) -> list[str]:
+    """Names of strips of which nothing could be rectified."""
+    return [read_json(path) for path in sorted((folder / "layers").glob("*.json")) if _is_empty(path)]
+
+
+def _is_empty(path: Path) -> bool:
+    return not isinstance(read_json(path), dict)
 
 
 def check_layers(layers: list[Layer]) -> None:
@@ -266,7 +274,8 @@ def read_balance(folder: Path) -> tuple[list[ToneBalance], float]:
     """The balance of each band, and the usual difference between balanced layers."""
     found = read_json(folder / "balance.json")
     names = ("gain", "offset", "fall_off", "camera", "covariance", "tied")
-    bands = [ToneBalance(**{k: np.array(v) if k in names else v for k, v in band.items()}) for band in found["bands"]]
+    values: list[dict[str, Any]] = found["bands"]
+    bands = [ToneBalance(**{k: np.array(v) if k in names else v for k, v in band.items()}) for band in values]
     return bands, found["usual_difference"]
 
 
@@ -416,7 +425,7 @@ def cells_job(folder: Path, key: Key, layers: dict[int, Layer], settings: Mosaic
         raster = replace(raster, bands=2, dtype="float32", nodata=float("nan"), descriptions=SIGMA_BANDS)
         sigma = np.where(there, np.sqrt(total), np.float32(np.nan)).astype(np.float32)
         write_tile(_file(folder, "tiles", key, "sigma.tif"), raster, sigma)
-    rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    rows, columns = np.flatnonzero(np.any(there, axis=1)), np.flatnonzero(np.any(there, axis=0))
     top, left = key[0] * size, key[1] * size
     told["box"] = [int(top + rows[0]), int(top + rows[-1] + 1), int(left + columns[0]), int(left + columns[-1] + 1)]
     numbers, counts = np.unique(source[source > 0], return_counts=True)
@@ -471,7 +480,7 @@ def _seams_of_tile(
                 ("raw", one.values, other.values), ("balanced", values[at[a]], values[at[b]])
             ):  # fmt: skip
                 step = np.array([_nodes(p - q, wide)[r, c].mean(axis=(1, 2)) for p, q in zip(x, y, strict=True)])
-                told[name] = [float(np.abs(step).mean(axis=0).sum()), float((step**2).mean(axis=0).sum())]
+                told[name] = [float((step**2).mean(axis=0).sum()), float(step.mean(axis=0).sum())]
             told["nodes"] = len(r)
         out.append(told)
     return out
@@ -569,7 +578,7 @@ def _features(
             ]
             a, b = seam["layers"]
             n = max(seam["nodes"], 1)
-            steps = {f"step_{name}": round(seam[name][0] / n, 4) for name in ("raw", "balanced")}
+            steps = {f"step_{name}": round(seam[name][1] / n, 4) for name in ("raw", "balanced")}
             yield places, {"layers": [layers[a].name, layers[b].name], "tile": list(key), **steps}
 
 
@@ -580,13 +589,13 @@ def _summary(told: dict[Key, Any], layers: list[Layer]) -> dict[str, Any]:
         for k, n in t["cells"].items():
             cells[layers[int(k)].name] += n
         for seam in t["seams"]:
-            total += [seam["nodes"], *seam["raw"], *seam["balanced"]]
+            n = max(seam["nodes"], 1)
+            tones = [seam[name][1] ** 2 / n for name in ("raw", "balanced")]  # of the seam as a whole
+            total += [seam["nodes"], seam["raw"][0], seam["balanced"][0], *tones]
     n = max(total[0], 1.0)
+    rms = np.sqrt(total[1:] / n).tolist()
+    names = ("raw_rms", "balanced_rms", "raw_tone_rms", "balanced_tone_rms")
     return {
         "cells": cells,
-        "step_across_seams": {
-            "nodes": int(total[0]),
-            "raw_mean": total[1] / n, "raw_rms": float(np.sqrt(total[2] / n)),
-            "balanced_mean": total[3] / n, "balanced_rms": float(np.sqrt(total[4] / n)),
-        },
-    }  # fmt: skip
+        "step_across_seams": {"nodes": int(total[0]), **dict(zip(names, rms, strict=True))},
+    }

@@ -19,6 +19,7 @@ from ..batch.block_mosaic import (
     MosaicSettings,
     Outputs,
     check_layers,
+    empty_layers,
     layers_in,
     make_mosaic,
     put_together,
@@ -278,7 +279,7 @@ def layer_job(
         layer = _layer_of_strip(args, path, strip, inside, stem, settings)
     done = inside / f"{stem}.json"
     if layer is None:
-        write_json(done, None)
+        write_json(done, None if strip is None else f"{path.name} {strip}")
     else:
         layer.write(done)
 
@@ -375,11 +376,14 @@ def _result(
     cameras = list(dict.fromkeys(layer.camera for layer in layers if layer.camera))
     balanced = [
         {
-            "sigma0": b.sigma0, "places": b.places, "refused": b.refused,
+            "sigma0": b.sigma0, "places": b.places, "refused": b.refused, "mean_offset": b.mean_offset[0],
+            "mean_offset_sigma": b.mean_offset[1],
             "layers": [
                 {"gain": float(g), "gain_sigma": float(sg), "offset": float(o), "offset_sigma": float(so),
                  "tied": bool(t)}
-                for g, sg, o, so, t in zip(b.gain, b.gain_sigma, b.offset, b.offset_sigma, b.tied, strict=True)
+                for g, sg, o, so, t in zip(
+                    b.gain, b.gain_sigma, b.offset - b.mean_offset[0], b.relative_offset_sigma, b.tied, strict=True
+                )
             ],
             "fall_off": [
                 {"camera": layers[int((b.camera == k).argmax())].camera, "s2": float(c[0]), "s2_sigma": float(s[0]),
@@ -390,7 +394,8 @@ def _result(
         for b in bands
     ]  # fmt: skip
     return {
-        **{name: path and str(path) for name, path in _assets(outputs).items()}, "stac": args.stac and str(args.stac),
+        **{name: path and str(path) for name, path in _assets(outputs).items()},
+        "stac": args.stac and str(args.stac), "empty": empty_layers(folder),
         "crs": settings.crs or "local", "gsd": settings.gsd, "rows": done["rows"], "columns": done["columns"],
         "tile": settings.tile, "balance": settings.balance, "seams_by": settings.seams, "feather": settings.feather,
         "cameras": cameras, "usual_difference": usual,
@@ -435,8 +440,11 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
     step = result["step_across_seams"]
     if step["nodes"]:
         print(
-            f"  step across {result['seam_lines']} seam lines: {step['raw_rms']:.2f} before, "
-            f"{step['balanced_rms']:.2f} grey values after the balance (RMS, before feathering)"
+            f"  step of tone across {result['seam_lines']} seam lines: {step['raw_tone_rms']:.2f} grey values before, "
+            f"{step['balanced_tone_rms']:.2f} after the balance (RMS of the lines; of single nodes "
+            f"{step['raw_rms']:.2f} and {step['balanced_rms']:.2f})"
         )
+    for name in result["empty"]:
+        print(f"  nothing of {name}")
     rest = [result[name] for name in ("source", "seams", "sigma", "stac") if result[name]]
     print("  beside it: " + ", ".join(rest))

@@ -182,7 +182,7 @@ def feather_weights(labels: IntArray, known: Mask, width: int) -> NDArray[np.flo
         first = np.argmax(known, axis=0)
         out[(first[bare], *np.nonzero(bare))] = 1.0
         total = out.sum(axis=0)
-    return out / np.where(total > 0, total, np.float32(1.0))
+    return (out / np.where(total > 0, total, 1.0)).astype(np.float32)
 
 
 @dataclass(frozen=True)

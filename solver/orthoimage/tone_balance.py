@@ -92,6 +92,19 @@ class ToneBalance:
         return np.sqrt(np.diag(self.covariance)[m : 2 * m])
 
     @property
+    def relative_offset_sigma(self) -> Array:
+        """Sigma of each offset against the mean of all of them, which overlaps hardly see."""
+        m = len(self.gain)
+        less_mean = np.eye(m) - 1.0 / m
+        return np.sqrt(np.diag(less_mean @ self.covariance[m : 2 * m, m : 2 * m] @ less_mean))
+
+    @property
+    def mean_offset(self) -> tuple[float, float]:
+        """Mean of all offsets, and its sigma."""
+        m = len(self.gain)
+        return float(self.offset.mean()), float(np.sqrt(self.covariance[m : 2 * m, m : 2 * m].mean()))
+
+    @property
     def fall_off_sigma(self) -> Array:
         return np.sqrt(np.diag(self.covariance)[2 * len(self.gain) :]).reshape(-1, 2)
 
@@ -221,7 +234,7 @@ def _sandwich(
     score = csr_array(of_place @ (A * (w * residual)[:, None])) - cross * (inverse * (B @ residual))[:, None]
     groups, at = np.unique(group, return_inverse=True)
     join = csr_array((np.ones(len(group)), (at, np.arange(len(group)))), shape=(len(groups), len(group)))
-    scores = np.asarray((join @ score).toarray())
+    scores = csr_array(join @ score).toarray()
     few = len(groups) / max(len(groups) - 1, 1)
     Q = np.linalg.inv(N)
     return Q @ (few * (scores.T @ scores) + prior) @ Q
