@@ -273,9 +273,13 @@ def write_balance(folder: Path, layers: list[Layer], several: list[Key], setting
 def read_balance(folder: Path) -> tuple[list[ToneBalance], float]:
     """The balance of each band, and the usual difference between balanced layers."""
     found = read_json(folder / "balance.json")
-    names = ("gain", "offset", "fall_off", "camera", "covariance", "tied")
-    values: list[dict[str, Any]] = found["bands"]
-    bands = [ToneBalance(**{k: np.array(v) if k in names else v for k, v in band.items()}) for band in values]
+    bands = [
+        ToneBalance(
+            np.array(b["gain"]), np.array(b["offset"]), np.array(b["fall_off"]), np.array(b["camera"]),
+            np.array(b["covariance"]), b["sigma0"], b["places"], b["refused"], np.array(b["tied"]),
+        )
+        for b in found["bands"]
+    ]  # fmt: skip
     return bands, found["usual_difference"]
 
 
