@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "process": ("process", "the same nodes over a recording, as fast as it goes"),
     "adjust": ("adjust", "batch adjustment of a recording or a block folder"),
     "navigate": ("navigate", "GNSS/inertial filter and smoother over a recording or a sensor folder"),
+    "batch": ("batch", "many recordings through process, adjust, navigate, rectify and analyze, on several workers"),
     "analyze": ("analyze", "offline analysis: one self-contained HTML report"),
     "info": ("info", "what a recording holds"),
     "new": ("new", "a commented flight folder to fill in"),
@@ -41,8 +42,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-def _parse(argv: list[str]) -> argparse.Namespace:
-    """Parse the arguments; an unknown option is reported with the usage of its command."""
+def parse(argv: list[str]) -> argparse.Namespace:
+    """Parse the words behind ``triline``; an unknown option is reported with the usage of its command."""
     command = next((word for word in argv if not word.startswith("-")), None)
     parser, subparser = _parser(command if command in COMMANDS else None)
     args, unknown = parser.parse_known_args(argv)
@@ -98,12 +99,16 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
     # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if os.environ.pop("TRILINE_JOB", ""):
+        from ..jobs.work import end_with_parent
+
+        end_with_parent()
     with clean_streams():
         return _run(sys.argv[1:] if argv is None else argv)
 
 
 def _run(argv: list[str]) -> int:
-    args = _parse(argv)
+    args = parse(argv)
     try:
         return args.run(args)
     except UserError as error:

@@ -43,6 +43,7 @@ from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import refuse_unless_folder
 from ..formats.scene_block import is_scene_block
 from ..recording.reader import RecordingReader
+from ..recording.remote import path_of
 from ..recording.summary import damage_lines
 from ..terminal import drawing, plain
 from .adjust_scenes import run_scenes
@@ -62,7 +63,9 @@ FEW = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", metavar="INPUT", help="block folder, block of satellite scenes, or recording (MCAP)")
+    parser.add_argument(
+        "input", metavar="INPUT", help="block folder, block of satellite scenes, or recording (URLs, too)"
+    )
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
     group = parser.add_argument_group("model")
     group.add_argument(
@@ -123,7 +126,8 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
-    if is_scene_block(Path(args.input)):
+    path = path_of(args.input)
+    if path.is_dir() and is_scene_block(path):
         if args.clock_sigma:
             raise UserError("--clock-sigma does not go with satellite scenes")
         if args.camera is not None:
@@ -131,14 +135,14 @@ def run(args: argparse.Namespace) -> int:
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
-    block = read_input(Path(args.input))
+    block = read_input(path)
     if args.camera is not None:
         note = f"camera of {args.camera}"
         block = replace(block, camera=read_camera_instead(args.camera, block.camera), notes=(*block.notes, note))
     surface = None
     if dem:
-        path, crs = Path(dem["dem"]), dem.get("dem_crs")
-        surface = surface_control(path, block.frame, crs, dem["dem_sigma_m"], dem.get("dem_shift_sigma_m"))
+        raster, crs = Path(dem["dem"]), dem.get("dem_crs")
+        surface = surface_control(raster, block.frame, crs, dem["dem_sigma_m"], dem.get("dem_shift_sigma_m"))
     air = None
     if args.refraction is not None:
         air = refraction_of(args.refraction, WGS84, str(args.input))
@@ -175,7 +179,7 @@ def read_input(path: Path) -> BlockData:
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
     refuse_importable(path)
-    reader = RecordingReader(path)
+    reader = RecordingReader(path, by_ranges=True)
     block = block_from_messages(reader.messages(TOPICS), path.name)
     return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..formats.new_file import new_file
+from ..recording.remote import path_of
 from ..recording.summary import Holdings
 from ..report.accuracy_table import accuracy_lines
 
@@ -17,7 +18,9 @@ EXAMPLE = "triline analyze flight.mcap -o report.html"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="MCAP recording, with results of the adjuster for a full report")
+    parser.add_argument(
+        "recording", type=path_of, help="MCAP recording or URL, with results of the adjuster for a full report"
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("report.html"), help="HTML file (report.html)")
 
 

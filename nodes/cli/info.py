@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from ..convert import iso
 from ..formats.importable import refuse_importable
 from ..recording.access import Recording
+from ..recording.remote import path_of
 from ..recording.seal import verify
 from ..recording.summary import findings, holdings
 from ..terminal import plain
@@ -19,7 +19,7 @@ EXAMPLE = "triline info flight.mcap"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+    parser.add_argument("recording", type=path_of, metavar="RECORDING", help="flight.mcap, or its URL")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,7 +47,7 @@ def _summary(recording: Recording) -> dict[str, Any]:
         "topics": [vars(row) for row in rows],
         "damage": findings(reader, decode=False, outside=False),
     }
-    seal = verify(reader.path)
+    seal = None if reader.remote is not None else verify(reader.path)
     if seal is not None:
         summary["signed"] = {**asdict(seal), "words": str(seal)}
     if "configuration/project" in present:
@@ -71,6 +71,8 @@ def _summary(recording: Recording) -> dict[str, Any]:
         ]  # fmt: skip
     if "truth/world" in present:
         summary["world"] = recording.true_world()
+    if reader.remote is not None:
+        summary["bytes_read"] = reader.remote.fetched
     return summary
 
 
@@ -98,6 +100,9 @@ def _lines(s: dict[str, Any]) -> list[str]:
         rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] else "-"
         sources = ", ".join(row["sources"])
         lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
+    if "bytes_read" in s:
+        read = f"{s['bytes_read'] / 1e6:.3f} MB of {s['bytes'] / 1e6:.3f} MB read"
+        lines.append(f"{read}; checksums of what was not read are not compared")
     lines.append("start, end: of what was measured and computed; rate: between the first and last message of the topic")
     if "signed" in s:
         lines.append(f"{s['signed']['words']}{'' if s['signed']['altered'] else ', nothing was altered'}")

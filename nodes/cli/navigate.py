@@ -27,6 +27,7 @@ from ..errors import UserError
 from ..formats.new_file import refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
 from ..formats.sensor_folder import SensorFolder, read_sensor_folder
+from ..recording.remote import RemotePath, path_of
 
 HELP = "GNSS/inertial filter and smoother over a recording or a sensor folder"
 EXAMPLE = "triline navigate flight_sensors/ -o navigation"
@@ -55,13 +56,15 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--rate {args.rate}: wanted a number above 0")
     if args.hold_out is not None and args.hold_out < 2:
         raise UserError(f"--hold-out {args.hold_out}: wanted at least 2")
-    source = Path(args.input)
+    source = path_of(args.input)
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
     platform = None if args.platform is None else Path(args.platform)
     if platform is not None and not platform.is_file():
         raise UserError(f"{platform}: no such file")
     default = source / "navigation" if source.is_dir() else source.with_name(source.name + ".navigation")
+    if isinstance(source, RemotePath) and not args.output:
+        raise UserError(f"{source}: results of a recording elsewhere need a folder here: -o DIR")
     out = Path(args.output) if args.output else default
     refuse_unless_folder(out)
     if source.is_dir():

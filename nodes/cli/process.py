@@ -20,6 +20,7 @@ from ..formats.new_file import refuse_unless_file
 from ..garbage_collection import RareCollections
 from ..node import Node
 from ..recording.reader import RecordingReader
+from ..recording.remote import path_of
 from ..recording.runner import ProcessSummary, process
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
@@ -35,7 +36,7 @@ CAMERA = "configuration/camera"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="flight.mcap")
+    parser.add_argument("recording", type=path_of, metavar="RECORDING", help="flight.mcap, or its URL")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="recording to write")
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file with one table a node")
     parser.add_argument(
@@ -53,6 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_dem_options(parser.add_argument_group("heights"))
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the output (default: none)")
+    parser.add_argument(
+        "--processes", type=int, choices=(1, 2), default=2,
+        help="of this machine at most; the output is the same (default: 2, where there are two processors)",
+    )  # fmt: skip
     parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
 
 
@@ -81,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
                 if told is not None:
                     told(fraction)
 
-            summary = process(reader, nodes, writer.write_raw, progressed, apart=True, instead=instead)
+            summary = process(reader, nodes, writer.write_raw, progressed, apart=args.processes > 1, instead=instead)
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
         if not summary.outputs:

@@ -16,6 +16,7 @@ from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_b
 from ..errors import UserError
 from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
+from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
 from .progress import progress
 from .rectify_recording import cells_of, prepared
@@ -31,7 +32,7 @@ _OF_BOTH = ("dem_crs", "refraction", "sigma", "pixel_sigma", "height_sigma")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", type=Path, metavar="INPUT", nargs="+",
+        "input", type=path_of, metavar="INPUT", nargs="+",
         help="recording with image lines, or with --sensor an image; with --mosaic several, and finished orthoimages",
     )  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="GeoTIFF to write")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import UserError
+from ..recording.remote import RemotePath
 
 
 def refuse_importable(path: Path) -> None:
@@ -12,7 +13,7 @@ def refuse_importable(path: Path) -> None:
 
     Returns silently where nothing is there, or what is there is a recording, or of no known kind.
     """
-    if not path.exists() or (path.is_file() and _is_mcap(path)):
+    if isinstance(path, RemotePath) or not path.exists() or (path.is_file() and _is_mcap(path)):
         return
     from .detect import KINDS, kind_of_path  # imports the readers of all kinds
 

@@ -15,6 +15,7 @@ from ...solver.navigation.inertial_data import TACTICAL, GnssData, InertialGrade
 from .. import convert
 from ..errors import UserError
 from ..recording.reader import RecordingReader
+from ..recording.remote import path_of
 from .sensor_folder import Platform, SensorFolder, read_platform
 
 _FIELDS = {
@@ -50,7 +51,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     ------
     UserError : not a recording, or no inertial data in it
     """
-    reader = RecordingReader(path)
+    reader = RecordingReader(path, by_ranges=True)
     imu = [message.body for message in reader.sorted_messages(["sensor/imu"])]
     gnss = [message.body for message in reader.sorted_messages(["sensor/gnss"])]
     if not imu:
@@ -77,7 +78,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
             platform = replace(platform, wander_time_s=project.wander_time_s)
     fixes = _fixes(gnss, start_ns)
     offset_s = start_ns / convert.SECOND_NS
-    return RecordedSensors(Path(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
+    return RecordedSensors(path_of(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
 
 
 def _grade(imu: list[Any], notes: list[str]) -> InertialGrade:

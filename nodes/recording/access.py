@@ -60,7 +60,8 @@ class Recording:
 
     Parameters
     ----------
-    path : of an MCAP file; a damaged one gives what can be read of it
+    path : of an MCAP file, or its URL (`s3://bucket/flight.mcap`), of which is fetched what is asked for; a damaged one
+        gives what can be read of it
 
     Raises
     ------
@@ -69,7 +70,7 @@ class Recording:
 
     def __init__(self, path: str | Path) -> None:
         try:
-            self.reader = RecordingReader(path)
+            self.reader = RecordingReader(path, by_ranges=True)
         except OSError as error:
             raise UserError(f"{path}: {(error.strerror or str(error)).lower()}") from None
 

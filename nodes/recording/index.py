@@ -58,6 +58,10 @@ class Index:
     def __len__(self) -> int:
         return len(self.chunk)
 
+    def take(self, rows: NDArray[np.int64]) -> Index:
+        """Some of the messages, in this order."""
+        return Index(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
     @classmethod
     def of_rows(cls, rows: array[int]) -> Index:
         """The index from its rows, one behind the other; in them the first chunk is 1, and 0 is outside chunks."""

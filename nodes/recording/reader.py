@@ -1,4 +1,7 @@
-"""Reading recordings, whole or damaged: MCAP files of messages with their envelopes, laid out as `writer` says."""
+"""Reading recordings, whole or damaged: MCAP files of messages with their envelopes, laid out as `writer` says.
+
+Of a recording that lies elsewhere (a URL) can be fetched only what is asked for; see `ranges`.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,8 @@ from ..errors import UserError
 from ..node import Message
 from . import mcap_scan as scan
 from .index import CHANNEL_METADATA, Channel, Index
+from .ranges import Ranged, open_ranged
+from .remote import RemoteFile, RemotePath, path_of
 
 #: Rows of the index that are looked up together.
 _TOGETHER = 8192
@@ -40,25 +45,32 @@ class RecordingReader:
 
     Parameters
     ----------
-    path : of the file
+    path : of the file, or its URL
     salvage : look for chunks even in a file that does not begin as an MCAP file
+    by_ranges : fetch only those messages of a URL that are asked for; nothing then compares the checksums of
+        uncompressed chunks. One whose end does not say where its messages stand is fetched whole all the same
 
     Attributes
     ----------
     channels : id -> Channel
-    index : where the messages stand
+    remote : the file elsewhere, None for one that is here
     damage : stretches of the file that cannot be read
     complete : whether the file ends as it should
     problems : counts of messages that were skipped, by kind; ``last_problem`` says what was wrong with the newest
     """
 
-    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
-        self.path = Path(path)
-        with open(self.path, "rb") as file:
-            self.size = file.seek(0, 2)
-            if self.size == 0:
-                raise UserError(f"{path}: empty, wanted an MCAP recording")
-            self._buffer = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    def __init__(self, path: str | Path, *, salvage: bool = False, by_ranges: bool = False) -> None:
+        self.path = path_of(path)
+        self.remote = RemoteFile(self.path) if isinstance(self.path, RemotePath) else None
+        if self.remote is not None:
+            self.size, self._buffer = self.remote.size, self.remote.buffer
+            self.remote.fetch(0, len(scan.MAGIC))
+        else:
+            with open(self.path, "rb") as file:
+                self.size = file.seek(0, 2)
+                if self.size == 0:
+                    raise UserError(f"{path}: empty, wanted an MCAP recording")
+                self._buffer = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
         self._begins = self._buffer[: len(scan.MAGIC)] == scan.MAGIC
         if not self._begins and not salvage:
             raise UserError(f"{path}: not an MCAP recording")
@@ -74,12 +86,24 @@ class RecordingReader:
         self._copies: set[int] = set()
         self._chunks: list[Chunk] = []
         self._content = lru_cache(maxsize=64)(self._load)
-        self.index = self._scan()
+        self._ranged: Ranged | None = None
+        if self.remote is not None:
+            if by_ranges and self._begins:
+                self._ranged = self._scan_end(self.remote)
+            if self._ranged is None:
+                self.remote.fetch_all()
+        self._index = self._scan() if self._ranged is None else self._ranged.index
 
     @property
     def n_chunks(self) -> int:
         """Whole chunks."""
-        return len(self._chunks)
+        return len(self._chunks if self._ranged is None else self._ranged.chunks)
+
+    @property
+    def index(self) -> Index:
+        """Where the messages stand, and when they were sent."""
+        self._know(np.arange(len(self._index)))
+        return self._index
 
     # ---- what stands where
 
@@ -101,31 +125,64 @@ class RecordingReader:
                 self.damage.append(scan.Damage(found.offset, 0, str(error)))
         index = Index.of_rows(rows)
         self.problems["without a channel"] += int((~np.isin(index.channel, list(self.channels))).sum())
-        return self._without_copies(index)
+        return index.take(self._without_copies(index)) if self._copies else index
 
-    def _without_copies(self, index: Index) -> Index:
-        """Without the copies of messages that are there; those of messages that are lost stand at the head."""
+    def _scan_end(self, file: RemoteFile) -> Ranged | None:
+        """The same from the end of a file elsewhere; None where the end does not say it."""
+        try:
+            ranged = open_ranged(file)
+            end = self.size - len(scan.MAGIC)
+            self._check_summary(ranged.footer, end)
+            header = scan.parse(self._first_record(file))
+            self.library = header.library if isinstance(header, Header) else ""
+            for record in ranged.summary:
+                self._define(record, 2)
+            index = ranged.index
+            self.problems["without a channel"] += int((~np.isin(index.channel, list(self.channels))).sum())
+            copied = {self.channels[number].topic for number in self._copies}
+            twice = [c.id for c in self.channels.values() if c.topic in copied]
+            ranged.heads(np.flatnonzero(np.isin(index.channel, twice)))
+            ranged.take(self._without_copies(index))
+        except ValueError:
+            self.channels, self._schemas, self._trust, self._copies = {}, {}, {}, set()
+            self.problems.clear()
+            return None
+        self.complete = True
+        return ranged
+
+    def _first_record(self, file: RemoteFile) -> memoryview:
+        begin = len(scan.MAGIC)
+        end = begin + scan.RECORD_HEAD.size + min(scan.RECORD_HEAD.unpack_from(self._buffer, begin)[1], 1 << 16)
+        file.fetch(begin, end)
+        return self._buffer[begin:end]
+
+    def _know(self, numbers: NDArray[np.int64]) -> None:
+        """Have number and stamps of messages here."""
+        if self._ranged is not None:
+            try:
+                self._ranged.heads(numbers)
+            except ValueError as error:
+                raise UserError(f"{self.path}: {error}; a copy on this machine can be checked and recovered") from None
+
+    def _without_copies(self, index: Index) -> NDArray[np.int64]:
+        """Which messages to take, in order: no copies of messages that are there; those of lost ones come first."""
 
         def whose(c: Channel) -> tuple[str, str, int, str]:
             return c.topic, c.source, c.start, c.platform
 
         first = {whose(c): c.id for c in self.channels.values() if c.id not in self._copies}
         order = np.arange(len(index))
-        channel = index.channel.copy()
+        before = index.channel.copy()
         for copy in sorted(self._copies):
-            rows = np.flatnonzero(index.channel == copy)
+            rows = np.flatnonzero(before == copy)
             original = first.get(whose(self.channels[copy]))
             if original is None:
                 continue
             del self.channels[copy]
-            lost = ~np.isin(index.sequence[rows], index.sequence[index.channel == original])
-            channel[rows] = original
+            lost = ~np.isin(index.sequence[rows], index.sequence[before == original])
+            index.channel[rows] = original
             order[rows] = np.where(lost, rows - len(index), len(index))
-        if not self._copies:
-            return index
-        chosen = np.argsort(order, kind="stable")[: int((order < len(index)).sum())]
-        columns = (index.chunk, index.place, channel, index.sequence, index.receive_ns, index.stamp_ns)
-        return Index(*(column[chosen] for column in columns))
+        return np.argsort(order, kind="stable")[: int((order < len(index)).sum())]
 
     def _note(self, found: scan.Record, rows: array[int]) -> None:
         """Note a record outside chunks."""
@@ -226,6 +283,8 @@ class RecordingReader:
 
     def _load(self, number: int) -> memoryview:
         try:
+            if self._ranged is not None:
+                return self._ranged.content(number)
             return scan.chunk_content(self._chunks[number])
         except ValueError as error:  # it was whole when the file was opened
             raise UserError(f"{self.path}: {error}; the file has changed while it was read") from None
@@ -236,9 +295,12 @@ class RecordingReader:
 
     def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
         """The same for many messages, one after the other."""
-        index, channels = self.index, self.channels
+        index, channels = self._index, self.channels
         for begin in range(0, len(numbers), _TOGETHER):
             part = numbers[begin : begin + _TOGETHER]
+            if self._ranged is not None:
+                self._know(part)
+                self._ranged.payloads(part)
             columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
             for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
                 data = scan.payload_at(self._buffer if chunk < 0 else self._content(chunk), place)
@@ -258,7 +320,7 @@ class RecordingReader:
             for c in self.channels.values()
             if c.known and (names is None or c.topic in names or any(row.matches(c.topic) for row in rows))
         ]
-        return np.flatnonzero(np.isin(self.index.channel, chosen))
+        return np.flatnonzero(np.isin(self._index.channel, chosen))
 
     def sort(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """The same messages by stamp, place of the topic in the table, topic, source, start and sequence."""
@@ -277,7 +339,8 @@ class RecordingReader:
         place_of = np.zeros(size, dtype=np.int64)
         for channel, place in order.items():
             place_of[channel.id] = place
-        index = self.index
+        self._know(numbers)
+        index = self._index
         keys = (index.sequence[numbers], place_of[index.channel[numbers]], index.stamp_ns[numbers])
         return numbers[np.lexsort(keys)]
 

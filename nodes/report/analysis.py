@@ -16,6 +16,7 @@ from .evaluation import evaluate_flight
 from .flight import Flight, updates_with_new_rays
 from .integrity import integrity
 from .source import WANTED
+from .tracks import tracks
 
 _LARGEST_REJECTED = 200
 
@@ -33,7 +34,8 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
     ``damage`` (one line each), ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status),
     ``parameters`` (of the newest report that has any), ``rejected_observations`` (the largest first), ``latency_s``
-    (median, max), ``integrity`` (see `integrity.integrity`; absent where no report has a light), ``events``
+    (median, max), ``integrity`` (see `integrity.integrity`; absent where no report has a light), ``tracks`` (see
+    `tracks.tracks`), ``events``
     """
     result = {"recording": _recording(flight, held), "damage": held.damage, **evaluate_flight(flight)}
     result["topics"] = {
@@ -58,6 +60,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     sound = integrity(flight)
     if sound is not None:
         result["integrity"] = sound
+    result["tracks"] = tracks(flight)
     result["events"] = [
         {"time_s": float(flight.seconds(stamp)), "level": _level(body), "node": body.name, "text": body.message}
         for stamp, body in flight.events

@@ -24,7 +24,7 @@ def messages_of(recording: str | Path) -> Iterator[Message]:
     UserError : not a recording
     FileNotFoundError : no such file
     """
-    return RecordingReader(recording).sorted_messages(WANTED)
+    return RecordingReader(recording, by_ranges=True).sorted_messages(WANTED)
 
 
 def read(recording: str | Path) -> tuple[Flight, Holdings]:
@@ -35,7 +35,7 @@ def read(recording: str | Path) -> tuple[Flight, Holdings]:
     UserError : not a recording
     FileNotFoundError : no such file
     """
-    reader = RecordingReader(recording)
+    reader = RecordingReader(recording, by_ranges=True)
     flight = collect(reader.sorted_messages(WANTED))
     held = holdings(reader)
     if held.span_ns:

@@ -1,0 +1,1 @@
+"""Jobs over many recordings: what there is to do for each, what is done, and who does it."""

@@ -1,0 +1,127 @@
+"""The recordings that somebody names: files, folders, patterns, lists, and the same in an object store."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
+
+from ..errors import UserError
+from ..recording.remote import is_url, listed
+
+#: Ending of recordings: what is taken of a folder.
+RECORDING = ".mcap"
+_PATTERN = re.compile(r"[*?\[]")
+_UNUSUAL = re.compile(r"[^\w.+=@ -]")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording to work on.
+
+    Attributes
+    ----------
+    name : of the folder of its results, with ``/`` where folders lie in folders
+    path : absolute, or a URL
+    size : bytes
+    modified : what changes with the content: time of the last change, or what the store says
+    """
+
+    name: str
+    path: str
+    size: int
+    modified: str
+
+
+def sources(inputs: Iterable[str], out: Path) -> list[Source]:
+    """The recordings that inputs name, in order and once each.
+
+    A recording of a folder or pattern is named as it lies below the folder (the part of the pattern without wildcards),
+    one that is named itself by its own name, with as many folders before it as it takes to tell all of them apart.
+
+    Parameters
+    ----------
+    inputs : files, folders (with all below them), patterns, ``@FILE`` (a file with one of these a line), URLs
+    out : folder of results; what lies in it is no input
+
+    Raises
+    ------
+    UserError : nothing there, or no recording among it
+    """
+    found: dict[str, tuple[str, int, str]] = {}
+    for text in _expanded(inputs):
+        before = len(found)
+        for path, name, size, modified in _remote(text) if is_url(text) else _local(text, out.resolve()):
+            found.setdefault(path, (name, size, modified))
+        if len(found) == before and not _names_any(text, found):
+            raise UserError(f"{text}: no recording ({RECORDING}) there")
+    names = _told_apart({path: name for path, (name, _, _) in found.items()})
+    return [Source(names[path], path, size, modified) for path, (_, size, modified) in found.items()]
+
+
+def _names_any(text: str, found: Iterable[str]) -> bool:
+    """Whether something that an earlier input gave lies there."""
+    start = text if is_url(text) else str(Path(text).resolve())
+    return any(path.startswith(start) for path in found) or bool(_PATTERN.search(text) and glob.glob(text))
+
+
+def _expanded(inputs: Iterable[str]) -> Iterator[str]:
+    for text in inputs:
+        if not text.startswith("@"):
+            yield text
+            continue
+        for line in Path(text[1:]).read_text(encoding="utf-8").splitlines():
+            if line.strip() and not line.lstrip().startswith("#"):
+                yield line.strip()
+
+
+def _local(text: str, out: Path) -> Iterator[tuple[str, str, int, str]]:
+    path = Path(text)
+    if path.is_file():
+        chosen, base = [path], path.parent
+    elif path.is_dir():
+        chosen, base = sorted(path.rglob("*" + RECORDING)), path
+    elif _PATTERN.search(text):
+        chosen = [p for p in map(Path, sorted(glob.glob(text, recursive=True))) if p.is_file()]
+        base = _base(text)
+    else:
+        raise UserError(f"{text}: no such file or folder")
+    base = base.resolve()
+    for each in chosen:
+        whole = each.resolve()
+        hidden = any(part.startswith(".") for part in whole.relative_to(base).parts) if base in whole.parents else False
+        if not whole.is_file() or (whole != path.resolve() and (hidden or out in whole.parents)):
+            continue
+        stat = whole.stat()
+        below = whole.relative_to(base) if base in whole.parents else Path(whole.name)
+        yield str(whole), below.with_suffix("").as_posix(), stat.st_size, str(stat.st_mtime_ns)
+
+
+def _base(pattern: str) -> Path:
+    """The folder of a pattern before its first wildcard."""
+    fixed = list(takewhile(lambda part: not _PATTERN.search(part), Path(pattern).parts))
+    return Path(*fixed)
+
+
+def _remote(text: str) -> Iterator[tuple[str, str, int, str]]:
+    base, rows = listed(text, RECORDING)
+    for url, size, modified in rows:
+        below = url[len(base) :].lstrip("/") if url.startswith(base) else url.rsplit("/", 1)[-1]
+        yield url, str(PurePosixPath(below).with_suffix("")), size, modified
+
+
+def _told_apart(names: dict[str, str]) -> dict[str, str]:
+    """Names of folders by path, each once: folders are put before those that are there twice."""
+    taken = dict(names)
+    deepest = max((path.count("/") for path in names), default=0)
+    for depth in range(1, deepest + 1):
+        times = Counter(taken.values())
+        for path, name in names.items():
+            if times[taken[path]] > 1:
+                above = PurePosixPath(path.split("://")[-1]).parts[: -1 - name.count("/")]
+                taken[path] = "/".join([*(part for part in above[-depth:] if part != "/"), name])
+    return {path: "/".join(_UNUSUAL.sub("_", part) for part in name.split("/")) for path, name in taken.items()}
