@@ -99,18 +99,29 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
     # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if os.environ.pop("TRILINE_JOB", ""):
+    job = bool(os.environ.pop("TRILINE_JOB", ""))
+    if job:
         from ..jobs.work import end_with_parent
 
         end_with_parent()
     with clean_streams():
-        return _run(sys.argv[1:] if argv is None else argv)
+        return _run(sys.argv[1:] if argv is None else argv, job)
 
 
-def _run(argv: list[str]) -> int:
+def _tell_fetched() -> None:
+    """Say what was fetched of recordings elsewhere."""
+    remote = sys.modules.get("triline.nodes.recording.remote")
+    for file in () if remote is None else remote.OPENED:
+        print(file, file=sys.stderr)
+
+
+def _run(argv: list[str], job: bool) -> int:
     args = parse(argv)
     try:
-        return args.run(args)
+        code = args.run(args)
+        if job or getattr(args, "verbose", False):
+            _tell_fetched()
+        return code
     except UserError as error:
         print(f"triline {args.command}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
     except FileNotFoundError as error:

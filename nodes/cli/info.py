@@ -102,7 +102,7 @@ def _lines(s: dict[str, Any]) -> list[str]:
         lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
     if "bytes_read" in s:
         read = f"{s['bytes_read'] / 1e6:.3f} MB of {s['bytes'] / 1e6:.3f} MB read"
-        lines.append(f"{read}; checksums of what was not read are not compared")
+        lines.append(f"{read}; by ranges: gaps from first and last messages, checksums not compared")
     lines.append("start, end: of what was measured and computed; rate: between the first and last message of the topic")
     if "signed" in s:
         lines.append(f"{s['signed']['words']}{'' if s['signed']['altered'] else ', nothing was altered'}")

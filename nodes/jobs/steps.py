@@ -30,7 +30,7 @@ class Step:
         return [self.name, source, "-o", self.output, "--json", *self.options, *options]
 
 
-#: By name, in the order in which they are done. A job is one process, for as many run side by side as there are workers.
+#: By name, in the order in which they are done. A job is one process: as many run side by side as there are workers.
 STEPS = {
     step.name: step
     for step in (

@@ -75,7 +75,7 @@ class Recording:
             raise UserError(f"{path}: {(error.strerror or str(error)).lower()}") from None
 
     def __repr__(self) -> str:
-        return f"Recording({str(self.reader.path)!r}, {len(self.reader.index)} messages)"
+        return f"Recording({str(self.reader.path)!r}, {len(self.reader.channel_of)} messages)"
 
     def topics(self) -> pd.DataFrame:
         """One row a topic: messages, first and last stamp, rate, sources, gaps."""

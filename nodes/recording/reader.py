@@ -100,6 +100,21 @@ class RecordingReader:
         return len(self._chunks if self._ranged is None else self._ranged.chunks)
 
     @property
+    def by_ranges(self) -> bool:
+        """Whether messages are fetched when they are asked for."""
+        return self._ranged is not None
+
+    @property
+    def channel_of(self) -> NDArray[np.int64]:
+        """The channel of each message of the index (n,), without looking at the messages."""
+        return self._index.channel
+
+    def stamps(self, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Stamps, ns, and sequence numbers of messages of the index, both (k,)."""
+        self._know(numbers)
+        return self._index.stamp_ns[numbers], self._index.sequence[numbers]
+
+    @property
     def index(self) -> Index:
         """Where the messages stand, and when they were sent."""
         self._know(np.arange(len(self._index)))

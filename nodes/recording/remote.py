@@ -64,6 +64,8 @@ def is_url(text: str) -> bool:
 
 def path_of(text: str | Path) -> Path:
     """The path that a word of a command line names, or the URL."""
+    if isinstance(text, RemotePath):
+        return text
     return RemotePath(text) if isinstance(text, str) and is_url(text) else Path(text)
 
 

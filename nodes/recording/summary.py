@@ -44,24 +44,29 @@ class TopicSummary:
 
 
 def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
-    """All topics of a recording, those of the topic table first and in its order."""
+    """All topics of a recording, those of the topic table first and in its order.
+
+    Of a recording that is read by ranges the first and the last message of each channel are looked at: its times and gaps
+    are right where messages stand in their order, duplicates are not seen.
+    """
     by_topic: dict[str, TopicSummary] = {}
     for channel in reader.channels.values():
         row = by_topic.setdefault(channel.topic, TopicSummary(channel.topic, channel.type_name))
-        chosen = np.flatnonzero(reader.index.channel == channel.id)
+        chosen = np.flatnonzero(reader.channel_of == channel.id)
         if channel.source not in row.sources:
             row.sources.append(channel.source)
         if not len(chosen):
             continue
-        stamps, sequences = reader.index.stamp_ns[chosen], reader.index.sequence[chosen]
+        stamps, sequences = reader.stamps(chosen[[0, -1]] if reader.by_ranges and len(chosen) > 1 else chosen)
         row.first_ns = int(min(stamps.min(), row.first_ns)) if row.messages else int(stamps.min())
         row.last_ns = max(int(stamps.max()), row.last_ns)
         row.messages += len(chosen)
         if channel.known:
             distinct = np.unique(sequences)
             meant = distinct[distinct % channel.every == 0] // channel.every
-            row.gaps += int(meant[-1] - meant[0]) + 1 - len(meant) if len(meant) else 0
-            row.duplicates += len(sequences) - len(distinct)
+            there = len(chosen) if reader.by_ranges else len(meant)
+            row.gaps += max(int(meant[-1] - meant[0]) + 1 - there, 0) if len(meant) else 0
+            row.duplicates += 0 if reader.by_ranges else len(chosen) - len(distinct)
             if not topics.find(channel.topic).latched and topics.find(channel.topic).family is not Family.STATUS:
                 row.backwards += int((np.diff(stamps[np.argsort(sequences, kind="stable")]) < 0).sum())
     for row in by_topic.values():
@@ -78,7 +83,12 @@ def time_span_ns(reader: RecordingReader) -> tuple[int, int] | None:
     """
     rows = {c.id: topics.find(c.topic) for c in reader.channels.values() if c.known}
     timed = [id for id, row in rows.items() if row.family in _TIMED and not row.latched]
-    stamps = reader.index.stamp_ns[np.isin(reader.index.channel, timed)]
+    chosen = np.flatnonzero(np.isin(reader.channel_of, timed))
+    if reader.by_ranges and len(chosen):  # the ends of each channel tell, see topic_summaries
+        _, first = np.unique(reader.channel_of[chosen], return_index=True)
+        _, last = np.unique(reader.channel_of[chosen][::-1], return_index=True)
+        chosen = chosen[np.concatenate([first, len(chosen) - 1 - last])]
+    stamps, _ = reader.stamps(chosen)
     return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
 
@@ -111,7 +121,7 @@ class Holdings:
 def holdings(reader: RecordingReader) -> Holdings:
     """What a recording holds; messages that were found unusable so far count as damage."""
     return Holdings(
-        str(reader.path), reader.size, len(reader.index), time_span_ns(reader), topic_summaries(reader),
+        str(reader.path), reader.size, len(reader.channel_of), time_span_ns(reader), topic_summaries(reader),
         damage_lines(reader),
     )  # fmt: skip
 

@@ -32,10 +32,10 @@ def flight_rows(plans: Sequence[Plan], progress: Progress) -> list[dict[str, Any
     dicts with
 
     - ``flight, recording, bytes``; ``state``: "finished", "failed" or "unfinished"; ``reason``: of the first failure;
-    - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job), ``attempts``,
-      ``output`` and ``log`` (paths below the folder of results, None where they are not);
+    - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job),
+      ``attempts``, ``output`` and ``log`` (paths below the folder of results, None where they are not);
     - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS), ``rmse_m`` (X, Y, Z) of object points
-      ``against`` "truth" or "check points", ``tracks``: of the report, see `analysis.analyse`; None where there is none;
+      ``against`` "truth" or "check points", ``tracks``: of the report, see `analysis.analyse`; None without one;
     - ``adjust``: ``sigma0, rejected, check_rmse_m`` of the batch adjustment; None without one.
     """
     return [_row(plan, progress) for plan in plans]
