@@ -23,6 +23,8 @@ INSTALL = "needs Dask: pip install 'triline[cluster]'"
 _CONNECT_S = 15.0
 #: So long may a cluster be away before it is taken for lost, s.
 _LOST_S = 20.0
+#: Time between two questions after the number of workers, s.
+_COUNT_S = 2.0
 
 
 class DaskPool:
@@ -55,6 +57,7 @@ class DaskPool:
         self._ended = distributed.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         self._given: dict[str, tuple[Job, Any]] = {}  # job and future by key
         self._away_s: float | None = None
+        self._workers, self._counted_s = 0, -_COUNT_S
         try:
             self._check()
         except BaseException:
@@ -85,9 +88,11 @@ class DaskPool:
             time.sleep(0.05)
 
     def workers(self) -> int:
-        with suppress(OSError, TimeoutError):
-            return len(self._client.scheduler_info(n_workers=-1)["workers"])
-        return 0
+        if time.monotonic() - self._counted_s > _COUNT_S and self._client.status == "running":
+            with suppress(Exception):  # a scheduler that is lost is told of elsewhere
+                self._workers = len(self._client.nthreads())
+            self._counted_s = time.monotonic()
+        return self._workers
 
     def close(self) -> None:
         """Cancel what waits and what runs; workers end the processes of cancelled jobs."""

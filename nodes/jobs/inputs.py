@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -12,6 +13,8 @@ from pathlib import Path, PurePosixPath
 
 from ..errors import UserError
 from ..recording.remote import is_url, listed
+from .records import record_of
+from .steps import PROCESSED
 
 #: Ending of recordings: what is taken of a folder.
 RECORDING = ".mcap"
@@ -40,8 +43,9 @@ class Source:
 def sources(inputs: Iterable[str], out: Path) -> list[Source]:
     """The recordings that inputs name, in order and once each.
 
-    A recording of a folder or pattern is named as it lies below the folder (the part of the pattern without wildcards),
-    one that is named itself by its own name, with as many folders before it as it takes to tell all of them apart.
+    What an earlier run made is no recording of a folder. A recording of a folder or pattern is named as it lies below
+    the folder (the part of the pattern without wildcards), one that is named itself by its own name, with as many
+    folders before it as it takes to tell all of them apart.
 
     Parameters
     ----------
@@ -55,7 +59,7 @@ def sources(inputs: Iterable[str], out: Path) -> list[Source]:
     found: dict[str, tuple[str, int, str]] = {}
     for text in _expanded(inputs):
         before = len(found)
-        for path, name, size, modified in _remote(text) if is_url(text) else _local(text, out.resolve()):
+        for path, name, size, modified in _remote(text) if is_url(text) else _local(text, Path(os.path.abspath(out))):
             found.setdefault(path, (name, size, modified))
         if len(found) == before and not _names_any(text, found):
             raise UserError(f"{text}: no recording ({RECORDING}) there")
@@ -65,7 +69,7 @@ def sources(inputs: Iterable[str], out: Path) -> list[Source]:
 
 def _names_any(text: str, found: Iterable[str]) -> bool:
     """Whether something that an earlier input gave lies there."""
-    start = text if is_url(text) else str(Path(text).resolve())
+    start = text if is_url(text) else os.path.abspath(text)
     return any(path.startswith(start) for path in found) or bool(_PATTERN.search(text) and glob.glob(text))
 
 
@@ -84,17 +88,18 @@ def _local(text: str, out: Path) -> Iterator[tuple[str, str, int, str]]:
     if path.is_file():
         chosen, base = [path], path.parent
     elif path.is_dir():
-        chosen, base = sorted(path.rglob("*" + RECORDING)), path
+        below = sorted(path.rglob("*" + RECORDING))
+        chosen, base = [p for p in below if p.name != PROCESSED or not record_of(p.parent, "process").exists()], path
     elif _PATTERN.search(text):
         chosen = [p for p in map(Path, sorted(glob.glob(text, recursive=True))) if p.is_file()]
         base = _base(text)
     else:
         raise UserError(f"{text}: no such file or folder")
-    base = base.resolve()
+    base = Path(os.path.abspath(base))  # links keep their names
     for each in chosen:
-        whole = each.resolve()
+        whole = Path(os.path.abspath(each))
         hidden = any(part.startswith(".") for part in whole.relative_to(base).parts) if base in whole.parents else False
-        if not whole.is_file() or (whole != path.resolve() and (hidden or out in whole.parents)):
+        if not whole.is_file() or (each != path and (hidden or out in whole.parents)):
             continue
         stat = whole.stat()
         below = whole.relative_to(base) if base in whole.parents else Path(whole.name)

@@ -68,7 +68,7 @@ def plans(
     options : words that a step gets beside its own, by name
     """
     chosen = [name for name in STEPS if name in wanted]
-    return [_plan(source, out.resolve() / source.name, chosen, options) for source in found]
+    return [_plan(source, Path(os.path.abspath(out)) / source.name, chosen, options) for source in found]
 
 
 def _plan(source: Source, folder: Path, chosen: Sequence[str], options: Mapping[str, tuple[str, ...]]) -> Plan:

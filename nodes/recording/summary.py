@@ -46,7 +46,7 @@ class TopicSummary:
 def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
     """All topics of a recording, those of the topic table first and in its order.
 
-    Of a recording that is read by ranges the first and the last message of each channel are looked at: its times and gaps
+    Of a recording that is read by ranges the first and the last message of each channel are looked at: times and gaps
     are right where messages stand in their order, duplicates are not seen.
     """
     by_topic: dict[str, TopicSummary] = {}
