@@ -1,7 +1,7 @@
 """Many recordings through `triline batch`: two workers against one, workers and schedulers that are killed, a store.
 
     python bench/batch_fleet.py speed [--flights 40]
-    python bench/batch_fleet.py killed [--flights 20] [--every 4]
+    python bench/batch_fleet.py killed [--flights 20] [--every 5]
     python bench/batch_fleet.py restarted [--flights 12]
     python bench/batch_fleet.py store
 
@@ -39,7 +39,7 @@ def main() -> int:
     parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("what", choices=("speed", "killed", "restarted", "store"))
     parser.add_argument("--flights", type=int, help="recordings (speed 40, killed 20, restarted 12)")
-    parser.add_argument("--every", type=float, default=4.0, help="seconds between kills (4)")
+    parser.add_argument("--every", type=float, help="seconds between kills (1.5 times what a job takes)")
     parser.add_argument("--rounds", type=int, default=1, help="of speed (1)")
     parser.add_argument("--recordings", type=Path, help="folder to keep simulated recordings in")
     args = parser.parse_args()
@@ -162,8 +162,11 @@ def equal_to_process(paths: list[Path], out: Path, work: Path) -> int:
 
 def killed(args, recordings: Path, work: Path) -> tuple[dict, bool]:
     paths = flights(recordings, args.flights or 20)
-    chance = random.Random(1)
-    figures: dict[str, object] = {"recordings": len(paths), "seconds between kills": args.every}
+    chance, begun = random.Random(1), time.monotonic()
+    frame.triline("process", str(paths[0]), "-o", str(work / "alone.mcap"), "-q")
+    # a job that is always killed before its end would never be done
+    every = args.every or 1.5 * (time.monotonic() - begun)
+    figures: dict[str, object] = {"recordings": len(paths), "seconds between kills": every}
     good = True
     for kind in ("cluster", "here"):
         port, out, kills = free_port(), work / f"out-{kind}", 0
@@ -173,7 +176,7 @@ def killed(args, recordings: Path, work: Path) -> tuple[dict, bool]:
             where = ("--scheduler", f"tcp://127.0.0.1:{port}") if kind == "cluster" else ("--workers", "2")
             with started(work, paths, out, "--do", "process", *where) as program:
                 while program.poll() is None:
-                    time.sleep(args.every)
+                    time.sleep(every)
                     victims = [*children(w1.pid), *children(w2.pid)] if kind == "cluster" else children(program.pid)
                     victims = [pid for pid in victims if "tracker" not in command_of(pid)]
                     if victims and program.poll() is None:
@@ -239,7 +242,8 @@ def restarted(args, recordings: Path, work: Path) -> tuple[dict, bool]:
                     answers(port)
                     again = batch(paths, out, *words)
         figures |= {
-            f"{kind}: finished before": again["jobs"]["earlier"], f"{kind}: done by the second run": again["jobs"]["now"],
+            f"{kind}: finished before": again["jobs"]["earlier"],
+            f"{kind}: done by the second run": again["jobs"]["now"],
             f"{kind}: done again": sum(path.stat().st_mtime_ns != when for path, when in before.items()),
             f"{kind}: equal to process": equal_to_process(paths, out, work),
         }  # fmt: skip

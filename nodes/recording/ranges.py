@@ -16,7 +16,7 @@ from mcap.records import ChunkIndex, Footer, McapRecord, Statistics
 from numpy.typing import NDArray
 
 from . import mcap_scan as scan
-from .index import Index
+from .index import LAST_NS, Index
 from .remote import RemoteFile
 
 #: Of the end so much is fetched at once, bytes; most indices are smaller.
@@ -84,7 +84,7 @@ class Ranged:
         if not ((heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == index.channel[rows])).all():
             raise NoIndexError("the index of the recording names places where no message of that channel stands")
         index.sequence[rows] = heads["sequence"]
-        index.stamp_ns[rows] = np.minimum(heads["publish"], np.uint64(2**63 - 1)).astype(np.int64)
+        index.stamp_ns[rows] = np.minimum(heads["publish"], np.uint64(LAST_NS)).astype(np.int64)
 
     def payloads(self, numbers: NDArray[np.int64]) -> None:
         """Fetch messages."""
@@ -115,7 +115,7 @@ class Ranged:
         channel, sequence, _, publish = scan.MESSAGE_HEAD.unpack_from(content, place + scan.RECORD_HEAD.size)
         if content[place] != Opcode.MESSAGE or channel != self.index.channel[row]:
             raise NoIndexError("the index of the recording names places where no message of that channel stands")
-        self.index.sequence[row], self.index.stamp_ns[row] = sequence, min(publish, 2**63 - 1)
+        self.index.sequence[row], self.index.stamp_ns[row] = sequence, min(publish, LAST_NS)
 
 
 def open_ranged(file: RemoteFile) -> Ranged:
@@ -166,7 +166,8 @@ def _of_chunk(number: int, chunk: ChunkIndex, data: memoryview) -> NDArray[np.in
         if opcode != Opcode.MESSAGE_INDEX or size + _INDEX_HEAD.size != length or position + length > len(data):
             raise NoIndexError("an index of messages that makes no sense")
         rows = np.frombuffer(data, _ENTRY, size // _ENTRY.itemsize, position + _INDEX_HEAD.size)
-        parts.append(np.stack([rows["place"], np.full(len(rows), channel), rows["time"]]).astype(np.int64))
+        place, log = (np.minimum(rows[name], np.uint64(LAST_NS)).astype(np.int64) for name in ("place", "time"))
+        parts.append(np.stack([place, np.full(len(rows), channel), log]))
         position += length
     place, channel, log = np.concatenate([*parts, np.empty((3, 0), np.int64)], axis=1)
     order = np.argsort(place, kind="stable")

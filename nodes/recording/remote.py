@@ -38,8 +38,16 @@ _CREDENTIALS = {"s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile
 class RemotePath(type(Path())):
     """A URL in the place of a path: commands and readers of recordings take it as a path that is never a folder."""
 
+    _url = ""
+
+    def __new__(cls, *parts: str | Path) -> RemotePath:
+        made = super().__new__(cls, *parts)
+        if len(parts) == 1 and "://" in str(parts[0]):
+            made._url = str(parts[0])  # a path would leave out what stands twice
+        return made
+
     def __str__(self) -> str:
-        return _URL.sub(r"\1://", super().__str__().replace("\\", "/"), count=1)
+        return self._url or _URL.sub(r"\1://", super().__str__().replace("\\", "/"), count=1)
 
     def exists(self, *_: Any, **__: Any) -> bool:
         return True  # the reader says it if it is not: a question for each look would cost a request each

@@ -38,7 +38,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
         figures=drawn,
         all_tiles=_tiles(result),
         flights=[_cells(row) for row in rows],
-        failures=[_failure(row) for row in rows if row["state"] == "failed"],
+        failures=[cells for row in rows for cells in _failures(row)],
         steps=list(dict.fromkeys(name for row in rows for name in row["steps"])),
     )
     write_whole(path, text)
@@ -106,10 +106,15 @@ def _cells(row: dict[str, Any]) -> list[Any]:
     ]
 
 
-def _failure(row: dict[str, Any]) -> list[Any]:
-    name, step = next((name, step) for name, step in row["steps"].items() if step["state"] == "failed")
-    log = Markup('<a href="{}">log</a>').format(quote(step["log"])) if step["log"] else None
-    return [row["flight"], name, step["reason"], step["attempts"], log]
+def _failures(row: dict[str, Any]) -> list[list[Any]]:
+    return [
+        [
+            row["flight"], name, step["reason"], step["attempts"],
+            Markup('<a href="{}">log</a>').format(quote(step["log"])) if step["log"] else None,
+        ]
+        for name, step in row["steps"].items()
+        if step["state"] == "failed"
+    ]  # fmt: skip
 
 
 def _map(rows: Sequence[dict[str, Any]]) -> Figure | None:

@@ -20,6 +20,9 @@ HEAVY = (
     "rerun",
     "rosbags",
     "h5py",
+    "dask",
+    "distributed",
+    "fsspec",
 )
 
 
@@ -46,6 +49,8 @@ def imported(*words: str) -> set[str]:
         ("analyze", "none.mcap"),
         ("view", "none.mcap"),
         ("fly", "none"),
+        ("batch", "recordings/strip.mcap", "-o", "none", "--list"),
+        ("batch", "none", "-o", "none"),
     ],
     ids=lambda words: words[0],
 )

@@ -1,0 +1,260 @@
+"""`triline batch` on workers of this machine: results, second runs, failures, and what is killed or interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from triline.nodes.cli import main
+
+TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
+#: Quick, and has no input but the recording.
+ADJUST = ("--do", "adjust", "--workers", "2")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A short flight."""
+    path = tmp_path_factory.mktemp("flown") / "flown.mcap"
+    plan = ("--seconds", "8", "--lead-in", "1", "--lead-out", "0.5", "--seed", "2")
+    assert main(["simulate", "-o", str(path), *plan, "-q"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def adjustable(flown):
+    """The same, with a trajectory."""
+    path = flown.with_name("adjustable.mcap")
+    assert main(["process", str(flown), "-o", str(path), "-q"]) == 0
+    return path
+
+
+@pytest.fixture
+def season(adjustable, tmp_path, monkeypatch):
+    """A folder with three flights; the working folder is the one above it."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("day1/f1", "day1/f2", "day2/f3"):
+        path = tmp_path / "season" / f"{name}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.link(adjustable, path)
+    return tmp_path / "season"
+
+
+def summary(out: str | Path = "out") -> dict:
+    return json.loads(Path(out, "summary.json").read_text())
+
+
+def records(out: str | Path = "out") -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in sorted(Path(out).rglob("*.done.json"))}
+
+
+def started(*words: str) -> subprocess.Popen:
+    return subprocess.Popen([*TRILINE, "batch", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def jobs_of(process: subprocess.Popen) -> list[int]:
+    """The processes that a batch has started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == process.pid:
+                found.append(int(stat.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def until(wanted, what: str):
+    """What a question gives as soon as it gives anything."""
+    end = time.monotonic() + 60
+    while not (found := wanted()):
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+    return found
+
+
+def test_results_are_those_of_the_single_commands(flown, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.link(flown, "f.mcap")
+    do = ("--do", "process,adjust,analyze", "--with", "process --pace throughput")
+    assert main(["batch", "f.mcap", "-o", "out", *do]) == 0
+    told = capsys.readouterr().out
+    row = summary()["flights"][0]
+    assert row["state"] == "finished"
+    assert f"{row['sigma0']:.3f}" in told
+    assert [step["state"] for step in row["steps"].values()] == ["finished"] * 3
+
+    assert main(["process", "f.mcap", "-o", "alone.mcap", "--pace", "throughput"]) == 0
+    assert Path("alone.mcap").read_bytes() == Path("out/f/processed.mcap").read_bytes()
+    assert main(["adjust", "out/f/processed.mcap", "-o", "alone"]) == 0
+    for name in ("points.csv", "residuals.csv", "trajectory_refined.csv"):
+        assert Path("alone", name).read_bytes() == Path("out/f/adjustment", name).read_bytes()
+    report = json.loads(Path("out/f/analyze.json").read_text())
+    assert row["rmse_m"] == report["points"]["adjusted"]["rmse_m"]
+    assert row["adjust"]["sigma0"] == json.loads(Path("alone/result.json").read_text())["sigma0"]
+
+    page = Path("out/index.html").read_text()
+    assert 'href="f/report.html"' in page
+    assert 'href="f/processed.mcap"' in page
+    assert page.count("<img") == 1, "the map; one flight gives no curve"
+    track = row["tracks"][0]
+    assert track["strip"] == "S1"
+    assert abs(track["lat_deg"][0] - 48.93) < 0.1
+    assert Path("out/summary.csv").read_text().splitlines()[1].startswith("f,finished,")
+
+    capsys.readouterr()
+    assert main(["batch", "f.mcap", "-o", "out", *do, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["jobs"] == {
+        "finished": 3, "earlier": 3, "now": 0, "failed": 0, "not_begun": 0,
+    }  # fmt: skip
+
+
+def to_do(capsys, *words: str) -> list[list[str]]:
+    """What a batch would do, by flight."""
+    capsys.readouterr()
+    assert main(["batch", "season", "-o", "out", "--list", "--json", *words]) == 0
+    return [row["to_do"] for row in json.loads(capsys.readouterr().out)]
+
+
+def test_what_is_missing_or_made_of_something_else_is_done_again(season, capsys):
+    assert main(["batch", "season", "-o", "out", *ADJUST, "-q"]) == 0
+    assert to_do(capsys, *ADJUST) == [[], [], []]
+    assert to_do(capsys, "--do", "adjust,analyze") == [["analyze"]] * 3
+    assert to_do(capsys, *ADJUST, "--with", "adjust --snoop") == [["adjust"]] * 3
+
+    shutil.rmtree("out/day1/f1/adjustment")
+    os.utime("season/day2/f3.mcap", ns=(0, 1))  # the same file has three names
+    assert to_do(capsys, *ADJUST) == [["adjust"]] * 3
+    before = records()
+    assert main(["batch", "season/day1", "-o", "out/day1", *ADJUST, "-q"]) == 0
+    assert {path for path, when in records().items() if before[path] != when} == {
+        "out/day1/f1/adjust.done.json", "out/day1/f2/adjust.done.json",
+    }  # fmt: skip
+
+    Path("camera.json").write_text("{}")
+    options = ("--with", f"adjust --camera {Path('camera.json')}")
+    Path("out/day2/f3/adjust.done.json").write_text("no record")
+    assert to_do(capsys, *ADJUST)[2] == ["adjust"]
+    assert to_do(capsys, *ADJUST, *options) == [["adjust"]] * 3
+
+
+def test_a_failure_is_named_with_its_reason_and_log_and_stops_nothing_else(season, capsys):
+    Path("season/day1/broken.mcap").write_bytes(b"no recording")
+    assert main(["batch", "season", "-o", "out", "--do", "adjust,navigate", "--workers", "2"]) == 1
+    told = capsys.readouterr()
+    assert "day1/broken: adjust failed: " in told.err
+    assert "not an MCAP recording" in told.err
+    result = summary()
+    assert result["jobs"] == {"finished": 3, "earlier": 0, "now": 3, "failed": 5, "not_begun": 0}
+    by_name = {row["flight"]: row for row in result["flights"]}
+    assert by_name["day1/f1"]["steps"]["adjust"]["state"] == "finished"
+    assert "no sensor/imu" in by_name["day1/f1"]["steps"]["navigate"]["reason"]
+    step = by_name["day1/broken"]["steps"]["adjust"]
+    assert step["reason"] in Path("out", step["log"]).read_text()
+    assert 'href="day1/broken/adjust.log"' in Path("out/index.html").read_text()
+
+
+def test_a_step_whose_input_failed_is_not_begun(season, capsys):
+    Path("none.mcap").write_bytes(b"no recording")
+    assert main(["batch", "none.mcap", "-o", "out", "--do", "process,analyze,adjust"]) == 1
+    assert "process failed" in capsys.readouterr().err
+    steps = summary()["flights"][0]["steps"]
+    assert [steps[name]["state"] for name in ("process", "adjust", "analyze")] == ["failed", "not begun", "not begun"]
+
+
+def test_a_job_that_is_killed_is_done_again(season):
+    process = started("season", "-o", "out", *ADJUST)
+    os.kill(until(lambda: jobs_of(process), "no job began")[0], signal.SIGKILL)
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    attempts = sorted(row["steps"]["adjust"]["attempts"] for row in summary()["flights"])
+    assert attempts == [1, 1, 2]
+
+
+def test_one_that_is_always_killed_ends_as_a_failure(season):
+    process = started("season/day2/f3.mcap", "-o", "out", *ADJUST, "--retries", "1")
+    for _ in range(2):
+        os.kill(until(lambda: jobs_of(process), "no job began")[0], signal.SIGKILL)
+        until(lambda: not jobs_of(process) or process.poll() is not None, "the job lives")
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "f3: adjust failed (2 attempts): ended by SIGKILL" in told
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_batch_leaves_what_is_finished_and_nothing_else(season, how):
+    """The same command then does the rest; no job works on without its batch."""
+    process = started("season", "-o", "out", "--do", "adjust", "--workers", "1")
+    before = until(records, "nothing was finished")
+    jobs = until(lambda: jobs_of(process), "no second job began")
+    process.send_signal(how)
+    _, told = process.communicate(timeout=60)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in jobs), "a job works on")
+    if how is not signal.SIGKILL:
+        assert process.returncode == 1
+        assert "interrupted; " in told
+        assert "the same command goes on from there" in told
+        assert not list(Path("out").rglob(".job-*"))
+        assert summary()["flights"][0]["state"] == "finished"
+    assert main(["batch", "season", "-o", "out", *ADJUST, "-q"]) == 0
+    after = records()
+    assert len(after) == 3
+    assert {path: after[path] for path in before} == before, "finished jobs are not done again"
+    assert summary()["jobs"]["earlier"] >= len(before)
+    assert not list(Path("out").rglob(".job-*"))
+
+
+def test_two_batches_do_not_write_to_one_folder(season, capsys):
+    process = started("season", "-o", "out", *ADJUST)
+    until(lambda: jobs_of(process), "no job began")
+    assert main(["batch", "season", "-o", "out", *ADJUST]) == 1
+    assert "another program" in capsys.readouterr().err
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--do", "proces"), "--do proces: no such step, wanted some of process, navigate, adjust, rectify, analyze"),
+        (("--do", ","), "--do: wanted some of"),
+        (("--workers", "0"), "--workers 0: wanted 1 at least"),
+        (("--retries", "-1"), "--retries -1: wanted 0 at least"),
+        (("--with", "adjust --snoop"), "wanted one of the steps first: process, analyze"),
+        (("--with", "process -o x.mcap"), "-o is set by `triline batch`"),
+        (("--with", "process 'x"), "no closing quotation"),
+    ],
+)
+def test_bad_options_are_one_line(season, capsys, words, told):
+    assert main(["batch", "season", "-o", "out", *words]) == 1
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_options_that_a_step_would_refuse_are_refused_before_any_work(season, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", "season", "-o", "out", "--with", "process --pace quick"])
+    assert ended.value.code == 2
+    assert "--pace" in capsys.readouterr().err
+    assert not Path("out").exists()
+
+
+def test_without_dask_one_line_says_how_to_install_it(season):
+    code = (
+        "import sys\nsys.modules['distributed'] = None\nfrom triline.nodes.cli import main\n"
+        "sys.exit(main(['batch', 'season', '-o', 'out', '--scheduler', 'tcp://127.0.0.1:1']))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 1
+    wanted = "--scheduler tcp://127.0.0.1:1: needs Dask: pip install 'triline[cluster]'"
+    assert run.stderr.splitlines()[-1] == f"triline batch: {wanted}"

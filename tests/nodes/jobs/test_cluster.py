@@ -1,0 +1,159 @@
+"""`triline batch --scheduler`: a real Dask scheduler and worker, which are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from triline.nodes.cli import main
+
+TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
+CPU = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+
+class Cluster:
+    """A scheduler and one worker, each a process; `end` kills both."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as s:
+            s.bind(("127.0.0.1", 0))
+            self.port = s.getsockname()[1]
+        self.address, self.folder = f"tcp://127.0.0.1:{self.port}", folder
+        self.processes: list[subprocess.Popen] = []
+        self.scheduler = self._start(
+            "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"
+        )
+        until(self._answers, "the scheduler does not answer")
+        words = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "w"), "--death-timeout", "60")
+        self.nanny = self._start("distributed.cli.dask_worker", self.address, *words)
+
+    def _start(self, module: str, *words: str) -> subprocess.Popen:
+        with open(self.folder / "cluster.log", "ab") as log:
+            command = [sys.executable, "-m", module, *words]
+            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=CPU)
+        self.processes.append(process)
+        return process
+
+    def _answers(self) -> bool:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 1):
+            return True
+        return False
+
+    def end(self) -> None:
+        for process in self.processes:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def until(wanted, what: str):
+    """What a question gives as soon as it gives anything."""
+    end = time.monotonic() + 90
+    while not (found := wanted()):
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+    return found
+
+
+def processes(words: str) -> dict[int, int]:
+    """Processes whose command line has these words: number of each, and of who started it."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, IndexError):
+            if words in (folder / "cmdline").read_text().replace("\0", " "):
+                found[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    return found
+
+
+@pytest.fixture(scope="module")
+def adjustable(tmp_path_factory):
+    path = tmp_path_factory.mktemp("flown") / "flown.mcap"
+    plan = ("--seconds", "8", "--lead-in", "1", "--lead-out", "0.5", "--seed", "2")
+    assert main(["simulate", "-o", str(path), *plan, "-q"]) == 0
+    assert main(["process", str(path), "-o", str(path.with_name("f0.mcap")), "-q"]) == 0
+    return path.with_name("f0.mcap")
+
+
+@pytest.fixture
+def season(adjustable, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for k in range(3):
+        os.link(adjustable, tmp_path / f"f{k}.mcap")
+    return tmp_path
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    made = Cluster(tmp_path)
+    yield made
+    made.end()
+
+
+def records() -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in sorted(Path("out").rglob("*.done.json"))}
+
+
+def batch(cluster: Cluster) -> subprocess.Popen:
+    words = ("f0.mcap", "f1.mcap", "f2.mcap", "-o", "out", "--do", "adjust", "--scheduler", cluster.address)
+    return subprocess.Popen([*TRILINE, "batch", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_lost_worker_or_scheduler_costs_only_what_it_was_doing(season, cluster):
+    """The worker is killed during its first job, the scheduler when some jobs are finished."""
+    job = f"adjust {season}/"
+    program = batch(cluster)
+    (pid, worker), *_ = until(lambda: list(processes(job).items()), "no job began")
+    os.kill(worker, signal.SIGKILL)
+    until(lambda: not Path(f"/proc/{pid}").exists(), "a job works on without its worker")
+    before = until(records, "nothing was finished")
+    cluster.scheduler.kill()
+    _, told = program.communicate(timeout=90)
+    if program.returncode:  # it may have been through before it heard of it
+        assert "the scheduler is gone; what is finished is kept, the same command goes on" in told.splitlines()[-1]
+    cluster.end()
+    until(lambda: not processes(job), "a job works on without its cluster")
+
+    again = Cluster(season)
+    try:
+        program = batch(again)
+        _, told = program.communicate(timeout=120)
+        assert program.returncode == 0, told
+    finally:
+        again.end()
+    after = records()
+    assert len(after) == 3
+    assert {path: after[path] for path in before} == before, "finished jobs are not done again"
+    assert json.loads(Path("out/summary.json").read_text())["jobs"]["finished"] == 3
+    assert not list(Path("out").rglob(".job-*"))
+    tables = [Path(f"out/f{k}/adjustment/points.csv").read_bytes() for k in range(3)]
+    assert main(["adjust", "f0.mcap", "-o", "alone"]) == 0
+    assert tables == [Path("alone/points.csv").read_bytes()] * 3
+
+
+def test_an_interrupted_batch_takes_its_jobs_from_the_cluster(season, cluster):
+    job = f"adjust {season}/"
+    program = batch(cluster)
+    until(lambda: processes(job), "no job began")
+    program.send_signal(signal.SIGINT)
+    _, told = program.communicate(timeout=60)
+    assert program.returncode == 1
+    assert "interrupted; " in told
+    until(lambda: not processes(job), "a job works on that nobody wants")
+
+
+def test_nobody_at_the_address_is_one_line(season, capsys, monkeypatch):
+    import triline.nodes.jobs.cluster as module
+
+    monkeypatch.setattr(module, "_CONNECT_S", 0.5)
+    assert main(["batch", "f0.mcap", "-o", "out", "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["triline batch: --scheduler tcp://127.0.0.1:1: nobody answers there, wanted a Dask scheduler"]

@@ -1,0 +1,90 @@
+"""Which recordings the words of a command line name, and what the folders of their results are called."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from triline.nodes.errors import UserError
+from triline.nodes.jobs.inputs import sources
+
+OUT = Path("results")
+
+
+@pytest.fixture
+def season(tmp_path, monkeypatch):
+    """Two days with a flight of the same name, and what is no recording."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("s/day1/flight.mcap", "s/day2/flight.mcap", "s/first.mcap", "s/.trash/old.mcap", "s/notes.txt"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return tmp_path
+
+
+def names(*inputs: str, out: Path = OUT) -> list[str]:
+    return [source.name for source in sources(inputs, out)]
+
+
+def test_a_folder_gives_all_below_it_by_their_place(season):
+    assert names("s") == ["day1/flight", "day2/flight", "first"]
+
+
+def test_a_pattern_names_from_its_first_wildcard_on(season):
+    assert names("s/*/flight.mcap") == ["day1/flight", "day2/flight"]
+    assert names("s/day?/*.mcap", "s/first.mcap") == ["day1/flight", "day2/flight", "first"]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(season):
+    assert names("s/day1/flight.mcap") == ["flight"]
+    assert names("s/day1/flight.mcap", "s/day2/flight.mcap", "s/first.mcap") == ["day1/flight", "day2/flight", "first"]
+
+
+def test_each_recording_is_taken_once(season):
+    assert names("s/first.mcap", "s", "s/*.mcap") == ["first", "day1/flight", "day2/flight"]
+
+
+def test_a_list_has_one_a_line(season):
+    (season / "list").write_text("# two of them\ns/first.mcap\n\n  s/day1/flight.mcap\n")
+    assert names("@list") == ["first", "flight"]
+
+
+def test_results_are_no_input(season):
+    for name in ("s/out/first/processed.mcap", "s/earlier/first/processed.mcap", "s/mine/processed.mcap"):
+        (season / name).parent.mkdir(parents=True, exist_ok=True)
+        (season / name).write_bytes(b"x")
+    (season / "s/earlier/first/process.done.json").write_text("{}")
+    found = names("s", out=Path("s/out"))
+    assert found == ["day1/flight", "day2/flight", "first", "mine/processed"]
+    assert names("s/earlier/*/processed.mcap") == ["first/processed"], "what is named itself is taken"
+
+
+def test_size_and_time_of_the_file_are_known(season):
+    os.utime("s/first.mcap", ns=(5, 7_000_000_001))
+    (source,) = sources(["s/first.mcap"], OUT)
+    assert (source.path, source.size, source.modified) == (str(season / "s/first.mcap"), 12, "7000000001")
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [("none", "none: no such file or folder"), ("s/x*.mcap", "no recording"), ("empty", "no recording (.mcap) there")],
+)
+def test_what_names_nothing_is_refused(season, word, told):
+    (season / "empty").mkdir()
+    with pytest.raises(UserError, match=told.replace("(", r"\(").replace(")", r"\)")):
+        sources([word], OUT)
+
+
+def test_a_store_is_listed_by_the_same_rules(season):
+    url = f"file://{season}/s"
+    found = sources([url], OUT)
+    assert [source.name for source in found] == [".trash/old", "day1/flight", "day2/flight", "first"]
+    assert found[-1].path == f"{url}/first.mcap"
+    assert found[-1].size == 12
+    assert float(found[-1].modified) == pytest.approx(os.stat("s/first.mcap").st_mtime)
+    assert names(f"{url}/day*/flight.mcap") == ["day1/flight", "day2/flight"]
+    assert names(f"{url}/first.mcap") == ["first"]
+    with pytest.raises(UserError, match="no such file in the store"):
+        sources([f"{url}/none"], OUT)
