@@ -178,7 +178,7 @@ def killed(args, recordings: Path, work: Path) -> tuple[dict, bool]:
                 while program.poll() is None:
                     time.sleep(every)
                     victims = [*children(w1.pid), *children(w2.pid)] if kind == "cluster" else children(program.pid)
-                    victims = [pid for pid in victims if "tracker" not in command_of(pid)]
+                    victims = [pid for pid in victims if "resource_tracker" not in command_of(pid)]
                     if victims and program.poll() is None:
                         with suppress(ProcessLookupError):
                             os.kill(chance.choice(victims), signal.SIGKILL)

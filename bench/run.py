@@ -201,6 +201,30 @@ BENCHMARKS = (
         5,
     ),
     Benchmark(
+        "batch-speed",
+        "Do two workers take forty recordings through `triline batch` in half the time of one?",
+        ("python bench/batch_fleet.py speed",),
+        10,
+    ),
+    Benchmark(
+        "batch-killed",
+        "Is every recording done once, and as by `process`, where workers are killed?",
+        ("python bench/batch_fleet.py killed",),
+        8,
+    ),
+    Benchmark(
+        "batch-restarted",
+        "Does the same command do only what was not finished when program or scheduler were killed?",
+        ("python bench/batch_fleet.py restarted",),
+        5,
+    ),
+    Benchmark(
+        "batch-store",
+        "How much of a recording in an object store do commands fetch?",
+        ("python bench/batch_fleet.py store",),
+        2,
+    ),
+    Benchmark(
         "memory",
         "Do memory and latency stay flat over four hours?",
         ("python bench/long_flight.py --hours 4 --pace throughput",),

@@ -10,6 +10,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ..jobs.records import write_whole
 from .batch_rows import light_words
@@ -173,6 +174,8 @@ def _curves(rows: Sequence[dict[str, Any]]) -> Figure | None:
         ax.scatter([k for k, _ in known], [v for _, v in known], c=colors, s=14)
         if wanted is not None:
             ax.axhline(wanted, color=REJECTED, lw=0.8)
+        ax.set_ylim(bottom=0.0, top=1.1 * max(1.0, *(v for _, v in known)))
         ax.set_title(name)
+    axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     axes[-1].set_xlabel("flight, in the order of the table")
     return drawn
