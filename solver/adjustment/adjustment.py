@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
+from .equations import BlockEquations
 from .gauss_newton import Descent
 from .network import Network
 from .problem import (
@@ -93,11 +94,17 @@ def solve(
     given = np.ones(n) if ray_weight is None else np.asarray(ray_weight, dtype=float)
     if given.shape != (n,) or not (given >= 0).all():
         raise ValueError(f"wanted {n} weights not below zero, got shape {given.shape}")
-    descent = Descent(problem, start, given, options)
-    while not descent.arrived and len(descent.history) < options.max_iterations:
+    equations = BlockEquations(problem, start, given, options.weights)
+    descent = Descent(equations, options)
+    descend(descent, progress)
+    return equations.solution(descent.finished(), tuple(descent.history))
+
+
+def descend(descent: Descent, progress: Callable[[Iteration], None] | None = None) -> None:
+    """Take steps until they arrive, or until there were enough of them."""
+    while not descent.arrived and len(descent.history) < descent.options.max_iterations:
         descent.step()
         if progress:
             progress(descent.history[-1])
         if not descent.arrived:
             descent.form_normals()
-    return descent.solution()

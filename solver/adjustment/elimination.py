@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .layout import Layout
-from .normal_matrix import BandedMatrix, DenseMatrix, NormalMatrix, Structure, find_structure
+from .normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
 
 IntArray = NDArray[np.int64]
 
@@ -77,10 +77,12 @@ class Elimination:
 
     def new_matrix(self) -> NormalMatrix:
         """A zero matrix for the reduced system."""
-        return DenseMatrix(self.n_unknowns) if self.structure is None else BandedMatrix(self.structure)
+        return new_matrix(self.n_unknowns, self.structure)
 
 
-def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ray: IntArray) -> Elimination:
+def plan_elimination(
+    layout: Layout, prior: csr_array, point: IntArray, first_ray: IntArray, dense: bool = False
+) -> Elimination:
     """Group rays and points.
 
     Parameters
@@ -89,6 +91,7 @@ def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ra
     prior : (n_unknowns, n_unknowns) normal matrix of the a-priori knowledge
     point : (n,) point of each ray, ascending
     first_ray : (p + 1,) rays of point i are ``first_ray[i]:first_ray[i + 1]``
+    dense : whether the system is dense whatever its size
     """
     cell, by_cell, cells = _cells(layout)
     clusters = []
@@ -107,7 +110,7 @@ def plan_elimination(layout: Layout, prior: csr_array, point: IntArray, first_ra
         place = table[cell[rays]].T + (point[rays] - low) * width
         clusters.append(Cluster(slice(low, high), rays, columns, np.ascontiguousarray(place)))
     cliques = [c.columns for c in clusters if len(c.columns)]
-    structure = find_structure(layout.n_of_sets, layout.n_unknowns, cliques, prior)
+    structure = None if dense else find_structure(layout.n_of_sets, layout.n_unknowns, cliques, prior)
     return Elimination(
         point, len(first_ray) - 1, by_cell, cell, tuple(cells), tuple(clusters), layout.n_unknowns, structure
     )

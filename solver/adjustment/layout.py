@@ -12,6 +12,7 @@ from ..camera.self_calibration import CameraDesign, SelfCalibration
 from ..models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, join_observations
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .network import Network, Strip
+from .surface_control import SurfaceControl
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
@@ -154,40 +155,76 @@ def build_layout(
     platform: PlatformErrors = NO_PLATFORM_ERRORS,
 ) -> Layout:
     """Correction sets for all strips (and lenses) that have rays, then the platform, then additional parameters."""
-    rays = network.rays
-    lens = network.camera.lens_of_line[rays.ccd]
-    separate = len(network.camera.lenses) > 1
-    key = rays.strip * (len(network.camera.lenses) if separate else 1) + (lens if separate else 0)
-    present, set_of_ray = np.unique(key, return_inverse=True)
+    _, present, set_of_ray = sets_of_rays(network)
     is_control = np.zeros(network.n_points, dtype=bool)
     is_control[network.control.point] = True
+    rays = network.rays
+    own = [set_of_ray == s for s in range(len(present))]
+    sets = correction_sets(
+        network.camera,
+        network.strips,
+        present,
+        [rays.time_s[mine] for mine in own],
+        [rays.time_s[mine & is_control[rays.point]] for mine in own],
+        options,
+        self_calibration is not None,
+    )
+    return layout_of(network, sets, set_of_ray, self_calibration, platform)
+
+
+def sets_of_rays(network: Network) -> tuple[IntArray, IntArray, IntArray]:
+    """Number of the correction set of each ray (n,), those that are present, and which of these each ray has (n,).
+
+    Numbers count strips, or lenses of strips where lenses look separately.
+    """
+    rays, lenses = network.rays, len(network.camera.lenses)
+    key = rays.strip if lenses <= 1 else rays.strip * lenses + network.camera.lens_of_line[rays.ccd]
+    present, set_of_ray = np.unique(key, return_inverse=True)
+    return key, present, set_of_ray
+
+
+def correction_sets(
+    camera: LineCamera,
+    strips: Sequence[Strip],
+    present: IntArray,
+    ray_time_s: Sequence[Array],
+    control_time_s: Sequence[Array],
+    options: ModelOptions,
+    self_calibration: bool,
+) -> tuple[CorrectionSet, ...]:
+    """Correction sets with these numbers (see `sets_of_rays`), given the times of their rays, and of those to control
+    points."""
+    lenses = len(camera.lenses)
     sets: list[CorrectionSet] = []
     first = 0
-    for s, k in enumerate(present):
-        strip_index, lens_index = divmod(int(k), len(network.camera.lenses)) if separate else (int(k), None)
-        strip = network.strips[strip_index]
-        mine = set_of_ray == s
+    for k, times, of_control in zip(present.tolist(), ray_time_s, control_time_s, strict=True):
+        strip_index, lens_index = divmod(k, lenses) if lenses > 1 else (k, None)
+        strip = strips[strip_index]
         name = f"strip {strip.id}"
         if lens_index is not None and strip.lens is None:
-            name += f", lens {network.camera.lenses[lens_index].id}"
-        extent = Extent(
-            name,
-            strip.trajectory.start_s,
-            strip.trajectory.end_s,
-            rays.time_s[mine],
-            rays.time_s[mine & is_control[rays.point]],
-            self_calibration is not None,
-        )
+            name += f", lens {camera.lenses[lens_index].id}"
+        extent = Extent(name, strip.trajectory.start_s, strip.trajectory.end_s, times, of_control, self_calibration)
         model = options.build(extent)
         sets.append(CorrectionSet(strip_index, lens_index, model, first))
         first += model.n_unknowns
-    designs = [(np.flatnonzero(set_of_ray == s), item) for s, item in enumerate(sets)]
+    return tuple(sets)
+
+
+def layout_of(
+    network: Network,
+    sets: Sequence[CorrectionSet],
+    set_of_ray: IntArray,
+    self_calibration: SelfCalibration | None = None,
+    platform: PlatformErrors = NO_PLATFORM_ERRORS,
+) -> Layout:
+    """The layout of correction sets that are known, with the one (n,) of each ray; sets may be without rays here."""
+    rays, unknowns = network.rays, unknowns_of(sets, self_calibration, platform, network.surface)
+    places = ((np.flatnonzero(set_of_ray == s), item) for s, item in enumerate(sets))
+    designs = [(mine, item) for mine, item in places if len(mine)]
     parts = [(mine, item.first_column, item.model.design(rays.time_s[mine])) for mine, item in designs]
     node, component, columns, coefficients = _terms(parts, len(rays))
-    camera = None
-    names = [name for s in sets for name in s.model.unknown_names]
-    prior = [_shifted(s.model.pseudo_observations(), s.first_column) for s in sets]
     if platform.n_unknowns:
+        first = sets[-1].columns.stop
         own = [
             (mine, first, platform_design(network.strips[item.strip], rays.time_s[mine], platform, network.heading))
             for mine, item in designs
@@ -195,11 +232,52 @@ def build_layout(
         more = _terms(own, len(rays))
         node, component = np.append(node, len(coefficients) + more[0]), np.append(component, more[1])
         columns, coefficients = np.concatenate([columns, more[2]]), np.concatenate([coefficients, more[3]])
+    camera = None
+    if self_calibration is not None and self_calibration.n_unknowns:
+        camera = self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
+    return Layout(
+        tuple(sets),
+        set_of_ray.astype(np.int64),
+        node,
+        component,
+        columns,
+        coefficients,
+        camera,
+        unknowns.n_model,
+        unknowns.n_camera,
+        unknowns.names,
+        unknowns.prior,
+        network.heading,
+        n_surface=int(network.surface is not None),
+        platform=platform,
+    )
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Unknowns of the reduced system without the rays: see `Layout`."""
+
+    n_model: int
+    n_camera: int
+    names: tuple[str, ...]
+    prior: PseudoObservations
+
+
+def unknowns_of(
+    sets: Sequence[CorrectionSet],
+    self_calibration: SelfCalibration | None,
+    platform: PlatformErrors,
+    surface: SurfaceControl | None,
+) -> Unknowns:
+    """Names of the unknowns in the order of their columns, and what is known of them beforehand."""
+    first = sets[-1].columns.stop
+    names = [name for s in sets for name in s.model.unknown_names]
+    prior = [_shifted(s.model.pseudo_observations(), s.first_column) for s in sets]
+    if platform.n_unknowns:
         names += platform.unknown_names
         prior.append(_shifted(platform.pseudo_observations(), first))
         first += platform.n_unknowns
     if self_calibration is not None and self_calibration.n_unknowns:
-        camera = self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
         names += self_calibration.unknown_names
         m = self_calibration.n_unknowns
         prior.append(
@@ -212,27 +290,12 @@ def build_layout(
             )
         )
     n_camera = len(names) - first
-    if network.surface is not None:
+    if surface is not None:
         names.append(SURFACE_SHIFT)
-        sigma = np.array([network.surface.shift_sigma_m])
+        sigma = np.array([surface.shift_sigma_m])
         column = np.array([[first + n_camera]], dtype=np.int32)
         prior.append(PseudoObservations(column, np.ones((1, 1)), np.zeros(1), sigma, (SURFACE_SHIFT,)))
-    return Layout(
-        tuple(sets),
-        set_of_ray.astype(np.int64),
-        node,
-        component,
-        columns,
-        coefficients,
-        camera,
-        first,
-        n_camera,
-        tuple(names),
-        join_observations(prior),
-        network.heading,
-        n_surface=int(network.surface is not None),
-        platform=platform,
-    )
+    return Unknowns(first, n_camera, tuple(names), join_observations(prior))
 
 
 def platform_design(strip: Strip, time_s: Array, platform: PlatformErrors, heading: bool) -> Design:

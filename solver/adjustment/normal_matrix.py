@@ -56,6 +56,10 @@ class NormalMatrix(Protocol):
         """Remember the diagonal as it is now: the scale that the rounding of what is subtracted later is judged by."""
         ...
 
+    def take_scale(self, diagonal: Array) -> None:
+        """Take a diagonal (n,) for that scale."""
+        ...
+
     def factorise(self) -> Factor: ...
 
 
@@ -79,6 +83,9 @@ class DenseMatrix:
 
     def keep_scale(self) -> None:
         self.reference = np.diagonal(self.values).copy()
+
+    def take_scale(self, diagonal: Array) -> None:
+        self.reference = diagonal.copy()
 
     def factorise(self) -> Factor:
         """Factor, which overwrites the matrix."""
@@ -154,12 +161,21 @@ class BandedMatrix:
     def keep_scale(self) -> None:
         self.reference = np.concatenate([np.diagonal(block) for block in (*self.diagonal, self.corner)])
 
+    def take_scale(self, diagonal: Array) -> None:
+        self.reference = np.empty(len(diagonal))
+        self.reference[self.structure.position] = diagonal
+
     def factorise(self) -> Factor:
         if self.reference is None:
             self.keep_scale()
         assert self.reference is not None
         s = self.structure
         return BandedFactor(s.position, s.bounds, self.diagonal, self.below, self.border, self.corner, self.reference)
+
+
+def new_matrix(n: int, structure: Structure | None) -> NormalMatrix:
+    """A zero matrix for n unknowns."""
+    return DenseMatrix(n) if structure is None else BandedMatrix(structure)
 
 
 def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:

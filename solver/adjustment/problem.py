@@ -153,7 +153,7 @@ def pose_problem(
 ) -> Problem:
     """Unknowns, priors and elimination plan of a network."""
     layout = build_layout(network, model, self_calibration, platform)
-    network = _with_left_out(network, layout)
+    network = with_left_out(network, layout)
     prior = whiten_prior(layout.prior, layout.n_unknowns)
     return Problem(
         network,
@@ -166,7 +166,7 @@ def pose_problem(
     )
 
 
-def _with_left_out(network: Network, layout: Layout, sign: float = 1.0) -> Network:
+def with_left_out(network: Network, layout: Layout, sign: float = 1.0) -> Network:
     """The network with what the model cannot follow in (or, sign -1, no more in) the noise of the rays' orientation."""
     rays = network.rays
     variance = np.zeros((len(rays), 6))
@@ -191,7 +191,7 @@ def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
     old = solution.problem
     correction = old.layout.corrections(solution.state.theta)
     rays = old.network.rays
-    refined = _with_left_out(old.network, old.layout, -1.0)
+    refined = with_left_out(old.network, old.layout, -1.0)
     position, angles = corrected(rays, old.layout, correction)
     refined = refined.with_orientation(position.T, angles.T)
     problem = pose_problem(refined, model, old.self_calibration, old.layout.platform)

@@ -1,0 +1,102 @@
+"""Who works on partitions, and where these lie: what an adjustment wants of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol, TypeVar
+
+T = TypeVar("T")
+
+
+class Store(Protocol):
+    """Objects by name, which every worker reads and writes. What is written again under a name is the same again."""
+
+    def save(self, name: str, value: Any) -> None: ...
+    def load(self, name: str) -> Any: ...
+    def remove(self, prefix: str) -> None:
+        """Remove all objects whose name begins so."""
+        ...
+
+
+class Runner(Protocol):
+    """Works on partitions: here, in processes, or on a cluster.
+
+    A task is ``task(store, key, *arguments)``. It may run twice, where a worker dies: it reads objects of the store
+    and writes others, never the ones it reads.
+    """
+
+    store: Store
+
+    def run(
+        self,
+        task: Callable[..., T],
+        keys: Sequence[int],
+        arguments: Callable[[int], tuple[Any, ...]],
+        merge: Callable[[T, T], T],
+    ) -> T:
+        """Results of all partitions merged in a tree whose shape depends on their number alone."""
+        ...
+
+    def each(
+        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[T]:
+        """Results of the partitions, one after the other in the order of the keys."""
+        ...
+
+
+class Tree:
+    """Adds up results in pairs of neighbours, pairs of pairs and so on, whatever the order in which they come.
+
+    At most about the logarithm of their number are held where they come in order.
+    """
+
+    def __init__(self, count: int, merge: Callable[[Any, Any], Any]):
+        self._merge = merge
+        self._width = [count]
+        while self._width[-1] > 1:
+            self._width.append((self._width[-1] + 1) // 2)
+        self._waiting: dict[tuple[int, int], Any] = {}
+
+    def add(self, place: int, value: Any) -> None:
+        """The result of one partition."""
+        level = 0
+        while level < len(self._width) - 1:
+            other = place ^ 1
+            if other < self._width[level]:
+                if (level, other) not in self._waiting:
+                    break
+                partner = self._waiting.pop((level, other))
+                value = self._merge(partner, value) if other < place else self._merge(value, partner)
+            place, level = place // 2, level + 1
+        self._waiting[level, place] = value
+
+    def total(self) -> Any:
+        """What all results are together."""
+        ((place, value),) = self._waiting.items()
+        assert place == (len(self._width) - 1, 0)
+        return value
+
+
+class Here:
+    """Everything in this process, one partition after the other."""
+
+    def __init__(self, store: Store):
+        self.store = store
+
+    def run(
+        self,
+        task: Callable[..., T],
+        keys: Sequence[int],
+        arguments: Callable[[int], tuple[Any, ...]],
+        merge: Callable[[T, T], T],
+    ) -> T:
+        tree = Tree(len(keys), merge)
+        for place, key in enumerate(keys):
+            tree.add(place, task(self.store, key, *arguments(key)))
+        return tree.total()
+
+    def each(
+        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[T]:
+        for key in keys:
+            yield task(self.store, key, *arguments(key))
