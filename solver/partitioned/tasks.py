@@ -155,8 +155,10 @@ def extents(store: Store, key: int) -> Extents:
 
 def pose(store: Store, key: int) -> Plan:
     """Pose a partition (``part-K``) as the block is (object ``posed``)."""
-    network: Network = replace(store.load(f"network-{key}"), strips=store.load("strips"))
+    network: Network = store.load(f"network-{key}")
     posed: Posed = store.load("posed")
+    if posed.platform.n_unknowns:  # whose effect needs the trajectories
+        network = replace(network, strips=store.load("strips"))
     part = pose_part(network, posed)
     store.save(f"part-{key}", part)
     meet = {c.columns.tobytes(): c.columns for c in part.problem.elimination.clusters if len(c.columns)}

@@ -198,13 +198,13 @@ def simulate_network(
     true_camera = disturb_camera(camera, self_calibration, values) if self_calibration and values else camera
     strips, corrections, looks = [], {}, []
     for s, line in enumerate(lines):
-        truth = _fly(line, noise, pose_rate_hz, rng)
+        truth = fly(line, noise, pose_rate_hz, rng)
         first = truth.start_s + 0.5
         strip = Strip(line.id, truth, first, line.line_rate_hz, int(line.duration_s * line.line_rate_hz))
-        looks.append(_looks(true_camera, strip, line, points_l, s))
+        looks.append(looks_of(true_camera, strip, line, points_l, s))
         model = errors.build(Extent(f"strip {line.id}", truth.start_s, truth.end_s))
         corrections[line.id] = draw_unknowns(model, rng)
-        measured = _measure(truth, model, corrections[line.id], noise, rng)
+        measured = measured_trajectory(truth, model, corrections[line.id], noise, rng)
         strips.append(replace(strip, trajectory=measured))
     point, strip_of, ccd, u, v = (np.concatenate(a) for a in zip(*looks, strict=True))
     u = u + rng.normal(0.0, noise.image_px, len(u))
@@ -216,8 +216,8 @@ def simulate_network(
         strips,
         ids,
         Measurements(point, strip_of, ccd, u, v, sigma, sigma),
-        _control(points_l, control, noise, rng),
-        _known(points_l, np.asarray(check, dtype=np.int64)),
+        control_of(points_l, control, noise, rng),
+        known_points(points_l, np.asarray(check, dtype=np.int64)),
     )
     order = np.array([int(id[1:]) for id in network.point_ids])
     return SimulatedNetwork(network, points_l[order], corrections, values)
@@ -256,6 +256,11 @@ def scatter_points(
     return np.column_stack([x, y, relief(x, y)])
 
 
+def swath_m(camera: LineCamera, above_m: float) -> float:
+    """Width of a strip on the ground, from a height above it."""
+    return 2 * _field_of_view(camera)[0] * above_m
+
+
 def _field_of_view(camera: LineCamera) -> tuple[float, float, float, float]:
     """Tangents: half the swath, foremost and rearmost view; and the angle of a pixel."""
     xy = [
@@ -266,7 +271,7 @@ def _field_of_view(camera: LineCamera) -> tuple[float, float, float, float]:
     return half, fore, aft, float(np.linalg.norm(xy[0][1] - xy[0][0]))
 
 
-def _fly(line: FlightLine, noise: Noise, rate_hz: float, rng: np.random.Generator) -> Trajectory:
+def fly(line: FlightLine, noise: Noise, rate_hz: float, rng: np.random.Generator) -> Trajectory:
     """True trajectory, half a second longer than the strip on both sides."""
     step = 1.0 / rate_hz
     t = np.arange(-0.5, line.duration_s + 0.5 + step, step)
@@ -280,7 +285,7 @@ def _fly(line: FlightLine, noise: Noise, rate_hz: float, rng: np.random.Generato
     return Trajectory(t + 0.5, position, quaternion_from_matrix(matrix_from_angles(*angles.T)))
 
 
-def _measure(
+def measured_trajectory(
     truth: Trajectory, model: CorrectionModel, theta: Array, noise: Noise, rng: np.random.Generator
 ) -> Trajectory:
     """Measured = true - correction + wander."""
@@ -294,7 +299,7 @@ def _measure(
     return Trajectory(truth.time_s, truth.position_l - correction[:, :3], quaternion)
 
 
-def _looks(
+def looks_of(
     camera: LineCamera, strip: Strip, line: FlightLine, points_l: Array, index: int
 ) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
     """Point, strip, CCD line, image line and sample of all a strip sees: Newton's method on the line condition."""
@@ -326,7 +331,8 @@ def _looks(
     return p, np.full(len(p), index), k, u, v
 
 
-def _control(points_l: Array, roles: Mapping[int, str], noise: Noise, rng: np.random.Generator) -> Control:
+def control_of(points_l: Array, roles: Mapping[int, str], noise: Noise, rng: np.random.Generator) -> Control:
+    """Control with its noise for some points, by index and role."""
     index = np.array(sorted(roles), dtype=np.int64)
     sigma = np.tile(np.array(noise.control_m, dtype=float), (len(index), 1))
     xyz = points_l[index] + rng.normal(size=(len(index), 3)) * sigma
@@ -336,5 +342,6 @@ def _control(points_l: Array, roles: Mapping[int, str], noise: Noise, rng: np.ra
     return Control(index, xyz, sigma)
 
 
-def _known(points_l: Array, index: IntArray) -> Control:
+def known_points(points_l: Array, index: IntArray) -> Control:
+    """True coordinates of some points, as check points."""
     return Control(index, points_l[index], np.full((len(index), 3), 1e-6))

@@ -1,0 +1,258 @@
+"""Partitions of a block in files, and the processes or the Dask cluster that work on them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ...solver.partitioned.runner import Tree
+from ..errors import UserError
+
+T = TypeVar("T")
+
+#: Results of partitions that may wait for each worker, beside the one it works on.
+AHEAD = 1
+#: Times that a partition is tried again after its worker has died.
+RETRIES = 3
+
+
+class FolderStore:
+    """Objects as files of a folder that all workers see; see `solver.partitioned.runner.Store`.
+
+    Parameters
+    ----------
+    folder : an empty folder that is made if it is not there, readable by its owner alone
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.pickle"
+
+    def save(self, name: str, value: Any) -> None:
+        """Write by renaming, so that no reader ever meets half of it."""
+        path = self._path(name)
+        part = path.with_suffix(f".{os.getpid()}-{secrets.token_hex(4)}")
+        with part.open("wb") as file:
+            pickle.dump(value, file, protocol=5)
+        os.replace(part, path)
+
+    def load(self, name: str) -> Any:
+        with self._path(name).open("rb") as file:
+            return pickle.load(file)
+
+    def remove(self, name: str) -> None:
+        self._path(name).unlink(missing_ok=True)
+
+
+def _work(task: Callable[..., T], store: FolderStore, key: int, arguments: tuple[Any, ...]) -> tuple[T, int, int]:
+    """Do a task; its result, the process and its largest resident set so far in kB."""
+    result = task(store, key, *arguments)
+    return result, os.getpid(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+class _Counted:
+    """What runners have in common.
+
+    Attributes
+    ----------
+    peak_mb : largest resident set of each worker by its process
+    """
+
+    store: FolderStore
+
+    def __init__(self, store: FolderStore):
+        self.store = store
+        self.peak_mb: dict[str, float] = {}
+
+    def _results(
+        self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Places of the keys and results, as they come."""
+        raise NotImplementedError
+
+    def _note(self, worker: str, peak_kb: int) -> None:
+        self.peak_mb[worker] = max(self.peak_mb.get(worker, 0.0), peak_kb / 1024)
+
+    def run(
+        self,
+        task: Callable[..., T],
+        keys: Sequence[int],
+        arguments: Callable[[int], tuple[Any, ...]],
+        merge: Callable[[T, T], T],
+    ) -> T:
+        """See `solver.partitioned.runner.Runner`."""
+        tree = Tree(len(keys), merge)
+        for place, result in self._results(task, keys, arguments):
+            tree.add(place, result)
+        return tree.total()
+
+    def each(
+        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[T]:
+        """See `solver.partitioned.runner.Runner`."""
+        waiting: dict[int, T] = {}
+        following = 0
+        for place, result in self._results(task, keys, arguments):
+            waiting[place] = result
+            while following in waiting:
+                yield waiting.pop(following)
+                following += 1
+
+
+class ProcessRunner(_Counted):
+    """Processes on this machine. One that dies is replaced, and its partition done again.
+
+    Parameters
+    ----------
+    store : where partitions lie
+    workers : number of processes
+    """
+
+    def __init__(self, store: FolderStore, workers: int):
+        super().__init__(store)
+        self.workers = workers
+        self._pool = self._new_pool()
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"))
+
+    def _results(
+        self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any]]:
+        todo, tries = list(range(len(keys)))[::-1], dict.fromkeys(range(len(keys)), 0)
+        running: dict[Future[Any], int] = {}
+        while todo or running:
+            try:
+                while todo and len(running) < self.workers * (1 + AHEAD):
+                    place = todo[-1]
+                    job = self._pool.submit(_work, task, self.store, keys[place], arguments(keys[place]))
+                    running[job] = todo.pop()
+                done = [job for job in wait(running, return_when=FIRST_COMPLETED).done if not job.exception()]
+                broken = [job for job in running if job.done() and job.exception()]
+                for job in broken:
+                    error = job.exception()
+                    if error is not None and not isinstance(error, BrokenProcessPool):
+                        raise error
+            except BrokenProcessPool:
+                done, broken = [job for job in running if job.done() and not job.exception()], list(running)
+            for job in done:
+                result, process, peak = job.result()
+                self._note(str(process), peak)
+                yield running.pop(job), result
+            if broken:
+                again = [running.pop(job) for job in list(running)]
+                for place in again:
+                    tries[place] += 1
+                    if tries[place] > RETRIES:
+                        raise UserError(f"partition {keys[place]}: the process that works on it ended {RETRIES} times")
+                todo += sorted(again, reverse=True)
+                self._pool.shutdown(wait=False, cancel_futures=True)
+                self._pool = self._new_pool()
+
+    def close(self) -> None:
+        """End the processes."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def processes(self) -> list[int]:
+        """Of the workers."""
+        return list(self._pool._processes)
+
+
+class DaskRunner(_Counted):
+    """Workers of a Dask cluster, which see the folder of the store under the same path.
+
+    Parameters
+    ----------
+    store : where partitions lie
+    scheduler : address, ``tcp://HOST:PORT``
+
+    Raises
+    ------
+    UserError : Dask is not installed, nobody answers at the address, or the workers do not see the folder
+    """
+
+    def __init__(self, store: FolderStore, scheduler: str, timeout_s: float = 20.0):
+        super().__init__(store)
+        try:
+            from distributed import Client
+        except ImportError:
+            raise UserError("--scheduler needs Dask: pip install 'triline[cluster]'") from None
+        try:
+            self._client = Client(scheduler, timeout=f"{timeout_s:g}s", set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            reason = str(error).strip().splitlines()[0] if str(error).strip() else "no answer"
+            raise UserError(f"--scheduler {scheduler}: cannot be reached ({reason})") from None
+        self._check()
+
+    def _check(self) -> None:
+        """Whether every worker reads what is written here."""
+        word = secrets.token_hex(8)
+        self.store.save("word", word)
+        found = self._client.run(_read_word, self.store.folder)
+        if not found:
+            raise UserError("--scheduler: the cluster has no workers")
+        for worker, read in found.items():
+            if read != word:
+                raise UserError(
+                    f"--scheduler: worker {worker} does not see {self.store.folder}; "
+                    "--scratch names a folder that all workers share"
+                )
+
+    def _results(
+        self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any]]:
+        from distributed import as_completed
+
+        threads = sum(self._client.nthreads().values())
+        most, following = max(2, threads * (1 + AHEAD)), 0
+        running: dict[Any, int] = {}
+        arrived = as_completed([], with_results=False, raise_errors=False)
+
+        def submit(place: int) -> None:
+            key = keys[place]
+            name = f"{task.__name__}-{key}-{secrets.token_hex(6)}"
+            job = self._client.submit(
+                _work, task, self.store, key, arguments(key), key=name, pure=False, retries=RETRIES
+            )
+            running[job] = place
+            arrived.add(job)
+
+        while following < min(most, len(keys)):
+            submit(following)
+            following += 1
+        for job in arrived:
+            place = running.pop(job)
+            if job.status != "finished":
+                error = job.exception()
+                if type(error).__name__ == "KilledWorker":
+                    raise UserError(f"partition {keys[place]}: every worker that was given it died") from None
+                raise error if error is not None else RuntimeError(f"partition {keys[place]}: {job.status}")
+            result, process, peak = job.result()
+            job.release()
+            self._note(str(process), peak)
+            if following < len(keys):
+                submit(following)
+                following += 1
+            yield place, result
+
+    def close(self) -> None:
+        """Leave the cluster."""
+        self._client.close()
+
+
+def _read_word(folder: Path) -> object:
+    try:
+        return FolderStore(folder).load("word")
+    except OSError:
+        return None
