@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .layout import Layout
+from .nested_dissection import Dissection
 from .normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
 
 IntArray = NDArray[np.int64]
@@ -73,7 +74,7 @@ class Elimination:
     cells: tuple[Cell, ...]
     clusters: tuple[Cluster, ...]
     n_unknowns: int
-    structure: Structure | None
+    structure: Structure | Dissection | None
 
     def new_matrix(self) -> NormalMatrix:
         """A zero matrix for the reduced system."""

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from .frontal import FrontalMatrix
+from .nested_dissection import Dissection, find_fronts
 from .reduced_system import BandedFactor, DenseFactor, Factor
 
 Array = NDArray[np.floating]
@@ -19,6 +21,8 @@ IntArray = NDArray[np.int64]
 
 #: Systems up to this size are dense whatever their structure.
 DENSE_UP_TO = 600
+#: Systems from this size on are tried in fronts. Tuned: below, a band is as fast.
+FRONTS_FROM = 1200
 #: Levels of the band are joined to blocks of at least this size.
 BLOCK = 48
 
@@ -173,9 +177,11 @@ class BandedMatrix:
         return BandedFactor(s.position, s.bounds, self.diagonal, self.below, self.border, self.corner, self.reference)
 
 
-def new_matrix(n: int, structure: Structure | None) -> NormalMatrix:
+def new_matrix(n: int, structure: Structure | Dissection | None) -> NormalMatrix:
     """A zero matrix for n unknowns."""
-    return DenseMatrix(n) if structure is None else BandedMatrix(structure)
+    if structure is None:
+        return DenseMatrix(n)
+    return FrontalMatrix(structure) if isinstance(structure, Dissection) else BandedMatrix(structure)
 
 
 def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:
@@ -184,8 +190,12 @@ def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> N
     target.reshape(-1)[place] += block.ravel()
 
 
-def find_structure(n_model: int, n_unknowns: int, cliques: Sequence[IntArray], prior: csr_array) -> Structure | None:
+def find_structure(
+    n_model: int, n_unknowns: int, cliques: Sequence[IntArray], prior: csr_array
+) -> Structure | Dissection | None:
     """Order and blocks for a matrix with the entries of `prior` and within some cliques; None where dense is as good.
+
+    A large system is taken apart by nested dissection where that saves work against a band.
 
     Unknowns from `n_model` on (additional parameters) go to the border. The others are ordered by reverse
     Cuthill-McKee; its levels, joined until they are worth a block, are the blocks.
@@ -232,13 +242,33 @@ def find_structure(n_model: int, n_unknowns: int, cliques: Sequence[IntArray], p
     edge = n_unknowns - n_model
     work = (blocks**3).sum() / 3 + (blocks[:-1] ** 2 * blocks[1:] + blocks[:-1] * blocks[1:] ** 2).sum()
     work += edge * (blocks**2).sum() * 2 + edge**2 * n_model
-    if 2 * work > n_unknowns**3 / 3:
+    dense_work = n_unknowns**3 / 3
+    if n_unknowns >= FRONTS_FROM:
+        dissection = find_fronts(*_whole_graph(group, n_groups, n_unknowns, cliques, prior))
+        if 2 * 2 * dissection.work < min(work, dense_work):
+            return dissection
+    if 2 * work > dense_work:
         return None
     position = np.empty(n_unknowns, dtype=np.int64)
     by_group = np.argsort(place[group], kind="stable")
     position[by_group] = np.arange(n_model)
     position[n_model:] = np.arange(n_model, n_unknowns)
     return Structure(position, np.array(bounds, dtype=np.int64))
+
+
+def _whole_graph(
+    group: IntArray, n_groups: int, n_unknowns: int, cliques: Sequence[IntArray], prior: csr_array
+) -> tuple[csr_array, IntArray, IntArray]:
+    """Which groups meet, the group of each unknown, and their sizes; each unknown of the border is one by itself."""
+    edge = n_unknowns - len(group)
+    every = np.concatenate([group, n_groups + np.arange(edge)])
+    total = n_groups + edge
+    member = [np.unique(every[c]) for c in cliques]
+    rows = np.repeat(np.arange(len(member)), [len(m) for m in member])
+    touch = csr_array((np.ones(len(rows)), (rows, np.concatenate(member))), shape=(len(member), total))
+    row, column = (every[c] for c in prior.tocoo().coords)
+    pairs = csr_array((np.ones(len(row)), (row, column)), shape=(total, total))
+    return csr_array(touch.T @ touch + pairs), every, np.bincount(every, minlength=total)
 
 
 def _alike(n_model: int, cliques: Sequence[IntArray]) -> tuple[IntArray, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
@@ -70,7 +71,7 @@ class DenseFactor:
     def __init__(self, matrix: Array, reference: Array | None = None):
         n = len(matrix)
         diagonal = np.diagonal(matrix).copy()
-        self.scale = _scale(diagonal if reference is None else reference)
+        self.scale = scale_of(diagonal if reference is None else reference)
         limit, sound = (SINGULAR, SINGULAR) if reference is None else (ROUNDING, 10 * ROUNDING)
         scaled = matrix.T  # column by column as LAPACK wants it, and in place
         scaled *= self.scale[:, None]
@@ -101,7 +102,7 @@ class DenseFactor:
     def inverse(self) -> Array:
         """(n, n) cofactor matrix."""
         if self._inverse is None:
-            self._inverse = _inverse_of(self._factor)
+            self._inverse = inverse_of(self._factor)
             self._inverse *= self.scale[:, None]
             self._inverse *= self.scale
         return self._inverse
@@ -150,7 +151,7 @@ class BandedFactor:
     ):
         self.position, self.bounds = position, bounds
         n, last = len(position), len(diagonal)
-        scale = _scale(reference)
+        scale = scale_of(reference)
         self._scale = scale  # in the order of the band
         self.scale = scale[position]
         parts = [scale[bounds[i] : bounds[i + 1]] for i in range(last)] + [scale[bounds[-1] :]]
@@ -163,7 +164,7 @@ class BandedFactor:
         values = np.empty(0)
         if not self._factorise(scaled, under, edge, end, 0.0, 10 * ROUNDING):
             self._factorise(scaled, under, edge, end, RAISED, 0.0)
-            values, self._null = self._null_vectors(n)
+            values, self._null = null_vectors(self._solve, n)
             if not len(values):
                 self._factorise(scaled, under, edge, end, 0.0, 0.0)
         vectors = self._null[position]
@@ -177,7 +178,7 @@ class BandedFactor:
         self._L, self._C, self._B = [], [], []
         here, edge, end = diagonal[0], border[0], corner
         for i in range(len(diagonal)):
-            L, sound = _cholesky(here, raised, limit)
+            L, sound = cholesky(here, raised, limit)
             if not sound:
                 return False
             B = solve_triangular(L, edge.T, lower=True, check_finite=False).T
@@ -188,25 +189,8 @@ class BandedFactor:
                 C = solve_triangular(L, below[i].T, lower=True, check_finite=False).T
                 self._C.append(C)
                 here, edge = diagonal[i + 1] - C @ C.T, border[i + 1] - B @ C.T
-        self._E, sound = _cholesky(end, raised, limit)
+        self._E, sound = cholesky(end, raised, limit)
         return sound
-
-    def _null_vectors(self, n: int) -> tuple[Array, Array]:
-        """Eigenvalues and vectors of the scaled matrix that count as zero, from the raised factor."""
-        rng = np.random.default_rng(0)
-        wanted = 16
-        while True:  # subspace iteration with the inverse; more vectors if all of them belong to the null space
-            wanted = min(wanted, n)
-            V = np.linalg.qr(rng.standard_normal((n, wanted)))[0]
-            for _ in range(8):
-                V = np.linalg.qr(self._solve(V))[0]
-            T = V.T @ self._solve(V)
-            values, turn = np.linalg.eigh(0.5 * (T + T.T))
-            eigenvalues = 1.0 / values - RAISED
-            zero = eigenvalues < ROUNDING
-            if wanted == n or not zero.all():
-                return np.maximum(eigenvalues[zero], 0.0), (V @ turn)[:, zero]
-            wanted *= 2
 
     def _solve(self, b: Array) -> Array:
         """Solve with the (raised) scaled factor, in the order of the band; (n,) or (n, m)."""
@@ -242,13 +226,13 @@ class BandedFactor:
         """Blocks of the scaled inverse where the matrix has blocks, from the last to the first (Takahashi)."""
         if self._z is None:
             last = len(self._L)
-            corner = _inverse_of(self._E)
+            corner = inverse_of(self._E)
             diagonal: Blocks = [np.empty(0)] * last
             below: Blocks = [np.empty(0)] * (last - 1)
             border: Blocks = [np.empty(0)] * last
             for i in range(last - 1, -1, -1):
                 XB = solve_triangular(self._L[i], self._B[i].T, lower=True, trans=1, check_finite=False).T
-                own = _inverse_of(self._L[i])
+                own = inverse_of(self._L[i])
                 if i + 1 < last:
                     XC = solve_triangular(self._L[i], self._C[i].T, lower=True, trans=1, check_finite=False).T
                     below[i] = -(diagonal[i + 1] @ XC + border[i + 1].T @ XB)
@@ -296,13 +280,31 @@ class BandedFactor:
         return (d * self._scale**2)[self.position]
 
 
-def _scale(diagonal: Array) -> Array:
+def null_vectors(solve: Callable[[Array], Array], n: int) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of a scaled matrix (n, n) that count as zero, from solutions with its raised factor."""
+    rng = np.random.default_rng(0)
+    wanted = 16
+    while True:  # subspace iteration with the inverse; more vectors if all of them belong to the null space
+        wanted = min(wanted, n)
+        V = np.linalg.qr(rng.standard_normal((n, wanted)))[0]
+        for _ in range(8):
+            V = np.linalg.qr(solve(V))[0]
+        T = V.T @ solve(V)
+        values, turn = np.linalg.eigh(0.5 * (T + T.T))
+        eigenvalues = 1.0 / values - RAISED
+        zero = eigenvalues < ROUNDING
+        if wanted == n or not zero.all():
+            return np.maximum(eigenvalues[zero], 0.0), (V @ turn)[:, zero]
+        wanted *= 2
+
+
+def scale_of(diagonal: Array) -> Array:
     """What makes a diagonal 1."""
     positive = diagonal > 0
     return np.where(positive, 1.0 / np.sqrt(np.where(positive, diagonal, 1.0)), 1.0)
 
 
-def _cholesky(matrix: Array, raised: float, limit: float) -> tuple[Array, bool]:
+def cholesky(matrix: Array, raised: float, limit: float) -> tuple[Array, bool]:
     """Lower factor of a matrix with its diagonal raised, and whether its squared pivots are above a limit."""
     if not len(matrix):
         return matrix, True
@@ -312,7 +314,7 @@ def _cholesky(matrix: Array, raised: float, limit: float) -> tuple[Array, bool]:
     return factor, bool(info == 0 and (np.diagonal(factor) ** 2).min() > limit)
 
 
-def _inverse_of(factor: Array | None) -> Array:
+def inverse_of(factor: Array | None) -> Array:
     """``(L L^T)^-1`` from L."""
     if factor is None or not len(factor):
         return np.empty((0, 0))

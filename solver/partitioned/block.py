@@ -15,6 +15,7 @@ from ..adjustment.gauss_newton import Descent
 from ..adjustment.layout import Unknowns, correction_sets, unknowns_of
 from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
+from ..adjustment.nested_dissection import Dissection
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
 from ..adjustment.problem import USUAL, AdjustmentOptions, Iteration
 from ..adjustment.reduced_system import DenseFactor, Factor
@@ -53,7 +54,7 @@ class PartitionedBlock:
     unknowns: Unknowns
     prior: Prior
     plans: tuple[tasks.Plan, ...] = field(repr=False)
-    structure: Structure | None = field(repr=False)
+    structure: Structure | Dissection | None = field(repr=False)
     n_rays: int
     n_points: int
     n_control: int

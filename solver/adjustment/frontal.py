@@ -1,0 +1,253 @@
+"""A sparse symmetric matrix in fronts, its Cholesky factor, and the cofactors of unknowns that meet.
+
+Multifrontal: each front of a `nested_dissection.Dissection` is a dense matrix over its own unknowns and the later ones
+they meet; what is left when its own are eliminated is added to the front it hangs on. Cofactors go the other way, from
+the last front to the first (Takahashi), and are computed where the factor has entries, which is where observations and
+points need them; libraries of sparse Cholesky factors leave them to the user.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array
+
+from .nested_dissection import Dissection
+from .reduced_system import RAISED, ROUNDING, Undetermined, cholesky, inverse_of, null_vectors, scale_of
+
+Array = NDArray[np.floating]
+IntArray = NDArray[np.int64]
+
+
+
+class FrontalMatrix:
+    """Columns of the fronts' own unknowns: (own + rows, own) each; see `normal_matrix.NormalMatrix`."""
+
+    def __init__(self, dissection: Dissection):
+        self.dissection = dissection
+        own = np.diff(dissection.bounds)
+        self.panels = [np.zeros((int(m) + len(r), int(m))) for m, r in zip(own, dissection.rows, strict=True)]
+        self.reference: Array | None = None
+
+    def add(self, columns: IntArray, block: Array) -> None:
+        place = self.dissection.position[columns]
+        if not (np.diff(place) > 0).all():
+            order = np.argsort(place)
+            place, block = place[order], block[np.ix_(order, order)]
+        for t, low, high in pieces(self.dissection, place):
+            rows = self._local(t, place[low:])
+            self.panels[t][np.ix_(rows, rows[: high - low])] += block[low:, low:high]
+
+    def add_sparse(self, matrix: csr_array) -> None:
+        entries = matrix.tocoo()
+        row, column = (self.dissection.position[i] for i in entries.coords)
+        lower = np.flatnonzero(row >= column)
+        front = np.searchsorted(self.dissection.bounds, column[lower], side="right") - 1
+        order = np.argsort(front, kind="stable")
+        lower, front = lower[order], front[order]
+        limits = np.searchsorted(front, np.arange(len(self.panels) + 1))
+        for t in np.unique(front).tolist():
+            own = lower[limits[t] : limits[t + 1]]
+            at = column[own] - self.dissection.bounds[t]
+            np.add.at(self.panels[t], (self._local(t, row[own]), at), entries.data[own])
+
+    def _local(self, t: int, place: IntArray) -> IntArray:
+        """Rows of a panel that places stand in."""
+        first, end = self.dissection.bounds[t], self.dissection.bounds[t + 1]
+        below = np.searchsorted(self.dissection.rows[t], place) + (end - first)
+        return np.where(place < end, place - first, below)
+
+    def damp(self, damping: float) -> None:
+        for panel in self.panels:
+            i = np.arange(panel.shape[1])
+            panel[i, i] *= 1.0 + damping
+
+    def keep_scale(self) -> None:
+        self.reference = np.concatenate([np.diagonal(panel) for panel in self.panels])
+
+    def take_scale(self, diagonal: Array) -> None:
+        self.reference = np.empty(len(diagonal))
+        self.reference[self.dissection.position] = diagonal
+
+    def factorise(self) -> FrontalFactor:
+        """Factor, which takes the place of the matrix."""
+        if self.reference is None:
+            self.keep_scale()
+        assert self.reference is not None
+        return FrontalFactor(self.dissection, self.panels, self.reference)
+
+
+class FrontalFactor:
+    """Cholesky factor in fronts; see `reduced_system.Factor`.
+
+    A singular matrix gets its diagonal raised by `reduced_system.RAISED`; the null vectors are then found by iteration,
+    and solution and cofactors have no part in them, as in `reduced_system.BandedFactor`.
+
+    Parameters
+    ----------
+    dissection : order and fronts
+    panels : columns of the matrix, which become those of the factor
+    reference : (n,) diagonal before the points were eliminated, in the order of the fronts
+    """
+
+    def __init__(self, dissection: Dissection, panels: list[Array], reference: Array):
+        self.dissection = dissection
+        n = len(dissection.position)
+        scale = scale_of(reference)
+        self._scale = scale  # in the order of the fronts
+        self.scale = scale[dissection.position]
+        bounds = dissection.bounds
+        for t, panel in enumerate(panels):
+            own = slice(int(bounds[t]), int(bounds[t + 1]))
+            panel *= np.concatenate([scale[own], scale[dissection.rows[t]]])[:, None]
+            panel *= scale[own]
+        self._z: list[Array] | None = None
+        self._null, values = np.empty((n, 0)), np.empty(0)
+        self._panels = panels
+        if not self._factorise(0.0, 10 * ROUNDING):
+            self._factorise(RAISED, 0.0)
+            values, self._null = null_vectors(self._solve, n)
+            if not len(values):
+                self._factorise(0.0, 0.0)
+        del self._panels
+        vectors = self._null[dissection.position]
+        vectors = vectors / np.abs(vectors).max(axis=0, initial=1e-300)
+        self.undetermined = Undetermined(vectors, values, self.scale)
+
+    def _factorise(self, raised: float, limit: float) -> bool:
+        """Factor with the diagonal raised; whether all squared pivots are above the limit."""
+        d = self.dissection
+        count = len(self._panels)
+        self._L: list[Array] = []
+        waiting: list[list[tuple[IntArray, Array]]] = [[] for _ in range(count)]
+        for t, panel in enumerate(self._panels):
+            own, size = panel.shape[1], len(panel)
+            front = np.zeros((size, size))
+            front[:, :own] = panel
+            for rows, rest in waiting[t]:
+                at = self._local(t, rows)
+                front[np.ix_(at, at)] += rest
+            waiting[t] = []
+            L, sound = cholesky(front[:own, :own], raised, limit)
+            if not sound:
+                return False
+            factor = np.empty((size, own))
+            factor[:own] = L
+            if size > own:
+                below = solve_triangular(L, front[own:, :own].T, lower=True, check_finite=False).T
+                factor[own:] = below
+                if d.parent[t] >= 0:
+                    rest = front[own:, own:] - below @ below.T
+                    waiting[int(d.parent[t])].append((d.rows[t], rest))
+            self._L.append(factor)
+        return True
+
+    def _local(self, t: int, place: IntArray) -> IntArray:
+        d = self.dissection
+        first, end = d.bounds[t], d.bounds[t + 1]
+        return np.where(place < end, place - first, np.searchsorted(d.rows[t], place) + (end - first))
+
+    def _solve(self, b: Array) -> Array:
+        """Solve with the (raised) scaled factor, in the order of the fronts; (n,) or (n, m)."""
+        d, x = self.dissection, np.array(b, dtype=float)
+        for t, factor in enumerate(self._L):
+            own, m = slice(int(d.bounds[t]), int(d.bounds[t + 1])), factor.shape[1]
+            x[own] = solve_triangular(factor[:m], x[own], lower=True, check_finite=False)
+            x[d.rows[t]] -= factor[m:] @ x[own]
+        for t in range(len(self._L) - 1, -1, -1):
+            factor = self._L[t]
+            own, m = slice(int(d.bounds[t]), int(d.bounds[t + 1])), factor.shape[1]
+            right = x[own] - factor[m:].T @ x[d.rows[t]]
+            x[own] = solve_triangular(factor[:m], right, lower=True, trans=1, check_finite=False)
+        return x
+
+    def solve(self, rhs: Array) -> Array:
+        """``matrix^-1 rhs`` for (n,) or (n, m)."""
+        scale = self._scale if rhs.ndim == 1 else self._scale[:, None]
+        b = np.empty_like(rhs)
+        b[self.dissection.position] = rhs
+        b *= scale
+        b -= self._null @ (self._null.T @ b)
+        x = self._solve(b)
+        x -= self._null @ (self._null.T @ x)
+        return (scale * x)[self.dissection.position]
+
+    def _selected(self) -> list[Array]:
+        """Columns (own + rows, own) of the scaled inverse, from the last front to the first."""
+        if self._z is None:
+            d, count = self.dissection, len(self._L)
+            z: list[Array] = [np.empty(0)] * count
+            whole: dict[int, Array] = {}  # inverse over own and rows, of fronts that others hang on
+            left = np.bincount(d.parent[d.parent >= 0], minlength=count)
+            for t in range(count - 1, -1, -1):
+                factor = self._L[t]
+                size, m = factor.shape
+                own = inverse_of(factor[:m])
+                columns = np.empty((size, m))
+                below = np.empty((0, 0))
+                if size > m:
+                    up = int(d.parent[t])
+                    at = self._local(up, d.rows[t])
+                    below = whole[up][np.ix_(at, at)]
+                    X = solve_triangular(factor[:m], factor[m:].T, lower=True, trans=1, check_finite=False).T
+                    columns[m:] = -below @ X
+                    own = own - X.T @ columns[m:]
+                columns[:m] = 0.5 * (own + own.T)
+                z[t] = columns
+                if d.parent[t] >= 0:
+                    left[d.parent[t]] -= 1
+                    if not left[d.parent[t]]:
+                        whole.pop(int(d.parent[t]), None)
+                if left[t]:
+                    full = np.empty((size, size))
+                    full[:, :m] = columns
+                    full[:m, m:] = columns[m:].T
+                    full[m:, m:] = below
+                    whole[t] = full
+            self._z = z
+        return self._z
+
+    def cofactors(self, columns: IntArray) -> Array:
+        """Block (m, m) of the cofactor matrix; cheap where all of the unknowns meet."""
+        d = self.dissection
+        place = d.position[columns]
+        order = np.argsort(place)
+        sorted_place = place[order]
+        Q = np.empty((len(place), len(place)))
+        z = self._selected()
+        for t, low, high in pieces(d, sorted_place):
+            later = sorted_place[high:]
+            at = np.searchsorted(d.rows[t], later)
+            if len(later) and not (at.max() < len(d.rows[t]) and (d.rows[t][at] == later).all()):
+                unit = np.zeros((len(d.position), len(columns)))
+                unit[columns, np.arange(len(columns))] = 1.0
+                whole = self.solve(unit)[columns]
+                return 0.5 * (whole + whole.T)
+            m = z[t].shape[1]
+            own = sorted_place[low:high] - d.bounds[t]
+            Q[low:high, low:high] = z[t][np.ix_(own, own)]
+            Q[high:, low:high] = z[t][np.ix_(at + m, own)]
+            Q[low:high, high:] = Q[high:, low:high].T
+        null = self._null[sorted_place]
+        Q -= null @ null.T / RAISED
+        scale = self._scale[sorted_place]
+        Q *= scale[:, None]
+        Q *= scale
+        result = np.empty_like(Q)
+        result[np.ix_(order, order)] = Q
+        return result
+
+    def variances(self) -> Array:
+        """(n,) diagonal of the cofactor matrix."""
+        diagonal = np.concatenate([np.diagonal(columns) for columns in self._selected()])
+        diagonal = diagonal - (self._null**2).sum(axis=1) / RAISED
+        return (diagonal * self._scale**2)[self.dissection.position]
+
+
+def pieces(dissection: Dissection, place: IntArray) -> list[tuple[int, int, int]]:
+    """Fronts that ascending places belong to, each with the range of these places."""
+    front = np.searchsorted(dissection.bounds, place, side="right") - 1
+    starts = np.flatnonzero(np.diff(front, prepend=-1))
+    ends = np.append(starts[1:], len(place))
+    return [(int(front[low]), int(low), int(high)) for low, high in zip(starts, ends, strict=True)]
