@@ -2,7 +2,7 @@
 
     python bench/large_blocks.py                    # 125 000 rays to 3 million on two workers, beside the whole solver
     python bench/large_blocks.py --rays 125 250     # thousands of rays
-    python bench/large_blocks.py --kill             # a Dask cluster of two workers, one killed in every pass
+    python bench/large_blocks.py --kill             # a Dask cluster of two workers, one killed every few seconds
 
 Parallel and cross strips, two looks a point in every strip that sees it, Lagrange corrections at fixes 1.2 km apart, a
 control point in every third partition; the block grows in both directions, points are as dense in all. Every
@@ -274,7 +274,7 @@ def main() -> None:
     parser.add_argument("--whole", type=float, default=WHOLE, metavar="N", help=f"up to N thousand ({WHOLE})")
     parser.add_argument("--workers", type=int, default=2, help="processes (2)")
     parser.add_argument("--kill", action="store_true", help="kill workers of a Dask cluster")
-    parser.add_argument("--every", type=float, default=1.5, metavar="S", help="with --kill: one every S seconds (1.5)")
+    parser.add_argument("--every", type=float, default=3.0, metavar="S", help="with --kill: one every S seconds (3)")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--scheduler", default="", help=argparse.SUPPRESS)
     given = parser.parse_args()

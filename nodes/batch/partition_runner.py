@@ -217,13 +217,14 @@ class DaskRunner(_Counted):
         threads = sum(self._client.nthreads().values())
         most, following = max(2, threads * (1 + AHEAD)), 0
         running: dict[Any, int] = {}
-        arrived = as_completed([], with_results=False, raise_errors=False)
+        arrived = as_completed([], loop=self._client.loop, with_results=False, raise_errors=False)
+        tries = [0] * len(keys)
 
         def submit(place: int) -> None:
             key = keys[place]
             name = f"{task.__name__}-{key}-{secrets.token_hex(6)}"
             job = self._client.submit(
-                _work, task, self.store, key, arguments(key), key=name, pure=False, retries=RETRIES
+                _work, task, self.store, key, arguments(key), key=name, pure=False
             )
             running[job] = place
             arrived.add(job)
@@ -236,7 +237,11 @@ class DaskRunner(_Counted):
             if job.status != "finished":
                 error = job.exception()
                 if type(error).__name__ == "KilledWorker":
-                    raise UserError(f"partition {keys[place]}: every worker that was given it died") from None
+                    tries[place] += 1
+                    if tries[place] > RETRIES:
+                        raise UserError(f"partition {keys[place]}: every worker that was given it died")
+                    submit(place)
+                    continue
                 raise error if error is not None else RuntimeError(f"partition {keys[place]}: {job.status}")
             result, process, peak = job.result()
             job.release()

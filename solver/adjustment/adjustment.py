@@ -94,6 +94,8 @@ def solve(
     given = np.ones(n) if ray_weight is None else np.asarray(ray_weight, dtype=float)
     if given.shape != (n,) or not (given >= 0).all():
         raise ValueError(f"wanted {n} weights not below zero, got shape {given.shape}")
+    if problem.parts is not None:
+        return problem.parts.solve(problem, start, given, options, progress)
     equations = BlockEquations(problem, start, given, options.weights)
     descent = Descent(equations, options)
     descend(descent, progress)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,15 @@ class Cofactors:
     unknowns : (n_unknowns,) variances of the reduced unknowns (orientation, then additional parameters)
     points : (p, 3, 3) of the object points, m^2; zero in directions that are not determined
     observed : (n, 2, 2) of the adjusted image coordinates, whitened: ``A Q A^T``
+    squares : (n,) squared whitened residuals, and
+    statistics : `ray_statistics.RayStatistics` of the rays, where they were computed with the cofactors
     """
 
     unknowns: Array
     points: Array
     observed: Array
+    squares: Array | None = None
+    statistics: Any = None
 
     def residuals(self, ray_weight: Array) -> Array:
         """Cofactors (n, 2, 2) of whitened residuals: ``Qvv = I - A Q A^T``; for rays left out ``I + A Q A^T``.
@@ -47,6 +52,8 @@ class Cofactors:
 
 def cofactors(solution: Solution) -> Cofactors:
     """All cofactor blocks of a solution."""
+    if solution.problem.parts is not None:
+        return solution.problem.parts.cofactors(solution)
     p, n = solution.network.n_points, len(solution.network.rays)
     points, observed = np.empty((p, 3, 3)), np.empty((n, 2, 2))
     for cluster, D in _clusters(solution):

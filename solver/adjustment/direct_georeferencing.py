@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..models.base import ModelOptions
-from .adjustment import Problem, State, pose_problem
+from .adjustment import State, pose_problem
+from .layout import Layout
 from .linearisation import linearise_and_weigh
 from .network import Network
+from .normal_equations import Prior
 
 Array = NDArray[np.floating]
 
@@ -44,13 +46,18 @@ def georeference(network: Network, model: ModelOptions, ray_weight: Array | None
     ray_weight : (n,) factors on the weights; 0 leaves a ray out
     """
     problem = pose_problem(network, model)
-    state = State(np.zeros(problem.layout.n_unknowns), network.approximate_l)
+    return georeference_posed(network, problem.layout, problem.prior, ray_weight)
+
+
+def georeference_posed(network: Network, layout: Layout, prior: Prior, ray_weight: Array | None) -> Georeferenced:
+    """`georeference` with the unknowns of a model and what is known of them beforehand."""
+    state = State(np.zeros(layout.n_unknowns), network.approximate_l)
     weight = np.ones(len(network.rays)) if ray_weight is None else ray_weight
     p = network.rays.point
     count = network.n_points
     lin, inverse, known = None, np.empty((count, 3, 3)), np.zeros(count, dtype=bool)
     for _ in range(4):
-        _, lin, _ = linearise_and_weigh(network.rays, problem.layout, state.theta, state.points_l)
+        _, lin, _ = linearise_and_weigh(network.rays, layout, state.theta, state.points_l)
         lin = lin.reweighted(weight)
         J = np.moveaxis(lin.point, 2, 0)  # (n, 2, 3)
         normal = _per_point(np.einsum("nij,nik->njk", J, J), p, count)
@@ -59,7 +66,7 @@ def georeference(network: Network, model: ModelOptions, ray_weight: Array | None
         state = State(state.theta, state.points_l + np.einsum("pij,pj->pi", inverse, right))
     assert lin is not None
     image = np.einsum("pii->pi", inverse)
-    total = image + _through_trajectory(problem, lin.orientation, np.moveaxis(lin.point, 2, 0), inverse)
+    total = image + _through_trajectory(network, layout, prior, lin.orientation, np.moveaxis(lin.point, 2, 0), inverse)
     xyz = np.where(known[:, None], state.points_l, np.nan)
     return Georeferenced(xyz, _root(image, known), _root(total, known))
 
@@ -83,9 +90,11 @@ def _inverse(normal: Array) -> tuple[Array, NDArray[np.bool_]]:
     return result, known
 
 
-def _through_trajectory(problem: Problem, d_orientation: Array, J: Array, inverse: Array) -> Array:
+def _through_trajectory(
+    network: Network, layout: Layout, prior: Prior, d_orientation: Array, J: Array, inverse: Array
+) -> Array:
     """Variances (p, 3) that a-priori errors of the correction functions bring into the points."""
-    layout, point = problem.layout, problem.network.rays.point
+    point = network.rays.point
     # what an orientation error of a ray does to its point, (n, 3, 6)
     effect = inverse[point] @ np.einsum("nij,ikn->njk", J, d_orientation)
     rows, columns, values = [], [], []
@@ -95,16 +104,16 @@ def _through_trajectory(problem: Problem, d_orientation: Array, J: Array, invers
             rows.append(3 * point[present] + axis)
             columns.append(layout.columns[t, present])
             values.append(effect[present, axis, component] * layout.coefficients[node, present])
-    shape = (3 * problem.network.n_points, layout.n_unknowns)
+    shape = (3 * network.n_points, layout.n_unknowns)
     M = csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
-    B = problem.prior.matrix
+    B = prior.matrix
     if np.diff(B.indptr).max(initial=0) <= 1:
         information = np.asarray(B.multiply(B).sum(axis=0)).ravel()
         variance = np.divide(1.0, information, out=np.zeros_like(information), where=information > 0)
         spread = np.asarray(M.multiply(M) @ variance).ravel()
     else:  # continuity binds the unknowns of a set, never those of two
         spread = np.zeros(shape[0])
-        by_column, normal = M.tocsc(), problem.prior.normal.tocsc()
+        by_column, normal = M.tocsc(), prior.normal.tocsc()
         for item in layout.sets:
             own = csr_array(by_column[:, item.columns])
             covariance = _pseudo_inverse(normal[item.columns, item.columns].toarray())

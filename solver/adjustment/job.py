@@ -63,6 +63,7 @@ class Phase:
     name: str
 
 
+Pose = Callable[[Network, ModelOptions, SelfCalibration | None, PlatformErrors], Problem]
 Event = Phase | Iteration | Round | Removal
 Progress = Callable[[Event], None]
 
@@ -198,8 +199,13 @@ class BatchResult:
         return np.where((self.solution.points.rank == 3)[:, None], self.solution.state.points_l, np.nan)
 
 
-def run(network: Network, job: Job, progress: Progress | None = None) -> BatchResult:
+def run(network: Network, job: Job, progress: Progress | None = None, pose: Pose | None = None) -> BatchResult:
     """Do the job.
+
+    Parameters
+    ----------
+    network, job, progress : what is adjusted, how, and whom it is told
+    pose : poses the problem of a block in partitions, which takes the network's rays to them; see `refuse_in_parts`
 
     Raises
     ------
@@ -213,7 +219,7 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
     for model in (job.model, job.then):
         if model is not None:
             last = model is (job.then or job.model)
-            outcome = _Stage(network, model, job, tell, outcome)
+            outcome = _Stage(network, model, job, tell, outcome, pose)
             outcome.work(last)
             stages.append(outcome.solution)
     assert outcome is not None
@@ -235,7 +241,7 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
         outcome.components,
         outcome.scales.factor["image"],
         weaknesses(solution),
-        georeference(stages[0].network, job.model, _taking_part(solution)),
+        _georeferenced(stages[0], job.model, _taking_part(solution)),
         group_sums(solution, Q),
         outcome.steps,
         doubts(solution, lost, joint_limit(job.critical)),
@@ -243,10 +249,36 @@ def run(network: Network, job: Job, progress: Progress | None = None) -> BatchRe
     )
 
 
+def refuse_in_parts(network: Network, job: Job) -> None:
+    """Raise NotAdjustableError, with the reason, for what blocks in partitions cannot do."""
+    wanted = {
+        "a second model (--then)": job.then is not None,
+        "the tests of additional parameters (--keep all goes)": job.self_calibration is not None and job.eliminate,
+        "a surface of tie points (--dem)": network.surface is not None,
+    }
+    for what, asked in wanted.items():
+        if asked:
+            raise NotAdjustableError(f"a block in partitions is adjusted without {what}")
+
+
+def _georeferenced(first: Solution, model: ModelOptions, weight: Array) -> Georeferenced:
+    if first.problem.parts is not None:
+        return Georeferenced(*first.problem.parts.georeference(weight))
+    return georeference(first.network, model, weight)
+
+
 class _Stage:
     """One model's adjustment, as it goes through its steps."""
 
-    def __init__(self, network: Network, model: ModelOptions, job: Job, tell: Progress, before: _Stage | None):
+    def __init__(
+        self,
+        network: Network,
+        model: ModelOptions,
+        job: Job,
+        tell: Progress,
+        before: _Stage | None,
+        pose: Pose | None = None,
+    ):
         self.job, self.tell = job, tell
         self.scales = Scales(dict(before.scales.factor)) if before else Scales()
         self.snooping: Snooping | None = None
@@ -263,7 +295,7 @@ class _Stage:
             problem = continue_problem(before.solution, model)
             problem = self._adapt(replace(problem, control=before.solution.problem.control), control=False)
         else:
-            problem = pose_problem(network, model, job.self_calibration, job.platform)
+            problem = (pose or pose_problem)(network, model, job.self_calibration, job.platform)
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
             start = solve(problem, points, weight, replace(job.options, robust=huber()), tell)
@@ -276,6 +308,14 @@ class _Stage:
 
     def _state_noise(self, network: Network, model: ModelOptions) -> None:
         """Weigh rays with what the corrections leave of the noise of poses: with less of it they follow more."""
+        if (parts := self.solution.problem.parts) is not None:
+            options = replace(self.job.options, robust=self.job.robust)
+            for _ in range(NOISE_ROUNDS):
+                if not parts.with_noise_left(self.solution):
+                    return
+                problem = self.solution.problem
+                self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
+            return
         for _ in range(NOISE_ROUNDS):
             left = with_noise_left(network, self.solution)
             if left is None:
@@ -442,7 +482,7 @@ class _Stage:
 def weaknesses(solution: Solution) -> tuple[Combination, ...] | None:
     """Combinations of unknowns that the observations do not determine; None where there are too many to search."""
     problem, layout = solution.problem, solution.layout
-    if layout.n_unknowns > MOST_UNKNOWNS:
+    if layout.n_unknowns > MOST_UNKNOWNS or problem.parts is not None:
         return None
     lin = solution.linearisation.reweighted(solution.ray_weight)
     state = solution.state

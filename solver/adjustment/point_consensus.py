@@ -152,6 +152,8 @@ def consensus_of_points(solution: Solution, points: Places, limit: float) -> dic
 
     Points of which no two rays agree are absent.
     """
+    if solution.problem.parts is not None:
+        return solution.problem.parts.consensus(solution, points, limit)
     network, state = solution.network, solution.state
     own = {int(p): np.flatnonzero(network.rays.point == p) for p in points}
     place, lin = state.points_l.copy(), solution.linearisation

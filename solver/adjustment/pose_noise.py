@@ -17,6 +17,7 @@ Source: Wiener smoother as in P. S. Maybeck, Stochastic Models, Estimation, and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -26,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry.measured_trajectory import MeasuredPoses, MeasuredTrajectory
 from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from .linearisation import Linearisation
-from .network import Network, Rays
+from .network import Network, Rays, Strip
 from .normal_equations import PointNormals, inverse_factors
 from .problem import Solution
 
@@ -110,18 +111,34 @@ def with_noise_left(network: Network, solution: Solution) -> Network | None:
     rays, slow = network.rays, getattr(solution.problem.model, "slow", None)
     if slow is None or rays.orientation_noise is None or not any(s.noise_time_s for s in network.strips):
         return None
-    found = ray_information(solution.linearisation, solution.points, rays.point, solution.ray_weight)
-    left = np.broadcast_to(np.eye(6), found.shape).copy()
-    for i, strip in enumerate(network.strips):
-        mine = np.flatnonzero(rays.strip == i)
-        _follow(left, rays, mine, found[mine], slow.wander_density, strip.noise_time_s)
+    left = noise_left(rays, noise_information(solution), network.strips, slow.wander_density)
     return replace(network, rays=replace(rays, orientation_noise=left_of_noise(rays.orientation_noise, left)))
 
 
-def _follow(left: Array, rays: Rays, mine: IntArray, information: Array, density: Array, noise_time_s: float) -> None:
-    piece = np.floor(rays.time_s[mine] / PIECE_S).astype(np.int64)
-    for k, of_piece in information_by_pieces(rays.time_s[mine], information).items():
-        left[mine[piece == k]] = followed(of_piece, density, noise_time_s)
+#: Information (6, 6) a second about corrections, by strip and piece of `PIECE_S`.
+Pieces = dict[tuple[int, int], Array]
+
+
+def noise_information(solution: Solution) -> Pieces:
+    """What the rays of a solution say of the corrections."""
+    rays, pieces = solution.network.rays, {}
+    found = ray_information(solution.linearisation, solution.points, rays.point, solution.ray_weight)
+    for i in np.unique(rays.strip).tolist():
+        mine = np.flatnonzero(rays.strip == i)
+        for k, of_piece in information_by_pieces(rays.time_s[mine], found[mine]).items():
+            pieces[i, k] = of_piece
+    return pieces
+
+
+def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], density: Array) -> Array:
+    """What corrections leave of the noise of position of rays: (n, 6, 6), see `followed`."""
+    left = np.broadcast_to(np.eye(6), (len(rays), 6, 6)).copy()
+    number = np.floor(rays.time_s / PIECE_S).astype(np.int64)
+    for i in np.unique(rays.strip).tolist():
+        mine = np.flatnonzero(rays.strip == i)
+        for k in np.unique(number[mine]).tolist():
+            left[mine[number[mine] == k]] = followed(pieces[i, k], density, strips[i].noise_time_s)
+    return left
 
 
 #: Information is kept so long, s.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +69,7 @@ class Problem:
     network, model, self_calibration : what is adjusted, and how
     layout, elimination, prior, control : made from these
     earlier : solutions of models run before; their corrections are in the orientation of the network's rays
+    parts : partitions that do the work on rays and points, which the network then lists only; None for all in memory
     """
 
     network: Network
@@ -77,6 +80,43 @@ class Problem:
     prior: Prior
     control: ControlWeights
     earlier: tuple[Solution, ...] = ()
+    parts: Parts | None = None
+
+
+class Parts(Protocol):
+    """A block in partitions (`triline.solver.partitioned`): what is done with its rays and points, and where.
+
+    Solutions have no equations then (`Solution.linearisation`, `whitening`); the functions of this room that need them
+    ask here.
+    """
+
+    def solve(
+        self,
+        problem: Problem,
+        start: Solution | State | Array | None,
+        ray_weight: Array,
+        options: AdjustmentOptions,
+        progress: Callable[[Iteration], None] | None,
+        image_factor: float = 1.0,
+    ) -> Solution:
+        """`adjustment.solve`, with the sigmas of the rays multiplied by a factor first."""
+        ...
+
+    def cofactors(self, solution: Solution) -> Any:
+        """`covariance.cofactors`, with the statistics of the rays."""
+        ...
+
+    def georeference(self, ray_weight: Array) -> tuple[Array, Array, Array]:
+        """Points, and sigmas, of `direct_georeferencing.georeference`."""
+        ...
+
+    def consensus(self, solution: Solution, points: NDArray[np.int64], limit: float) -> dict[int, Any]:
+        """`point_consensus.consensus_of_points`."""
+        ...
+
+    def with_noise_left(self, solution: Solution) -> bool:
+        """Weigh rays with what `pose_noise.with_noise_left` leaves, from the next solution on; False where all is left."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ class RayStatistics:
 
 def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
     """`statistics_of_rays` of a solution."""
+    if cofactors.statistics is not None:
+        return cofactors.statistics
     rays, lin = solution.network.rays, solution.linearisation
     return statistics_of_rays(rays, lin, solution.whitening, solution.ray_weight, cofactors)
 

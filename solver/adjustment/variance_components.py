@@ -21,6 +21,7 @@ from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
 from .covariance import Cofactors, cofactors, point_unknown_cofactors
 from .linearisation import Whitening
 from .normal_equations import Prior
+from .normal_matrix import DENSE_UP_TO
 
 Array = NDArray[np.floating]
 
@@ -105,11 +106,12 @@ def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float,
     """Number, ``v^T P v`` and redundancy of each group in a solution, and of the surface that points lie on, if any."""
     problem, weight = solution.problem, solution.ray_weight
     v = solution.linearisation.residual
+    squares = (v * v).sum(axis=0) if of.squares is None else of.squares
     trace = np.einsum("nii->n", of.observed)
     result = {
         "image": (
             2 * int((weight > 0).sum()),
-            float(np.sum(weight * (v * v).sum(axis=0))),
+            float(np.sum(weight * squares)),
             float(np.sum(np.where(weight > 0, 2.0 - weight * trace, 0.0))),
         )
     }
@@ -150,6 +152,13 @@ def _row_variances(solution: Solution) -> Array:
     if entries.max(initial=0) <= 1:
         square = B.multiply(B)
         return np.asarray(square @ solution.factor.variances()).ravel()
+    if solution.layout.n_unknowns > DENSE_UP_TO:
+        found = np.empty(B.shape[0])
+        for row in range(B.shape[0]):
+            own = slice(B.indptr[row], B.indptr[row + 1])
+            b = B.data[own]
+            found[row] = b @ solution.factor.cofactors(B.indices[own].astype(np.int64)) @ b
+        return found
     Q = solution.factor.cofactors(np.arange(solution.layout.n_unknowns))
     return np.asarray(B.multiply(B @ Q).sum(axis=1)).ravel()
 
@@ -215,6 +224,8 @@ def scaled(
 ) -> Solution:
     """The adjustment with sigmas of groups multiplied by factors, from the values of the one before."""
     problem = Scales().times(change).apply(solution.problem)
+    if problem.parts is not None:
+        return problem.parts.solve(problem, solution, solution.ray_weight, options, None, change.get("image", 1.0))
     f = 1.0 / change.get("image", 1.0)
     lin = solution.linearisation.reweighted(np.full(len(solution.ray_weight), f * f))
     start = replace(solution, problem=problem, whitening=Whitening(solution.whitening.g * f), linearisation=lin)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -17,7 +18,7 @@ from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
 from ..adjustment.nested_dissection import Dissection
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
-from ..adjustment.problem import USUAL, AdjustmentOptions, Iteration
+from ..adjustment.problem import USUAL, AdjustmentOptions, Iteration, State
 from ..adjustment.reduced_system import DenseFactor, Factor
 from ..adjustment.robust import WeightFunction
 from ..camera.line_camera import LineCamera
@@ -30,6 +31,26 @@ from .runner import Runner
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
+
+
+class Versions:
+    """Numbers for versions of the partitions' state, none twice."""
+
+    def __init__(self) -> None:
+        self._last = -1
+
+    def new(self) -> int:
+        """The next one."""
+        self._last += 1
+        return self._last
+
+
+class Kept:
+    """A version of the partitions' state that is kept as long as this is."""
+
+    def __init__(self, block: PartitionedBlock, version: int):
+        self.version = version
+        weakref.finalize(self, block.remove, version).atexit = False
 
 
 @dataclass(frozen=True)
@@ -58,6 +79,12 @@ class PartitionedBlock:
     n_rays: int
     n_points: int
     n_control: int
+    versions: Versions = field(default_factory=lambda: Versions(), repr=False)
+
+    def remove(self, version: int) -> None:
+        """Remove a version of the partitions' state."""
+        for key in self.keys:
+            self.runner.store.remove(f"state-{key}-{version}")
 
     @property
     def n_unknowns(self) -> int:
@@ -80,7 +107,7 @@ class PartitionedSolution:
     factor : factorised reduced system
     cost : sum of squared whitened residuals of rays, control and a-priori observations
     n_observations, n_unknowns, iterations, converged, history : as in `adjustment.Solution`
-    version : of the partitions' state
+    kept : the state of the partitions
     """
 
     block: PartitionedBlock
@@ -92,7 +119,7 @@ class PartitionedSolution:
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
-    version: int
+    kept: Kept
 
     @property
     def redundancy(self) -> int:
@@ -153,54 +180,75 @@ class PartitionedEquations:
         self,
         block: PartitionedBlock,
         weights: str = "motion",
-        start: PartitionedSolution | None = None,
-        changes: tasks.Changes | None = None,
+        start: tuple[int, Array] | None = None,
+        changes: Callable[[int], tasks.Changes] | None = None,
+        prior: Prior | None = None,
+        given: Callable[[int], tuple[Array | None, State | None]] = lambda key: (None, None),
+        theta: Array | None = None,
     ):
         self.block = block
+        self.prior = prior or block.prior
         self.place = {key: i for i, key in enumerate(block.keys)}
         self.weights_given = start is not None
-        self.changes = changes or tasks.Changes()
+        self.changes = tasks.Changes()
+        self.own_changes = changes
         self.rank = 0
         self._cost: float | None = None
+        self.first = block.versions.new()
         if start is not None:
-            self.version, self.theta = start.version, start.theta
+            self.version, self.theta = start
             return
-        self.version, self.theta = 0, np.zeros(block.n_unknowns)
-        self._of_parts = block.runner.run(tasks.begin, block.keys, lambda key: (0, weights, None, None), tasks.add)
-        self._settle(self._of_parts)
+        self.version, self.theta = self.first, np.zeros(block.n_unknowns) if theta is None else theta
+        version = self.version
+        cost = block.runner.run(tasks.begin, block.keys, lambda key: (version, weights, *given(key)), tasks.add)
+        self._settle(cost)
 
     @property
     def cost(self) -> float:
         if self._cost is None:
+            following, changes = self.block.versions.new(), self._changes()
             version = self.version
             cost = self.block.runner.run(
-                tasks.change, self.block.keys, lambda key: (version, version + 1, self.changes), tasks.add
+                tasks.change, self.block.keys, lambda key: (version, following, changes(key)), tasks.add
             )
-            self._next()
-            self.changes = tasks.Changes()
+            self._next(following)
             self._settle(cost)
         assert self._cost is not None
         return self._cost
 
-    def _settle(self, of_parts: float) -> None:
-        e = self.block.prior.residual(self.theta)
-        self._of_parts, self._cost = of_parts, of_parts + float(e @ e)
+    def _changes(self) -> Callable[[int], tasks.Changes]:
+        """What waits for each partition, which is taken from here."""
+        common, own = self.changes, self.own_changes
+        self.changes, self.own_changes = tasks.Changes(), None
 
-    def _next(self) -> None:
-        for key in self.block.keys:
-            self.block.runner.store.remove(f"state-{key}-{self.version}")
-        self.version += 1
+        def of(key: int) -> tasks.Changes:
+            if own is None:
+                return common
+            first = own(key)
+            return common._replace(image=first.image, given=first.given, control=first.control)
+
+        return of
+
+    def _settle(self, of_parts: float) -> None:
+        e = self.prior.residual(self.theta)
+        self._cost = of_parts + float(e @ e)
+
+    def _next(self, version: int) -> None:
+        """Go on to another version; the one before goes if it is of this adjustment."""
+        if self.version >= self.first:
+            self.block.remove(self.version)
+        self.version = version
 
     def form(self, damping: float) -> Normals:
-        block, version, prior = self.block, self.version, self.block.prior
+        block, version, prior = self.block, self.version, self.prior
+        following, changes = block.versions.new(), self._changes()
         sums = block.runner.run(
             tasks.form,
             block.keys,
-            lambda key: (version, version + 1, block.n_unknowns, self.changes, damping),
+            lambda key: (version, following, block.n_unknowns, changes(key), damping),
             tasks.Sums.__add__,
         )
-        self._next()
-        self.changes = tasks.Changes()
+        self._next(following)
         self._settle(sums.cost)
         self.rank = sums.rank
         matrix = block.new_matrix()
@@ -213,15 +261,15 @@ class PartitionedEquations:
         return Normals(matrix, rhs, sums.squares)
 
     def attempt(self, d_theta: Array, renewed: bool) -> float:
-        block, version = self.block, self.version
+        block, version, following = self.block, self.version, self.block.versions.new()
 
         def step(key: int) -> tuple[int, int, Array, bool]:
-            return version, version + 1, d_theta[block.plans[self.place[key]].columns], renewed
+            return version, following, d_theta[block.plans[self.place[key]].columns], renewed
 
         cost = block.runner.run(tasks.attempt, block.keys, step, tasks.add)
-        self._next()
+        self._next(following)
         self.trial = self.theta + d_theta
-        e = block.prior.residual(self.trial)
+        e = self.prior.residual(self.trial)
         self.renewed = renewed
         return cost + float(e @ e)
 
@@ -250,14 +298,17 @@ class PartitionedEquations:
             self._cost = None
         self.changes = self.changes._replace(**what)
 
-    def solution(self, outcome: Outcome, history: tuple[Iteration, ...], n_rays: int) -> PartitionedSolution:
-        """The solution at the values reached."""
+    def solution(
+        self, outcome: Outcome, history: tuple[Iteration, ...], n_rays: int, n_control: int
+    ) -> PartitionedSolution:
+        """The solution at the values reached, with the numbers of rays and control coordinates that take part."""
         block = self.block
-        n = 2 * n_rays + block.prior.n_observations + block.n_control
+        n = 2 * n_rays + self.prior.n_observations + n_control
         u = block.n_unknowns - len(outcome.factor.undetermined) + self.rank
         return PartitionedSolution(
-            block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history, self.version
-        )
+            block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history,
+            Kept(block, self.version),
+        )  # fmt: skip
 
 
 def solve_block(
@@ -269,12 +320,13 @@ def solve_block(
     equations = PartitionedEquations(block, options.weights)
     descent = Descent(equations, options)
     descend(descent, progress)
-    return equations.solution(descent.finished(), tuple(descent.history), block.n_rays)
+    return equations.solution(descent.finished(), tuple(descent.history), block.n_rays, block.n_control)
 
 
-def describe_block(solution: PartitionedSolution) -> tasks.Totals:
-    """Cofactors of all points, residuals and tests of all rays: `tasks.Described` in the store, ``result-K``."""
-    block, factor, version = solution.block, solution.factor, solution.version
+def cofactors_for(
+    block: PartitionedBlock, factor: Factor, version: int
+) -> Callable[[int], tuple[int, Array | tuple[Array, ...], Array]]:
+    """What `tasks.describe` wants to know of the block for a partition: version, cofactors and variances."""
     variances = factor.variances()
 
     def wanted(key: int) -> tuple[int, Array | tuple[Array, ...], Array]:
@@ -287,6 +339,13 @@ def describe_block(solution: PartitionedSolution) -> tasks.Totals:
             blocks = tuple(factor.cofactors(c) for c in plan.cliques)
         return version, blocks, variances[plan.columns]
 
+    return wanted
+
+
+def describe_block(solution: PartitionedSolution) -> tasks.Totals:
+    """Cofactors of all points, residuals and tests of all rays: `tasks.Described` in the store, ``result-K``."""
+    block = solution.block
+    wanted = cofactors_for(block, solution.factor, solution.kept.version)
     return block.runner.run(tasks.describe, block.keys, wanted, tasks.Totals.__add__)
 
 

@@ -17,12 +17,15 @@ from scipy.sparse import csr_array
 
 from ..adjustment.covariance import cofactors
 from ..adjustment.equations import BlockEquations, Outcome, Reached
-from ..adjustment.layout import sets_of_rays
+from ..adjustment.direct_georeferencing import georeference_posed
+from ..adjustment.layout import layout_of, sets_of_rays
 from ..adjustment.linearisation import Linearisation, Whitening
 from ..adjustment.network import Network
-from ..adjustment.normal_equations import PointNormals
+from ..adjustment.normal_equations import PointNormals, whiten_prior
 from ..adjustment.normal_matrix import DenseMatrix
-from ..adjustment.problem import State
+from ..adjustment.point_consensus import consensus_of_points
+from ..adjustment.pose_noise import Pieces, left_of_noise, noise_information, noise_left
+from ..adjustment.problem import Solution, State, with_left_out
 from ..adjustment.ray_statistics import RayStatistics, ray_statistics
 from ..adjustment.reduced_system import Undetermined
 from ..adjustment.robust import WeightFunction
@@ -155,7 +158,10 @@ def extents(store: Store, key: int) -> Extents:
 
 def pose(store: Store, key: int) -> Plan:
     """Pose a partition (``part-K``) as the block is (object ``posed``)."""
-    network: Network = store.load(f"network-{key}")
+    return _posed(store, key, store.load(f"network-{key}"))
+
+
+def _posed(store: Store, key: int, network: Network) -> Plan:
     posed: Posed = store.load("posed")
     if posed.platform.n_unknowns:  # whose effect needs the trajectories
         network = replace(network, strips=store.load("strips"))
@@ -230,7 +236,8 @@ class Described:
     points_l, rank : (p, 3) metres, (p,)
     point_cofactors : (p, 3, 3) m^2
     weight, rays : (n,) of the rays, with their statistics
-    squares, trace : (n,) weighted squares of the whitened residuals, and trace of ``A Q A^T``
+    squares : (n,) squared whitened residuals
+    observed : (n, 2, 2) cofactors of the adjusted image coordinates, whitened
     """
 
     point_ids: tuple[str, ...]
@@ -240,7 +247,7 @@ class Described:
     weight: Array
     rays: RayStatistics
     squares: Array
-    trace: Array
+    observed: Array
 
 
 @dataclass(frozen=True)
@@ -284,9 +291,9 @@ class Blocks:
         return self._variances
 
 
-def describe(store: Store, key: int, read: int, cofactors_of: Array | tuple[Array, ...], variances: Array) -> Totals:
-    """Statistics of a partition (``result-K``), given the block's cofactors of its unknowns: all (u, u), or those of
-    its `Plan.cliques`."""
+def described(store: Store, key: int, read: int, cofactors_of: Array | tuple[Array, ...], variances: Array) -> Described:
+    """Statistics of a partition, given the block's cofactors of its unknowns: all (u, u), or those of its
+    `Plan.cliques`."""
     part, equations = _load(store, key, read)
     given: Sequence[tuple[IntArray, Array]] | Array
     if isinstance(cofactors_of, np.ndarray):
@@ -294,32 +301,94 @@ def describe(store: Store, key: int, read: int, cofactors_of: Array | tuple[Arra
     else:
         meet = {c.columns.tobytes(): c.columns for c in part.problem.elimination.clusters if len(c.columns)}
         given = list(zip(meet.values(), cofactors_of, strict=True))
-    solution = equations.solution(Outcome(Blocks(given, variances), 0, True), ())
+    solution = _solution(equations, Blocks(given, variances))
     Q = cofactors(solution)
-    statistics = ray_statistics(solution, Q)
-    v, weight = solution.linearisation.residual, equations.weight
-    squares = weight * (v * v).sum(axis=0)
-    trace = np.einsum("nii->n", Q.observed)
-    described = Described(
+    v = solution.linearisation.residual
+    return Described(
         part.problem.network.point_ids,
         solution.state.points_l,
         solution.points.rank,
         Q.points,
-        weight,
-        statistics,
-        squares,
-        trace,
+        equations.weight,
+        ray_statistics(solution, Q),
+        (v * v).sum(axis=0),
+        Q.observed,
     )
-    store.save(f"result-{key}", described)
-    used = weight > 0
-    image = [2.0 * used.sum(), squares.sum(), np.where(used, 2.0 - weight * trace, 0.0).sum()]
-    control = part.problem.control
+
+
+def describe(store: Store, key: int, read: int, cofactors_of: Array | tuple[Array, ...], variances: Array) -> Totals:
+    """`described`, into the store (``result-K``); sums of it."""
+    found = described(store, key, read, cofactors_of, variances)
+    store.save(f"result-{key}", found)
+    part, equations = _load(store, key, read)
+    used = found.weight > 0
+    left = np.where(used, 2.0 - found.weight * np.einsum("nii->n", found.observed), 0.0)
+    image = [2.0 * used.sum(), (found.weight * found.squares).sum(), left.sum()]
+    control = equations.problem.control
     known = control.weight > 0
-    c = control.residual(solution.state.points_l)
-    taken = control.weight * np.einsum("pii->pi", Q.points)
+    c = control.residual(found.points_l)
+    taken = control.weight * np.einsum("pii->pi", found.point_cofactors)
     of_control = [float(known.sum()), float(np.sum(c * c)), float(np.where(known, 1.0 - taken, 0.0).sum())]
-    largest = float(statistics.largest_w[used].max(initial=0.0))
+    largest = float(found.rays.largest_w[used].max(initial=0.0))
     return Totals(np.array(image), np.array(of_control), largest)
+
+
+class Points(NamedTuple):
+    """Where the points of a partition are, how many of their directions are determined, and the rays' weights."""
+
+    points_l: Array
+    rank: IntArray
+    weight: Array
+
+
+def points(store: Store, key: int, read: int) -> Points:
+    """Points of a partition."""
+    equations = _load(store, key, read)[1]
+    assert equations.points is not None
+    return Points(equations.at.state.points_l, equations.points.rank, equations.weight)
+
+
+def consensus(store: Store, key: int, read: int, places: IntArray, limit: float) -> dict[int, tuple[IntArray, bool]]:
+    """`consensus_of_points` of some points of a partition."""
+    _, equations = _load(store, key, read)
+    none = Blocks(np.empty((0, 0)), np.empty(0))
+    return consensus_of_points(_solution(equations, none), places, limit)
+
+
+def information(store: Store, key: int, read: int) -> Pieces:
+    """What the rays of a partition say of corrections (`pose_noise.noise_information`)."""
+    _, equations = _load(store, key, read)
+    return noise_information(_solution(equations, Blocks(np.empty((0, 0)), np.empty(0))))
+
+
+def both(a: Pieces, b: Pieces) -> Pieces:
+    """Information added up."""
+    return {k: a[k] + b[k] if k in a and k in b else a[k] if k in a else b[k] for k in a.keys() | b.keys()}
+
+
+def pose_with_noise(store: Store, key: int) -> Plan:
+    """Pose a partition again, its rays weighed with what corrections (``pieces``) leave of the noise of poses."""
+    network: Network = store.load(f"network-{key}")
+    pieces, density, strips = store.load("pieces")
+    assert network.rays.orientation_noise is not None
+    left = noise_left(network.rays, pieces, strips, density)
+    noise = left_of_noise(network.rays.orientation_noise, left)
+    return _posed(store, key, replace(network, rays=replace(network.rays, orientation_noise=noise)))
+
+
+def georeferenced(store: Store, key: int, weight: Array) -> tuple[Array, Array, Array]:
+    """Points of a partition without adjustment, and their sigmas (see `direct_georeferencing`)."""
+    network: Network = store.load(f"network-{key}")
+    posed: Posed = store.load("posed")
+    number, _, _ = sets_of_rays(network)
+    layout = layout_of(network, posed.sets, np.searchsorted(posed.present, number))
+    network = with_left_out(network, layout)
+    found = georeference_posed(network, layout, whiten_prior(layout.prior, layout.n_unknowns), weight)
+    return found.xyz_l, found.image_sigma_m, found.sigma_m
+
+
+def _solution(equations: BlockEquations, factor: Blocks) -> Solution:
+    return equations.solution(Outcome(factor, 0, True), ())
 
 
 def _changed(store: Store, key: int, read: int, changes: Changes) -> tuple[Part, BlockEquations]:
@@ -398,8 +467,3 @@ def _load(store: Store, key: int, version: int) -> tuple[Part, BlockEquations]:
         place = layout if coefficients is None else layout.fitted(coefficients, shift)  # pyright: ignore[reportArgumentType]
         equations.retry(Reached(state, weights, lin, place))
     return part, equations
-
-
-def keep(store: Store, key: int, read: int, write: int) -> None:
-    """Write a version again under another number."""
-    store.save(f"state-{key}-{write}", store.load(f"state-{key}-{read}"))
