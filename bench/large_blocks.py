@@ -192,8 +192,8 @@ def compare(given: argparse.Namespace) -> int:
             rows.append(r)
             print(
                 f"{r['rays']:8d} rays in {r['partitions']:3d} partitions, {r['unknowns']:6d} unknowns beside the points"
-                f" ({r['solver']}), {r['steps']} steps, {r['seconds']:7.1f} s, leading process {r['leader_mb']:5.0f} MB,"
-                f" workers {r['worker_mb']:5.0f} MB, on disk {r['spilled_mb']:5.0f} MB, sigma0 {r['sigma0']:.5f}",
+                f" ({r['solver']}), {r['steps']} steps, {r['seconds']:7.1f} s, leading process {r['leader_mb']:5.0f}"
+                f" MB, workers {r['worker_mb']:5.0f} MB, on disk {r['spilled_mb']:5.0f} MB, sigma0 {r['sigma0']:.5f}",
                 flush=True,
             )
             met &= max(r["leader_mb"], r["worker_mb"]) < MEMORY_MB

@@ -223,9 +223,7 @@ class DaskRunner(_Counted):
         def submit(place: int) -> None:
             key = keys[place]
             name = f"{task.__name__}-{key}-{secrets.token_hex(6)}"
-            job = self._client.submit(
-                _work, task, self.store, key, arguments(key), key=name, pure=False
-            )
+            job = self._client.submit(_work, task, self.store, key, arguments(key), key=name, pure=False)
             running[job] = place
             arrived.add(job)
 

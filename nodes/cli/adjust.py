@@ -6,9 +6,11 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,10 @@ import numpy as np
 from ...solver.adjustment.adjustment import Iteration
 from ...solver.adjustment.block_data import BlockData, network_from_block
 from ...solver.adjustment.determinability import Limits, Removal
-from ...solver.adjustment.job import Event, Job, NotAdjustableError, Phase
+from ...solver.adjustment.job import Event, Job, NotAdjustableError, Phase, Pose, refuse_in_parts
 from ...solver.adjustment.job import run as run_job
+from ...solver.adjustment.joined_block import JoinedBlock, join_blocks
+from ...solver.adjustment.options_by_strip import OptionsByStrip
 from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
 from ...solver.adjustment.straightened import straightened
@@ -28,9 +32,12 @@ from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
 from ...solver.models.platform import MOST_CLOCK_S, PlatformErrors
+from ...solver.partitioned.engine import Engine
+from ...solver.partitioned.part import RAYS
 from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
 from ..batch.adjustment_summary import summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
+from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
 from ..batch.scene_adjustment import SETS
 from ..batch.two_steps import OWNERS, UNUSED, step_settings
 from ..errors import UserError
@@ -53,10 +60,17 @@ from .locate import refraction_of
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result
   triline adjust flight.mcap --camera result/camera.json -o again
-  triline adjust flight.mcap --dem ground.tif --dem-sigma 0.5 --dem-crs EPSG:5773 --per-line -o result"""
+  triline adjust flight.mcap --dem ground.tif --dem-sigma 0.5 --dem-crs EPSG:5773 --per-line -o result
+  triline adjust day1.mcap day2.mcap --workers 4 --snoop -o result"""
 
 #: An adjustment that has not converged is refused if its sigma0 is larger than this.
 HOPELESS = 100.0
+
+#: Renamed strips that a note lists.
+RENAMED_SHOWN = 6
+
+#: Fewest rays of a partition: below, reading and writing it costs more than its work.
+LEAST_RAYS = 100
 
 #: Up to so many segments or fixes a strip are not checked against the number of rays.
 FEW = 20
@@ -64,8 +78,10 @@ FEW = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", metavar="INPUT", help="block folder, block of satellite scenes, or recording (URLs, too)"
-    )
+        "input", nargs="+", metavar="INPUT",
+        help="block folder, block of satellite scenes, or recording (URLs, too); several recordings or folders of one camera "
+        "are adjusted as one block: points of the same name tie them",
+    )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
     group = parser.add_argument_group("model")
     group.add_argument(
@@ -108,6 +124,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "'triline locate'; behind the input",
     )  # fmt: skip
     group.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
+    group = parser.add_argument_group("large blocks")
+    group.add_argument(
+        "--workers", type=int, metavar="N",
+        help="adjust in partitions on N processes here; the answers are those of one process",
+    )  # fmt: skip
+    group.add_argument("--scheduler", metavar="ADDRESS", help="in partitions on a Dask cluster, tcp://HOST:PORT")
+    group.add_argument(
+        "--scratch", type=Path, metavar="DIR",
+        help="folder for the partitions, which all workers see (a temporary one)",
+    )  # fmt: skip
+    group.add_argument("--partition-rays", type=int, default=RAYS, metavar="N", help=f"rays of a partition ({RAYS})")
     parser.add_argument(
         "--per-line", action="store_true", help="refined orientation of every image line: orientation_lines.csv (-o)"
     )
@@ -126,16 +153,27 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
-    path = path_of(args.input)
-    if path.is_dir() and is_scene_block(path):
+    refuse_worker_options(args)
+    paths = [path_of(path) for path in args.input]
+    args.input = args.input[0]
+    scenes = next((path for path in paths if path.is_dir() and is_scene_block(path)), None)
+    if scenes is not None:
         if args.clock_sigma:
             raise UserError("--clock-sigma does not go with satellite scenes")
         if args.camera is not None:
             raise UserError("--camera does not go with satellite scenes")
+        if len(paths) > 1:
+            raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
+        if args.workers or args.scheduler:
+            raise UserError("--workers and --scheduler do not go with satellite scenes")
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
-    block = read_input(path)
+    if len(paths) > 1 and args.clock_sigma:
+        raise UserError("--clock-sigma goes with one recording: each has a clock of its own")
+    recordings = [read_input(path) for path in paths]
+    joined = join_inputs(recordings, paths) if len(paths) > 1 else None
+    block = recordings[0] if joined is None else joined.block
     if args.camera is not None:
         note = f"camera of {args.camera}"
         block = replace(block, camera=read_camera_instead(args.camera, block.camera), notes=(*block.notes, note))
@@ -149,7 +187,15 @@ def run(args: argparse.Namespace) -> int:
         block = replace(block, notes=(*block.notes, "refraction taken off the image points"))
     if block.apriori.then and args.then is None:
         block = replace(block, notes=(*block.notes, UNUSED))
-    adjustment = adjust_block(block, job_of(args, block), _ProgressLines(args), surface, air)
+    job = job_of(args, block)
+    if joined is not None:
+        jobs = [job_of(args, own) for own in recordings]
+        job = replace(job, model=by_recording(joined, [own.model for own in jobs]))
+        if job.then is not None:
+            job = replace(job, then=by_recording(joined, [own.then or job.then for own in jobs]))
+    del recordings
+    with partitions_of(args) as pose:
+        adjustment = adjust_block(block, job, _ProgressLines(args), surface, air, pose)
     content = result_of(adjustment)
     if args.output:
         write_result(
@@ -182,6 +228,88 @@ def read_input(path: Path) -> BlockData:
     reader = RecordingReader(path, by_ranges=True)
     block = block_from_messages(reader.messages(TOPICS), path.name)
     return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
+
+
+def refuse_worker_options(args: argparse.Namespace) -> None:
+    """Raise UserError for numbers of workers and rays, and for options, that do not go."""
+    if args.workers is not None and args.workers < 1:
+        raise UserError(f"--workers {args.workers}, wanted 1 at least")
+    if args.workers is not None and args.scheduler:
+        raise UserError("--workers and --scheduler: wanted one of them")
+    if args.partition_rays < LEAST_RAYS:
+        raise UserError(f"--partition-rays {args.partition_rays}, wanted {LEAST_RAYS} at least")
+    if args.scratch is not None and not (args.workers or args.scheduler):
+        raise UserError("--scratch goes with --workers or --scheduler")
+
+
+@contextmanager
+def partitions_of(args: argparse.Namespace) -> Iterator[Pose | None]:
+    """What takes a block to partitions, and these while they are worked on; None where it stays here."""
+    if not (args.workers or args.scheduler):
+        yield None
+        return
+    if args.scratch is not None:
+        refuse_unless_folder(args.scratch)
+        args.scratch.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix="triline-", dir=args.scratch) as folder:
+        store = FolderStore(Path(folder).resolve() / "partitions")
+        runner = DaskRunner(store, args.scheduler) if args.scheduler else ProcessRunner(store, args.workers)
+        try:
+            yield Engine(runner, args.partition_rays).pose
+        finally:
+            runner.close()
+
+
+def join_inputs(blocks: Sequence[BlockData], paths: Sequence[Path]) -> JoinedBlock:
+    """Several recordings as one block, whose notes say what joins them.
+
+    Raises
+    ------
+    UserError : recordings that cannot be joined
+    """
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        raise UserError("a recording is given twice")
+    try:
+        joined = join_blocks(blocks, names)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    notes = joining_notes(joined, names)
+    return replace(joined, block=replace(joined.block, notes=(*notes, *joined.block.notes)))
+
+
+def joining_notes(joined: JoinedBlock, names: Sequence[str]) -> list[str]:
+    """What was joined by what, in words."""
+    of = ", ".join(
+        f"{name} ({strips} strips, {points} image points)"
+        for name, strips, points in zip(names, joined.strips, joined.image_points, strict=True)
+    )
+    notes = [f"{len(names)} recordings as one block: {of}"]
+    if joined.ties + joined.ground:
+        notes.append(
+            f"joined by {joined.ties} tie points and {joined.ground} known points that more than one of them has measured"
+        )
+    else:
+        notes.append("no point was measured in more than one recording: they are adjusted side by side")
+    if joined.elsewhere:
+        notes.append(f"{joined.elsewhere} tie points have a name that comes again at another place, and are kept apart")
+    if joined.renamed:
+        shown = ", ".join(f"{id} of {name} is {new}" for name, id, new in joined.renamed[:RENAMED_SHOWN])
+        more = len(joined.renamed) - RENAMED_SHOWN
+        notes.append(f"strips of the same name: {shown}" + (f", and {more} more" if more > 0 else ""))
+    notes.append(
+        "corrections and a-priori sigmas of the trajectory are those of each recording, camera and sigma factors common"
+    )
+    return notes
+
+
+def by_recording(joined: JoinedBlock, models: Sequence[ModelOptions]) -> ModelOptions:
+    """The model with the settings of each recording; one for all where they say the same."""
+    if all(model == models[0] for model in models):
+        return models[0]
+    return OptionsByStrip({strip: models[i] for strip, i in joined.recording.items()})
 
 
 def job_of(args: argparse.Namespace, block: BlockData) -> Job:
@@ -275,6 +403,7 @@ def adjust_block(
     tell: Any = None,
     surface: SurfaceControl | None = None,
     refraction: Refraction | None = None,
+    pose: Pose | None = None,
 ) -> Adjustment:
     """Adjust a block as a job asks.
 
@@ -283,6 +412,7 @@ def adjust_block(
     tell : is called with what happens
     surface : on which tie points lie
     refraction : is taken off the image points
+    pose : takes the block to partitions, where it is adjusted in these (`partitions_of`)
 
     Raises
     ------
@@ -294,7 +424,9 @@ def adjust_block(
             network = replace(network_from_block(block), surface=surface)
             if refraction is not None:
                 network = straightened(network, block.frame, refraction)
-            result = run_job(network, job, tell)
+            if pose is not None:
+                refuse_in_parts(network, job)
+            result = run_job(network, job, tell, pose)
     except NotAdjustableError as error:
         raise UserError(f"{block.name}: {error}") from None
     except ValueError as error:

@@ -225,4 +225,3 @@ def residual_scale(absolute: Array) -> float:
 
 def _weighted(lin: Linearisation, weight: Array) -> Linearisation:
     return lin if (weight == 1.0).all() else lin.reweighted(weight)
-

@@ -20,7 +20,6 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 
-
 class FrontalMatrix:
     """Columns of the fronts' own unknowns: (own + rows, own) each; see `normal_matrix.NormalMatrix`."""
 

@@ -203,7 +203,8 @@ def correction_sets(
         name = f"strip {strip.id}"
         if lens_index is not None and strip.lens is None:
             name += f", lens {camera.lenses[lens_index].id}"
-        extent = Extent(name, strip.trajectory.start_s, strip.trajectory.end_s, times, of_control, self_calibration)
+        limits = strip.trajectory.start_s, strip.trajectory.end_s
+        extent = Extent(name, *limits, times, of_control, self_calibration, strip.id)
         model = options.build(extent)
         sets.append(CorrectionSet(strip_index, lens_index, model, first))
         first += model.n_unknowns

@@ -175,5 +175,3 @@ def _expanded(groups: IntArray, start: IntArray) -> IntArray:
     if not len(groups):
         return np.empty(0, dtype=np.int64)
     return np.concatenate([np.arange(start[g], start[g + 1]) for g in groups.tolist()])
-
-

@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.measured_trajectory import MeasuredPoses, MeasuredTrajectory
+from ..models.base import ModelOptions
 from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from .linearisation import Linearisation
 from .network import Network, Rays, Strip
 from .normal_equations import PointNormals, inverse_factors
+from .options_by_strip import slow_errors_of_strip
 from .problem import Solution
 
 Array = NDArray[np.floating]
@@ -111,7 +113,7 @@ def with_noise_left(network: Network, solution: Solution) -> Network | None:
     rays, slow = network.rays, getattr(solution.problem.model, "slow", None)
     if slow is None or rays.orientation_noise is None or not any(s.noise_time_s for s in network.strips):
         return None
-    left = noise_left(rays, noise_information(solution), network.strips, slow.wander_density)
+    left = noise_left(rays, noise_information(solution), network.strips, solution.problem.model)
     return replace(network, rays=replace(rays, orientation_noise=left_of_noise(rays.orientation_noise, left)))
 
 
@@ -130,14 +132,14 @@ def noise_information(solution: Solution) -> Pieces:
     return pieces
 
 
-def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], density: Array) -> Array:
+def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], model: ModelOptions) -> Array:
     """What corrections leave of the noise of position of rays: (n, 6, 6), see `followed`."""
     left = np.broadcast_to(np.eye(6), (len(rays), 6, 6)).copy()
     number = np.floor(rays.time_s / PIECE_S).astype(np.int64)
     for i in np.unique(rays.strip).tolist():
-        mine = np.flatnonzero(rays.strip == i)
-        for k in np.unique(number[mine]).tolist():
-            left[mine[number[mine] == k]] = followed(pieces[i, k], density, strips[i].noise_time_s)
+        mine, slow = np.flatnonzero(rays.strip == i), slow_errors_of_strip(model, strips[i].id)
+        for k in np.unique(number[mine]).tolist() if slow is not None else ():
+            left[mine[number[mine] == k]] = followed(pieces[i, k], slow.wander_density, strips[i].noise_time_s)
     return left
 
 

@@ -36,6 +36,7 @@ class Extent:
     ray_time_s, control_time_s : times of the rays, and of those to control points, in any order, for models that place
         segments or merge fixes by them
     self_calibration : whether additional parameters are estimated in the same adjustment
+    strip : name of the strip alone
     """
 
     name: str
@@ -44,6 +45,7 @@ class Extent:
     ray_time_s: Array = field(default_factory=lambda: np.empty(0), repr=False)
     control_time_s: Array = field(default_factory=lambda: np.empty(0), repr=False)
     self_calibration: bool = False
+    strip: str = ""
 
     def __post_init__(self) -> None:
         if not self.end_s > self.start_s:

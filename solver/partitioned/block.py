@@ -14,9 +14,9 @@ from ..adjustment.adjustment import descend
 from ..adjustment.equations import Normals, Outcome, residual_scale
 from ..adjustment.gauss_newton import Descent
 from ..adjustment.layout import Unknowns, correction_sets, unknowns_of
+from ..adjustment.nested_dissection import Dissection
 from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
-from ..adjustment.nested_dissection import Dissection
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
 from ..adjustment.problem import USUAL, AdjustmentOptions, Iteration, State
 from ..adjustment.reduced_system import DenseFactor, Factor
@@ -356,5 +356,3 @@ def _whole(lower: csr_array) -> csr_array:
     off = row != column
     rows, columns = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
     return csr_array((np.concatenate([entries.data, entries.data[off]]), (rows, columns)), shape=lower.shape)
-
-

@@ -182,7 +182,8 @@ class Engine:
     def consensus(self, solution: Solution, points: IntArray, limit: float) -> dict[int, Any]:
         assert isinstance(solution, SolutionInParts) and solution.kept is not None
         version = solution.kept.version
-        own = {key: points[(points >= a.start) & (points < a.stop)] for key in self.block.keys if (a := self.of_points(key))}
+        part = np.searchsorted(self._points, points, side="right") - 1
+        own = {key: points[part == key] for key in self.block.keys}
         keys = [key for key, mine in own.items() if len(mine)]
         result: dict[int, Any] = {}
 
@@ -202,7 +203,7 @@ class Engine:
         version = solution.kept.version
         pieces = self.runner.run(tasks.information, self.block.keys, lambda key: (version,), tasks.both)
         light = tuple(replace(s, noise=None) for s in strips)
-        self.runner.store.save("pieces", (pieces, slow.wander_density, light))
+        self.runner.store.save("pieces", (pieces, solution.problem.model, light))
         for _ in self.runner.each(tasks.pose_with_noise, self.block.keys, lambda key: ()):
             pass
         return True

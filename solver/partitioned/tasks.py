@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..adjustment.covariance import cofactors
-from ..adjustment.equations import BlockEquations, Outcome, Reached
 from ..adjustment.direct_georeferencing import georeference_posed
+from ..adjustment.equations import BlockEquations, Outcome, Reached
 from ..adjustment.layout import layout_of, sets_of_rays
 from ..adjustment.linearisation import Linearisation, Whitening
 from ..adjustment.network import Network
@@ -291,7 +291,9 @@ class Blocks:
         return self._variances
 
 
-def described(store: Store, key: int, read: int, cofactors_of: Array | tuple[Array, ...], variances: Array) -> Described:
+def described(
+    store: Store, key: int, read: int, cofactors_of: Array | tuple[Array, ...], variances: Array
+) -> Described:
     """Statistics of a partition, given the block's cofactors of its unknowns: all (u, u), or those of its
     `Plan.cliques`."""
     part, equations = _load(store, key, read)
@@ -369,9 +371,9 @@ def both(a: Pieces, b: Pieces) -> Pieces:
 def pose_with_noise(store: Store, key: int) -> Plan:
     """Pose a partition again, its rays weighed with what corrections (``pieces``) leave of the noise of poses."""
     network: Network = store.load(f"network-{key}")
-    pieces, density, strips = store.load("pieces")
+    pieces, model, strips = store.load("pieces")
     assert network.rays.orientation_noise is not None
-    left = noise_left(network.rays, pieces, strips, density)
+    left = noise_left(network.rays, pieces, strips, model)
     noise = left_of_noise(network.rays.orientation_noise, left)
     return _posed(store, key, replace(network, rays=replace(network.rays, orientation_noise=noise)))
 
@@ -420,7 +422,9 @@ def _save(store: Store, key: int, version: int, equations: BlockEquations) -> No
     if equations.trial is not None:
         reached = equations.trial[0]
         same = reached.whitening is at.whitening
-        fitted = reached.layout.camera.coefficients if reached.layout.camera and reached.layout is not at.layout else None
+        fitted = (
+            reached.layout.camera.coefficients if reached.layout.camera and reached.layout is not at.layout else None
+        )
         trial = (
             reached.state,
             None if same else reached.whitening.g,
