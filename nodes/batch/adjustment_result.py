@@ -339,7 +339,8 @@ def _sigma0_note(result: BatchResult) -> str:
 
 def _weakness_notes(result: BatchResult) -> list[str]:
     if result.weak is None:
-        return ["too many unknowns to search for undetermined combinations"]
+        where = "in partitions" if result.solution.problem.parts is not None else "of so many unknowns"
+        return [f"undetermined combinations {where} are not searched for"]
     if not result.weak:
         return []
     free = len(result.solution.factor.undetermined) > 0

@@ -79,8 +79,8 @@ FEW = 20
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input", nargs="+", metavar="INPUT",
-        help="block folder, block of satellite scenes, or recording (URLs, too); several recordings or folders of one camera "
-        "are adjusted as one block: points of the same name tie them",
+        help="block folder, block of satellite scenes, or recording (URLs, too); several recordings or folders of one "
+        "camera are adjusted as one block: points of the same name tie them",
     )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for result.json, points.csv, residuals.csv, ...")
     group = parser.add_argument_group("model")
@@ -289,7 +289,7 @@ def joining_notes(joined: JoinedBlock, names: Sequence[str]) -> list[str]:
     notes = [f"{len(names)} recordings as one block: {of}"]
     if joined.ties + joined.ground:
         notes.append(
-            f"joined by {joined.ties} tie points and {joined.ground} known points that more than one of them has measured"
+            f"joined by {joined.ties} tie points and {joined.ground} known points that more than one of them measured"
         )
     else:
         notes.append("no point was measured in more than one recording: they are adjusted side by side")

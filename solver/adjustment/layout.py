@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import CameraDesign, SelfCalibration
 from ..models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, join_observations
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors

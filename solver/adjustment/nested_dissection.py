@@ -4,7 +4,8 @@ The graph of unknowns is cut where it is narrow: by one of the levels that a wal
 other, about in the middle. What is left on either side is cut again, until a part is small. Unknowns that meet nearly
 all others (constants of strips, additional parameters) come last, as the border of everything.
 
-Source: A. George and J. W. H. Liu, An automatic nested dissection algorithm for irregular finite element problems, 1978.
+Source: A. George and J. W. H. Liu, An automatic nested dissection algorithm for irregular finite element problems,
+1978.
 """
 
 from __future__ import annotations

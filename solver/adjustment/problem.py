@@ -115,7 +115,7 @@ class Parts(Protocol):
         ...
 
     def with_noise_left(self, solution: Solution) -> bool:
-        """Weigh rays with what `pose_noise.with_noise_left` leaves, from the next solution on; False where all is left."""
+        """Weigh rays with what `pose_noise.with_noise_left` leaves, from the next solution on; False for all of it."""
         ...
 
 

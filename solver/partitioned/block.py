@@ -294,7 +294,7 @@ class PartitionedEquations:
         """Weights are as they are."""
 
     def _do(self, **what: object) -> None:
-        if not what.keys() == {"reweigh"} or self.changes or what["reweigh"] != (None, 1.0):
+        if what.keys() != {"reweigh"} or self.changes or what["reweigh"] != (None, 1.0):
             self._cost = None
         self.changes = self.changes._replace(**what)
 

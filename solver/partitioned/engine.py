@@ -100,9 +100,8 @@ class Engine:
         block = self.block
 
         def changes(key: int) -> tasks.Changes:
-            return tasks.Changes(
-                image=image_factor, given=ray_weight[self.of_rays(key)], control=problem.control.weight[self.of_points(key)]
-            )  # fmt: skip
+            control = problem.control.weight[self.of_points(key)]
+            return tasks.Changes(image=image_factor, given=ray_weight[self.of_rays(key)], control=control)
 
         if isinstance(start, SolutionInParts):
             assert start.kept is not None

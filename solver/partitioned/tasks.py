@@ -322,7 +322,7 @@ def describe(store: Store, key: int, read: int, cofactors_of: Array | tuple[Arra
     """`described`, into the store (``result-K``); sums of it."""
     found = described(store, key, read, cofactors_of, variances)
     store.save(f"result-{key}", found)
-    part, equations = _load(store, key, read)
+    _, equations = _load(store, key, read)
     used = found.weight > 0
     left = np.where(used, 2.0 - found.weight * np.einsum("nii->n", found.observed), 0.0)
     image = [2.0 * used.sum(), (found.weight * found.squares).sum(), left.sum()]

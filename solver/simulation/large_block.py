@@ -146,7 +146,7 @@ def large_block(
     cross: int,
     tiles: tuple[int, int],
     points: int,
-    noise: Noise = Noise(),
+    noise: Noise = Noise(),  # noqa: B008  (frozen)
     seed: int = 1,
     pose_rate_hz: float = 20.0,
 ) -> LargeBlock:
