@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -56,7 +58,7 @@ class Spoilt:
     def __init__(self, batch, equations, point, ray, by):
         residual = equations.residual.copy()
         residual[point, 2 * ray : 2 * ray + 2] += by
-        moved = EntryEquations(**{**vars(equations), "residual": residual})
+        moved = replace(equations, residual=residual)
         self.weight, self.w = entry_weight(batch, moved)
         self.of_point = self.weight[batch.rays.point == point]
         self.others = self.weight[batch.rays.point != point]
