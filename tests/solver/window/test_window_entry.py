@@ -97,7 +97,7 @@ def test_three_looks_that_agree_stay_where_known_coordinates_are_wrong(entering)
     for batch, equations, point in known:
         off = equations.off.copy()
         off[point, 2] += 47.0
-        moved = EntryEquations(**{**vars(equations), "off": off})
+        moved = replace(equations, off=off)
         square, *_ = moved.test(equations.present, batch.control.weight)
         assert square[point] > chi2.isf(SUSPECTED, 6)
         weight, _ = entry_weight(batch, moved)
