@@ -56,7 +56,7 @@ def drive(
     Parameters
     ----------
     pool : who does them; stays open
-    retries : how often a job is given out again that was killed, or whose input is far away
+    retries : how often a job is given out again that was killed, or whose store was away
     progress : is kept up to date
     told : called with every job that has ended for good, and with None a few times a second
     """

@@ -129,4 +129,14 @@ def _told_apart(names: dict[str, str]) -> dict[str, str]:
             if times[taken[path]] > 1:
                 above = PurePosixPath(path.split("://")[-1]).parts[: -1 - name.count("/")]
                 taken[path] = "/".join([*(part for part in above[-depth:] if part != "/"), name])
-    return {path: "/".join(_UNUSUAL.sub("_", part) for part in name.split("/")) for path, name in taken.items()}
+    named = {path: "/".join(map(_folder_name, name.split("/"))) for path, name in taken.items()}
+    by_name: dict[str, str] = {}
+    for path, name in named.items():
+        if by_name.setdefault(name, path) != path:
+            raise UserError(f"{path}: would have the folder {name}, as {by_name[name]} has; give it another name")
+    return named
+
+
+def _folder_name(part: str) -> str:
+    """A part of a name as the name of a folder; stores take any characters, and ``..`` among them."""
+    return _UNUSUAL.sub("_", part) if part.strip(".") else "_" * max(len(part), 1)

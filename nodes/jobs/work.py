@@ -20,6 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..recording.remote import AWAY
 from .plan import Job
 from .records import is_finished, record_of, write_record
 
@@ -41,7 +42,7 @@ class Outcome:
     good : whether its result is there
     seconds : that it took
     reason : why it is not good: the last line that the command wrote
-    again : whether it may go well another time: it was killed, or its input is far away
+    again : whether it may go well another time: it was killed, or the store of its input was away
     stopped : it was told to end
     """
 
@@ -116,7 +117,7 @@ def _in_folder(job: Job, folder: Path, working: Path, begun: float, unwanted: Ca
     record_of(folder, job.step).unlink(missing_ok=True)
     os.replace(log, folder / log.name)
     reason, killed = _reason(job, folder / log.name, process.returncode)
-    return Outcome(job.flight, job.step, False, seconds, reason, again=killed or "://" in job.words[1])
+    return Outcome(job.flight, job.step, False, seconds, reason, again=killed or f": {AWAY} " in reason)
 
 
 def _wait(process: subprocess.Popen[bytes], unwanted: Callable[[], bool]) -> bool:

@@ -29,8 +29,17 @@ _BLOCK, _AT_A_TIME = 8 << 20, 4
 #: A store that does not answer is given up after so long, s, where it can be told.
 _PATIENCE_S = 10
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/+", re.IGNORECASE)
+#: How it begins what may be over the next time: a store that is away or fails.
+AWAY = "for now the store"
 #: What carries a protocol into an installation, by protocol.
-_PACKAGES = {"sftp": "paramiko", "ssh": "paramiko", "webdav": "webdav4", "dav": "webdav4", "gs": "gcsfs", "az": "adlfs"}
+_PACKAGES = {
+    "sftp": "paramiko",
+    "ssh": "paramiko",
+    "webdav": "'webdav4[fsspec]'",
+    "dav": "'webdav4[fsspec]'",
+    "gs": "gcsfs",
+    "az": "adlfs",
+}
 #: What a store takes for who one is, for the message that it refuses.
 _CREDENTIALS = {"s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile; AWS_ENDPOINT_URL names another store"}
 
@@ -98,12 +107,16 @@ def listed(url: str, ending: str) -> tuple[str, list[tuple[str, int, str]]]:
             rows = {name: row for name, row in rows.items() if name.endswith(ending)}
         else:
             base, rows = key.rpartition("/")[0], {found["name"]: found}
+        protocol, _, rest = url.partition("://")
+        whole = f"{protocol}://{rest.rstrip('/')}"
+        # names of files have no protocol, and of most stores no host either
+        before = whole[: len(whole) - len(key)] if whole.endswith(key) else fs.unstrip_protocol("")
         files = [
-            (fs.unstrip_protocol(name), int(row["size"]), _modified(row))
+            (before + name, int(row["size"]), _modified(row))
             for name, row in sorted(rows.items())
             if row["type"] == "file"
         ]
-        return fs.unstrip_protocol(base), files
+        return before + base, files
 
 
 class RemoteFile:
@@ -202,12 +215,17 @@ def _runs(missing: NDArray[np.bool_], there: NDArray[np.bool_]) -> list[tuple[in
 def _store(url: str) -> tuple[Any, str]:
     """The file system of a URL, and what the file is called there."""
     protocol = url.partition("://")[0]
+    if secret := re.match(r"([^:/]+://[^:/@]*):[^/@]*@", url):
+        where = f"FSSPEC_{protocol.upper()}_PASSWORD"
+        raise UserError(
+            f"{secret[1]}:..@..: a password in a URL would stand in logs; put it into {where}, or use a key"
+        )
     try:
         import fsspec
         import fsspec.utils
     except ImportError:
         raise UserError(f"{url}: needs fsspec: pip install 'triline[cluster]'") from None
-    options: dict[str, Any] = {"skip_instance_cache": True, "use_listings_cache": False}
+    options: dict[str, Any] = {"skip_instance_cache": True}
     if protocol == "s3":
         timeouts = {"connect_timeout": _PATIENCE_S, "read_timeout": 6 * _PATIENCE_S}
         options["config_kwargs"] = {**timeouts, "retries": {"max_attempts": 3}}
@@ -244,7 +262,7 @@ def _meaning(error: Exception, protocol: str) -> str:
     told = " ".join(str(error).split()) or type(error).__name__
     takes = f" (it takes {_CREDENTIALS[protocol]})" if protocol in _CREDENTIALS else ""
     names = {kind.__name__ for kind in type(error).__mro__}
-    if isinstance(error, PermissionError) or "AuthenticationException" in names:
+    if isinstance(error, PermissionError) or "authentication" in told.lower():
         return f"the store refuses: {told}{takes}"
     if names & {"NoCredentialsError", "PartialCredentialsError", "ProfileNotFound", "TokenRetrievalError"}:
         return f"no credentials for the store: {told}{takes}"
@@ -253,8 +271,8 @@ def _meaning(error: Exception, protocol: str) -> str:
         "HTTPClientError",
         "SSHException",
     }:
-        return f"the store cannot be reached: {told}"
-    return f"the store fails: {type(error).__name__}: {told}"
+        return f"{AWAY} cannot be reached: {told}"
+    return f"{AWAY} fails: {type(error).__name__}: {told}"
 
 
 def _modified(row: dict[str, Any]) -> str:

@@ -88,3 +88,23 @@ def test_a_store_is_listed_by_the_same_rules(season):
     assert names(f"{url}/first.mcap") == ["first"]
     with pytest.raises(UserError, match="no such file in the store"):
         sources([f"{url}/none"], OUT)
+
+
+def test_names_of_a_store_lead_nowhere_else(season):
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    for name in ("/b/x/../../../etc/evil.mcap", "/b/a<b>.mcap", "/b/plain.mcap"):
+        store.store[name] = store._open(name, "wb")
+    try:
+        found = [source.name for source in sources(["memory://b"], OUT)]
+    finally:
+        store.store.clear()
+    assert found == ["a_b_", "plain", "x/__/__/__/etc/evil"]
+
+
+def test_two_that_would_share_a_folder_are_refused(season):
+    for name in ("s/a?.mcap", "s/a!.mcap"):
+        Path(name).write_bytes(b"x")
+    with pytest.raises(UserError, match="would have the folder a_"):
+        sources(["s"], OUT)
