@@ -199,7 +199,7 @@ class DaskRunner(_Counted):
         """Whether every worker reads what is written here."""
         word = secrets.token_hex(8)
         self.store.save("word", word)
-        found = self._client.run(_read_word, self.store.folder)
+        found: Any = self._client.run(_read_word, self.store.folder)
         if not found:
             raise UserError("--scheduler: the cluster has no workers")
         for worker, read in found.items():
@@ -214,7 +214,8 @@ class DaskRunner(_Counted):
     ) -> Iterator[tuple[int, Any]]:
         from distributed import as_completed
 
-        threads = sum(self._client.nthreads().values())
+        of_workers: Any = self._client.nthreads()
+        threads = sum(of_workers.values())
         most, following = max(2, threads * (1 + AHEAD)), 0
         running: dict[Any, int] = {}
         arrived = as_completed([], loop=self._client.loop, with_results=False, raise_errors=False)

@@ -26,7 +26,9 @@ class FrontalMatrix:
     def __init__(self, dissection: Dissection):
         self.dissection = dissection
         own = np.diff(dissection.bounds)
-        self.panels = [np.zeros((int(m) + len(r), int(m))) for m, r in zip(own, dissection.rows, strict=True)]
+        self.panels: list[Array] = [
+            np.zeros((int(m) + len(r), int(m))) for m, r in zip(own, dissection.rows, strict=True)
+        ]
         self.reference: Array | None = None
 
     def add(self, columns: IntArray, block: Array) -> None:

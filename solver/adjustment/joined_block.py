@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,7 +268,7 @@ def _image(blocks: Sequence[BlockData], places: Sequence[IntArray], first_strip:
     """Image points of all blocks, one block after the other."""
     first_row = np.cumsum([0, *(len(b.image) for b in blocks)])
 
-    def joined(name: str) -> Array:
+    def joined(name: str) -> Any:
         return np.concatenate([getattr(block.image, name) for block in blocks])
 
     of_sample = [b.image.sigma_px if b.image.sigma_sample_px is None else b.image.sigma_sample_px for b in blocks]

@@ -11,6 +11,7 @@ Source: A. George and J. W. H. Liu, An automatic nested dissection algorithm for
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +133,8 @@ def _levels(graph: csr_array) -> IntArray:
     """Level of each node in a walk from the rim of a graph that hangs together."""
     start, depth, level = 0, -1, np.zeros(graph.shape[0], dtype=np.int64)
     for _ in range(6):
-        order, before = breadth_first_order(graph, start, directed=False)
+        walk: Any = breadth_first_order(graph, start, directed=False)
+        order, before = walk
         found = np.zeros(graph.shape[0], dtype=np.int64)
         for node in order[1:].tolist():
             found[node] = found[before[node]] + 1
@@ -168,11 +170,13 @@ def find_fronts(graph: csr_array, group: IntArray, size: IntArray) -> Dissection
 
 
 def _neighbours(graph: csr_array, groups: IntArray) -> IntArray:
-    return np.unique(np.concatenate([graph.indices[graph.indptr[g] : graph.indptr[g + 1]] for g in groups.tolist()]))
+    parts = [graph.indices[graph.indptr[g] : graph.indptr[g + 1]] for g in groups.tolist()]
+    return np.unique(np.concatenate(parts)).astype(np.int64)
 
 
 def _expanded(groups: IntArray, start: IntArray) -> IntArray:
     """Places of the unknowns of groups, by their places."""
     if not len(groups):
         return np.empty(0, dtype=np.int64)
-    return np.concatenate([np.arange(start[g], start[g + 1]) for g in groups.tolist()])
+    limits = start.tolist()
+    return np.concatenate([np.arange(limits[g], limits[g + 1], dtype=np.int64) for g in groups.tolist()])

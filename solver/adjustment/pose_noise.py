@@ -138,7 +138,9 @@ def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], model: Model
     number = np.floor(rays.time_s / PIECE_S).astype(np.int64)
     for i in np.unique(rays.strip).tolist():
         mine, slow = np.flatnonzero(rays.strip == i), slow_errors_of_strip(model, strips[i].id)
-        for k in np.unique(number[mine]).tolist() if slow is not None else ():
+        if slow is None:
+            continue
+        for k in np.unique(number[mine]).tolist():
             left[mine[number[mine] == k]] = followed(pieces[i, k], slow.wander_density, strips[i].noise_time_s)
     return left
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +148,7 @@ def _can_be_estimated(sums: dict[str, tuple[int, float, float]], group: str) -> 
 
 def _row_variances(solution: Solution) -> Array:
     """Diagonal of ``B Q B^T`` for the whitened a-priori equations B."""
-    B = solution.problem.prior.matrix
+    B: Any = solution.problem.prior.matrix
     entries = np.diff(B.indptr)
     if entries.max(initial=0) <= 1:
         square = B.multiply(B)
@@ -155,7 +156,7 @@ def _row_variances(solution: Solution) -> Array:
     if solution.layout.n_unknowns > DENSE_UP_TO:
         found = np.empty(B.shape[0])
         for row in range(B.shape[0]):
-            own = slice(B.indptr[row], B.indptr[row + 1])
+            own = slice(*B.indptr[row : row + 2].tolist())
             b = B.data[own]
             found[row] = b @ solution.factor.cofactors(B.indices[own].astype(np.int64)) @ b
         return found

@@ -144,8 +144,8 @@ class Engine:
             solved.kept,
         )
 
-    def _start(self, points_l: Array | None) -> Array:
-        assert self._network is not None
+    def _start(self, points_l: Solution | Array | None) -> Array:
+        assert self._network is not None and not isinstance(points_l, Solution)
         return self._network.approximate_l if points_l is None else points_l
 
     def of_points(self, key: int) -> slice:
@@ -226,8 +226,12 @@ def listed(network: Network) -> Network:
         rays.sigma_sample_px,
         rays.time_s,
         nothing(n),
-        *(nothing(n, 3) for _ in range(4)),
-        *(nothing(n, 2) for _ in range(2)),
+        nothing(n, 3),
+        nothing(n, 3),
+        nothing(n, 3),
+        nothing(n, 3),
+        nothing(n, 2),
+        nothing(n, 2),
         nothing(n),
     )
     return replace(network, rays=light)

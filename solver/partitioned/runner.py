@@ -25,7 +25,8 @@ class Runner(Protocol):
     and writes others, never the ones it reads.
     """
 
-    store: Store
+    @property
+    def store(self) -> Store: ...
 
     def run(
         self,

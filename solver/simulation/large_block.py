@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ class LargeBlock:
         tiles = [self.tile(key) for key in range(len(self.tiles))]
         first = np.arange(len(tiles)) * self.points
 
-        def joined(name: str) -> Array:
+        def joined(name: str) -> Any:
             return np.concatenate([getattr(t.measurements, name) for t in tiles])
 
         def together(parts: Iterator[Control]) -> Control:

@@ -1,0 +1,142 @@
+"""Several recordings as one block: what is joined, what is kept apart, and the same answers as of one recording."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from adjustment_networks import CAMERA
+
+from triline.solver.adjustment.adjustment import adjust
+from triline.solver.adjustment.block_data import BlockData, ImagePoints, KnownPoints, network_from_block
+from triline.solver.adjustment.covariance import cofactors
+from triline.solver.adjustment.joined_block import join_blocks
+from triline.solver.geometry.frames import LocalFrame
+from triline.solver.geometry.trajectory import Trajectory
+from triline.solver.models.dgr import DgrOptions
+from triline.solver.simulation.network import regular_block
+
+FRAME = LocalFrame(48.0, 11.0, 500.0)
+
+
+@pytest.fixture(scope="module")
+def block():
+    """Three strips and a cross strip, one block."""
+    network = regular_block(CAMERA, np.random.default_rng(4), DgrOptions(), 120, 3, 1, length_m=4000.0).network
+    known = network.control
+    covariance = np.stack([np.diag(s**2) for s in known.sigma_m])
+    rays, ids = network.rays, [network.point_ids[i] for i in known.point]
+    names = (*ids, *(id for id in network.point_ids if id not in ids))
+    place = {id: i for i, id in enumerate(names)}
+    point = np.array([place[id] for id in network.point_ids])[rays.point]
+    sigma = rays.sigma_line_px
+    image = ImagePoints(point, rays.strip, rays.ccd, rays.line, rays.sample, sigma, rays.time_s, {}, sigma)
+    ground = KnownPoints(tuple(ids), known.xyz_l, covariance, ("control",) * len(ids))
+    return BlockData("block", FRAME, network.camera, network.strips, names, ground, image)
+
+
+def some_strips(block, which):
+    """The recording of some strips: their image points, and the known points."""
+    rows = np.flatnonzero(np.isin(block.image.strip, which))
+    place = np.full(len(block.strips), -1)
+    place[which] = np.arange(len(which))
+    image = block.image
+    part = [getattr(image, n)[rows] for n in ("ccd", "line", "sample", "sigma_px", "time_s")]
+    own = ImagePoints(image.point[rows], place[image.strip[rows]], *part, {}, image.sigma_sample_px[rows])
+    return replace(block, strips=tuple(block.strips[i] for i in which), image=own)
+
+
+def later(block, seconds):
+    """A recording of another day: its times count from another moment, and stand at other values."""
+    strips = [
+        replace(
+            s,
+            trajectory=Trajectory(s.trajectory.time_s - seconds, s.trajectory.position_l, s.trajectory.quaternion),
+            first_line_time_s=s.first_line_time_s - seconds,
+        )
+        for s in block.strips
+    ]
+    image = replace(block.image, time_s=block.image.time_s - seconds)
+    return replace(
+        block, strips=tuple(strips), image=image, time_reference_ns=block.time_reference_ns + seconds * 10**9
+    )
+
+
+def answers(block):
+    solution = adjust(network_from_block(block), DgrOptions())
+    Q = cofactors(solution)
+    place = {id: i for i, id in enumerate(solution.network.point_ids)}
+    return solution, Q, place
+
+
+def test_two_recordings_are_one_with_the_same_content(block):
+    joined = join_blocks([some_strips(block, [0, 1]), later(some_strips(block, [2, 3]), 64)], ["day1", "day2"])
+    assert (joined.strips, sum(joined.image_points)) == ((2, 2), len(block.image))
+    assert joined.ties > 30 and joined.ground >= 1 and not joined.elsewhere and not joined.renamed
+    assert joined.recording == {"S1": 0, "S2": 0, "S3": 1, "C1": 1}
+    (one, Q1, place1), (two, Q2, place2) = answers(block), answers(joined.block)
+    assert two.redundancy == one.redundancy
+    assert two.sigma0 == pytest.approx(one.sigma0, rel=1e-9)
+    ours = np.array([place2[id] for id in place1])
+    sigma = np.sqrt(np.einsum("pii->pi", Q1.points))
+    known = one.points.rank == 3
+    assert known.sum() > 100
+    assert (np.abs(two.state.points_l[ours] - one.state.points_l) < 1e-6 * sigma)[known].all()
+    again = np.sqrt(np.einsum("pii->pi", Q2.points))[ours]
+    np.testing.assert_allclose(again[known], sigma[known], rtol=1e-8)
+
+
+def test_names_that_come_again(block):
+    """The same strips twice, under the same names; a tie point whose name means another point in the second."""
+    first, second = some_strips(block, [0, 1]), some_strips(block, [0, 2])
+    seen = [np.unique(b.image.point) for b in (first, second)]
+    n = len(block.ground)
+    a, b = (int(i) for i in np.intersect1d(*seen)[np.intersect1d(*seen) >= n][[0, -1]])
+    names = list(second.point_ids)
+    names[a], names[b] = names[b], names[a]
+    joined = join_blocks([first, replace(second, point_ids=tuple(names))], ["day1", "day2"])
+    assert [s.id for s in joined.block.strips] == ["S1@day1", "S2", "S1@day2", "S3"]
+    assert joined.renamed == (("day1", "S1", "S1@day1"), ("day2", "S1", "S1@day2"))
+    assert joined.elsewhere == 2
+    assert {f"{block.point_ids[a]}@day2", f"{block.point_ids[b]}@day2"} <= set(joined.block.point_ids)
+    solution, _, _ = answers(joined.block)
+    assert solution.sigma0 < 1.2
+
+
+def test_another_frame_is_turned_into_the_first(block):
+    """The second recording has its origin 20 km away."""
+    first, second = some_strips(block, [0, 1]), some_strips(block, [2, 3])
+    away = LocalFrame(48.2, 11.1, 300.0)
+    turn = away.R_el.T @ FRAME.R_el
+    offset = (FRAME.origin_e - away.origin_e) @ away.R_el
+    from triline.solver.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+
+    strips = [
+        replace(
+            s,
+            trajectory=Trajectory(
+                s.trajectory.time_s,
+                s.trajectory.position_l @ turn.T + offset,
+                quaternion_from_matrix(turn @ matrix_from_quaternion(s.trajectory.quaternion)),
+            ),
+        )
+        for s in second.strips
+    ]
+    ground = replace(second.ground, xyz_l=second.ground.xyz_l @ turn.T + offset)
+    moved = replace(second, frame=away, strips=tuple(strips), ground=ground)
+    joined = join_blocks([first, moved], ["here", "there"]).block
+    for ours, theirs in zip(joined.strips[2:], second.strips, strict=True):
+        np.testing.assert_allclose(ours.trajectory.position_l, theirs.trajectory.position_l, atol=1e-6)
+        turned = matrix_from_quaternion(ours.trajectory.quaternion)
+        np.testing.assert_allclose(turned, matrix_from_quaternion(theirs.trajectory.quaternion), atol=1e-12)
+
+
+def test_what_contradicts_is_refused(block):
+    first, second = some_strips(block, [0, 1]), some_strips(block, [2, 3])
+    wrong = replace(second.ground, xyz_l=second.ground.xyz_l + [0.0, 0.3, 0.0])
+    with pytest.raises(ValueError, match=r"known point .*: day2 and day1 do not say the same .*0.300 m apart"):
+        join_blocks([first, replace(second, ground=wrong)], ["day1", "day2"])
+    other = replace(block.camera, lines=tuple(replace(li, xy_mm=li.xy_mm + 0.01) for li in block.camera.lines))
+    with pytest.raises(ValueError, match="day2 has another camera than day1"):
+        join_blocks([first, replace(second, camera=other)], ["day1", "day2"])
+    with pytest.raises(ValueError, match="attitude of day2"):
+        join_blocks([first, replace(second, heading=True)], ["day1", "day2"])
