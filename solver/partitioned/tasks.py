@@ -25,7 +25,7 @@ from ..adjustment.normal_equations import PointNormals, whiten_prior
 from ..adjustment.normal_matrix import DenseMatrix
 from ..adjustment.point_consensus import consensus_of_points
 from ..adjustment.pose_noise import Pieces, left_of_noise, noise_information, noise_left
-from ..adjustment.problem import Solution, State, with_left_out
+from ..adjustment.problem import Solution, State
 from ..adjustment.ray_statistics import RayStatistics, ray_statistics
 from ..adjustment.reduced_system import Undetermined
 from ..adjustment.robust import WeightFunction
@@ -380,11 +380,10 @@ def pose_with_noise(store: Store, key: int) -> Plan:
 
 def georeferenced(store: Store, key: int, weight: Array) -> tuple[Array, Array, Array]:
     """Points of a partition without adjustment, and their sigmas (see `direct_georeferencing`)."""
-    network: Network = store.load(f"network-{key}")
-    posed: Posed = store.load("posed")
+    part: Part = store.load(f"part-{key}")
+    network, posed = part.problem.network, store.load("posed")
     number, _, _ = sets_of_rays(network)
     layout = layout_of(network, posed.sets, np.searchsorted(posed.present, number))
-    network = with_left_out(network, layout)
     found = georeference_posed(network, layout, whiten_prior(layout.prior, layout.n_unknowns), weight)
     return found.xyz_l, found.image_sigma_m, found.sigma_m
 

@@ -132,7 +132,7 @@ def test_another_frame_is_turned_into_the_first(block):
 
 def test_what_contradicts_is_refused(block):
     first, second = some_strips(block, [0, 1]), some_strips(block, [2, 3])
-    wrong = replace(second.ground, xyz_l=second.ground.xyz_l + [0.0, 0.3, 0.0])
+    wrong = replace(second.ground, xyz_l=second.ground.xyz_l + np.array([0.0, 0.3, 0.0]))
     with pytest.raises(ValueError, match=r"known point .*: day2 and day1 do not say the same .*0.300 m apart"):
         join_blocks([first, replace(second, ground=wrong)], ["day1", "day2"])
     other = replace(block.camera, lines=tuple(replace(li, xy_mm=li.xy_mm + 0.01) for li in block.camera.lines))

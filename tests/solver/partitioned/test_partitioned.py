@@ -96,7 +96,7 @@ def test_noise_of_poses_is_counted_over_partitions(network):
         rays=replace(network.rays, orientation_noise=np.broadcast_to(noise, (len(network.rays), 6, 6)).copy()),
         strips=tuple(replace(strip, noise_time_s=1.0) for strip in network.strips),
     )
-    job = Job(WanderOptions.from_settings({"wander_time_s": 100.0}))
+    job = Job(WanderOptions.from_settings({"wander_time_s": 300.0}))
     whole, parts = run(noisy, job), run(noisy, job, pose=Engine(Here(Memory()), 700).pose)
     assert whole.iterations > run(network, job).iterations
     same(whole, parts)
