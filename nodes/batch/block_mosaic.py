@@ -26,7 +26,7 @@ from ..errors import UserError
 from ..formats.geojson import write_line_features
 from ..formats.geotiff import SIGMA_BANDS, Raster, TilePlace, cloud_optimised, write_tile, write_virtual
 from ..formats.new_file import new_file
-from .mosaic_jobs import Job, read_json, run_jobs, write_json
+from .mosaic_jobs import Job, Workers, read_json, write_json
 from .mosaic_layers import Layer, Window, sigma_of_layer, windows_of_layers
 
 Array = NDArray[np.floating]
@@ -111,7 +111,7 @@ def tiles_of(layers: list[Layer]) -> dict[Key, list[int]]:
 
 
 def make_mosaic(
-    folder: Path, layers: list[Layer], settings: MosaicSettings, workers: int,
+    folder: Path, layers: list[Layer], settings: MosaicSettings, workers: Workers,
     told: Callable[[float], None] | None = None,
 ) -> dict[str, int]:  # fmt: skip
     """Do all jobs after the layers; returns how many of each kind there are, and how many were done already.
@@ -138,7 +138,7 @@ def make_mosaic(
             if told is not None:
                 told(begin + (end - begin) * share)
 
-        done["done before"] += run_jobs(work, jobs, workers, mine)
+        done["done before"] += workers.run(work, jobs, mine)
 
     several = [key for key, there in tiles.items() if len(there) > 1]
     jobs = [

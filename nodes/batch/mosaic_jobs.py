@@ -33,54 +33,76 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-def run_jobs(
-    work: Callable[..., None], jobs: list[Job], workers: int, told: Callable[[float], None] | None = None
-) -> int:
-    """Do what is not done; returns how many jobs were done already.
+class Workers:
+    """Processes that do jobs; they are started when they are first wanted, and end with the context.
 
-    With one worker jobs run here, with more of them in processes of their own. A process that is lost (killed, out of
-    memory) costs the jobs that were running, which are begun again.
-
-    Raises
-    ------
-    UserError : of a job, or processes were lost again and again
+    Parameters
+    ----------
+    number : of processes; with one, jobs are done in this process
     """
-    missing = [job for job in jobs if not job.done.exists()]
-    before = len(jobs) - len(missing)
-    if workers <= 1 or len(missing) <= 1:
-        for k, job in enumerate(missing):
-            work(*job.arguments)
-            if told is not None:
-                told((before + k + 1) / len(jobs))
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+
+    def run(self, work: Callable[..., None], jobs: list[Job], told: Callable[[float], None] | None = None) -> int:
+        """Do what is not done; returns how many jobs were done already.
+
+        A process that is lost (killed, out of memory) costs the jobs that were running, which are begun again.
+
+        Raises
+        ------
+        UserError : of a job, or processes were lost again and again
+        """
+        missing = [job for job in jobs if not job.done.exists()]
+        before = len(jobs) - len(missing)
+        if self.number <= 1 or len(missing) <= 1:
+            for k, job in enumerate(missing):
+                work(*job.arguments)
+                if told is not None:
+                    told((before + k + 1) / len(jobs))
+            return before
+        for attempt in range(RETRIES + 1):
+            if not missing:
+                break
+            try:
+                self._in_processes(work, missing, len(jobs), told)
+            except BrokenProcessPool:
+                self._end()
+                if attempt == RETRIES:
+                    raise UserError(
+                        f"a worker was lost {RETRIES + 1} times (killed, or out of memory): the same command goes on "
+                        "with what is missing; with fewer --workers it takes less memory"
+                    ) from None
+            missing = [job for job in missing if not job.done.exists()]
         return before
-    for attempt in range(RETRIES + 1):
-        if not missing:
-            break
-        try:
-            _in_processes(work, missing, min(workers, len(missing)), len(jobs), told)
-        except BrokenProcessPool:
-            if attempt == RETRIES:
-                raise UserError(
-                    f"a worker was lost {RETRIES + 1} times (killed, or out of memory): the same command goes on with "
-                    "what is missing; with fewer --workers it takes less memory"
-                ) from None
-        missing = [job for job in missing if not job.done.exists()]
-    return before
 
-
-def _in_processes(
-    work: Callable[..., None], jobs: list[Job], workers: int, total: int, told: Callable[[float], None] | None
-) -> None:
-    # a fresh process: GDAL and BLAS have threads, which a forked one would lack
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        running = [pool.submit(work, *job.arguments) for job in jobs]
+    def _in_processes(
+        self, work: Callable[..., None], jobs: list[Job], total: int, told: Callable[[float], None] | None
+    ) -> None:
+        if self._pool is None:
+            # fresh processes: GDAL and BLAS have threads, which a forked one would lack
+            self._pool = ProcessPoolExecutor(self.number, mp_context=multiprocessing.get_context("spawn"))
+        running = [self._pool.submit(work, *job.arguments) for job in jobs]
         try:
             for k, future in enumerate(as_completed(running)):
                 future.result()
                 if told is not None:
                     told((total - len(jobs) + k + 1) / total)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            for future in running:
+                future.cancel()
             raise
 
 

@@ -25,7 +25,7 @@ from ..batch.block_mosaic import (
     put_together,
     read_balance,
 )
-from ..batch.mosaic_jobs import Job, open_parts, remove_parts, run_jobs, write_json
+from ..batch.mosaic_jobs import Job, Workers, open_parts, remove_parts, write_json
 from ..batch.mosaic_layers import (
     Layer,
     SpillingMosaic,
@@ -96,12 +96,13 @@ def run(args: argparse.Namespace) -> int:
     continued = open_parts(folder, _plan(args, kinds, settings))
     (folder / "layers").mkdir(exist_ok=True)
     jobs = _layer_jobs(args, kinds, folder, settings, crs)
-    with progress("rectifying", args.quiet or args.json) as told:
-        before = run_jobs(layer_job, jobs, workers, told)
-    layers = layers_in(folder)
-    check_layers(layers)
-    with progress("mosaic", args.quiet or args.json) as told:
-        counts = make_mosaic(folder, layers, settings, workers, told)
+    with Workers(workers) as pool:
+        with progress("rectifying", args.quiet or args.json) as told:
+            before = pool.run(layer_job, jobs, told)
+        layers = layers_in(folder)
+        check_layers(layers)
+        with progress("mosaic", args.quiet or args.json) as told:
+            counts = make_mosaic(folder, layers, settings, pool, told)
     tags = {"TIFFTAG_IMAGEDESCRIPTION": f"mosaic of {len(layers)} layers, balance {settings.balance}"}
     done = put_together(folder, layers, settings, outputs, tags, args.compress or "deflate")
     forget_files()

@@ -1,0 +1,168 @@
+"""`triline rectify --mosaic` of orthoimages over a known ground: tones, seams, sigmas, bytes, runs that go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import rasterio
+from block_of_orthoimages import GSD, LEFT, TOP, make_block
+from rio_cogeo.cogeo import cog_validate
+
+from triline.nodes.cli import main
+
+ENDS = ("tif", "source.tif", "seams.geojson", "sigma.tif")
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory):
+    return make_block(tmp_path_factory.mktemp("block"))
+
+
+def _mosaic(block, target, *more):
+    sigmas = [word for path in block.sigmas for word in ("--input-sigma", str(path))]
+    words = [*map(str, block.files), "--mosaic", "--tile", "256", "--sigma", f"{target.with_suffix('')}.sigma.tif"]
+    return ["rectify", *words, *sigmas, "-o", str(target), *more]
+
+
+def _bytes(target):
+    return {end: target.with_suffix(f".{end}").read_bytes() for end in ENDS}
+
+
+@pytest.fixture(scope="module")
+def made(block, tmp_path_factory):
+    target = tmp_path_factory.mktemp("one") / "block.tif"
+    assert main(_mosaic(block, target, "--workers", "1", "--keep", "--json", "--stac", str(target) + ".json")) == 0
+    return target
+
+
+def test_mosaic_shows_the_ground_in_one_tone(block, made, capsys):
+    assert main(_mosaic(block, made, "--workers", "1", "--keep", "--json")) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["continued"] > 10  # nothing had to be done again
+    layers = told["bands"][0]["layers"]
+    for k, layer in enumerate(layers):
+        assert abs(layer["gain"] - block.gain[k]) < 4 * layer["gain_sigma"] < 0.05
+        assert abs(layer["offset"] - block.offset[k]) < 4 * layer["offset_sigma"]
+    step = told["step_across_seams"]
+    assert step["raw_tone_rms"] > 50 and step["balanced_tone_rms"] < 6
+    assert told["bands"][0]["refused"] > 0  # places where the truck stands
+    valid, errors, warnings = cog_validate(str(made), strict=True)
+    assert valid and not errors and not warnings
+    with rasterio.open(made) as mosaic:
+        assert (mosaic.transform.c, mosaic.transform.f, mosaic.transform.a) == (LEFT, TOP, GSD)
+        grey = mosaic.read(1).astype(float)
+    assert grey.shape == block.ground.shape
+    known = grey > 0
+    assert known[3:].all()
+    # the mean gain is 1 and the mean offset 0: the mosaic has the tone of the ground itself
+    assert np.median(np.abs(grey - block.ground)[known]) < 10
+    with (
+        rasterio.open(made.with_suffix(".source.tif")) as source,
+        rasterio.open(made.with_suffix(".sigma.tif")) as sigmas,
+    ):
+        layer, sigma = source.read(1), sigmas.read(1)
+    assert set(np.unique(layer[known])) == {1, 2, 3}
+    inside = np.zeros_like(known)
+    inside[:100] = True  # far from the first seam
+    np.testing.assert_allclose(sigma[inside & known], block.sigma_m[0], rtol=1e-5)
+    assert block.sigma_m[0] - 1e-6 <= np.nanmin(sigma) and np.nanmax(sigma) <= block.sigma_m[-1] + 1e-6
+
+
+def test_seam_lines_are_where_the_source_changes(made):
+    seams = json.loads(made.with_suffix(".seams.geojson").read_text())["features"]
+    pairs = {tuple(f["properties"]["layers"]) for f in seams}
+    assert pairs == {("strip0", "strip1"), ("strip1", "strip2")}
+    lon, lat = np.concatenate([f["geometry"]["coordinates"] for f in seams]).T
+    assert lon.min() > 8.9 and lon.max() < 9.1 and 48.6 < lat.min() < lat.max() < 48.8
+    ends = [tuple(f["geometry"]["coordinates"][k]) for f in seams for k in (0, -1)]
+    lonely = [end for end in ends if ends.count(end) == 1]
+    assert len(lonely) == 4  # two seams from edge to edge of the block, whole across the tiles
+
+
+def test_stac_item_says_where_the_mosaic_is(made):
+    item = json.loads((made.parent / (made.name + ".json")).read_text())
+    assert item["type"] == "Feature" and item["stac_version"] == "1.0.0"
+    assert {"mosaic", "source", "seams", "sigma"} == set(item["assets"])
+    assert all((made.parent / asset["href"]).exists() for asset in item["assets"].values())
+    west, south, east, north = item["bbox"]
+    assert 8.99 < west < east < 9.05 and 48.7 < south < north < 48.8
+
+
+def test_workers_and_a_run_that_goes_on_give_the_same_bytes(block, made, tmp_path):
+    other = tmp_path / "block.tif"
+    assert main(_mosaic(block, other, "--workers", "2", "-q")) == 0
+    assert _bytes(other) == _bytes(made)
+    assert not (tmp_path / "block.tif.parts").exists()
+    # what a killed run leaves: some results, none of the later ones, files that never got their names
+    parts = made.with_name("block.tif.parts")
+    there = sorted(parts.glob("labels/*.npy")) + sorted(parts.glob("tiles/*.json"))
+    for path in there[1::2]:
+        path.unlink()
+    (parts / "tiles" / ".9_9.tif.part").write_bytes(b"half")
+    before = _bytes(made)
+    made.unlink()
+    assert main(_mosaic(block, made, "--workers", "1", "--keep", "-q")) == 0
+    assert _bytes(made) == before
+
+
+def test_virtual_mosaic_of_tiles(block, made, tmp_path):
+    target = tmp_path / "block.vrt"
+    assert (
+        main(
+            ["rectify", *map(str, block.files), "--mosaic", "--tile", "256", "--workers", "1", "-o", str(target), "-q"]
+        )
+        == 0
+    )
+    with rasterio.open(target) as virtual, rasterio.open(made) as whole:
+        assert virtual.shape == whole.shape and virtual.crs == whole.crs and virtual.transform == whole.transform
+        assert (virtual.read(1) > 0).sum() == (whole.read(1) > 0).sum()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--tile", "300"], "--tile 300: wanted a power of two"),
+        (["--feather", "900"], "--feather 900: wanted 0 to 256 cells"),
+        (["--gsd", "3"], "cells of 2 x 2, wanted 3"),
+        (["--crs", "EPSG:32633"], "is not in EPSG:32633"),
+        (["--control", "c.csv"], "--control: is of one image"),
+        (["--sensor", "one.geom"], "--sensor: 1 for 3 images"),
+        (["--sigma", "s.tif"], "wanted the sigmas of each orthoimage"),
+    ],
+)
+def test_what_does_not_go_together_is_named(block, tmp_path, capsys, words, told):
+    command = ["rectify", *map(str, block.files), "--mosaic", "--workers", "1", "-o", str(tmp_path / "x.tif"), *words]
+    assert main(command) == 1
+    error = capsys.readouterr().err
+    assert told in error and "Traceback" not in error and not (tmp_path / "x.tif").exists()
+
+
+def test_options_of_a_mosaic_want_it(block, tmp_path, capsys):
+    assert main(["rectify", str(block.files[0]), "--sensor", "x", "--tile", "256", "-o", str(tmp_path / "x.tif")]) == 1
+    assert "--tile: goes with --mosaic" in capsys.readouterr().err
+    assert main(["rectify", *map(str, block.files), "-o", str(tmp_path / "x.tif")]) == 1
+    assert "more than one, which goes with --mosaic only" in capsys.readouterr().err
+
+
+def test_parts_of_another_plan_are_not_taken(block, made, tmp_path):
+    target = tmp_path / "block.tif"
+    shutil.copytree(made.with_name("block.tif.parts"), tmp_path / "block.tif.parts")
+    words = [
+        "rectify",
+        *map(str, block.files),
+        "--mosaic",
+        "--tile",
+        "256",
+        "--workers",
+        "1",
+        "-o",
+        str(target),
+        "-q",
+        "--keep",
+    ]
+    assert main([*words, "--balance", "none", "--seams", "middle"]) == 0
+    with rasterio.open(target) as plain, rasterio.open(made) as balanced:
+        assert np.abs(plain.read(1).astype(float) - balanced.read(1)).max() > 50
