@@ -17,7 +17,9 @@ lets expect. ``--constants`` runs one block with the costs of seams divided and 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import json
 import os
 import signal
@@ -177,8 +179,12 @@ def constants(folder: Path) -> None:
         for factor in (0.25, 1.0, 4.0):
             setattr(seams, name, factor * usual)
             target = folder / f"{name}{factor}.tif"
-            print(f"{name} x {factor}: ", end="", flush=True)
-            triline(command(block, target, "--workers", "1")[len(frame.TRILINE) : -2])
+            told = io.StringIO()
+            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(io.StringIO()):
+                triline(command(block, target, "--workers", "1")[len(frame.TRILINE) :])
+            step = json.loads(told.getvalue())["step_across_seams"]
+            values = [step[k] for k in ("nodes", "balanced_tone_rms", "balanced_rms")]
+            frame.show({f"{name} x {factor:g}: nodes of seam, step of tone, of nodes": values})
         setattr(seams, name, usual)
 
 

@@ -388,6 +388,18 @@ BENCHMARKS = (
         8,
     ),
     Benchmark(
+        "mosaic",
+        "Mosaic of a block: tones across seams, recovered gains, memory against size, runs that are killed",
+        ("python bench/mosaic.py",),
+        5,
+    ),
+    Benchmark(
+        "scale",
+        "What does a flight cost in each stage, and what do 10, 1 000 and 100 000 of them need?",
+        ("python bench/scale.py",),
+        12,
+    ),
+    Benchmark(
         "satellites",
         "How long does location by satellite models take, beside rasterio's?",
         ("python bench/satellites.py",),
