@@ -36,6 +36,8 @@ Key = tuple[int, int]
 NODE, BEYOND = 4, 16
 #: Cells a side of the places whose mean grey values are balanced, and how many a tile gives at most.
 PLACE, MOST_PLACES = 16, 200
+#: Places a side of the parts of a tile whose errors are taken to be alike in the sigmas of the balance.
+PART = 8
 #: Balances: none, gain and offset, these and the fall-off of light along the CCD line.
 BALANCES = ("none", "gain", "fall-off")
 #: Seams: least cuts, or halfway between the middles of the strips.
@@ -216,7 +218,7 @@ def tones_job(folder: Path, key: Key, layers: dict[int, Layer], settings: Mosaic
         _file(folder, "tones", key, "npz"),
         place=np.array(place, dtype=np.int64), layer=np.array(layer, dtype=np.int64),
         value=np.array(grey, dtype=float).reshape(len(place), -1), off_middle=np.array(middle, dtype=float),
-        rough=np.array(rough, dtype=float),
+        rough=np.array(rough, dtype=float), part=(r // PART) * (n // PART + 1) + c // PART,
     )  # fmt: skip
 
 
@@ -256,7 +258,7 @@ def write_balance(folder: Path, layers: list[Layer], several: list[Key], setting
         for number, p in parts:
             places.append(p["place"] + first)
             first += len(p["rough"])
-            group.append(np.full(len(p["rough"]), number))
+            group.append(number * (settings.tile // PLACE) ** 2 + p["part"])
         if settings.balance == "none" or not first:
             result = ToneBalance.none(camera)
         else:

@@ -17,6 +17,8 @@ from ..formats.new_file import new_file
 
 #: A job whose process was lost is begun again so many times.
 RETRIES = 3
+#: Megabytes of blocks that GDAL may hold in a process; its own default is a share of the memory of the machine.
+CACHE_MB = 32
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,10 @@ class Job:
 
     done: Path
     arguments: tuple[Any, ...]
+
+
+def _hold_little() -> None:
+    os.environ["GDAL_CACHEMAX"] = str(CACHE_MB)
 
 
 class Workers:
@@ -93,7 +99,9 @@ class Workers:
     ) -> None:
         if self._pool is None:
             # fresh processes: GDAL and BLAS have threads, which a forked one would lack
-            self._pool = ProcessPoolExecutor(self.number, mp_context=multiprocessing.get_context("spawn"))
+            self._pool = ProcessPoolExecutor(
+                self.number, mp_context=multiprocessing.get_context("spawn"), initializer=_hold_little
+            )
         running = [self._pool.submit(work, *job.arguments) for job in jobs]
         try:
             for k, future in enumerate(as_completed(running)):

@@ -25,7 +25,7 @@ from ..batch.block_mosaic import (
     put_together,
     read_balance,
 )
-from ..batch.mosaic_jobs import Job, Workers, open_parts, remove_parts, write_json
+from ..batch.mosaic_jobs import CACHE_MB, Job, Workers, open_parts, remove_parts, write_json
 from ..batch.mosaic_layers import (
     Layer,
     SpillingMosaic,
@@ -96,7 +96,9 @@ def run(args: argparse.Namespace) -> int:
     continued = open_parts(folder, _plan(args, kinds, settings))
     (folder / "layers").mkdir(exist_ok=True)
     jobs = _layer_jobs(args, kinds, folder, settings, crs)
-    with Workers(workers) as pool:
+    import rasterio
+
+    with rasterio.Env(GDAL_CACHEMAX=CACHE_MB), Workers(workers) as pool:
         with progress("rectifying", args.quiet or args.json) as told:
             before = pool.run(layer_job, jobs, told)
         layers = layers_in(folder)

@@ -33,6 +33,8 @@ MEAN_OFFSET_SIGMA = 0.05
 GAIN_SIGMA, OFFSET_SIGMA, FALL_OFF_SIGMA = 0.5, 0.5, 0.5
 #: Places worse than so many sigmas count less, and than so many not at all. Statistical levels (1 %, 0.001 %).
 DOUBTED, REFUSED = 2.58, 4.4
+#: With fewer groups of places an orthoimage than this the covariance is that of independent, equal errors.
+FEWEST_GROUPS = 6
 #: Rounds of the iteration, at most, and the change of a gain that ends it.
 ROUNDS, ENOUGH = 40, 1e-7
 
@@ -188,6 +190,8 @@ def balance(samples: ToneSamples, camera: IntArray, fall_off: Mask) -> ToneBalan
         theta = theta + step
         moved = float(np.abs(np.concatenate([step[:m], step[m : 2 * m] / max(level, 1.0), step[2 * m :]])).max())
     covariance = _sandwich(A, slope, residual, weight[place] / scale**2, of_place, samples.group, N, prior)
+    if len(np.unique(samples.group)) < FEWEST_GROUPS * m:
+        covariance = np.linalg.inv(N)  # too few groups for their scatter to tell anything
     used = weight[place] > 0
     redundancy = max(int(used.sum()) - int((weight > 0).sum()) - 2 * m, 1)
     sigma0 = float(np.sqrt((weight[place] * residual**2).sum() / redundancy))
