@@ -6,9 +6,10 @@
     python bench/batch_fleet.py store
 
 ``speed``: simulated recordings of 24 s (a strip of 8 s) on one worker and on two, in turns; *of twice the speed* is the
-time of one over twice that of two. The machine has to be idle; *load before* says whether it was. ``killed``: a Dask
-cluster of two workers here, one of which is killed (SIGKILL) every few seconds, and the same for the processes of
-``--workers 2``; *equal to process* counts results that are byte for byte those of `triline process`. ``restarted``: the
+time of one over twice that of two. The machine has to be idle; *load before* says whether it was. *Workers are busy*:
+share of the time in which they have a job; *processor s a job*: what a job costs, with its part of the program; of one
+worker and of two. ``killed``: a Dask cluster of two workers here, one of which is killed (SIGKILL) every few seconds,
+and the same for the processes of ``--workers 2``; *equal to process* counts results that are byte for byte those of `triline process`. ``restarted``: the
 program, and the scheduler of a cluster, killed when some jobs are finished; the same command again: *done again* counts
 finished jobs that were done a second time. ``store``: an S3 server of this machine (moto) with a recording of image
 lines and ties; what each command fetched of it.
@@ -19,6 +20,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import resource
 import signal
 import socket
 import subprocess
@@ -76,16 +78,22 @@ def batch(paths: list[Path], out: Path, *words: str) -> dict:
 def speed(args, recordings: Path, work: Path) -> tuple[dict, bool]:
     paths = flights(recordings, args.flights or 40)
     load = os.getloadavg()[0]
-    seconds: dict[int, list[float]] = {1: [], 2: []}
+    seconds: dict[int, float] = {1: 0.0, 2: 0.0}
+    busy, processor = dict(seconds), dict(seconds)
     for turn in range(args.rounds):
         for workers in (1, 2) if turn % 2 == 0 else (2, 1):
-            out = work / f"out-{turn}-{workers}"
-            seconds[workers].append(batch(paths, out, "--workers", str(workers))["seconds"])
-    one, two = (sum(seconds[n]) / args.rounds for n in (1, 2))
-    share = one / two / 2.0
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            result = batch(paths, work / f"out-{turn}-{workers}", "--workers", str(workers))
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            seconds[workers] += result["seconds"]
+            processor[workers] += after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            busy[workers] += sum(step["seconds"] for row in result["flights"] for step in row["steps"].values())
+    jobs, share = 2 * len(paths), seconds[1] / seconds[2] / 2.0
     figures = {
-        "recordings": len(paths), "jobs": 2 * len(paths), "load before": load, "one worker, s": one,
-        "two workers, s": two, "of twice the speed": share,
+        "recordings": len(paths), "jobs": jobs, "load before": load, "one worker, s": seconds[1] / args.rounds,
+        "two workers, s": seconds[2] / args.rounds, "of twice the speed": share,
+        "workers are busy, share": [busy[n] / seconds[n] / n for n in (1, 2)],
+        "processor s a job": [processor[n] / jobs / args.rounds for n in (1, 2)],
     }  # fmt: skip
     return figures, share >= 0.85
 

@@ -176,11 +176,9 @@ def _told(progress: Progress, pool: Pool, args: argparse.Namespace) -> Iterator[
         now = time.monotonic()
         if outcome is None and now - last >= _LINE_PERIOD_S and not (args.quiet or args.json):
             last = now
-            rate = progress.ended / (now - begun)
-            left = f", {_clock((progress.total - progress.ended) / rate)} left" if rate else ""
             working = f"{progress.running} given out, {_workers(pool.workers())}"
-            told = f"{progress.ended} of {progress.total} jobs, {working}, {60 * rate:.1f} a minute{left}"
-            print(told, file=sys.stderr, flush=True)
+            told = f"{progress.ended} of {progress.total} jobs, {working}, {_rate(progress, now - begun)}"
+            print(told.removesuffix(", "), file=sys.stderr, flush=True)
 
     yield line
 
@@ -188,12 +186,13 @@ def _told(progress: Progress, pool: Pool, args: argparse.Namespace) -> Iterator[
 @contextmanager
 def _bar(progress: Progress, pool: Pool) -> Iterator[Callable[[Outcome | None], None]]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    # the bar's own estimate looks back half a minute, in which no long job may end
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("jobs, {task.fields[rate]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("jobs"), TimeElapsedColumn(),
+        TextColumn("{task.fields[rate]}"),
     )  # fmt: skip
     with Bar(*columns, console=Console(file=drawing(sys.stderr)), transient=True) as bar:
         begun = time.monotonic()
@@ -202,11 +201,18 @@ def _bar(progress: Progress, pool: Pool) -> Iterator[Callable[[Outcome | None], 
         def told(outcome: Outcome | None) -> None:
             if outcome is not None and not outcome.good:
                 bar.console.print(plain(_failure(outcome)), markup=False, highlight=False)
-            rate = 60 * progress.ended / (time.monotonic() - begun)
-            bar.update(task, completed=progress.ended, rate=f"{rate:.1f} a minute" if rate else "")
-            bar.update(task, description=_workers(pool.workers()))
+            rate = _rate(progress, time.monotonic() - begun)
+            bar.update(task, completed=progress.ended, description=_workers(pool.workers()), rate=rate)
 
         yield told
+
+
+def _rate(progress: Progress, seconds: float) -> str:
+    """Jobs a minute, and the time that the rest takes at this rate; "" before any job has ended."""
+    if not progress.ended:
+        return ""
+    left = seconds / progress.ended * (progress.total - progress.ended)
+    return f"{60.0 * progress.ended / seconds:.1f} a minute, {_clock(left)} left"
 
 
 def _workers(n: int) -> str:
