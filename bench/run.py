@@ -265,6 +265,12 @@ BENCHMARKS = (
         8,
     ),
     Benchmark(
+        "large-blocks",
+        "Do blocks in partitions have the answers of the whole, in how much time and memory?",
+        ("python bench/large_blocks.py", "python bench/large_blocks.py --rays 250 --kill"),
+        8,
+    ),
+    Benchmark(
         "navigation",
         "Is the inertial navigator fast, accurate and consistent?",
         ("python bench/navigation.py",),

@@ -14,7 +14,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.screening import arriving as module
-from triline.solver.window.screening.entry import SUSPECTED, EntryEquations, entry_weight
+from triline.solver.window.screening.entry import SUSPECTED, entry_weight
 
 
 @pytest.fixture(scope="module")
