@@ -311,8 +311,9 @@ class Authority:
         if routers:
             rules.append(_rule("ground-asks", "ingress", _ASKING, ["triline/**"]))
             rules.append(_rule("ground-says", "ingress", ("put",), [f"{own}/{topic}" for topic in UPLINK_TOPICS]))
+            rules.append(_rule("ground-answers", "ingress", ("reply",), [f"{own}/query/**"]))
             subjects.append({"id": "routers", "cert_common_names": routers})
-            policies.append({"rules": ["ground-asks", "ground-says"], "subjects": ["routers"]})
+            policies.append({"rules": ["ground-asks", "ground-says", "ground-answers"], "subjects": ["routers"]})
         return _access(rules, subjects, policies)
 
 

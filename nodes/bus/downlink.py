@@ -25,8 +25,9 @@ INVENTORY = "query/inventory"
 QUESTIONS = ("orientation", "inventory", "recorded")
 #: Turns: what is sent first. What fills gaps comes behind what steers the flight and before what only looks good.
 FIRST, SECOND, GAPS, LAST = range(4)
-#: Bytes that a message costs on the link beside payload and envelope: key, frames of Zenoh, TLS, TCP and IP.
-OVERHEAD = 110
+#: Bytes that a message costs on the link beside payload and envelope: key, frames of Zenoh, TLS, TCP, IP and Ethernet;
+#: and an answer, which names its key in full and what it answers. As `bench/fleet.py` measures them.
+OVERHEAD, ANSWER_OVERHEAD = 150, 260
 #: A link that was quiet may send so much at once, s of its bytes a second.
 BURST_S = 0.25
 #: Messages that wait for their turn, s: later ones are more worth, and what can be asked for again is.
@@ -142,9 +143,9 @@ def for_the_link(raw: RawMessage) -> RawMessage:
     return raw._replace(data=tile.SerializeToString(deterministic=True))
 
 
-def cost(raw: RawMessage) -> int:
+def cost(raw: RawMessage, overhead: int = OVERHEAD) -> int:
     """Bytes of a message on the link, about."""
-    return len(raw.data) + 25 + len(raw.envelope.source) + OVERHEAD
+    return len(raw.data) + 25 + len(raw.envelope.source) + overhead
 
 
 class Meter:

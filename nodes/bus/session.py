@@ -47,6 +47,8 @@ Answer = Callable[[dict[str, str]], Any]
 Recipe = Callable[[Any, int], Any]
 #: For so long a session stays open beside the one that takes its place, s.
 BOTH_S = 1.0
+#: What a router answers, of any platform, to who wants to know whether his link carries anything.
+LINK = "link"
 #: Names of topics that others tell are shorter than this.
 LONGEST_TOPIC = 200
 
@@ -510,8 +512,20 @@ class Bus:
             except zenoh.ZError as error:  # it is tried again
                 self.opened_anew.append(f"cannot be opened anew: {_one_line(error)}")
 
-    def _open_anew(self, why: str) -> None:
-        """Open another session, declare everything there, change over, and close the one before."""
+    def open_anew(self, why: str) -> bool:
+        """Take another session in place of one whose link carries nothing; False where none can be opened now."""
+        try:
+            self._open_anew(why, wait=False)
+        except zenoh.ZError:
+            return False
+        return True
+
+    def _open_anew(self, why: str, wait: bool = True) -> None:
+        """Open another session, declare everything there, change over, and close the one before.
+
+        A session with much to send over a link that is gone can take minutes to close: without ``wait`` it is left to a
+        thread.
+        """
         with self._opening:
             if self._ended.is_set():
                 return
@@ -526,6 +540,9 @@ class Bus:
                     publishers[raw.topic].put(bytes(raw.data), attachment=pack(raw.envelope))
                 self._links.opened(time.monotonic())
                 self.opened_anew.append(why)
+            if not wait:
+                threading.Thread(target=_withdraw, args=(old, withdrawn), name="old session", daemon=True).start()
+                return
             # others are just learning of both sessions; one that is closed now can stay linked as a ghost
             self._ended.wait(BOTH_S)
             _withdraw(old, withdrawn)
@@ -637,7 +654,13 @@ def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
         session = zenoh.open(config)
     except zenoh.ZError as error:
         raise UserError(f"the router cannot listen: {_one_line(error)}") from None
+
+    def here(query: Any) -> None:
+        with query:
+            query.reply(query.key_expr, b"", attachment=pack(Envelope(0, "router", 0)))
+
     with session:
+        session.declare_queryable(topics.key_expression("*", f"query/{LINK}"), zenoh.handlers.Callback(here))
         yield lambda: len(session.info.peers_zid()) + len(session.info.routers_zid())
 
 

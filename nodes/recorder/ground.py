@@ -37,8 +37,8 @@ FLEET = "fleet"
 #: An aircraft is asked for its inventory so often unless told otherwise, s; what it had then and is not here the next
 #: time is missing.
 INVENTORY_S = 5.0
-#: An answer takes so long at most, s.
-ANSWER_S = 30.0
+#: An answer takes so long at most, s: what is there, and some messages.
+INVENTORY_ANSWER_S, ANSWER_S = 10.0, 30.0
 #: Who answers for an aircraft.
 ANSWERS = frozenset({"router", "recorder"})
 #: Aircraft that are recorded, at most: names come over the link.
@@ -343,7 +343,7 @@ def _fill(
         if not linked():
             continue
         try:
-            answers = list(bus.ask("inventory", ANSWER_S, aircraft.platform))
+            answers = list(bus.ask("inventory", INVENTORY_ANSWER_S, aircraft.platform))
             inventory = next((m.Inventory.FromString(raw.data) for raw in answers if raw.topic == INVENTORY), None)
         except (ValueError, DecodeError):
             continue

@@ -17,6 +17,7 @@ from ...schemas import topics
 from ...schemas.envelope import RawMessage
 from ..bus.authority import AIRCRAFT, ROUTER, UPLINK_TOPICS
 from ..bus.downlink import (
+    ANSWER_OVERHEAD,
     GAPS,
     PORTION_BYTES,
     QUESTIONS,
@@ -29,7 +30,7 @@ from ..bus.downlink import (
     share_of,
 )
 from ..bus.program import ProgramOptions
-from ..bus.session import Bus, routing
+from ..bus.session import LINK, Bus, routing
 from ..bus.status import StatusPublisher
 from ..config import build
 from ..errors import UserError
@@ -38,6 +39,9 @@ from ..ordering import TopicCounts
 
 #: The ground is called again after so long where it does not answer, s.
 CALL_AGAIN_S = 1.0
+#: The router on the ground is asked so often whether the link carries anything, s; when it has not answered for so long
+#: the link is gone. TCP alone would try again ever more rarely, and carry on minutes after the link is back.
+LINK_S, LINK_GONE_S = 2.0, 8.0
 #: Answers of nodes on board take so long at most, s.
 ANSWER_S = 10.0
 
@@ -83,6 +87,13 @@ class OnBoardRouter(Node):
         except ValueError as error:
             self.problem("malformed", f"{raw.topic}: {error}")
 
+    def hears(self, ground: Bus) -> bool:
+        """Whether the router on the ground answers."""
+        try:
+            return any(True for _ in ground.ask(LINK, LINK_S))
+        except ValueError:
+            return False
+
     def send(self, ground: Bus, timeout_s: float) -> None:
         """Send the next message that waits, at its turn."""
         found = self.waiting.take(timeout_s)
@@ -111,9 +122,10 @@ class OnBoardRouter(Node):
             small = for_the_link(raw)
             if spent > PORTION_BYTES:
                 return
-            if not self.meter.let_pass(cost(small), GAPS, self._stop.is_set):
+            n = cost(small, ANSWER_OVERHEAD)
+            if not self.meter.let_pass(n, GAPS, self._stop.is_set):
                 raise ValueError("the router ends")
-            spent += cost(small)
+            spent += n
             yield small
 
     def statistics(self) -> dict[str, TopicCounts]:
@@ -195,6 +207,18 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
         while not options.stop.is_set():
             router.send(ground, 0.1)
 
+    def watch() -> None:
+        heard_s = time.monotonic()
+        while not options.stop.wait(LINK_S):
+            begun_s = time.monotonic()
+            if router.hears(ground):
+                heard_s = time.monotonic()
+                router.linked = True
+            elif begun_s - heard_s > LINK_GONE_S:
+                router.linked = False
+                if ground.open_anew("the link was gone"):
+                    heard_s = time.monotonic()
+
     ground.announce("router")
     for name in QUESTIONS:
         questions(name)
@@ -205,10 +229,12 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
     board.announce("router")
     sending = threading.Thread(target=sender, name="downlink")
     sending.start()
+    watching = threading.Thread(target=watch, name="link", daemon=True)
+    watching.start()
+    router.linked = router.hears(ground)
     status = StatusPublisher(board, "router")
     told = None
     while not options.stop.wait(0.1):
-        router.linked = ground.peers() > 0
         if router.linked != told:
             told = router.linked
             options.report(f"router: {router.state()}")
