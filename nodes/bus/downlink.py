@@ -91,6 +91,10 @@ def share_of(topic: str) -> Share | None:
     return None
 
 
+#: Verdicts are stamped so far ahead of platform time, ns: nobody has passed their place by then.
+VERDICT_AHEAD_NS = 500_000_000
+
+
 class Asked(NamedTuple):
     """A question for messages: those of a run of a publisher on a topic whose numbers lie in ``runs`` (first and last,
     both included) and are divided by ``every``."""

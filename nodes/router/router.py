@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 from ...schemas import topics
 from ...schemas.envelope import RawMessage
+from ...schemas.topics import Family
 from ..bus.authority import AIRCRAFT, ROUTER, UPLINK_TOPICS
 from ..bus.downlink import (
     ANSWER_OVERHEAD,
@@ -22,6 +23,7 @@ from ..bus.downlink import (
     PORTION_BYTES,
     QUESTIONS,
     SHARES,
+    VERDICT_AHEAD_NS,
     Meter,
     Waiting,
     asked,
@@ -73,13 +75,18 @@ class OnBoardRouter(Node):
         sent = f"{self.meter.passed / 1e6:.1f} MB down"
         return f"linked, {sent}" if self.linked else f"no link to the ground, {sent}"
 
+    def uplink(self, raw: RawMessage) -> RawMessage:
+        """What the ground says, stamped ahead of the platform time here: the desk knows an older one."""
+        stamp_ns = max(raw.envelope.stamp_ns, self.newest_ns + VERDICT_AHEAD_NS)
+        return raw._replace(envelope=raw.envelope._replace(stamp_ns=stamp_ns))
+
     def take(self, raw: RawMessage) -> None:
         """A message of a node on board; never waits."""
+        if topics.find(raw.topic).family not in (Family.STATUS, Family.OBSERVATION):
+            self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
         share = share_of(raw.topic)
         if share is None or raw.envelope.sequence % share.every:
             return
-        if not raw.topic.startswith("status/"):
-            self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
         if not self.linked and not topics.find(raw.topic).latched:
             return  # the ground asks for it when it is back
         try:
@@ -223,7 +230,7 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
     for name in QUESTIONS:
         questions(name)
     for topic in UPLINK_TOPICS:
-        ground.subscribe(topic, board.publish_raw)
+        ground.subscribe(topic, lambda raw: board.publish_raw(router.uplink(raw)))
     for name in router.inputs:
         board.subscribe(name, router.take)
     board.announce("router")
