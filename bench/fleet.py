@@ -29,6 +29,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -320,6 +321,25 @@ def listen(config: Path, seconds: float) -> None:
     print(json.dumps(heard))
 
 
+def screen(bundle: Path, folder: Path) -> None:
+    """What `triline monitor --fleet` shows after 8 s, as ``fleet.svg`` and ``fleet.txt``."""
+    from rich.console import Console
+
+    from triline.nodes.bus.bundle import load_bundle
+    from triline.nodes.bus.session import Bus
+    from triline.nodes.monitor import fleet
+
+    stop = threading.Event()
+    threading.Timer(8.0, stop.set).start()
+    with Bus(fleet.FLEET, source="monitor", secure=load_bundle(bundle)) as bus:
+        overview = fleet.watch(bus, stop, "fleet", quiet=True)
+    with open(os.devnull, "w") as nowhere:
+        console = Console(record=True, width=100, force_terminal=True, file=nowhere)
+        console.print(fleet.screen(overview, "fleet"))
+        (folder / "fleet.svg").write_text(console.export_svg(title="triline monitor --fleet", clear=False))
+        (folder / "fleet.txt").write_text(console.export_text())
+
+
 def forgeries(network: Network, programs: Programs, keys: Path, folder: Path) -> Counter[str]:
     """What forgers in aircraft and at a desk get through to the office."""
     here = [sys.executable, __file__]
@@ -373,6 +393,9 @@ def campaign(args: argparse.Namespace, folder: Path) -> int:
                 print(f"{now - begun:4.0f} s: the link of a1 is {'cut' if state == 'down' else 'back'}", flush=True)
             if not picture and now > cut_at + 0.7 * args.cut:
                 picture = snapshot(network, keys, 8.0)
+                if args.picture:
+                    place = [sys.executable, __file__, "--role", "screen", str(keys / "ann"), str(args.picture)]
+                    programs.start("office", "screen", place)
         flown_ns = time.time_ns()
         network.set_link("a1", nets["a1"], "up")
         for node in ("navigator", "adjuster"):
@@ -455,6 +478,8 @@ def main() -> int:
     if len(sys.argv) > 2 and sys.argv[1] == "--role":
         if sys.argv[2] == "forge":
             forge(Path(sys.argv[3]), sys.argv[4], sys.argv[5])
+        elif sys.argv[2] == "screen":
+            screen(Path(sys.argv[3]), Path(sys.argv[4]))
         else:
             listen(Path(sys.argv[3]), float(sys.argv[4]))
         return 0
@@ -462,9 +487,14 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=200.0, help="of a strip, and of the flights")
     parser.add_argument("--cut", type=float, default=120.0, help="of the link of a1, s; it begins after 30 s")
     parser.add_argument("--limit", type=float, default=64_000.0, help="bytes a second that a router may send")
-    parser.add_argument("--picture", type=Path, help="folder for a Rerun file of the fleet as it flies")
+    parser.add_argument(
+        "--picture", type=Path, help="folder for a Rerun file of the flight, and the monitor in the cut"
+    )
     parser.add_argument("--folder", type=Path, help="keep recordings and logs there")
     args = parser.parse_args()
+    if args.picture is not None:
+        args.picture = args.picture.resolve()
+        args.picture.mkdir(parents=True, exist_ok=True)
     why = allowed()
     if why:
         sys.exit(f"bench/fleet.py: {why}")

@@ -376,6 +376,12 @@ BENCHMARKS = (
         7,
     ),
     Benchmark(
+        "fleet",
+        "Four aircraft, three routers: what of a cut link, a slow one and forgeries comes to the ground?",
+        ("python bench/fleet.py",),
+        9,
+    ),
+    Benchmark(
         "faults-long",
         "What do live nodes lose in half an hour at ten times real time, and how does their memory grow?",
         ("python bench/faults.py --long --seconds 1655",),

@@ -24,8 +24,6 @@ EXAMPLE = """triline confirm GCP3 --port 17447
   triline confirm sensor/gnss --source receiver2    # its messages count from now on
   triline confirm sensor/gnss --clock 0.1           # add 0.1 s to its times from now on"""
 
-#: Time from the newest platform time until the verdict takes effect, ns: by then every node has received it.
-AHEAD_NS = 500_000_000
 #: Largest correction of GNSS times, s, as the navigator takes it.
 LARGEST_CLOCK_S = 100.0
 #: Longest wait for ground points and platform time, and for the answer to the verdict, s.
@@ -50,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from ..bus.downlink import VERDICT_AHEAD_NS
     from ..bus.session import Bus
 
     topic = args.point if _is_topic(args.point) else ""
@@ -74,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         if args.clock is not None:
             verdict.clock_s = args.clock
         heard.sent.set()
-        bus.publish(Message("observation/verdict", heard.stamp_ns + AHEAD_NS, verdict))
+        bus.publish(Message("observation/verdict", heard.stamp_ns + VERDICT_AHEAD_NS, verdict))
         answered = _wait(lambda: heard.answer != "", ANSWER_S)
     if args.json:
         result = {"point": args.point, "accepted": not args.reject, "answer": heard.answer, "looks": heard.looks}
