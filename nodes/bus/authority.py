@@ -54,8 +54,9 @@ UPLINK_TOPICS = ("observation/verdict",)
 _ASKING = ("query", "declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _SAYING = ("put", "delete", "reply", "liveliness_token")
 #: Of links to the ground: an end that is silent for so long is gone, ms; a publisher waits so long for a slow link, us,
-#: before it counts as cut; and so many bytes wait in the socket, so that what is urgent does not wait behind them.
-LEASE_MS, SLOW_US, SOCKET_BYTES = 8000, 20_000_000, 65_536
+#: before it counts as cut; and so many bytes wait in the socket and go together, so that what is urgent does not wait
+#: behind them.
+LEASE_MS, SLOW_US, SOCKET_BYTES, BATCH_BYTES = 8000, 20_000_000, 16_384, 8192
 #: A router that does not answer for so long is not there, ms.
 CALL_MS = 4000
 
@@ -344,6 +345,7 @@ def ground_link_settings(bundle: Path, member: Certified) -> dict[str, Any]:
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": SLOW_US,
         "transport/link/tls/so_sndbuf": SOCKET_BYTES,
+        "transport/link/tx/batch_size": BATCH_BYTES,
     }
 
 

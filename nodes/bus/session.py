@@ -412,6 +412,7 @@ class Bus:
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=timeout_s,
+            priority=zenoh.Priority.REAL_TIME if name == LINK else zenoh.Priority.DATA,
         )
         for reply in replies:
             if reply.ok is None:

@@ -43,7 +43,7 @@ from ..ordering import TopicCounts
 CALL_AGAIN_S = 1.0
 #: The router on the ground is asked so often whether the link carries anything, s; when it has not answered for so long
 #: the link is gone. TCP alone would try again ever more rarely, and carry on minutes after the link is back.
-LINK_S, LINK_GONE_S = 2.0, 8.0
+LINK_S, LINK_GONE_S = 2.0, 12.0
 #: Answers of nodes on board take so long at most, s.
 ANSWER_S = 10.0
 
@@ -97,7 +97,7 @@ class OnBoardRouter(Node):
     def hears(self, ground: Bus) -> bool:
         """Whether the router on the ground answers."""
         try:
-            return any(True for _ in ground.ask(LINK, LINK_S))
+            return any(True for _ in ground.ask(LINK, LINK_GONE_S))
         except ValueError:
             return False
 
@@ -215,16 +215,11 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
             router.send(ground, 0.1)
 
     def watch() -> None:
-        heard_s = time.monotonic()
         while not options.stop.wait(LINK_S):
-            begun_s = time.monotonic()
-            if router.hears(ground):
-                heard_s = time.monotonic()
-                router.linked = True
-            elif begun_s - heard_s > LINK_GONE_S:
-                router.linked = False
-                if ground.open_anew("the link was gone"):
-                    heard_s = time.monotonic()
+            router.linked = router.hears(ground)
+            while not router.linked and not ground.open_anew("the link was gone"):
+                if options.stop.wait(LINK_S):
+                    return
 
     ground.announce("router")
     for name in QUESTIONS:
@@ -238,7 +233,6 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
     sending.start()
     watching = threading.Thread(target=watch, name="link", daemon=True)
     watching.start()
-    router.linked = router.hears(ground)
     status = StatusPublisher(board, "router")
     told = None
     while not options.stop.wait(0.1):
