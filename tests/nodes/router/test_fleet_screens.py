@@ -1,0 +1,120 @@
+"""All aircraft on one screen and in one view."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import sample_messages as sample
+from rich.console import Console
+
+from triline.nodes import convert
+from triline.nodes.monitor.fleet import SILENT_S, FleetOverview, screen
+from triline.nodes.node import Message
+from triline.nodes.viewer.canvas import FleetLayout, NullCanvas
+from triline.nodes.viewer.fleet_scene import FleetScene
+from triline.schemas import codec
+from triline.schemas import messages as m
+from triline.schemas.envelope import Envelope, RawMessage
+
+
+def status(node: str, **fields) -> RawMessage:
+    body = m.NodeStatus(node=node, state="running", **fields)
+    return RawMessage(f"status/{node}", Envelope(1, node, 0, 1), codec.encode(body))
+
+
+def shown(overview: FleetOverview) -> str:
+    console = Console(file=io.StringIO(), width=110, record=True)
+    console.print(screen(overview, "fleet"))
+    return console.export_text()
+
+
+def test_each_aircraft_has_a_row_and_one_that_is_silent_has_no_light():
+    now = [100.0]
+    overview = FleetOverview(lambda: now[0])
+    overview.link("a1", "router", True)
+    overview.link("a2", "router", True)
+    overview.link("a2", "matcher", False)  # nodes come and go without the link
+    overview.take("a1", status("adjuster", light="good", lag_s=0.4))
+    overview.take("a2", status("adjuster", light="weak", light_reason="no control", alarm="no trajectory for 5 s"))
+    report = m.AdjustmentReport(
+        sigma0=1.02, redundancy=90, sigma=[0.02, 0.05, 0.04, 0, 0, 0], protection=[0.1, 0.2, 0.3]
+    )
+    overview.take("a1", RawMessage("adjustment/report", Envelope(1, "adjuster", 0, 1), codec.encode(report)))
+    ground = m.NodeStatus(node="ground", state="2 aircraft, 7 messages to come")
+    ground.counters.add(name="a2 missing", value=7)
+    overview.take("fleet", RawMessage("status/ground", Envelope(1, "ground", 0, 1), codec.encode(ground)))
+    overview.take("a3", RawMessage("status/x", Envelope(1, "x", 0, 1), b"\xff\xff"))  # rubbish is nobody
+    one, two = overview.rows()
+    assert (one["light"], one["sigma_m"], one["protection_m"], one["lag_s"], one["link"]) == (
+        "good",
+        0.05,
+        0.3,
+        0.4,
+        "linked",
+    )
+    assert (two["light"], two["reason"], two["missing"], two["heard_s"]) == ("weak", "no control", 7, 0.0)
+    text = shown(overview)
+    assert "0.050 m" in text and "a2: no control" in text and "a2: no trajectory for 5 s" in text and "\n" in text
+    now[0] += SILENT_S + 1.0
+    overview.link("a1", "router", False)
+    overview.take("a2", status("navigator"))
+    one, two = overview.rows()
+    assert (one["light"], one["link"], one["heard_s"]) == ("unknown", "gone", SILENT_S + 1.0)
+    assert "last known: good" in one["reason"] and two["light"] == "weak"
+    assert "a1 unknown gone, heard 16 s ago" in overview.line() and "7 to come" in overview.line()
+
+
+class Canvas(NullCanvas):
+    def __init__(self) -> None:
+        self.drawn: dict[str, list] = {}
+        self.layouts: list[FleetLayout] = []
+        self.text = ""
+
+    def lines(self, entity, strips, colors, radius, labels=None) -> None:
+        self.drawn[entity] = list(strips)
+
+    def points(self, entity, xyz, colors, radius, labels=None) -> None:
+        self.drawn[entity] = [np.asarray(xyz), labels]
+
+    def layout(self, layout) -> None:
+        self.layouts.append(layout)
+
+    def document(self, entity, markdown) -> None:
+        self.text = markdown
+
+
+def pose(topic: str, second: int, place: tuple[float, float, float]) -> Message:
+    body = sample.body(topic)
+    time_ns = sample.EPOCH_NS + second * convert.SECOND_NS
+    convert.set_time(body.timestamp, time_ns)
+    body.pose.position.x, body.pose.position.y, body.pose.position.z = place
+    return Message(topic, time_ns, body, "adjuster")
+
+
+def test_aircraft_of_two_projects_are_drawn_in_one_frame_and_a_gap_is_filled_later():
+    canvas = Canvas()
+    scene = FleetScene(canvas)
+    first = m.Project(name="one", crs="local", origin_latitude=48.0, origin_longitude=9.0, origin_height=300.0)
+    frame = convert.local_frame(first)
+    north, east, up = map(float, frame.to_geodetic(np.array([0.0, 5000.0, 0.0])))
+    other = m.Project(name="two", crs="local", origin_latitude=north, origin_longitude=east, origin_height=up)
+    scene.take("a1", Message("configuration/project", 0, first), 0.0)
+    for second in (0, 1, 2, 20, 21):
+        scene.take("a1", pose("orientation/final", second, (100.0 * second, 0.0, 1000.0)), 1.0)
+    scene.take("a2", pose("orientation/final", 0, (0.0, 0.0, 1000.0)), 1.0)  # before its project
+    scene.take("a2", Message("configuration/project", 0, other), 1.0)
+    scene.take("a2", pose("orientation/final", 1, (0.0, 0.0, 1000.0)), 1.0)
+    scene.take(
+        "a1", Message("status/adjuster", 0, m.NodeStatus(node="adjuster", light="weak", light_reason="a|b")), 1.0
+    )
+    scene.link("a2", "router", False)
+    scene.draw(2.0)
+    assert [len(piece) for piece in canvas.drawn["flight/a1/final"]] == [3, 2]  # nothing across the gap
+    a1, a2 = canvas.drawn["flight/a1/head"][0][0], canvas.drawn["flight/a2/head"][0][0]
+    assert abs(a2[1] - a1[1] - 5000.0) < 5.0 and canvas.drawn["flight/a2/head"][1] == ["a2: no link"]
+    assert canvas.layouts[-1].aircraft == ("a1", "a2") and "| a1 | weak | a/b |" in canvas.text
+    for second in range(3, 20):
+        scene.take("a1", pose("orientation/final", second, (100.0 * second, 0.0, 1000.0)), 3.0)
+    scene.draw(3.0)
+    assert [len(piece) for piece in canvas.drawn["flight/a1/final"]] == [22]
