@@ -5,14 +5,14 @@
     python bench/batch_fleet.py restarted [--flights 12]
     python bench/batch_fleet.py store
 
-``speed``: simulated recordings of 24 s (a strip of 8 s) on one worker and on two, in turns; *of twice the speed* is the
-time of one over twice that of two. The machine has to be idle; *load before* says whether it was. *Workers are busy*:
-share of the time in which they have a job; *processor s a job*: what a job costs, with its part of the program; of one
-worker and of two. ``killed``: a Dask cluster of two workers here, one of which is killed (SIGKILL) every few seconds,
-and the same for the processes of ``--workers 2``; *equal to process* counts results that are byte for byte those of `triline process`. ``restarted``: the
-program, and the scheduler of a cluster, killed when some jobs are finished; the same command again: *done again* counts
-finished jobs that were done a second time. ``store``: an S3 server of this machine (moto) with a recording of image
-lines and ties; what each command fetched of it.
+``speed``: simulated recordings of 24 s (a strip of 8 s) on one worker and on two, in turns; *of twice the speed* is
+the time of one over twice that of two. The machine has to be idle; *load before* says whether it was. *Workers are
+busy*: share of the time in which they have a job; *processor s a job*: what a job costs, with its part of the
+program; of one worker and of two. ``killed``: a Dask cluster of two workers here, one of which is killed (SIGKILL)
+every few seconds, and the same for the processes of ``--workers 2``; *equal to process* counts results that are byte
+for byte those of `triline process`. ``restarted``: the program, and the scheduler of a cluster, killed when some jobs
+are finished; the same command again: *done again* counts finished jobs that were done a second time. ``store``: an S3
+server of this machine (moto) with a recording of image lines and ties; what each command fetched of it.
 """
 
 from __future__ import annotations
