@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .inputs import Source
-from .records import is_finished
+from .records import is_finished, read_record
 from .steps import PROCESSED, STEPS
 
 
@@ -77,22 +77,30 @@ def _plan(source: Source, folder: Path, chosen: Sequence[str], options: Mapping[
     for name in chosen:
         step, words = STEPS[name], options.get(name, ())
         first = step.after if step.after in chosen else ""
-        # a file that an earlier step made has the name it has in the folder, whoever opens it
-        read = str(folder / PROCESSED) if first else source.path
+        before = jobs[first].made_of if first else _made_before(folder, step.after, source)
+        read = str(folder / PROCESSED) if before else source.path
         made_of: dict[str, Any] = {
             "version": version("triline"),
             "words": list(words),
             "files": {word: _state(word) for word in words if os.path.isabs(word) and os.path.exists(word)},
         }
-        made_of |= (
-            {"after": jobs[first].made_of}
-            if first
-            else {"input": Path(source.path).name, "bytes": source.size, "modified": source.modified}
-        )
+        made_of |= {"after": before} if before else _input(source)
         jobs[name] = Job(source.name, name, str(folder), tuple(step.words(read, words)), made_of)
         after[name] = (first,) if first else ()
     finished = frozenset(name for name, job in jobs.items() if is_finished(folder, name, job.made_of))
     return Plan(source, jobs, after, finished)
+
+
+def _input(source: Source) -> dict[str, Any]:
+    return {"input": Path(source.path).name, "bytes": source.size, "modified": source.modified}
+
+
+def _made_before(folder: Path, step: str, source: Source) -> dict[str, Any] | None:
+    """What the result of a step of an earlier run was made of, if it was made of this recording."""
+    record = read_record(folder, step) if step else None
+    if record is None or not isinstance(record["made_of"], dict):
+        return None
+    return record["made_of"] if _input(source).items() <= record["made_of"].items() else None
 
 
 def _state(path: str) -> list[int]:

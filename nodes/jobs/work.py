@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 
 from ..recording.remote import AWAY
@@ -76,7 +77,10 @@ def run(job: Job, unwanted: Callable[[], bool] = lambda: False) -> Outcome:
     job : what to do
     unwanted : told now and then whether to end before the job is done; nothing is left of it then
     """
-    folder = Path(job.folder)
+    folder, held = Path(job.folder), version("triline")
+    if held != job.made_of["version"]:  # a worker that came later
+        reason = f"a worker has triline {held}, wanted {job.made_of['version']}"
+        return Outcome(job.flight, job.step, False, reason=reason, again=True)
     if is_finished(folder, job.step, job.made_of):
         return Outcome(job.flight, job.step, True)
     begun = time.monotonic()

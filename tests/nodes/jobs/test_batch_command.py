@@ -115,6 +115,11 @@ def test_results_are_those_of_the_single_commands(flown, tmp_path, monkeypatch, 
     assert json.loads(capsys.readouterr().out)["jobs"] == {
         "finished": 3, "earlier": 3, "now": 0, "failed": 0, "not_begun": 0,
     }  # fmt: skip
+    assert main(["batch", "f.mcap", "-o", "out", "--do", "adjust", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["to_do"] == [], "what an earlier run processed is what is adjusted"
+    os.utime("f.mcap", ns=(0, 1))
+    assert main(["batch", "f.mcap", "-o", "out", "--do", "adjust", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["to_do"] == ["adjust"], "but not that of another recording"
 
 
 def to_do(capsys, *words: str) -> list[list[str]]:
