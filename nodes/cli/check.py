@@ -10,7 +10,8 @@ from pathlib import Path
 from ..bus.authority import CERTIFICATE
 from ..errors import UserError
 from ..recording.reader import RecordingReader
-from ..recording.seal import seal_of, verify
+from ..recording.seal import verify
+from ..recording.seal_place import seal_of
 from ..recording.summary import findings
 
 EXAMPLE = """triline check flight.mcap

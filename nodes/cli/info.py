@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from ..convert import iso
 from ..formats.importable import refuse_importable
 from ..recording.access import Recording
 from ..recording.remote import path_of
-from ..recording.seal import verify
+from ..recording.seal_place import seal_of
 from ..recording.summary import findings, holdings
 from ..terminal import plain
 
@@ -27,6 +28,16 @@ def run(args: argparse.Namespace) -> int:
     summary = _summary(Recording(args.recording))
     print(json.dumps(summary, indent=2) if args.json else "\n".join(map(plain, _lines(summary))))
     return 0
+
+
+def _signed(recording: Path) -> dict[str, Any] | None:
+    """What the seal beside a recording says; libraries of certificates are imported only where there is one."""
+    if not seal_of(recording).is_file():
+        return None
+    from ..recording.seal import verify
+
+    seal = verify(recording)
+    return None if seal is None else {**asdict(seal), "words": str(seal)}
 
 
 def _summary(recording: Recording) -> dict[str, Any]:
@@ -47,9 +58,9 @@ def _summary(recording: Recording) -> dict[str, Any]:
         "topics": [vars(row) for row in rows],
         "damage": findings(reader, decode=False, outside=False),
     }
-    seal = None if reader.remote is not None else verify(reader.path)
-    if seal is not None:
-        summary["signed"] = {**asdict(seal), "words": str(seal)}
+    signed = None if reader.remote is not None else _signed(reader.path)
+    if signed is not None:
+        summary["signed"] = signed
     if "configuration/project" in present:
         p = recording.project()
         summary["project"] = {

@@ -24,17 +24,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from ..errors import UserError
+from .seal_place import seal_of
 
-#: Ending of a seal, after the name of the recording.
-ENDING = ".seal"
 #: Of a seal so much is read at most, bytes, and of the recording at a time.
 LARGEST, AT_A_TIME = 1 << 28, 1 << 22
 _VERSION = 1
-
-
-def seal_of(recording: Path) -> Path:
-    """Where the seal of a recording stands."""
-    return recording.with_name(recording.name + ENDING)
 
 
 class Seal:

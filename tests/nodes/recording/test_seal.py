@@ -17,7 +17,8 @@ from triline.nodes.bus.authority import Authority
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 from triline.nodes.recorder.recorder import Recorder
-from triline.nodes.recording.seal import seal_of, verify
+from triline.nodes.recording.seal import verify
+from triline.nodes.recording.seal_place import seal_of
 from triline.schemas import codec
 from triline.schemas.envelope import Envelope, RawMessage
 
