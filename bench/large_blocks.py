@@ -2,7 +2,7 @@
 
     python bench/large_blocks.py                    # 125 000 rays to 3 million on two workers, beside the whole solver
     python bench/large_blocks.py --rays 125 250     # thousands of rays
-    python bench/large_blocks.py --kill             # a Dask cluster of two workers, one killed every few seconds
+    python bench/large_blocks.py --kill             # a Dask cluster of two workers; three times one is killed
 
 Parallel and cross strips, two looks a point in every strip that sees it, Lagrange corrections at fixes 1.2 km apart, a
 control point in every third partition; the block grows in both directions, points are as dense in all. Every
@@ -18,6 +18,7 @@ those of one that ran in peace, byte by byte.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -229,16 +230,18 @@ def kill(given: argparse.Namespace) -> int:
     answers = []
     for killing in (False, True):
         cluster = LocalCluster(
-            given.workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
-        )
+            given.workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+            silence_logs=50,
+        )  # fmt: skip
         over, killed = threading.Event(), []
 
         def strike(cluster: Any = cluster, over: threading.Event = over, killed: list[int] = killed) -> None:
-            while not over.wait(given.every):
+            while len(killed) < given.kills and not over.wait(given.every):
                 victims = [w.pid for w in cluster.workers.values() if w.pid]
                 if victims:
-                    os.kill(victims[len(killed) % len(victims)], signal.SIGKILL)
-                    killed.append(1)
+                    with contextlib.suppress(ProcessLookupError):  # it has ended since
+                        os.kill(victims[len(killed) % len(victims)], signal.SIGKILL)
+                        killed.append(1)
 
         striker = threading.Thread(target=strike)
         with tempfile.TemporaryDirectory() as name:
@@ -275,6 +278,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes (2)")
     parser.add_argument("--kill", action="store_true", help="kill workers of a Dask cluster")
     parser.add_argument("--every", type=float, default=3.0, metavar="S", help="with --kill: one every S seconds (3)")
+    parser.add_argument("--kills", type=int, default=3, metavar="N", help="with --kill: N times (3)")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--scheduler", default="", help=argparse.SUPPRESS)
     given = parser.parse_args()
