@@ -27,7 +27,7 @@ QUESTIONS = ("orientation", "inventory", "recorded")
 FIRST, SECOND, GAPS, LAST = range(4)
 #: Bytes that a message costs on the link beside payload and envelope: key, frames of Zenoh, TLS, TCP, IP and Ethernet;
 #: and an answer, which names its key in full and what it answers. As `bench/fleet.py` measures them.
-OVERHEAD, ANSWER_OVERHEAD = 150, 260
+OVERHEAD, ANSWER_OVERHEAD = 200, 380
 #: A link that was quiet may send so much at once, s of its bytes a second.
 BURST_S = 0.25
 #: Messages that wait for their turn, s: later ones are more worth, and what can be asked for again is.
