@@ -13,8 +13,8 @@ class Store(Protocol):
 
     def save(self, name: str, value: Any) -> None: ...
     def load(self, name: str) -> Any: ...
-    def remove(self, prefix: str) -> None:
-        """Remove all objects whose name begins so."""
+    def remove(self, name: str) -> None:
+        """Remove an object, if there is one of this name."""
         ...
 
 
