@@ -1,6 +1,7 @@
 """What a flight costs in each stage, fitted to measured runs, and a simulated cluster that works off many of them.
 
     python bench/scale.py [--seconds 10 20 40 80] [--kills 3] [--json]
+    python bench/scale.py --cluster       only the simulated clusters of docs/scale.md, which need no measured run
 
 Flights of four sizes are simulated with image lines (400 pixels), and go through ``process`` (navigator, adjuster),
 ``adjust`` and ``rectify --mosaic`` with one worker, each in a process of its own. Processor seconds (of all threads),
@@ -296,6 +297,25 @@ def real_run(recording: Path, folder: Path, jobs: int, kills: int) -> tuple[floa
     return end, simulate(cluster, work, 0.0, 0.0, np.random.default_rng(1), losses)["end_s"]
 
 
+#: Flights, workers, MB/s of the store and hours between losses of a worker, of the clusters in docs/scale.md.
+CLUSTERS = (
+    (10, 2, np.inf, np.inf), (1_000, 64, np.inf, np.inf), (1_000, 64, np.inf, 5.0), (100_000, 2_000, np.inf, 5.0),
+    (100_000, 2_000, 1_000.0, 5.0),
+)  # fmt: skip
+
+
+def clusters() -> None:
+    """Jobs of 600 s (25 % scatter) that read 1 GB and write 0.1 GB."""
+    print(" flights  workers  store MB/s  lost every h  efficiency  attempts")
+    for flights, workers, store, lost_h in CLUSTERS:
+        rng = np.random.default_rng(1)
+        work = 600.0 * np.maximum(1.0 + 0.25 * rng.standard_normal(flights), 0.1)
+        told = simulate(Cluster(workers, store, 500.0, lost_h), work, 1000.0, 100.0, rng)
+        print(
+            f"{flights:8} {workers:8} {store:11.0f} {lost_h:13.0f} {told['efficiency']:11.2f} {told['attempts']:9.0f}"
+        )
+
+
 # -- the table -------------------------------------------------------------------------------------------------------
 
 
@@ -303,7 +323,11 @@ def main() -> int:
     parser = frame.parser(__doc__)
     parser.add_argument("--seconds", type=float, nargs="+", default=[10, 20, 40, 80], help="of each of two strips")
     parser.add_argument("--kills", type=int, default=3, help="processes of the real run that are killed")
+    parser.add_argument("--cluster", action="store_true", help="only the simulated clusters")
     args = parser.parse_args()
+    if args.cluster:
+        clusters()
+        return 0
     good = True
     with tempfile.TemporaryDirectory() as name:
         runs = []
