@@ -131,11 +131,12 @@ def _cut(graph: csr_array, groups: IntArray, size: IntArray) -> list[_Node]:
 
 def _levels(graph: csr_array) -> IntArray:
     """Level of each node in a walk from the rim of a graph that hangs together."""
-    start, depth, level = 0, -1, np.zeros(graph.shape[0], dtype=np.int64)
+    count = len(graph.indptr) - 1
+    start, depth, level = 0, -1, np.zeros(count, dtype=np.int64)
     for _ in range(6):
         walk = breadth_first_order(graph, start, directed=False)
         order, before = cast(tuple[IntArray, IntArray], walk)
-        found = np.zeros(graph.shape[0], dtype=np.int64)
+        found = np.zeros(count, dtype=np.int64)
         for node in order[1:].tolist():
             found[node] = found[before[node]] + 1
         if found.max() <= depth:
