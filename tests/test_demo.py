@@ -118,10 +118,10 @@ def node_pid(name: str, port: int) -> int:
 
 
 def test_the_flight_before_is_kept(tmp_path):
-    from triline.nodes.cli import _parse
+    from triline.nodes.cli import parse
     from triline.nodes.cli.demo import Demo
 
-    demo = Demo(_parse(["demo", "-o", str(tmp_path), "--headless", "-q"]))
+    demo = Demo(parse(["demo", "-o", str(tmp_path), "--headless", "-q"]))
     for content in ("first", "second"):
         demo.clear()
         (tmp_path / "flight.mcap").write_text(content)

@@ -132,7 +132,8 @@ def _options(given: Sequence[str], wanted: Sequence[str]) -> dict[str, tuple[str
         found[name] = (*found.get(name, ()), *map(_absolute, words))
     for name, words in found.items():
         args = parse(STEPS[name].words("recording.mcap", words))
-        if getattr(args, "recording", getattr(args, "input", None)) not in ("recording.mcap", Path("recording.mcap")):
+        named = getattr(args, "recording", getattr(args, "input", None))
+        if [str(path) for path in (named if isinstance(named, list) else [named])] != ["recording.mcap"]:
             raise UserError(f"--with '{name} {' '.join(words)}': names another input")
     return found
 

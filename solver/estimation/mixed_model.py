@@ -29,6 +29,8 @@ _CONVERGED = 1e-9
 #: The same for parameters that are held, as a share of their size. Rounding.
 _ROUNDING = 1e-12
 _MOST_STEPS = 60
+#: Steps that shrink no more and are smaller than this share of the sigmas are rounding of the numerical derivatives.
+_NEGLIGIBLE = 1e-4
 #: Steps of numerical derivatives: in sigmas of observations, and in shares of the size of parameters. Derived: central
 #: differences, where rounding and bending are about alike.
 _STEP_SIGMAS, _STEP_SHARE = 0.1, 1e-5
@@ -234,7 +236,7 @@ class _Checked:
         if redundancy < 0:
             raise ValueError(f"{len(l)} points, {self.c} conditions each, wanted at least {d - q} conditions")
         beta, v = self.start, np.zeros_like(l)
-        Q = sigma**2
+        Q, before = sigma**2, np.inf
         for iteration in range(1, _MOST_STEPS + 1):
             F, A, B = self._linearised(beta, l + v, sigma)
             w = F - np.einsum("mcp,mp->mc", B, v)
@@ -248,11 +250,16 @@ class _Checked:
             C, change = self._normal(N, n, self.value - self.H @ beta)
             k = np.einsum("mce,me->mc", inverse, A @ change + w)
             new_v = -Q * np.einsum("mcp,mc->mp", B, k)
-            moved = np.abs(change) <= self.last_step * np.sqrt(np.maximum(np.diag(C), 0.0)) + _ROUNDING * self.scale
+            spread = np.sqrt(np.maximum(np.diag(C), 0.0))
+            moved = np.abs(change) <= self.last_step * spread + _ROUNDING * self.scale
+            step = float((np.abs(change) / (spread + _ROUNDING * self.scale)).max())
             turned = np.abs(new_v - v) / np.where(sigma > 0, sigma, 1.0)
             beta, v = beta + change, new_v
             if moved.all() and turned.max() < self.last_step * 10.0:
                 break
+            if max(step, float(turned.max())) < _NEGLIGIBLE and step > 0.5 * before:
+                break
+            before = step
             if not np.isfinite(beta).all():
                 raise ValueError(f"the solution diverged in step {iteration}")
         else:

@@ -15,12 +15,15 @@ __all__ = ["COMPONENTS", "MODELS", "CorrectionModel", "Design", "Extent", "Model
 MODELS: dict[str, type[ModelOptions]]
 
 
-def __getattr__(name: str) -> dict[str, type[ModelOptions]]:
-    if name != "MODELS":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def _find() -> dict[str, type[ModelOptions]]:
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
     ours = [options for options in ModelOptions.__subclasses__() if options.__module__.startswith(f"{__name__}.")]
-    found = {options.name: options for options in sorted(ours, key=lambda o: o.name)}
-    globals()["MODELS"] = found
+    return {options.name: options for options in sorted(ours, key=lambda o: o.name)}
+
+
+def __getattr__(name: str) -> dict[str, type[ModelOptions]]:
+    if name != "MODELS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()["MODELS"] = found = _find()
     return found
