@@ -13,7 +13,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...solver.partitioned.runner import Tree
+from ...solver.partitioned.runner import Runner, Store
+from ..dask_cluster import connect
 from ..errors import UserError
 
 T = TypeVar("T")
@@ -55,59 +56,26 @@ class FolderStore:
         self._path(name).unlink(missing_ok=True)
 
 
-def _work(task: Callable[..., T], store: FolderStore, key: int, arguments: tuple[Any, ...]) -> tuple[T, int, int]:
+def _work(task: Callable[..., T], store: Store, key: int, arguments: tuple[Any, ...]) -> tuple[T, int, int]:
     """Do a task; its result, the process and its largest resident set so far in kB."""
     result = task(store, key, *arguments)
     return result, os.getpid(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-class _Counted:
-    """What runners have in common.
+class _Counted(Runner):
+    """What runners in other processes have in common.
 
     Attributes
     ----------
     peak_mb : largest resident set of each worker by its process
     """
 
-    store: FolderStore
-
     def __init__(self, store: FolderStore):
-        self.store = store
+        super().__init__(store)
         self.peak_mb: dict[str, float] = {}
-
-    def _results(
-        self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
-    ) -> Iterator[tuple[int, Any]]:
-        """Places of the keys and results, as they come."""
-        raise NotImplementedError
 
     def _note(self, worker: str, peak_kb: int) -> None:
         self.peak_mb[worker] = max(self.peak_mb.get(worker, 0.0), peak_kb / 1024)
-
-    def run(
-        self,
-        task: Callable[..., T],
-        keys: Sequence[int],
-        arguments: Callable[[int], tuple[Any, ...]],
-        merge: Callable[[T, T], T],
-    ) -> T:
-        """See `solver.partitioned.runner.Runner`."""
-        tree = Tree(len(keys), merge)
-        for place, result in self._results(task, keys, arguments):
-            tree.add(place, result)
-        return tree.total()
-
-    def each(
-        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
-    ) -> Iterator[T]:
-        """See `solver.partitioned.runner.Runner`."""
-        waiting: dict[int, T] = {}
-        following = 0
-        for place, result in self._results(task, keys, arguments):
-            waiting[place] = result
-            while following in waiting:
-                yield waiting.pop(following)
-                following += 1
 
 
 class ProcessRunner(_Counted):
@@ -127,7 +95,7 @@ class ProcessRunner(_Counted):
     def _new_pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"))
 
-    def _results(
+    def results(
         self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
         todo, tries = list(range(len(keys)))[::-1], dict.fromkeys(range(len(keys)), 0)
@@ -179,46 +147,33 @@ class DaskRunner(_Counted):
 
     Raises
     ------
-    UserError : Dask is not installed, nobody answers at the address, or the workers do not see the folder
+    UserError : Dask is not installed, nobody answers at the address, there are no workers, or they have another
+        triline or do not see the folder
     """
 
     def __init__(self, store: FolderStore, scheduler: str, timeout_s: float = 20.0):
         super().__init__(store)
-        try:
-            from distributed import Client
-        except ImportError:
-            raise UserError("--scheduler needs Dask: pip install 'triline[cluster]'") from None
-        try:
-            self._client = Client(scheduler, timeout=f"{timeout_s:g}s", set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else "no answer"
-            raise UserError(f"--scheduler {scheduler}: cannot be reached ({reason})") from None
-        self._check()
-
-    def _check(self) -> None:
-        """Whether every worker reads what is written here."""
+        self._dask, self._client = connect(scheduler, "triline-adjust", timeout_s)
         word = secrets.token_hex(8)
-        self.store.save("word", word)
-        found: Any = self._client.run(_read_word, self.store.folder)
+        store.save("word", word)
+        found = self._client.run(_read_word, store.folder)
         if not found:
-            raise UserError("--scheduler: the cluster has no workers")
+            raise UserError(f"--scheduler {scheduler}: the cluster has no workers")
         for worker, read in found.items():
             if read != word:
                 raise UserError(
-                    f"--scheduler: worker {worker} does not see {self.store.folder}; "
+                    f"--scheduler: worker {worker} does not see {store.folder}; "
                     "--scratch names a folder that all workers share"
                 )
 
-    def _results(
+    def results(
         self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
     ) -> Iterator[tuple[int, Any]]:
-        from distributed import as_completed
-
         of_workers: Any = self._client.nthreads()
         threads = sum(of_workers.values())
         most, following = max(2, threads * (1 + AHEAD)), 0
         running: dict[Any, int] = {}
-        arrived = as_completed([], loop=self._client.loop, with_results=False, raise_errors=False)
+        arrived = self._dask.as_completed([], loop=self._client.loop, with_results=False, raise_errors=False)
         tries = [0] * len(keys)
 
         def submit(place: int) -> None:

@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster that runs already. Only this module imports Dask, and only where it is asked for.
+"""The workers of a Dask cluster that runs already (`dask_cluster`), as a pool for jobs.
 
 What runs on a worker is `_run`: it starts the command as a process of its own and returns a few words. Results lie in
 the folder of results and not on workers, so that a worker that is lost costs no more than what it was doing: a job that
@@ -7,20 +7,15 @@ is given out again finds what is finished.
 
 from __future__ import annotations
 
-import logging
 import time
 from contextlib import suppress
-from importlib.metadata import version
 from typing import Any
 
+from ..dask_cluster import connect, current_worker
 from ..errors import UserError
 from .plan import Job
 from .work import Outcome, run
 
-#: What a machine lacks that cannot speak to a cluster.
-INSTALL = "needs Dask: pip install 'triline[cluster]'"
-#: So long is waited for a scheduler to answer, s.
-_CONNECT_S = 15.0
 #: So long may a cluster be away before it is taken for lost, s.
 _LOST_S = 20.0
 #: Time between two questions after the number of workers, s.
@@ -40,37 +35,12 @@ class DaskPool:
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            import distributed
-        except ImportError:
-            raise UserError(f"--scheduler {address}: {INSTALL}") from None
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said here
-        self._dask: Any = distributed
+        self._dask, self._client = connect(address, "triline-batch")
         self._address = address
-        try:
-            self._client: Any = distributed.Client(
-                address, timeout=_CONNECT_S, set_as_default=False, name="triline-batch"
-            )
-        except (OSError, TimeoutError, ValueError) as error:
-            what = "nobody answers there" if isinstance(error, OSError | TimeoutError) else str(error)
-            raise UserError(f"--scheduler {address}: {what}, wanted a Dask scheduler") from None
-        self._ended = distributed.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        self._ended = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         self._given: dict[str, tuple[Job, Any]] = {}  # job and future by key
         self._away_s: float | None = None
         self._workers, self._counted_s = 0, -_COUNT_S
-        try:
-            self._check()
-        except BaseException:
-            self.close()
-            raise
-
-    def _check(self) -> None:
-        """Refuse a cluster whose workers cannot do the same."""
-        wanted = version("triline")
-        for worker, held in self._client.run(_version).items():
-            if held != wanted:
-                has = f"triline {held}" if held else "no triline"
-                raise UserError(f"--scheduler {self._address}: worker {worker} has {has}, wanted {wanted} as here")
 
     def submit(self, job: Job, attempt: int, place: int) -> None:
         key = f"triline-{job.flight}-{job.step}-{attempt}-{time.time_ns()}"
@@ -133,19 +103,9 @@ class DaskPool:
         return Outcome(job.flight, job.step, False, reason=what, again=True)
 
 
-def _version() -> str:
-    """The version of triline on a worker, "" without one."""
-    try:
-        return version("triline")
-    except Exception:
-        return ""
-
-
 def _run(job: Job) -> Outcome:
     """On a worker: do a job for as long as the cluster wants it."""
-    from distributed import get_worker
-
-    worker = get_worker()
+    worker = current_worker()
     key = worker.get_current_task()
 
     def unwanted() -> bool:

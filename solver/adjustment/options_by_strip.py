@@ -34,7 +34,7 @@ class OptionsByStrip(ModelOptions):
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
-        raise NotImplementedError("settings of strips come from their recordings")
+        raise TypeError("settings of strips come from their recordings")
 
     def build(self, extent: Extent) -> CorrectionModel:
         return self.options[extent.strip].build(extent)

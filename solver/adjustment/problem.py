@@ -127,8 +127,25 @@ class State:
     points_l: Array
 
 
+class Fitted:
+    """What a solution says of its fit, from its cost and what it counts."""
+
+    cost: float
+    n_observations: int
+    n_unknowns: int
+
+    @property
+    def redundancy(self) -> int:
+        return self.n_observations - self.n_unknowns
+
+    @property
+    def sigma0(self) -> float:
+        """``sqrt(v^T P v / (n - u))`` [K 4.54]; NaN without redundancy."""
+        return float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else float("nan")
+
+
 @dataclass(frozen=True)
-class Solution:
+class Solution(Fitted):
     """Result of an adjustment. Arrays of rays and points are in the network's order.
 
     Attributes
@@ -160,15 +177,6 @@ class Solution:
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
-
-    @property
-    def redundancy(self) -> int:
-        return self.n_observations - self.n_unknowns
-
-    @property
-    def sigma0(self) -> float:
-        """``sqrt(v^T P v / (n - u))`` [K 4.54]; NaN without redundancy."""
-        return float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else float("nan")
 
     @property
     def network(self) -> Network:

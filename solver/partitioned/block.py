@@ -18,7 +18,7 @@ from ..adjustment.nested_dissection import Dissection
 from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
-from ..adjustment.problem import USUAL, AdjustmentOptions, Iteration, State
+from ..adjustment.problem import USUAL, AdjustmentOptions, Fitted, Iteration, State
 from ..adjustment.reduced_system import DenseFactor, Factor
 from ..adjustment.robust import WeightFunction
 from ..camera.line_camera import LineCamera
@@ -97,7 +97,7 @@ class PartitionedBlock:
 
 
 @dataclass(frozen=True)
-class PartitionedSolution:
+class PartitionedSolution(Fitted):
     """Result of an adjustment in partitions; what it says of points and rays stands in the store (`describe`).
 
     Attributes
@@ -120,15 +120,6 @@ class PartitionedSolution:
     converged: bool
     history: tuple[Iteration, ...]
     kept: Kept
-
-    @property
-    def redundancy(self) -> int:
-        return self.n_observations - self.n_unknowns
-
-    @property
-    def sigma0(self) -> float:
-        """``sqrt(v^T P v / (n - u))``; NaN without redundancy."""
-        return float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else float("nan")
 
 
 def pose_block(

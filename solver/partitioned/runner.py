@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
 
@@ -15,33 +16,6 @@ class Store(Protocol):
     def load(self, name: str) -> Any: ...
     def remove(self, name: str) -> None:
         """Remove an object, if it is there."""
-        ...
-
-
-class Runner(Protocol):
-    """Works on partitions: here, in processes, or on a cluster.
-
-    A task is ``task(store, key, *arguments)``. It may run twice, where a worker dies: it reads objects of the store
-    and writes others, never the ones it reads.
-    """
-
-    @property
-    def store(self) -> Store: ...
-
-    def run(
-        self,
-        task: Callable[..., T],
-        keys: Sequence[int],
-        arguments: Callable[[int], tuple[Any, ...]],
-        merge: Callable[[T, T], T],
-    ) -> T:
-        """Results of all partitions merged in a tree whose shape depends on their number alone."""
-        ...
-
-    def each(
-        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
-    ) -> Iterator[T]:
-        """Results of the partitions, one after the other in the order of the keys."""
         ...
 
 
@@ -78,11 +52,25 @@ class Tree:
         return value
 
 
-class Here:
-    """Everything in this process, one partition after the other."""
+class Runner(ABC):
+    """Works on partitions: here, in processes, or on a cluster.
+
+    A task is ``task(store, key, *arguments)``. It may run twice, where a worker dies: it reads objects of the store
+    and writes others, never the ones it reads.
+
+    Parameters
+    ----------
+    store : where partitions lie
+    """
 
     def __init__(self, store: Store):
         self.store = store
+
+    @abstractmethod
+    def results(
+        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[tuple[int, T]]:
+        """Places of the keys and their results, as they come."""
 
     def run(
         self,
@@ -91,13 +79,30 @@ class Here:
         arguments: Callable[[int], tuple[Any, ...]],
         merge: Callable[[T, T], T],
     ) -> T:
+        """Results of all partitions merged in a tree whose shape depends on their number alone."""
         tree = Tree(len(keys), merge)
-        for place, key in enumerate(keys):
-            tree.add(place, task(self.store, key, *arguments(key)))
+        for place, result in self.results(task, keys, arguments):
+            tree.add(place, result)
         return tree.total()
 
     def each(
         self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
     ) -> Iterator[T]:
-        for key in keys:
-            yield task(self.store, key, *arguments(key))
+        """Results of the partitions, one after the other in the order of the keys."""
+        waiting: dict[int, T] = {}
+        following = 0
+        for place, result in self.results(task, keys, arguments):
+            waiting[place] = result
+            while following in waiting:
+                yield waiting.pop(following)
+                following += 1
+
+
+class Here(Runner):
+    """Everything in this process, one partition after the other."""
+
+    def results(
+        self, task: Callable[..., T], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
+    ) -> Iterator[tuple[int, T]]:
+        for place, key in enumerate(keys):
+            yield place, task(self.store, key, *arguments(key))

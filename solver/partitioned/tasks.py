@@ -279,7 +279,7 @@ class Blocks:
         self._blocks = {} if isinstance(blocks, np.ndarray) else {c.tobytes(): Q for c, Q in blocks}
 
     def solve(self, rhs: Array) -> Array:
-        raise NotImplementedError("a partition knows its own cofactors only")
+        raise TypeError("a partition knows its own cofactors only")
 
     def cofactors(self, columns: IntArray) -> Array:
         """Block (m, m) of unknowns of the partition that one cluster of points has."""

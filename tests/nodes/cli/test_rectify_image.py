@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -88,11 +90,52 @@ def test_cells_hold_what_the_model_sees_there(scene, tmp_path):
     assert ((classes == 0) == (values[0] > 0)).all() and set(np.unique(classes)) == {0, 1}
 
 
+def as_gdal(rpc):
+    """Polynomials as rasterio wants them."""
+    from rasterio.rpc import RPC
+
+    f = rpc.to_image
+    c = f.coefficients.tolist()
+    return RPC(
+        height_off=f.in_offset[2], height_scale=f.in_scale[2], lat_off=f.in_offset[1], lat_scale=f.in_scale[1],
+        long_off=f.in_offset[0], long_scale=f.in_scale[0], line_off=f.out_offset[1], line_scale=f.out_scale[1],
+        samp_off=f.out_offset[0], samp_scale=f.out_scale[0], samp_num_coeff=c[0], samp_den_coeff=c[1],
+        line_num_coeff=c[2], line_den_coeff=c[3],
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(shutil.which("gdalwarp") is None, reason="gdalwarp is not installed")
+@pytest.mark.parametrize("with_dem", [True, False])
+def test_beside_gdalwarp(scene, tmp_path, with_dem):
+    """The program itself, told not to interpolate: every cell looks at the same place in the image."""
+    _, _, model, _, dem, image = scene
+    rpb = tmp_path / "scene.RPB"
+    rpc = fit_to_model(model, -100.0, 1100.0).rpc
+    write_rpb(rpb, rpc)
+    ground = ["--dem", dem, "--dem-datum", "ellipsoid"] if with_dem else ["--height", 400.0]
+    out = rectify(tmp_path, image, rpb, *ground)
+    with rasterio.open(image) as source:
+        bands = source.read().astype(np.float32)
+    with rasterio.open(write_image(tmp_path / "tagged.tif", bands, nodata=-1.0), "r+") as target:
+        target.rpcs = as_gdal(rpc)
+    heights = [f"RPC_DEM={dem}", "RPC_DEMINTERPOLATION=bilinear"] if with_dem else ["RPC_HEIGHT=400"]
+    extent = [repr(float(v)) for v in out.bounds]
+    words = ["-rpc", "-et", "0", "-r", "bilinear", "-t_srs", out.crs.to_wkt(), "-te", *extent, "-dstnodata", "-1"]
+    words += ["-ts", str(out.width), str(out.height), *(word for option in heights for word in ("-to", option))]
+    subprocess.run(["gdalwarp", "-q", *words, tmp_path / "tagged.tif", tmp_path / "warped.tif"], check=True)
+    with rasterio.open(tmp_path / "warped.tif") as warped:
+        theirs = warped.read()
+    ours = out.read()
+    both = (ours[0] > 0) & (theirs[0] > 0)
+    assert both.sum() > 0.95 * max((ours[0] > 0).sum(), (theirs[0] > 0).sum())
+    inner = both & (ours.min(axis=0) > 12) & (ours[0] < TRUTH.lines + 7) & (ours[1] < TRUTH.samples + 7)
+    assert np.abs(ours - theirs)[:, inner].max() < 0.1
+
+
 @pytest.mark.parametrize("with_dem", [True, False])
 def test_beside_the_rpc_warp_of_gdal(scene, tmp_path, with_dem):
     """The same polynomials, DEM and cells: GDAL and triline look at the same place in the image."""
     from rasterio.enums import Resampling
-    from rasterio.rpc import RPC
     from rasterio.warp import reproject
 
     _, _, model, _, dem, image = scene
@@ -101,14 +144,7 @@ def test_beside_the_rpc_warp_of_gdal(scene, tmp_path, with_dem):
     write_rpb(rpb, rpc)
     ground = ["--dem", dem, "--dem-datum", "ellipsoid"] if with_dem else ["--height", 400.0]
     out = rectify(tmp_path, image, rpb, *ground)
-    f = rpc.to_image
-    c = f.coefficients.tolist()
-    gdal_rpc = RPC(
-        height_off=f.in_offset[2], height_scale=f.in_scale[2], lat_off=f.in_offset[1], lat_scale=f.in_scale[1],
-        long_off=f.in_offset[0], long_scale=f.in_scale[0], line_off=f.out_offset[1], line_scale=f.out_scale[1],
-        samp_off=f.out_offset[0], samp_scale=f.out_scale[0], samp_num_coeff=c[0], samp_den_coeff=c[1],
-        line_num_coeff=c[2], line_den_coeff=c[3],
-    )  # fmt: skip
+    gdal_rpc = as_gdal(rpc)
     options = {"RPC_DEM": str(dem), "RPC_DEMINTERPOLATION": "bilinear"} if with_dem else {"RPC_HEIGHT": 400.0}
     with rasterio.open(image) as source:
         bands = source.read()

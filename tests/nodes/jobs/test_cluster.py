@@ -151,9 +151,9 @@ def test_an_interrupted_batch_takes_its_jobs_from_the_cluster(season, cluster):
 
 
 def test_nobody_at_the_address_is_one_line(season, capsys, monkeypatch):
-    import triline.nodes.jobs.cluster as module
+    import triline.nodes.dask_cluster as module
 
-    monkeypatch.setattr(module, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(module, "CONNECT_S", 0.5)
     assert main(["batch", "f0.mcap", "-o", "out", "--scheduler", "tcp://127.0.0.1:1"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert told == ["triline batch: --scheduler tcp://127.0.0.1:1: nobody answers there, wanted a Dask scheduler"]

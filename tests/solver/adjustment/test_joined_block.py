@@ -10,6 +10,7 @@ from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import BlockData, ImagePoints, KnownPoints, network_from_block
 from triline.solver.adjustment.covariance import cofactors
 from triline.solver.adjustment.joined_block import join_blocks
+from triline.solver.adjustment.options_by_strip import OptionsByStrip
 from triline.solver.geometry.frames import LocalFrame
 from triline.solver.geometry.trajectory import Trajectory
 from triline.solver.models.dgr import DgrOptions
@@ -140,3 +141,21 @@ def test_what_contradicts_is_refused(block):
         join_blocks([first, replace(second, camera=other)], ["day1", "day2"])
     with pytest.raises(ValueError, match="attitude of day2"):
         join_blocks([first, replace(second, heading=True)], ["day1", "day2"])
+
+
+def test_each_recording_keeps_its_apriori_sigmas(block):
+    """A second day with a trajectory a hundred times as good: its strips stay where they were measured."""
+    joined = join_blocks([some_strips(block, [0, 1]), some_strips(block, [2, 3])], ["day1", "day2"]).block
+    usual, good = DgrOptions(), DgrOptions(*(tuple(0.01 * np.array(s)) for s in vars(DgrOptions()).values()))
+    network = network_from_block(joined)
+    alike = adjust(network, OptionsByStrip(dict.fromkeys(("S1", "S2", "S3", "C1"), usual)))
+    assert alike.sigma0 == adjust(network, usual).sigma0
+    mixed = adjust(network, OptionsByStrip({"S1": usual, "S2": usual, "S3": good, "C1": good}))
+    prior = mixed.layout.prior
+    for set_, strip in zip(mixed.layout.sets, joined.strips, strict=True):
+        rows = np.flatnonzero([f"strip {strip.id}" in label for label in prior.labels])
+        stated = (good if strip.id in ("S3", "C1") else usual).build(set_.model.extent).pseudo_observations()
+        np.testing.assert_array_equal(prior.sigma[rows], stated.sigma)
+    moved = {strip.id: np.abs(mixed.state.theta[set_.columns][:3]).max() for set_, strip in
+             zip(mixed.layout.sets, joined.strips, strict=True)}  # fmt: skip
+    assert max(moved["S3"], moved["C1"]) < 0.1 * max(moved["S1"], moved["S2"])
