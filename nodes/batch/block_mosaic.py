@@ -217,7 +217,8 @@ def tones_job(folder: Path, key: Key, layers: dict[int, Layer], settings: Mosaic
     _save(
         _file(folder, "tones", key, "npz"),
         place=np.array(place, dtype=np.int64), layer=np.array(layer, dtype=np.int64),
-        value=np.array(grey, dtype=float).reshape(len(place), -1), off_middle=np.array(middle, dtype=float),
+        value=np.array(grey, dtype=float).reshape(len(place), next(iter(layers.values())).bands),
+        off_middle=np.array(middle, dtype=float),
         rough=np.array(rough, dtype=float), part=(r // PART) * (n // PART + 1) + c // PART,
     )  # fmt: skip
 
@@ -264,7 +265,7 @@ def write_balance(folder: Path, layers: list[Layer], several: list[Key], setting
         else:
             samples = ToneSamples(
                 np.concatenate(places), np.concatenate([p["layer"] for _, p in parts]),
-                np.concatenate([p["value"].reshape(len(p["place"]), -1)[:, band] for _, p in parts if len(p["place"])]),
+                np.concatenate([p["value"][:, band] for _, p in parts]),
                 np.concatenate([p["off_middle"] for _, p in parts]), np.concatenate(group),
             )  # fmt: skip
             result = balance(samples, camera, fall_off)

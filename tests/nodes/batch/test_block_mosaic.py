@@ -166,3 +166,11 @@ def test_parts_of_another_plan_are_not_taken(block, made, tmp_path):
     assert main([*words, "--balance", "none", "--seams", "middle"]) == 0
     with rasterio.open(target) as plain, rasterio.open(made) as balanced:
         assert np.abs(plain.read(1).astype(float) - balanced.read(1)).max() > 50
+
+
+def test_a_tile_in_which_two_strips_share_no_whole_place(tmp_path):
+    block = make_block(tmp_path, strips=2, columns=500, seed=7)
+    target = tmp_path / "block.tif"
+    assert main(["rectify", *map(str, block.files), "--mosaic", "--tile", "128", "-o", str(target), "-q"]) == 0
+    with rasterio.open(target) as image:
+        assert (image.read(1) > 0).mean() > 0.9
