@@ -24,10 +24,10 @@ def triline(*arguments: object) -> None:
 
 
 def results(flight: Path) -> pd.DataFrame:
-    """Final orientations (name: time in ns) and object points of ``triline process`` over a flight; m and rad."""
+    """Final orientations (name: time in ns) and object points of ``triline process`` at the pace of flight; m, rad."""
     with tempfile.TemporaryDirectory() as folder:
         processed = Path(folder) / "processed.mcap"
-        triline("process", flight, "-o", processed)
+        triline("process", flight, "-o", processed, "--pace", "load")
         recording = Recording(processed)
         final = recording.poses("orientation/final")
         rows = [

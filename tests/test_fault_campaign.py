@@ -94,7 +94,7 @@ def test_green_lights_are_counted_in_what_a_live_recorder_writes(bench, tmp_path
     flight, out, live = (str(tmp_path / f"{name}.mcap") for name in ("flight", "out", "live"))
     plan = ["--seconds", "12", "--height", "300", "--control", "24", "--seed", "3", "--lead-in", "2"]
     assert main(["simulate", "-q", "-o", flight, *plan]) == 0
-    assert main(["process", "-q", flight, "-o", out]) == 0
+    assert main(["process", "-q", "--pace", "load", flight, "-o", out]) == 0
     with RecordingWriter(live) as writer:
         writer.write(Message("status/adjuster", 0, m.NodeStatus(node="adjuster", state="starting"), "adjuster", 0, 1))
         for message in RecordingReader(out).sorted_messages():

@@ -7,6 +7,7 @@ import json
 import os
 import textwrap
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from ...schemas import codec
@@ -32,7 +33,11 @@ EXAMPLE = "triline process flight.mcap -o out.mcap"
 FILTERED_S = 0.2
 #: Interval at which smoothed poses are handed to the adjuster at that pace, s.
 SMOOTH_EVERY_S = 2.0
-CAMERA = "configuration/camera"
+#: Updates of a flight follow each other faster than this, s; those at the pace for throughput do not.
+RARE_S = 5.0
+#: Nodes whose results are as good at the pace for throughput.
+FAST = {"navigator", "matcher", "adjuster"}
+CAMERA, REPORT, ADJUSTER = "configuration/camera", "adjustment/report", "adjuster"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,9 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"comma-separated, of {', '.join(registry.STEP_NODES)} (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--pace", choices=("load", "throughput"), default="load",
-        help="throughput: larger batches and filtered poses at 5 Hz, for long flights; as accurate, but results come "
-        "later (default: load, the pace of a live flight with its recorded changes under load)",
+        "--pace", choices=("load", "throughput"),
+        help="load: that of a live flight, with its recorded changes under load; throughput: larger batches and "
+        "filtered poses at 5 Hz, as accurate, but results come later (default: load where the recording holds results "
+        "at that pace, which come out the same, and with other nodes than navigator, matcher and adjuster; else "
+        "throughput)",
     )  # fmt: skip
     parser.add_argument(
         "--camera", type=Path, metavar="FILE",
@@ -62,15 +69,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    tables = at_pace(load(args.config, registry.names()), args.pace)
-    dem = dem_settings(args)
-    if dem:
-        tables = tables | {"adjuster": tables.get("adjuster", {}) | dem}
     refuse_importable(args.recording)
     reader = RecordingReader(args.recording)
     _check(reader, args)
-    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera)}
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
+    pace = args.pace or usual_pace(reader, names)
+    tables = at_pace(load(args.config, registry.names()), pace)
+    dem = dem_settings(args)
+    if dem:
+        tables = tables | {"adjuster": tables.get("adjuster", {}) | dem}
+    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera)}
     nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
     part = args.output.with_name(args.output.name + ".part")
@@ -98,12 +106,36 @@ def run(args: argparse.Namespace) -> int:
         part.unlink(missing_ok=True)
     seconds = time.monotonic() - begun
     if args.json:
-        print(json.dumps(result(summary, reader, args.output, seconds), indent=2))
+        print(json.dumps(result(summary, reader, args.output, seconds) | {"pace": pace}, indent=2))
         return 0
     for line in _lines(summary, reader, args.output, seconds):
         print(line)
+    if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
+        print("  live orientation is that of updates 5 s apart; that of a flight comes with --pace load")
     tell_damage("process", reader)
     return 0
+
+
+def usual_pace(reader: RecordingReader, nodes: Sequence[str]) -> str:
+    """The pace at which results come out as they are in a recording; of one that has none, that for throughput.
+
+    A live adjuster tells its status, and no other; in what was processed the reports say how far apart updates were.
+    Nodes that work with the live orientation, as the rectifier does, need that of a flight.
+    """
+    if ADJUSTER not in nodes or not set(nodes) <= FAST:
+        return "load"
+    held = set(reader.index.channel.tolist())
+    topics = {c.topic for c in reader.channels.values() if c.known and c.id in held}
+    if f"status/{ADJUSTER}" in topics:
+        return "load"
+    if REPORT not in topics:
+        return "throughput"
+    first = reader.select([REPORT])[:1]
+    try:
+        report = codec.decode(REPORT, next(reader.raws(first))[2])
+    except ValueError:
+        return "load"
+    return "throughput" if report.update_interval_s >= RARE_S else "load"
 
 
 def at_pace(tables: Tables, pace: str) -> Tables:

@@ -472,17 +472,18 @@ class Window:
             if state.solution != solution:
                 self._orientation.forget()
         result.events += findings.events
-        unknowns = len(state) + sum(b.determined for b in batches)
+        tally = batches.tally()
+        unknowns = len(state) + tally.determined
         return WindowReport(
             **vars(fit),
-            observations=unknowns + sum(b.information.rows for b in batches),
+            observations=unknowns + tally.rows,
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in flown), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=sum(b.active_rays for b in batches),
-            points=sum(b.n_points for b in batches),
-            control=sum(b.active_control for b in batches),
+            rays=tally.rays,
+            points=tally.points,
+            control=tally.control,
             strip=newest.id if newest else "",
             parameters=parameters(self.network, newest, findings.standing) if newest else (),
             quality=findings,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.bias_search import Verdict, judge
-from ..state.batch import Batch, Information, inverse_factors
+from ..state.batch import Batch, Information
 from ..state.unknowns import Border, Marginal, WindowState
 from .drifts import Cell
 
@@ -78,7 +78,7 @@ def biases_of(batch: Batch, p: int, weight: Array, out: Bools, cell: Cell | None
     if cell is not None:
         columns = np.concatenate([columns, -1 - cell.places])
         coupling = np.concatenate([coupling, cell.coupling[p]], axis=1)
-    L = inverse_factors(batch.normals)[p]
+    L = batch.inverse_factors[p]
     Q, moment, into = L.T @ L, L.T @ batch.normals.y[:, p], L.T @ coupling  # of the point given the orientation
     off = batch.control.xyz_l[p] - batch.origin_l[p]
     lost = np.where(out, weight, 0.0)

@@ -36,7 +36,7 @@ from ...adjustment.drift_hypotheses import (
 from ...adjustment.ray_statistics import whitened_pixels
 from ...adjustment.reduced_system import DenseFactor
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
-from ..state.batch import Batch, Information, inverse_factors
+from ..state.batch import Batch, Information
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal
 from .drifts import MOST_GROUPS, Cell, Compensation, Named, estimated
@@ -185,7 +185,7 @@ class DriftMonitor:
         effect[use, :, of_ray] = np.stack([pixels, pixels * since[:, None, None]], axis=2)[use]
         effect = effect.reshape(n, 2, k)
         v = np.einsum("nij,nj->ni", pixels, batch.residuals_px(state))
-        W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(inverse_factors(batch.normals), 1, 2)[rays.point]
+        W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(batch.inverse_factors, 1, 2)[rays.point]
         coupling = np.add.reduceat(np.swapaxes(W, 1, 2) @ effect, batch.first_ray[:-1], axis=0)
         rows = (batch.full_rows(np.arange(n)) - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
         flat, of_points = effect.reshape(2 * n, k), coupling.reshape(-1, k)
@@ -320,7 +320,7 @@ class DriftMonitor:
         if cell is not None and self._drift is not None:
             mine = np.isin(cell.places, self._drift[0])
             A[:, :, np.searchsorted(self._drift[0], cell.places[mine])] -= cell.coupling[:, :, mine]
-        A = np.swapaxes(inverse_factors(batch.normals), 1, 2) @ A
+        A = np.swapaxes(batch.inverse_factors, 1, 2) @ A
         return A @ drift.drift, A @ drift.covariance @ np.swapaxes(A, 1, 2)
 
     def named(self) -> list[Named]:

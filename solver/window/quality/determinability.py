@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ...adjustment.determinability import Evidence, Limits, examine, point_sigmas, ranks, strongest_correlations
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
-from ..state.batch import Batch, inverse_factors
+from ..state.batch import Batch
 from ..state.unknowns import WindowState
 
 Array = NDArray[np.floating]
@@ -147,7 +147,7 @@ class Determinability:
         for batch in sorted(batches, key=lambda b: -b.n_points)[:SAMPLED_BATCHES]:
             known = np.flatnonzero(batch.normals.rank == 3)
             columns = state.places(batch.columns)
-            to_points = -np.swapaxes(inverse_factors(batch.normals), 1, 2) @ (batch.coupling @ Q[columns])
+            to_points = -np.swapaxes(batch.inverse_factors, 1, 2) @ (batch.coupling @ Q[columns])
             points = batch.cofactors(everything[np.ix_(columns, columns)]).points
             cross.append(to_points[known].reshape(-1, len(places)))
             variance.append(np.einsum("pii->pi", points[known]).ravel())

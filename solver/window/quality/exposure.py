@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ...adjustment.protection import protection_factor
 from ...adjustment.reliability import CRITICAL_W, noncentrality
 from ..results import RefinedOrientation
-from ..state.batch import Batch, Information, inverse_factors
+from ..state.batch import Batch, Information
 from ..state.surface import LiveSurface
 from ..state.unknowns import Border, Marginal, WindowState
 
@@ -268,7 +268,7 @@ class Integrity:
         """The most exposed observations, and the largest lambda of the others."""
         assert batch.judged is not None
         cofactors, rays, weight = batch.judged[1], batch.rays, batch.control.weight
-        L, n = inverse_factors(batch.normals), len(rays)
+        L, n = batch.inverse_factors, len(rays)
         W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(L, 1, 2)[rays.point]
         point, axis = np.nonzero(weight > 0)
         through_point = (weight * np.einsum("pia,pia->pa", L, L))[point, axis]

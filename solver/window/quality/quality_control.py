@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,6 @@ from numpy.typing import NDArray
 from ..datum.control import ControlTests
 from ..datum.surface import SurfaceTests
 from ..results import RefinedOrientation, WindowOptions
-from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
 from .determinability import Determinability
@@ -107,7 +104,7 @@ class QualityControl:
             points=len(rays),
             refused=int((rays == 0).sum()),
             tied=tied,
-            free=tied - sum(map(partial(_tied_control, control=network.intake.control.keys()), batches, left)),
+            free=tied - self._tied_control(),
             control=known[rays > 0].sum(axis=0),
             control_refused=sum(b.control_refused for b in batches),
             control_doubt="; ".join(filter(None, (self._control.doubt, self._surface.doubt))),
@@ -130,6 +127,15 @@ class QualityControl:
         self.last = replace(found, light=light, reason=reason)
         return replace(self.last, events=tuple(events))
 
+    def _tied_control(self) -> int:
+        """How many points of the window are control, by name, and have two looks left."""
+        intake, count = self._network.intake, 0
+        for name in intake.control:
+            batch = intake.points[name].batch if name in intake.points else None
+            if batch is not None and batch in self._network.batches:
+                count += int(batch.points_left[batch.names.index(name)]) >= 2
+        return count
+
     @property
     def _alert_limit_m(self) -> float:
         ground = self._below.ground
@@ -148,9 +154,3 @@ class QualityControl:
         ground = self._below.ground
         on_ground = np.empty(0) if ground is None else ground.sigma_m(noise + C) ** 2
         return np.sqrt(exposure.sigma**2 + np.concatenate([np.diagonal(C), on_ground]))
-
-
-def _tied_control(batch: Batch, left: NDArray[np.int64], control: Set[str]) -> int:
-    """How many points of a batch are control, by name, and have two looks left."""
-    known = control & set(batch.names)
-    return sum(int(left[batch.names.index(name)]) >= 2 for name in known)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +73,7 @@ class ConsensusSchedule:
         if not due and count < asked + RECENT:
             self.asked[strip], self.refused[strip] = asked, refused
             return []
-        mine.sort(key=lambda b: -b.newest_s)
+        mine.sort(key=attrgetter("newest_s"), reverse=True)
         due = due or _mostly_refused(mine)
         self.asked[strip], self.refused[strip] = max(count, asked) if due else asked, refused
         chosen: list[Batch] = []

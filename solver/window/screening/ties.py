@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import TOGETHER
 from ...quantiles import chi2
-from ..state.batch import Batch, PointTies, inverse_factors
+from ..state.batch import Batch, PointTies
 from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
 
@@ -97,7 +97,7 @@ def _joint(batch: Batch, ties: PointTies, state: WindowState) -> Array:
     theta = state.values(batch.columns)
     batch.back_substitute(theta)
     rows = ties.rows(batch.origin_l, len(batch.columns))
-    through = rows.point @ np.swapaxes(inverse_factors(batch.normals), 1, 2)
+    through = rows.point @ np.swapaxes(batch.inverse_factors, 1, 2)
     design = rows.design - through @ batch.coupling
     C = design @ state.covariance(batch.columns) @ np.swapaxes(design, 1, 2) + through @ np.swapaxes(through, 1, 2)
     v = rows.residual - rows.design @ theta - np.einsum("pij,pj->pi", rows.point, batch.points_l - batch.origin_l)

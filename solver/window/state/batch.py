@@ -120,7 +120,9 @@ class Batch:
     image_factor : what the sigmas of its lines and samples have been multiplied by
     counted : whether its rays are counted there
     tested : number of the update that tested it last
+    n_points : p
     active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    inverse_factors : (p, 3, 3) ``L^-1`` of the points' normal matrices ``L L^T``
     coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
     judged : cofactors and statistics of the last test, and the solution of the window they are for
     """
@@ -141,6 +143,7 @@ class Batch:
     image_factor: float = 1.0
     counted: bool = False
     tested: int = -1
+    n_points: int = field(init=False)
     active_rays: int = field(init=False, default=0)
     active_control: int = field(init=False, default=0)
     determined: int = field(init=False, default=0)
@@ -150,6 +153,7 @@ class Batch:
     lin: Linearisation = field(init=False)
     whitening: Whitening = field(init=False)
     normals: PointNormals = field(init=False)
+    inverse_factors: Array = field(init=False, repr=False)
     information: Information = field(init=False)
     _rows: Array = field(init=False, repr=False)
     _places: tuple[IntArray, IntArray] = field(init=False, repr=False)
@@ -159,12 +163,10 @@ class Batch:
     coupling: Array = field(init=False, repr=False)
     surface_factor: Array = field(init=False, repr=False)
     surface_rows: SurfaceRows = field(init=False, repr=False)
-
-    @property
-    def n_points(self) -> int:
-        return len(self.names)
+    _left: tuple[Array, IntArray] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
+        self.n_points = len(self.names)
         self.newest_s, self.oldest_s = float(self.rays.time_s.max()), float(self.rays.time_s.min())
         self.strips = tuple(int(i) for i in np.unique(self.rays.strip))
         self.height_m = abs(float(np.median(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])))
@@ -221,8 +223,9 @@ class Batch:
         w[:, 1] = (b * j[:, 0] + c * j[:, 1]).T
         w[:, 2] = (d * j[:, 0] + e * j[:, 1] + f * j[:, 2]).T
         D = np.add.reduceat(w @ A, self.first_ray[:-1], axis=0)  # (p, 3, u)
+        self.inverse_factors = inverse_factors(normals)
         if tied is not None:
-            D += inverse_factors(normals) @ np.swapaxes(tied.point, 1, 2) @ tied.design
+            D += self.inverse_factors @ np.swapaxes(tied.point, 1, 2) @ tied.design
         surface, place = self.control.surface, self.layout.shift_column
         if surface is not None and normals.surface is not None:
             D[:, :, place] += normals.surface.T
@@ -283,7 +286,10 @@ class Batch:
     @property
     def points_left(self) -> IntArray:
         """(p,) rays with weight of each point."""
-        return np.bincount(self.rays.point, self.weight > 0, self.n_points).astype(np.int64)
+        if self._left is None or self._left[0] is not self.weight:  # weights are replaced, never written into
+            left = np.bincount(self.rays.point, self.weight > 0, self.n_points).astype(np.int64)
+            self._left = self.weight, left
+        return self._left[1]
 
     @property
     def control_refused(self) -> int:
@@ -300,7 +306,7 @@ class Batch:
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
-        L = inverse_factors(self.normals)
+        L = self.inverse_factors
         n, p = len(self.rays), self.n_points
         D, u = self.coupling, len(self.columns)
         inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)

@@ -84,7 +84,8 @@ def oriented(flight, tmp_path_factory):
     folder = tmp_path_factory.mktemp("oriented")
     (folder / "nodes.toml").write_text("[adjuster]\ngrid_hz = 4\n")
     options = ["--dem", flight[0] / "dem.tif", "--dem-sigma", 0.3, "--dem-shift-sigma", 0.2]
-    command = ["process", flight[0] / "flight.mcap", "-o", folder / "o.mcap", "-q", "--config", folder / "nodes.toml"]
+    options += ["--pace", "load", "--config", folder / "nodes.toml"]
+    command = ["process", flight[0] / "flight.mcap", "-o", folder / "o.mcap", "-q"]
     assert main([str(part) for part in command + options]) == 0
     return folder / "o.mcap"
 

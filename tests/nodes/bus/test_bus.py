@@ -67,7 +67,7 @@ def test_live_and_process_give_the_same_messages(rig, tmp_path):
         assert one == two
     # and the same as from the flight itself, which never was on a bus
     again = tmp_path / "again.mcap"
-    assert triline("process", flight, "-o", again).returncode == 0
+    assert triline("process", flight, "-o", again, "--pace", "load").returncode == 0
     assert payloads(again, "orientation/final") == payloads(processed, "orientation/final")
 
 

@@ -14,6 +14,7 @@ import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
+from places import ROOT
 from recording_file import write_recording
 
 import triline
@@ -133,6 +134,21 @@ def test_process_twice_gives_the_same_bytes(tmp_path):
     done = command("process", one, "-o", three, "--json")
     assert json.loads(done.stdout)["replaced"]["orientation/final"] == result["outputs"]["orientation/final"]
     assert three.read_bytes() == one.read_bytes()
+
+
+def test_the_usual_pace_of_process_keeps_that_of_the_results_in_a_recording(capsys, tmp_path):
+    def processed(source, name, *more):
+        code, out, _ = run(capsys, "process", source, "-o", tmp_path / name, "--json", *more)
+        assert code == 0
+        return json.loads(out)["pace"], (tmp_path / name).read_bytes()
+
+    flight = ROOT / "recordings" / "strip.mcap"
+    pace, fast = processed(flight, "fast.mcap")
+    assert (pace, fast) == ("throughput", processed(flight, "asked.mcap", "--pace", "throughput")[1])
+    assert processed(tmp_path / "fast.mcap", "again.mcap") == ("throughput", fast)
+    assert processed(flight, "navigated.mcap", "--nodes", "navigator")[0] == "load"
+    _, flown = processed(flight, "flown.mcap", "--pace", "load")
+    assert flown != fast and processed(tmp_path / "flown.mcap", "same.mcap") == ("load", flown)
 
 
 def test_process_refuses_in_one_line(capsys, flight, tmp_path):
