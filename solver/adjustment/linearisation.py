@@ -39,7 +39,7 @@ class Whitening:
 
     def apply(self, xy: Array) -> Array:
         """Whitened (2, ..., n) of (2, ..., n) in mm."""
-        return np.stack([self.g[0] * xy[0], self.g[1] * xy[0] + self.g[2] * xy[1]])
+        return np.array([self.g[0] * xy[0], self.g[1] * xy[0] + self.g[2] * xy[1]])
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def residual_covariance(rays: Rays, d_orientation: Array, attitude_rate: bool = 
 
 def _outer(a: Array) -> Array:
     """Elements xx, xy, yy of ``a a^T`` for (2, n)."""
-    return np.stack([a[0] * a[0], a[0] * a[1], a[1] * a[1]])
+    return np.array([a[0] * a[0], a[0] * a[1], a[1] * a[1]])
 
 
 def orientation_noise(rays: Rays, d_orientation: Array) -> Array | float:
@@ -95,14 +95,14 @@ def orientation_noise(rays: Rays, d_orientation: Array) -> Array | float:
         return 0.0
     of_ray = d_orientation.transpose(2, 0, 1)
     noise = of_ray @ rays.orientation_noise @ of_ray.transpose(0, 2, 1)
-    return np.stack([noise[:, 0, 0], noise[:, 0, 1], noise[:, 1, 1]])
+    return np.array([noise[:, 0, 0], noise[:, 0, 1], noise[:, 1, 1]])
 
 
 def pitch_covariance(rays: Rays) -> Array:
     """Covariance (3, n) from the pixel pitch alone, x and y alike; what adjustments of frame images do."""
     pitch = np.linalg.norm(rays.pitch_mm, axis=1)
     zero = np.zeros(len(rays))
-    return np.stack([(pitch * rays.sigma_line_px) ** 2, zero, (pitch * rays.sigma_sample_px) ** 2])
+    return np.array([(pitch * rays.sigma_line_px) ** 2, zero, (pitch * rays.sigma_sample_px) ** 2])
 
 
 def whiten(covariance: Array) -> Whitening:
@@ -116,7 +116,7 @@ def whiten(covariance: Array) -> Whitening:
     l11 = np.sqrt(np.maximum(xx, floor))
     l21 = xy / l11
     l22 = np.sqrt(np.maximum(yy - l21 * l21, floor))
-    return Whitening(np.stack([1.0 / l11, -l21 / (l11 * l22), 1.0 / l22]))
+    return Whitening(np.array([1.0 / l11, -l21 / (l11 * l22), 1.0 / l22]))
 
 
 def linearise(
@@ -204,7 +204,7 @@ def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layou
     for part, own, residual, d_orientation, _, _ in _by_chunks(rays, layout, theta, points_l):
         white = whiten(residual_covariance(own, d_orientation))
         a = white.apply(residual)
-        multiplier = np.stack([white.g[0] * a[0] + white.g[1] * a[1], white.g[2] * a[1]])  # C^-1 r
+        multiplier = np.array([white.g[0] * a[0] + white.g[1] * a[1], white.g[2] * a[1]])  # C^-1 r
         motion, pitch = _image_motion(own, d_orientation), own.pitch_mm.T
         later_s = (own.line_period_s * own.sigma_line_px) ** 2 * (motion * multiplier).sum(axis=0)
         samples = own.sigma_sample_px**2 * (pitch * multiplier).sum(axis=0)
@@ -276,7 +276,7 @@ def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tup
     turn = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation))
     a, b, c = turn.g
     g = whitening.g
-    fresh = Whitening(np.stack([a * g[0], b * g[0] + c * g[1], c * g[2]]))
+    fresh = Whitening(np.array([a * g[0], b * g[0] + c * g[1], c * g[2]]))
     arrays = []
     for old in (lin.residual, lin.orientation, lin.camera, lin.point):
         new = np.empty_like(old)

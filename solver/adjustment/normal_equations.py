@@ -121,13 +121,13 @@ class PointNormals:
     def back(self, t: Array) -> Array:
         """``L^-T t`` for (3, p)."""
         a, b, c, d, e, f = self.inverse_factor
-        return np.stack([a * t[0] + b * t[1] + d * t[2], c * t[1] + e * t[2], f * t[2]])
+        return np.array([a * t[0] + b * t[1] + d * t[2], c * t[1] + e * t[2], f * t[2]])
 
     def covariance(self) -> Array:
         """``(L L^T)^-1`` as (p, 3, 3): what the points would have with known orientation."""
         a, b, c, d, e, f = self.inverse_factor
         zero = np.zeros_like(a)
-        rows = np.stack([np.stack([a, zero, zero]), np.stack([b, c, zero]), np.stack([d, e, f])])
+        rows = np.array([np.array([a, zero, zero]), np.array([b, c, zero]), np.array([d, e, f])])
         return np.einsum("kin,kjn->nij", rows, rows)
 
 
@@ -171,7 +171,7 @@ def point_normals(
 
     pairs = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
     v = [total(j[0, a] * j[0, b] + j[1, a] * j[1, b]) for a, b in pairs]
-    g = np.stack([total(j[0, a] * r[0] + j[1, a] * r[1]) for a in range(3)])
+    g = np.array([total(j[0, a] * r[0] + j[1, a] * r[1]) for a in range(3)])
     g += (control.weight * (control.xyz_l - points_l)).T
     surface, m = control.surface, np.empty((3, 0))
     if surface is not None:
@@ -193,12 +193,12 @@ def point_normals(
     b = -l10 * a * c
     e = -l21 * c * f
     d = -(l20 * a + l21 * b) * f
-    y = np.stack([a * g[0], b * g[0] + c * g[1], d * g[0] + e * g[1] + f * g[2]])
+    y = np.array([a * g[0], b * g[0] + c * g[1], d * g[0] + e * g[1] + f * g[2]])
     rank = good_a.astype(np.int64) + good_c + good_f
     of_shift = None
     if surface is not None:
-        of_shift = np.stack([a * m[0], b * m[0] + c * m[1], d * m[0] + e * m[1] + f * m[2]])
-    return PointNormals(np.stack([a, b, c, d, e, f]), y, rank, of_shift)
+        of_shift = np.array([a * m[0], b * m[0] + c * m[1], d * m[0] + e * m[1] + f * m[2]])
+    return PointNormals(np.array([a, b, c, d, e, f]), y, rank, of_shift)
 
 
 def reduce_normals(
@@ -353,7 +353,7 @@ def back_substitute(
     p, index = elimination.n_points, elimination.point
     t = [np.bincount(index, lin.point[0, a] * change[0] + lin.point[1, a] * change[1], p) for a in range(3)]
     a, b, c, d, e, f = points.inverse_factor
-    rest = points.y - np.stack([a * t[0], b * t[0] + c * t[1], d * t[0] + e * t[1] + f * t[2]])
+    rest = points.y - np.array([a * t[0], b * t[0] + c * t[1], d * t[0] + e * t[1] + f * t[2]])
     if points.surface is not None:
         rest -= points.surface * layout.shift_of(d_theta)
     return points.back(rest).T

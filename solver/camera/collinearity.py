@@ -71,7 +71,7 @@ def collinearity(
     f1, f2 = ck * v1 + sk * u2, ck * u2 - sk * v1
     inverse = 1.0 / v3
     a = -focal_length_mm * inverse
-    xy = np.stack([a * f1, a * f2])
+    xy = np.array([a * f1, a * f2])
     b = xy * inverse  # d(xy) = a d(f1, f2) - b d(f3)
 
     d_orientation = np.empty((2, 6, len(d1)))

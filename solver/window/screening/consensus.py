@@ -63,12 +63,16 @@ class ConsensusSchedule:
         if not fresh:
             return []
         strip = max(batch.strips[-1] for batch in fresh)
-        mine = [b for b in batches if strip in b.strips]
-        count, asked = sum([b.n_points for b in mine]), self.asked.get(strip, 0)
+        mine, count, refused = [], 0, 0
+        for batch in batches:
+            if strip in batch.strips:
+                mine.append(batch)
+                count += batch.n_points
+                refused += batch.control_refused if batch.active_control else 0
+        asked, before = self.asked.get(strip, 0), self.refused.get(strip, 0)
         step = next((n for n in YOUNG if n > asked), np.inf)
         if step == np.inf and count < asked:  # points that were counted have left
             asked = max(count, YOUNG[-1])
-        refused, before = sum([b.control_refused for b in mine if b.active_control]), self.refused.get(strip, 0)
         due = count >= step or refused > before
         if not due and count < asked + RECENT:
             self.asked[strip], self.refused[strip] = asked, refused
@@ -87,9 +91,13 @@ class ConsensusSchedule:
 
 def _mostly_refused(newest_first: Sequence[Batch]) -> bool:
     """Whether of the newest points most have no look left."""
-    seen = np.cumsum([b.n_points for b in newest_first])
-    left = np.concatenate([b.points_left for b in newest_first[: int(np.searchsorted(seen, RECENT)) + 1]])
-    return bool(len(left) >= RECENT and (left == 0).sum() > REFUSED_SHARE * len(left))
+    seen = none = 0
+    for batch in newest_first:
+        seen += batch.n_points
+        none += int((batch.points_left == 0).sum())
+        if seen >= RECENT:
+            return none > REFUSED_SHARE * seen
+    return False
 
 
 def _subsets(rays: int) -> list[tuple[int, ...]]:

@@ -329,7 +329,7 @@ class WindowState:
     def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
         """Add a batch's information to the live part, or take it back (``sign = -1``)."""
         place = self._present(columns)
-        self._live[np.ix_(place, place)] += sign * information.matrix
+        _add(self._live, place, information.matrix, sign)
         self._live_rhs[place] += sign * information.rhs
         self.square += sign * information.square
         self.redundancy += sign * information.rows
@@ -342,9 +342,8 @@ class WindowState:
     def fix(self, columns: IntArray, information: Information) -> None:
         """Move a batch's information from the live to the fixed part."""
         place = self._present(columns)
-        block = np.ix_(place, place)
-        self._live[block] -= information.matrix
-        self._fixed[block] += information.matrix
+        _add(self._live, place, information.matrix, -1)
+        _add(self._fixed, place, information.matrix)
         self._live_rhs[place] -= information.rhs
         self._fixed_rhs[place] += information.rhs
 
@@ -409,7 +408,7 @@ class WindowState:
             if 3 * self._asked <= len(self):
                 return factor.few_cofactors(place)
             self._cofactors = factor.inverse()
-        return self._cofactors[np.ix_(place, place)]
+        return _block(self._cofactors, place)
 
     def propagated(self, functions: Array) -> Array:
         """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
@@ -459,6 +458,12 @@ def places_of(numbers: IntArray, wanted: IntArray) -> IntArray:
 def _block(matrix: Array, places: IntArray) -> Array:
     """Rows and columns of a large symmetric matrix; one after the other is several times faster than both at once."""
     return matrix.take(places, axis=0).take(places, axis=1)
+
+
+def _add(matrix: Array, places: IntArray, more: Array, sign: int = 1) -> None:
+    """Add to rows and columns of a large matrix whose rows stand one after the other; by one index that takes half the
+    time of two."""
+    matrix.reshape(-1)[places[:, None] * len(matrix) + places] += sign * more
 
 
 def _hold(matrix: Array, places: IntArray) -> None:
