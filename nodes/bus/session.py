@@ -37,6 +37,8 @@ LATCHED_KEPT = 100_000
 #: What else is recorded, and is not too much (pictures), a publisher keeps for those who missed it: for so long, s, at
 #: twice the usual rate of its topic, and so many messages at least.
 KEPT_S, LEAST_KEPT = 60.0, 20_000
+#: Publishers that do not answer are asked again for what they keep, for so long, s.
+ASKED_S = 10.0
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 Receive = Callable[[RawMessage], None]
@@ -289,31 +291,40 @@ class Bus:
     def recall(self, names: Iterable[str], seconds: float = KEPT_S, timeout_s: float = 3.0) -> list[RawMessage]:
         """What others have said lately on topics (names of the table), as far as they live and keep it, in any order.
 
-        Topics that are latched are left out: whoever subscribes to them gets all of it.
+        Topics that are latched are left out: whoever subscribes to them gets all of it. Where a publisher does not
+        answer in time, as on a busy machine, all are asked again, until `ASKED_S` have passed.
         """
-        found, prefix = [], len(self.key(""))
-        for name in names:
-            if not is_kept(name):
-                continue
-            replies = self._session.get(
-                f"{self.key(name)}/@adv/**?_time=[now(-{seconds:.3f}s)..]",  # where `zenoh.ext` answers from its cache
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-                timeout=timeout_s,
-            )
-            receive_ns = time.time_ns()
-            for sample in (reply.ok for reply in replies):
-                if sample is None or sample.attachment is None:
-                    continue
-                try:
+        found: dict[tuple[str, Envelope], RawMessage] = {}
+        until_s = time.monotonic() + ASKED_S
+        for name in filter(is_kept, names):
+            while not self._recall(name, seconds, timeout_s, found) and time.monotonic() < until_s:
+                pass
+        return list(found.values())
+
+    def _recall(
+        self, name: str, seconds: float, timeout_s: float, found: dict[tuple[str, Envelope], RawMessage]
+    ) -> bool:
+        """Add what was said lately on a topic; whether all who keep it have answered."""
+        replies = self._session.get(
+            f"{self.key(name)}/@adv/**?_time=[now(-{seconds:.3f}s)..]",  # where `zenoh.ext` answers from its cache
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=timeout_s,
+        )
+        receive_ns, prefix, complete = time.time_ns(), len(self.key("")), True
+        for reply in replies:
+            sample = reply.ok
+            if sample is None:
+                complete = False  # the time is over
+            elif sample.attachment is not None:
+                with contextlib.suppress(ValueError):  # what has no envelope was told when it came
                     envelope = unpack(sample.attachment.to_bytes())
-                except ValueError:  # it was told when it came
-                    continue
-                if envelope.start != self.start:
-                    topic = str(sample.key_expr)[prefix:]
-                    found.append(RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns))
-        return found
+                    if envelope.start != self.start:
+                        topic = str(sample.key_expr)[prefix:]
+                        raw = RawMessage(topic, envelope, sample.payload.to_bytes(), receive_ns)
+                        found.setdefault((topic, envelope), raw)
+        return complete
 
     # ---- liveliness and queries
 

@@ -6,6 +6,7 @@ import threading
 import time
 
 import sample_messages as sample
+import zenoh
 from bus_rig import Rig, free_port, simulated_flight, triline, wait_for
 
 from triline.nodes import convert
@@ -15,7 +16,7 @@ from triline.nodes.ordering import StreamCheck
 from triline.nodes.player.player import play
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import codec
-from triline.schemas.envelope import Envelope, RawMessage
+from triline.schemas.envelope import Envelope, RawMessage, pack
 
 TOPIC = "sensor/attitude"
 
@@ -45,6 +46,30 @@ def test_missing_numbers_are_asked_for_and_come_once_in_order():
         assert taken(*range(42, 100)) == [] and check.counts[TOPIC].duplicates == 0 == check.counts[TOPIC].gaps
         # what nobody keeps stays missing, and is not asked for without an end
         assert taken(150) == [150] and check.counts[TOPIC].gaps == 50
+
+
+def test_a_publisher_that_does_not_answer_in_time_is_asked_again():
+    port, held = free_port(), []
+
+    def answer(query: zenoh.Query) -> None:
+        if not held:  # as by a machine that does something else
+            held.append(query)
+        else:
+            query.reply(speaker.key(TOPIC), attitude(3).data, attachment=pack(attitude(3).envelope))
+
+    with Bus(port=port, source="simulator") as speaker, Bus(port=port, source="navigator") as listener:
+        wait_for(listener.peers, 20, "the link")
+        cache = speaker._session.declare_queryable(f"{speaker.key(TOPIC)}/@adv/**", answer)
+        said: list[RawMessage] = []
+
+        def asked() -> list[zenoh.Query]:
+            said[:] = listener.recall([TOPIC], timeout_s=0.2)
+            return held
+
+        wait_for(asked, 20, "the first question")
+        assert [raw.envelope.sequence for raw in said] == [3]
+        held.clear()
+        cache.undeclare()
 
 
 def test_what_speaks_no_more_and_what_is_too_much_is_not_recalled():
