@@ -79,14 +79,19 @@ def entry_weight(
     return np.where(active[place], 1.0, 0.0), w[place]
 
 
-def disagreement(equations: EntryEquations) -> list[tuple[float, int]]:
-    """Of each point with three rays or more, not in the state: weighted squares of its looks about their best place,
-    without the look whose loss makes them smallest, with all that is known of the orientation without them; and their
-    redundancy. So a single gross error at a point does not show."""
+def disagreement(equations: EntryEquations) -> list[tuple[float, int, bool]]:
+    """Of each point with two rays or more, not in the state: weighted squares of its looks about their best place, with
+    all that is known of the orientation without them; their redundancy; and whether a single gross error is spared. Of
+    three rays or more the look whose loss makes the squares smallest is left out, so that it is."""
     square, loss, _ = equations.by_themselves
     looks = equations.present.sum(axis=1)
-    best = np.maximum(square - loss.max(axis=1), 0.0)
-    return [(float(s), 2 * int(n) - 5) for s, n in zip(best, looks, strict=True) if n > 2]
+    spared = looks > 2
+    best = np.where(spared, np.maximum(square - loss.max(axis=1), 0.0), square)
+    return [
+        (float(s), 2 * int(n) - (5 if more else 3), bool(more))
+        for s, n, more in zip(best, looks, spared, strict=True)
+        if n > 1
+    ]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ likelihood: K.-R. Koch, Maximum likelihood estimate of variance components, Bull
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ...adjustment.network import Rays
 from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
@@ -56,8 +57,9 @@ LEAST_CONTROLLED, LEAST_LOOKS, IMAGE_QUESTIONED = 0.1, 40, 8.0
 #: units of its standard deviation, to say that the attitude vibrates, and that it still does; normalised residuals
 #: count up to so much; less vibration than this share of the image sigma is none. Tuned.
 TOGETHER_S, LEAST_PAIRS, SIGNIFICANT, STILL_SIGNIFICANT, OUTLYING, LEAST_VIBRATION = 0.05, 40, 4.0, 1.5, 4.0, 0.3
-#: Of the share that was vibration so much is kept at least from one look to the next. Tuned.
-SHARE_KEPT = 0.7
+#: All noise beyond that of the image is vibration where looks have more than this share of their variance in common;
+#: so much of what they had is kept at least from one look to the next. Tuned.
+VIBRATES, SHARE_KEPT = 0.3, 0.9
 #: Batches that are looked at then, the newest ones.
 MOST_JUDGED = 120
 #: Looks are questioned when so many looks at the slow errors have changed nothing. Tuned.
@@ -69,6 +71,11 @@ APART_S, LASTING, RAISED = (0.4, 0.8), 0.15, 1.5
 TOLD_AGAIN = 1.5
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
+NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
+#: The pair that is weighed against it, and the steps from a choice of factors to its neighbours.
+WANDERS = POSITION_WANDER, ATTITUDE_WANDER
+STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
 #: An error of the platform contradicts what was known of it beforehand if its normalised residual is larger (a
@@ -92,19 +99,25 @@ class SigmaCheck:
 
     def __init__(self, network: LiveNetwork, constants: bool = True) -> None:
         self._network = network
-        self._pairs = ((POSITION_WANDER, ATTITUDE_WANDER), (OFFSET, SHIFT))[: 1 + constants]
+        self._pairs = (WANDERS, (OFFSET, SHIFT))[: 1 + constants]
         self._ratios: deque[float] = deque(maxlen=REMEMBERED)
+        self._of_two: deque[float] = deque(maxlen=REMEMBERED)
         self._told = np.ones(len(ERROR_GROUPS) + 1)
-        self._vibration = 0.0
+        self._vibration = self._shared = 0.0
         self._steady = 0
         self._suspect = False
         self._told_platform: set[str] = set()
         self.events: list[str] = []
 
-    def entered(self, squares: Iterable[tuple[float, int]]) -> None:
-        """Points have come: weighted squares of each against what was known without it, and their redundancy."""
-        self._ratios.extend(square / _median_square(n) for square, n in squares if n > 0)
-        ratio = float(np.median(self._ratios)) if len(self._ratios) >= ENOUGH else 1.0
+    def entered(self, squares: Iterable[tuple[float, int, bool]]) -> None:
+        """Points have come, each as `entry.disagreement` judges it. Those of two looks count until enough have more."""
+        for square, redundancy, spared in squares:
+            if spared:
+                self._ratios.append(square / _median_square(redundancy))
+            else:
+                self._of_two.append(RIGHT * square / _median_square(redundancy))
+        known = self._ratios if len(self._ratios) >= ENOUGH else self._of_two
+        ratio = float(np.median(known)) if len(known) >= ENOUGH else 1.0
         self._suspect = ratio > SUSPECT
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
 
@@ -123,11 +136,10 @@ class SigmaCheck:
         network.state.solve()
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
-        factor = self._slow_errors(strip, now_s)
+        factor, of_image = self._slow_errors(strip, now_s)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
-        self._steady = 0 if of_slow else self._steady + 1
-        of_image = False
+        self._steady = 0 if of_slow or of_image else self._steady + 1
         if self._steady >= STEADY:
             judged = self._judged()
             if judged is not None and judged.last():
@@ -144,24 +156,46 @@ class SigmaCheck:
         self._tell_platform()
         return of_slow, of_image
 
-    def _slow_errors(self, strip: WindowStrip, now_s: float) -> Array:
-        """Factors (4,) that the residuals of a-priori equations ask for."""
+    def _slow_errors(self, strip: WindowStrip, now_s: float) -> tuple[Array, bool]:
+        """Factors (4,) that the residuals of a-priori equations ask for; whether the noise of looks was stated anew,
+        which may be what bends the trajectory."""
         before, state = self._network.sigmas.apriori, self._network.state
         group, square, redundancy = strip.apriori_fit(state, now_s - MEMORY_S)
         n = len(ERROR_GROUPS)
         squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
-        factor = before.copy()
+        factor, of_looks = before.copy(), False
         asked = (redundancies >= LEAST_REDUNDANCY) & ((factor > 1.0) | (squares > chi2.isf(QUESTIONED, redundancies)))
         if not self._suspect:  # a gross error that has not been found yet bends the attitude, control the position
             asked[ATTITUDE_WANDER] &= factor[ATTITUDE_WANDER] > 1.0
         for pair in self._pairs:
             if not asked[list(pair)].any():
                 continue
-            for g, wanted in zip(pair, _likely(strip, state, pair, (before[pair[0]], before[pair[1]])), strict=True):
-                factor[g] = _changed(float(factor[g]), wanted / float(factor[g]))
-            if (factor != before).any():
+            present = float(before[pair[0]]), float(before[pair[1]])
+            *wanted, ratio = _likely(strip, state, pair, present)
+            noise = self._noise() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
+            if noise is not None:
+                *wanted, ratio = _likely(strip, state, pair, present, noise)
+            for g, w in zip(pair, wanted, strict=True):
+                factor[g] = _changed(float(factor[g]), w / float(factor[g]))
+            if noise is not None and ratio > CHANGED:
+                self._state_noise(noise.variance * min(ratio, MOST_UP) ** 2, noise.pixel, noise.sigma_px)
+                of_looks = True
+            if (factor != before).any() or of_looks:
                 break  # what wanders is looked at first; the rest when that is settled
-        return factor
+        return factor, of_looks
+
+    def _noise(self) -> _Noise | None:
+        """What the looks say with the noise that is stated now; None while some have the weights of another one."""
+        network = self._network
+        batches = list(network.batches)
+        if any(b.noise_version != network.noise_version for b in batches):
+            return None
+        pixel, sigma = _pixel_and_sigma([b.rays for b in batches[-MOST_JUDGED:]])
+        information = [b.information for b in batches]
+        return _Noise(
+            sigma**2 + (network.pose_noise.vibration / pixel) ** 2, pixel, sigma / network.sigmas.image,
+            sum(i.rows for i in information), sum(i.square for i in information), *network.state.live(),
+        )  # fmt: skip
 
     def _judged(self) -> _Residuals | None:
         """Residuals of the looks in the window, where they ask for another noise than is stated; None where not."""
@@ -182,27 +216,34 @@ class SigmaCheck:
         point = np.concatenate([r.point + 1000 * REMEMBERED * i for i, r in enumerate(rays)])
         w = np.clip(np.concatenate([s.w for _, s in judged]), -OUTLYING, OUTLYING)
         redundancy = np.concatenate([s.redundancy for _, s in judged])
-        pixel = np.concatenate([np.linalg.norm(r.pitch_mm, axis=1) / r.focal_length_mm for r in rays])
-        sigma = np.concatenate([r.sigma_sample_px for r in rays]) / sigmas.image
-        return _Residuals(
-            time_s[order], point[order], w[order], redundancy[order], float(np.median(pixel)), float(np.median(sigma))
-        )
+        pixel, sigma = _pixel_and_sigma(rays)
+        return _Residuals(time_s[order], point[order], w[order], redundancy[order], pixel, sigma / sigmas.image)
 
     def _restate_looks(self, found: _Residuals) -> bool:
-        """State the noise of lines, samples and the attitude under them as residuals ask for; whether it changed."""
+        """State the noise of looks as residuals ask for; whether it changed."""
         sigmas, noise, pixel, sigma = self._network.sigmas, self._network.pose_noise, found.pixel, found.sigma_px
         shared = found.shared(0.0, TOGETHER_S, STILL_SIGNIFICANT if noise.vibration else SIGNIFICANT)
+        self._shared = max(shared, SHARE_KEPT * self._shared)
         total = (sigma * sigmas.image) ** 2 + (noise.vibration / pixel) ** 2
-        shared = max(shared, SHARE_KEPT * (noise.vibration / pixel) ** 2 / total)
         wanted = total * min(max(found.ratio, MOST_DOWN**2), MOST_UP**2)
-        vibration = pixel * np.sqrt(shared * wanted)
-        image = float(np.sqrt(max((1.0 - shared) * wanted, sigma**2)) / sigma)
-        if vibration < LEAST_VIBRATION * pixel * sigma:
-            vibration = 0.0
-        before = np.array([sigmas.image, noise.vibration / pixel / sigma])
-        now = np.array([image, vibration / pixel / sigma])
+        return self._state_noise(wanted, pixel, sigma)
+
+    def _state_noise(self, variance: float, pixel: float, sigma_px: float) -> bool:
+        """State the noise of lines and samples, or of the attitude under them; whether it changed.
+
+        Parameters
+        ----------
+        variance : of a sample with both, pixels squared
+        pixel, sigma_px : angle that a pixel subtends, rad, and the sigma of a sample as stated at first
+        """
+        sigmas, noise = self._network.sigmas, self._network.pose_noise
+        image, vibration = max(float(np.sqrt(variance)) / sigma_px, 1.0), 0.0
+        if self._shared > VIBRATES and image > np.hypot(1.0, LEAST_VIBRATION):
+            image, vibration = 1.0, pixel * sigma_px * float(np.sqrt(image**2 - 1.0))
+        before = np.array([sigmas.image, noise.vibration / pixel / sigma_px])
+        now = np.array([image, vibration / pixel / sigma_px])
         little = np.abs(now - before).max() < (CHANGED - 1.0) * np.hypot(*before)
-        if (now == before).all() or (little and image > 1.0):
+        if (now == before).all() or (little and now.max() > 1.0):
             return False
         sigmas.image, noise.vibration = image, vibration
         sigmas.version += 1
@@ -245,52 +286,97 @@ class SigmaCheck:
         return lines
 
 
-def _likely(
-    strip: WindowStrip, state: WindowState, pair: tuple[int, int], present: tuple[float, float]
-) -> tuple[float, float]:
-    """Factors of errors of position and attitude of one kind, by the likelihood of the data under a bank of them.
+@dataclass(frozen=True)
+class _Noise:
+    """What the looks in the window say, and the noise that is stated of them.
 
-    Whether a position is off or an attitude shows in the images by little. So each pair of factors is weighed by its
-    restricted likelihood, and variances are averaged: where the data cannot tell, both are larger, and no sigma is too
-    small. Minus twice the logarithm of the likelihood is ``log det N + sum 2 m log f - n' N^-1 n``, with m equations of
-    a group. Each pair costs a factorisation, and most of the bank is far from likely: the search goes from the factors
-    in force to neighbours as long as they count.
+    Attributes
+    ----------
+    variance : of a sample, pixels squared, with the vibration of the attitude
+    pixel, sigma_px : angle that a pixel subtends, rad, and the sigma of a sample as stated at first
+    rows, square : their observations less object coordinates, and the squares of these where all unknowns are zero
+    matrix, rhs : (n, n), (n,) normal equations
+    """
+
+    variance: float
+    pixel: float
+    sigma_px: float
+    rows: int
+    square: float
+    matrix: Array
+    rhs: Array
+
+
+def _likely(
+    strip: WindowStrip,
+    state: WindowState,
+    pair: tuple[int, int],
+    present: tuple[float, float],
+    noise: _Noise | None = None,
+) -> tuple[float, float, float]:
+    """Factors of errors of position and attitude of one kind, and what the noise of looks is to be multiplied by, from
+    the likelihood of the data under a bank of them.
+
+    Whether a position is off, or an attitude, or the looks are less good shows in the images by little. So each choice
+    of factors is weighed by its restricted likelihood, and variances are averaged: where the data cannot tell, all are
+    larger, and no sigma is too small. Minus twice the logarithm of the likelihood is ``log det N + sum 2 m log f + q -
+    n' N^-1 n``, with m equations of a group and the squares q of the looks at unknowns of zero. Each choice costs a
+    factorisation, and most of the bank is far from likely: the search goes from the factors in force to neighbours as
+    long as they count.
 
     Parameters
     ----------
     pair : groups of position and attitude
     present : factors in force
+    noise : of looks; None where it stays as it is
     """
     (A, a, now_a), (B, b, now_b) = (strip.apriori_information(g, state) for g in pair)
     N, rhs = state.normal()
     rest = N - A / now_a**2 - B / now_b**2
 
-    def cost_of(f: float, g: float) -> float:
+    def cost_of(f: float, g: float, h: float) -> float:
+        matrix, right, of_looks = rest + A / f**2 + B / g**2, rhs, 0.0
+        if noise is not None and h > 1.0:
+            less = 1.0 - h**-2
+            matrix -= less * noise.matrix
+            right = rhs - less * noise.rhs
+            of_looks = 2.0 * noise.rows * np.log(h) - less * noise.square
         try:
-            root = np.linalg.cholesky(rest + A / f**2 + B / g**2)
+            root = np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:
             return np.inf
-        y = solve_triangular(root, rhs, lower=True, check_finite=False)
-        far = (np.log(f) ** 2 + np.log(g) ** 2) / USUAL_LOG**2
-        return float(2.0 * np.log(np.diagonal(root)).sum() + 2.0 * (a * np.log(f) + b * np.log(g)) - y @ y + far)
+        y = solve_triangular(root, right, lower=True, check_finite=False)
+        far = (np.log(f) ** 2 + np.log(g) ** 2 + np.log(h) ** 2) / USUAL_LOG**2
+        equations = 2.0 * (a * np.log(f) + b * np.log(g))
+        return float(2.0 * np.log(np.diagonal(root)).sum() + equations + of_looks - y @ y + far)
 
-    cost = np.full((len(BANK), len(BANK)), np.inf)
+    banks = BANK, BANK, NOISES if noise is not None else (1.0,)
+    most = tuple(len(bank) for bank in banks)
+    cost = np.full(most, np.inf)
     first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
-    seen, waiting, least = {first}, [first], np.inf
+    seen, waiting, least = {(*first, 0)}, [(*first, 0)], np.inf
     while waiting:
-        i, j = waiting.pop()
-        cost[i, j] = cost_of(BANK[i], BANK[j])
-        least = min(least, cost[i, j])
-        if cost[i, j] > least + COUNTS and np.isfinite(least):
+        place = waiting.pop()
+        cost[place] = cost_of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
+        least = min(least, cost[place])
+        if cost[place] > least + COUNTS and np.isfinite(least):
             continue
-        beside = {(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)} - seen
-        near = sorted(c for c in beside if min(c) >= 0 and max(c) < len(BANK))
+        beside = {(place[0] + i, place[1] + j, place[2] + k) for i, j, k in STEPS} - seen
+        near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
         seen.update(near)
         waiting.extend(near)
     weight = np.exp(-0.5 * (cost - least))
     weight /= weight.sum()
-    square = np.square(BANK)
-    return float(np.sqrt(weight.sum(axis=1) @ square)), float(np.sqrt(weight.sum(axis=0) @ square))
+    square = [
+        float(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)) for i, bank in enumerate(banks)
+    ]
+    return float(np.sqrt(square[0])), float(np.sqrt(square[1])), float(np.sqrt(square[2]))
+
+
+def _pixel_and_sigma(rays: Sequence[Rays]) -> tuple[float, float]:
+    """Angle that a pixel subtends, rad, and the sigma of a sample as it is stated now, pixels: medians of rays."""
+    pixel = np.concatenate([np.linalg.norm(r.pitch_mm, axis=1) / r.focal_length_mm for r in rays])
+    return float(np.median(pixel)), float(np.median(np.concatenate([r.sigma_sample_px for r in rays])))
 
 
 @lru_cache

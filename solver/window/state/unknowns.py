@@ -368,6 +368,10 @@ class WindowState:
             rhs[place] += own_rhs
         return matrix, rhs
 
+    def live(self) -> tuple[Array, Array]:
+        """Normal equations (n, n), (n,) of the batches alone that can still lose a ray."""
+        return self._live, self._live_rhs
+
     def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
         """Factor and values (n,) with other unknowns held at zero."""
         matrix, rhs = self.normal()

@@ -148,15 +148,15 @@ def test_looks_that_disagree_make_tests_wider(camera_network):
     rng = np.random.default_rng(1)
     check = SigmaCheck(camera_network)
     good = RIGHT * rng.chisquare(1, 100)
-    check.entered((s, 1) for s in good)
+    check.entered((s, 1, True) for s in good)
     assert camera_network.sigmas.disagreement == 1.0
-    check.entered((9.0 * s, 1) for s in good)
+    check.entered((9.0 * s, 1, True) for s in good)
     assert 2.2 < camera_network.sigmas.disagreement < 4.0
 
 
 def test_a_few_points_say_nothing(camera_network):
     check = SigmaCheck(camera_network)
-    check.entered([(100.0, 3)] * (ENOUGH - 1))
+    check.entered([(100.0, 3, True)] * (ENOUGH - 1))
     assert camera_network.sigmas.disagreement == 1.0
 
 
