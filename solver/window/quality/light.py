@@ -12,7 +12,7 @@ became of the strip as a whole, until the next one begins.
 from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,8 @@ GOOD, WEAK, FAILED = "good", "weak", "failed"
 #: sigma0 over the window above which observations and a-priori sigmas contradict each other, if it is beyond its
 #: chi-square limit of this probability, which alone makes the light weak (tuned); and the redundancy needed to say so.
 CONTRADICTION, BY_CHANCE, CONTRADICTION_REDUNDANCY = 1.5, 1e-6, 30
-#: Looks that disagree by so much more than all sigmas allow, and constant errors of the trajectory that are so many
-#: times as large as stated, make the light weak (tuned).
+#: Looks that disagree by so much more than all sigmas allow, and errors of the trajectory that are so many times as
+#: large as stated, make the light weak (tuned).
 DISAGREE, DOUBTED = 1.3, 2.0
 #: Share of the points in the window without a ray left that says the same, and the points needed to say so (tuned).
 MOSTLY_REFUSED, ENOUGH_POINTS = 0.5, 20
@@ -79,7 +79,8 @@ class QualityFindings:
     ground_sigma_m, ground_protection_m : (4,) of the same on the ground, see `ground`; none where it is not known
     alert_limit_m : what protection levels on the ground stay below if the light is good; inf before the ground is seen
     standing : of the additional parameters
-    disagreement, constants : see `SigmaFactors`; the latter of offset, and of shift and drift
+    disagreement, trajectory : see `SigmaFactors`; the latter of offset, of shift and drift, and of the wander of
+        position: that of the attitude shows in the images, and its sigma is what these say
     light, reason : that are shown, see `LightDisplay`
     events : for the operator
     held_by : what holds the datum where no control is in the window
@@ -107,7 +108,7 @@ class QualityFindings:
     alert_limit_m: float
     standing: tuple[Standing, ...] = ()
     disagreement: float = 1.0
-    constants: tuple[float, float] = (1.0, 1.0)
+    trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
     light: str = GOOD
     reason: str = ""
     events: tuple[str, ...] = ()
@@ -142,7 +143,7 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
         return WEAK, f"observations disagree more than sigmas say: sigma0 {s.fit.sigma0:.2f}, by chance {chance:.2f}"
     if s.disagreement > DISAGREE:
         return WEAK, f"new looks disagree {s.disagreement:.1f} times as much as sigmas say, which are being questioned"
-    names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.constants, strict=False) if f > DOUBTED]
+    names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if names:
         return WEAK, f"the trajectory is worse than stated: {', '.join(names)}"
     return None
@@ -227,7 +228,8 @@ HOLD_S = 3.0
 WORDS_S, KIND_S = 5.0, 1.0
 #: A strip is good if this share of its final orientation is within the alert limit (tuned).
 GOOD_SHARE = 0.9
-#: A strip has failed that contradicted itself for this share of its time, or at its end (tuned).
+#: A strip has failed that contradicted itself for this share of its time, or at its end; its trajectory is in doubt if
+#: it was for so long (tuned).
 LONG = 0.1
 COLOURS = (GOOD, WEAK, FAILED)
 
@@ -248,6 +250,8 @@ class StripRecord:
     looks : how often the light was decided, by colour
     failure : why, the last time
     last : what was found last
+    doubted, trajectory : how often its trajectory was worse than stated, and by how much at most, see
+        `QualityFindings`; what was so for a while is in the strip as a whole
     on_gnss : what of the datum rested on GNSS at the last look, "" if ever nothing did
     weak_for : looks, by reason without its figures
     words : of these reasons
@@ -261,6 +265,8 @@ class StripRecord:
     looks: Counter[str] = field(default_factory=Counter[str])
     failure: str = ""
     last: QualityFindings | None = None
+    doubted: int = 0
+    trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
     on_gnss: str | None = None
     weak_for: Counter[str] = field(default_factory=Counter[str])
     words: dict[str, str] = field(default_factory=dict)
@@ -270,6 +276,9 @@ class StripRecord:
         """Remember what the light said in flight."""
         self.looks[colour] += 1
         self.last = s
+        self.doubted += max(s.trajectory) > DOUBTED
+        a, b, c = np.maximum(self.trajectory, s.trajectory).tolist()
+        self.trajectory = a, b, c
         if s.free is not None:
             self.free = max(self.free or 0, s.free)
         if self.on_gnss != "":
@@ -294,7 +303,10 @@ class StripRecord:
     def verdict(self, strip: str) -> tuple[str, str]:
         """Colour and reason for the strip of this name as a whole."""
         over = f"strip {strip} over"
-        doubt = contradiction(self.last) if self.last is not None else None
+        last = self.last
+        if last is not None and self.doubted > LONG * self.looks.total():
+            last = replace(last, trajectory=self.trajectory)
+        doubt = contradiction(last) if last is not None else None
         failed = self.looks[FAILED] / max(self.looks.total(), 1)
         if failed > LONG and (doubt is None or doubt[0] != FAILED):
             return FAILED, f"{over}: {self.failure} (for {100 * failed:.0f} % of its time)"

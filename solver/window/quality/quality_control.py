@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...models.base import OFFSET, POSITION_WANDER, SHIFT
 from ..datum.control import ControlTests
 from ..datum.surface import SurfaceTests
 from ..results import RefinedOrientation, WindowOptions
@@ -96,6 +97,7 @@ class QualityControl:
         rays = np.concatenate([np.empty(0, np.int64), *left])
         tied = int((rays >= 2).sum())
         known = np.concatenate([np.empty((0, 3)), *(b.control.weight for b in batches)]) > 0
+        a, b, c = network.sigmas.apriori[[OFFSET, SHIFT, POSITION_WANDER]].tolist()
         found = QualityFindings(
             strip="" if strip is None else strip.id,
             length_s=length_s,
@@ -121,7 +123,7 @@ class QualityControl:
             alert_limit_m=self._alert_limit_m,
             standing=() if self._parameters is None else self._parameters.standing,
             disagreement=float(network.sigmas.disagreement),
-            constants=(float(network.sigmas.apriori[0]), float(network.sigmas.apriori[1])),
+            trajectory=(a, b, c),
         )
         light, reason = self._display.look(now_s, found)
         self.last = replace(found, light=light, reason=reason)

@@ -6,7 +6,8 @@ after the other and keep a model that is wrong. Two quantities prevent that:
 *Disagreement.* Each point that comes is compared with the orientation as it is known without it, and without the look
 that disagrees most. Its weighted squares over their median under the chi-square distribution have a median of about 0.3
 over many points if all sigmas are right, also where every fifth look is a gross error. Where that of the newest points
-is clearly larger, tests of single looks are made wider by that much.
+is clearly larger, tests of single looks are made wider by that much. A strip begins with points of two looks, of which
+none can be spared; they count until there are others.
 
 *Variance components.* For each group of slow errors (`models.base.ERROR_GROUPS`) the squared residuals of its a-priori
 equations are compared with their redundancy over about the last `MEMORY_S`. Where they are significantly more, pairs of
@@ -14,8 +15,10 @@ factors on the sigmas of positions and attitudes are weighed by their restricted
 the unknowns present are stated anew, and those of all that come later. A factor falls again where the data no longer
 ask for it, and never below 1: a trajectory that is stated too good costs much, one that is stated too bad next to
 nothing. The image has a factor, too: from the median of squared normalised residuals, which gross errors do not move
-much. What looks at different points, taken at nearly the same time, have in common of these residuals is no noise of
-the image: the attitude vibrates. That part is stated as noise of the attitude, so that the orientation says it, too.
+much. Few looks with much noise look as if the trajectory wandered, and a wander that is stated so large would follow
+their noise from then on. So before one is stated larger, noise of looks is a third factor of the bank. Where looks at
+different points, taken at nearly the same time, have much of it in common it is no noise of the image: the attitude
+vibrates. It is stated as noise of the attitude then, so that the orientation says it, too.
 
 Source: W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, AVN 86, 1979; restricted
 likelihood: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin geodesique 60, 1986.

@@ -45,6 +45,7 @@ NONE = np.empty(0)
 OFF = replace(FINE, ground_protection_m=np.full(4, 2.0))
 OVER = replace(FINE, strip="", control=np.zeros(3), exposure=None, ground_protection_m=NONE, ground_sigma_m=NONE)
 TORN = replace(FINE, fit=replace(FINE.fit, sigma0=2.0))
+STEPPED = replace(FINE, trajectory=(1.0, 1.0, 3.4))
 
 
 # ---- on the ground
@@ -191,6 +192,7 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"ground_protection_m": np.full(4, np.nan)}, WEAK, "not known yet"),
         ({"ground_protection_m": NONE}, WEAK, "not known yet"),
         ({"tied": 1}, WEAK, "too few tie points within 40 s: 1 are seen twice, wanted 6"),
+        ({"trajectory": (2.5, 1.0, 1.9)}, WEAK, "the trajectory is worse than stated: offset 2.5 times"),
     ],
 )  # fmt: skip
 def test_the_light_says_why(change, colour, words):
@@ -257,6 +259,9 @@ def test_before_the_first_strip_there_is_nothing_to_say():
         ([FINE] * 10 + [TORN] * 4 + [FINE] * 6, 0.5, FAILED, "sigma0 2.0 (for 20 % of its time)"),
         ([FINE] * 19 + [TORN] + [FINE] * 20, 0.5, GOOD, "strip S1 over"),  # a moment only
         ([replace(FINE, control_doubt="GCP2 Z refused")] * 20, 0.5, WEAK, "strip S1 over: GCP2 Z refused"),
+        # a step of the GNSS on the way stays in the strip, a moment does not
+        ([FINE] * 10 + [STEPPED] * 4 + [FINE] * 6, 0.5, WEAK, "worse than stated: wander of position 3.4 times"),
+        ([FINE] * 19 + [STEPPED] + [FINE] * 20, 0.5, GOOD, "strip S1 over"),
         (
             [replace(FINE, control=np.zeros(3), exposure=replace(CALM, sigma=np.full(6, 0.9)))] * 20, 0.5,
             WEAK, "strip S1 over: no control within 25 s; position and height datum rest on GNSS",

@@ -12,7 +12,13 @@ from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
 from triline.solver.simulation.scenario import simulate
-from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
+from triline.solver.simulation.window_study import (
+    adjust_online,
+    direct_points,
+    navigate,
+    orientation_errors,
+    point_errors,
+)
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
 from triline.solver.window.screening.sigma_check import ENOUGH, RIGHT, SigmaCheck
 from triline.solver.window.state.network import LiveNetwork
@@ -75,6 +81,19 @@ def test_a_datum_difference_is_told_with_its_sigma():
     assert lines and all("+-" in line and "is published in the datum of control" in line for line in lines)
     assert not [name for r in online.reports for name in r.quality.names]  # no healthy source is accused
     assert all(r.quality.light != "good" for r in online.reports[-20:])
+
+
+def test_vibration_is_not_taken_for_a_wander():
+    """Before, the wander was stated up to 60 times as large, and a tenth of the looks rejected."""
+    simulation, online = flown("sine-fast")
+    assert any("vibrates" in event for event in online.events)
+    assert rejected(online) < 0.02 * len(simulation.images)
+    points = point_errors(simulation, online.whole_points)
+    direct = float(np.sqrt((direct_points(simulation, navigate(simulation)).error ** 2).sum(axis=1).mean()))
+    assert 0.3 * direct < rmse("sine-fast") < 1.1 * direct
+    assert 0.6 < points.nees.mean() < 1.6
+    assert 0.5 < orientation_errors(simulation, online.whole).nees.mean() < 2.0
+    assert max(r.quality.trajectory[2] for r in online.reports[len(online.reports) // 2 :]) < 3.0
 
 
 @pytest.mark.study
@@ -152,6 +171,19 @@ def test_looks_that_disagree_make_tests_wider(camera_network):
     assert camera_network.sigmas.disagreement == 1.0
     check.entered((9.0 * s, 1, True) for s in good)
     assert 2.2 < camera_network.sigmas.disagreement < 4.0
+
+
+def test_points_of_two_looks_tell_until_there_are_others(camera_network):
+    """Of them no look can be spared: they disagree three times as much where nothing is wrong."""
+    rng = np.random.default_rng(1)
+    check = SigmaCheck(camera_network)
+    of_two = rng.chisquare(1, 40)
+    check.entered((s, 1, False) for s in of_two)
+    assert camera_network.sigmas.disagreement == 1.0
+    check.entered((9.0 * s, 1, False) for s in rng.chisquare(1, 60))
+    assert 2.2 < camera_network.sigmas.disagreement < 4.0
+    check.entered((RIGHT * s, 1, True) for s in rng.chisquare(1, ENOUGH))
+    assert camera_network.sigmas.disagreement == 1.0
 
 
 def test_a_few_points_say_nothing(camera_network):
