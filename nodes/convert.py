@@ -28,6 +28,11 @@ Array = NDArray[np.floating]
 
 SECOND_NS = 1_000_000_000
 LOCAL_FRAME_ID = "local"
+#: Lines a second that a line camera can have; memory for lines is taken by it.
+LINE_RATES_HZ = (0.01, 100_000.0)
+#: Longest strip, s, and how far its first line may lie before or after the message that tells it: what goes beyond is
+#: no flight, and unknowns for all of it would take the memory and the time of the others.
+LONGEST_STRIP_S = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,23 @@ def pose_message(
         v = message.velocity
         v.x, v.y, v.z = np.asarray(velocity_l, dtype=float).tolist()
     return message
+
+
+def check_strip(body: Any, stamp_ns: int) -> None:
+    """Whether a strip can be used.
+
+    Raises
+    ------
+    ValueError : no name, a line rate that no camera has, more than a day long, or more than a day from ``stamp_ns``
+    """
+    slow, fast = LINE_RATES_HZ
+    if not body.id or not slow <= body.line_rate_hz <= fast:
+        raise ValueError(f"strip {body.id!r} with {body.line_rate_hz:g} lines a second, wanted {slow:g} to {fast:g}")
+    if not 0 <= body.lines <= LONGEST_STRIP_S * body.line_rate_hz:
+        raise ValueError(f"strip {body.id!r} of {body.lines} lines, {body.line_rate_hz:g} a second: more than a day")
+    away_s = (body.first_line_time_ns - stamp_ns) / SECOND_NS
+    if abs(away_s) > LONGEST_STRIP_S:
+        raise ValueError(f"strip {body.id!r} that begins {away_s:.0f} s after its message")
 
 
 def pose_sample(message: Any) -> PoseSample:

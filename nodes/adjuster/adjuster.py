@@ -30,9 +30,9 @@ APRIORI = ("trajectory", "project")
 PACES = ("load", "normal", "throughput")
 #: Platform time between updates at the pace for throughput, s.
 THROUGHPUT_S = 5.0
-#: Longest strip, s, and how far the time of a pose can be after the stamp of its message, s: what goes beyond is
-#: no flight, and unknowns for all of it would take the memory and the time of the others.
-LONGEST_STRIP_S, POSE_AHEAD_S = 86_400.0, 60.0
+#: How far the time of a pose can be after the stamp of its message, s: what goes beyond is no flight, and unknowns for
+#: all of it would take the memory and the time of the others.
+POSE_AHEAD_S = 60.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -244,7 +244,7 @@ class Adjuster(Node):
         elif topic == "observation/verdict":
             return self._verdict(body)
         elif topic == "configuration/strip":
-            return self._strip(body)
+            return self._strip(body, message.stamp_ns)
         elif topic in ("configuration/project", "configuration/camera"):
             return self._configure(topic, body, message.stamp_ns)
         return []
@@ -292,13 +292,8 @@ class Adjuster(Node):
         said = f"tie points lie on {self._elevation.path.name} +- {surface.sigma_m:g} m"
         return surface, [self._log(f"{said}, all of it +- {surface.shift_sigma_m:g} m")]
 
-    def _strip(self, body: Any) -> list[Message]:
-        if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
-            raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
-        if not 0 <= body.lines <= LONGEST_STRIP_S * body.line_rate_hz:
-            raise ValueError(
-                f"strip {body.id!r} of {body.lines} lines, {body.line_rate_hz:g} a second: more than a day"
-            )
+    def _strip(self, body: Any, stamp_ns: int) -> list[Message]:
+        convert.check_strip(body, stamp_ns)
         known = self._strips.bodies.get(body.id)
         if known is not None and known.ended and body.ended:
             return []

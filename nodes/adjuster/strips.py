@@ -77,7 +77,6 @@ class AdjustedStrips:
                 self._held[body.id] = body
                 return
             self._slow.add(first_s, slow)
-            self._stated[body.id] = slow, slow
             late_s = self.poses.first_known_s - first_s
             if REACHED_BACK_S < late_s < np.inf:
                 joined_s = self.poses.first_known_s - REACHED_BACK_S
@@ -85,7 +84,10 @@ class AdjustedStrips:
                     f"strip {body.id} is joined {late_s:.0f} s after its first line: what was flown before that is "
                     "not adjusted, neither final nor whole"
                 )
+        known = body.id in window.strips
         window.begin_strip(body.id, first_s, body.line_rate_hz, int(body.lines), slow, joined_s)
+        if self._by_poses and not known:  # a strip that the window refused is not followed
+            self._stated[body.id] = slow, slow
         if body.ended:
             window.end_strip(body.id, int(body.lines))
 

@@ -16,7 +16,7 @@ from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matr
 from ...solver.geometry.trajectory import Trajectory
 from ..errors import UserError
 from .camera_json import read_camera
-from .keys import Keys, read_toml
+from .keys import Keys, is_there, read_toml
 from .place_columns import PLACE, check_place_units, place_column
 from .projection import missing_grids
 from .table import Column, Table, one_line, read_table
@@ -298,8 +298,8 @@ def _strips(
 
 
 def _line_times(path: Path, refuse, notes: list[str]) -> NDArray[np.float64]:
-    if not path.is_file():
-        raise refuse("line_times", f"no file {path.name!r} beside it")
+    if not (is_there(path) and path.is_file()):
+        raise refuse("line_times", f"no file {path.name[:60]!r} beside it")
     table = read_table(path, _LINE_TIMES, notes)
     line, time = table["line"], table["time_s"]
     if len(line) < 2:

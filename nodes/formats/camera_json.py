@@ -11,9 +11,11 @@ import numpy as np
 from ...solver.camera.line_camera import CcdLine, Lens, LineCamera
 from ...solver.camera.sensors import line_from_parameters
 from ..errors import UserError
-from .keys import Keys, read_json
+from .keys import Keys, is_there, read_json
 from .table import Column, read_table, write_table
 
+#: The most pixels of a CCD line, ten times those of the longest lines that are built.
+MOST_PIXELS = 1_000_000
 _TABLE = (Column("sample", "integer", low=0), Column("x_mm"), Column("y_mm"))
 
 
@@ -109,7 +111,7 @@ def _line(keys: Keys, lenses: dict[str, Lens], notes: list[str]) -> CcdLine:
         if keys.has("pixels") and keys.integer("pixels", low=2) != len(xy):
             raise keys.refuse("pixels", f"{len(xy)}, the number of samples in {keys.text('table')}")
         return CcdLine(id, lens, xy, _chips(keys, len(xy)))
-    pixels = keys.integer("pixels", low=2)
+    pixels = keys.integer("pixels", low=2, high=MOST_PIXELS)
     centre = keys.numbers("center_mm", 2)
     return line_from_parameters(
         id,
@@ -131,8 +133,8 @@ def _chips(keys: Keys, pixels: int) -> tuple[int, ...]:
 
 
 def _read_table(path: Path, keys: Keys, notes: list[str]) -> np.ndarray:
-    if not path.is_file():
-        raise UserError(f"{keys.path}: {keys.name('table')}: no file {path.name!r} beside it")
+    if not (is_there(path) and path.is_file()):
+        raise UserError(f"{keys.path}: {keys.name('table')}: no file {path.name[:60]!r} beside it")
     table = read_table(path, _TABLE, notes)
     sample = table["sample"]
     if len(sample) < 2:

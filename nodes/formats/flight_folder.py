@@ -30,7 +30,7 @@ from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
-from .keys import Keys, read_toml
+from .keys import Keys, is_there, read_toml
 from .projection import missing_grids
 from .sensor_folder import read_grade
 from .time_columns import instant_ns
@@ -359,8 +359,8 @@ def _datum(keys: Keys) -> str:
 def _beside(flight: Flight, keys: Keys, key: str, text: str) -> Path:
     """A file by its name in the folder."""
     path = flight.folder / text
-    if not path.exists():
-        raise UserError(f"{keys.path}: {keys.name(key)}: no {text} in the folder")
+    if not is_there(path):
+        raise UserError(f"{keys.path}: {keys.name(key)}: no {text[:200]} in the folder")
     return path
 
 

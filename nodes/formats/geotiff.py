@@ -19,6 +19,7 @@ from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
 from .new_file import new_file
+from .raster_open import open_raster
 
 Array = NDArray[np.floating]
 
@@ -63,26 +64,23 @@ def read_heights(path: Path) -> Heights:
     ------
     UserError : not there, not a raster, without CRS, turned, too large, or without a single height
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
 
     if not path.exists():
         raise UserError(f"{path}: no such file")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                if source.crs is None:
-                    raise UserError(f"{path}: has no coordinate reference system")
-                t = source.transform
-                if t.b or t.d:
-                    raise UserError(f"{path}: is turned, wanted a raster along its axes")
-                if source.width * source.height > MOST_HEIGHTS:
-                    size = f"{source.width} x {source.height}"
-                    raise UserError(f"{path}: {size} heights are too many, wanted at most {MOST_HEIGHTS:.0e}")
-                band = source.read(1, masked=True)
-                crs = source.crs.to_wkt()
-                ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
+        with open_raster(path) as source:
+            if source.crs is None:
+                raise UserError(f"{path}: has no coordinate reference system")
+            t = source.transform
+            if t.b or t.d:
+                raise UserError(f"{path}: is turned, wanted a raster along its axes")
+            if source.width * source.height > MOST_HEIGHTS:
+                size = f"{source.width} x {source.height}"
+                raise UserError(f"{path}: {size} heights are too many, wanted at most {MOST_HEIGHTS:.0e}")
+            band = source.read(1, masked=True)
+            crs = source.crs.to_wkt()
+            ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
     except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
     z = np.ma.filled(band.astype(float), np.nan)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ from numpy.typing import NDArray
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.rectification.terrain import bilinear
 from ..errors import UserError
+from .keys import is_there
+from .raster_open import open_raster
 
 Array = NDArray[np.floating]
 
@@ -39,7 +40,7 @@ class RasterFile:
 
         self.path = path
         self._local = threading.local()
-        if not path.exists():
+        if not is_there(path):
             raise UserError(f"{path}: no such file")
         try:
             source = self.source
@@ -51,13 +52,8 @@ class RasterFile:
     @property
     def source(self) -> Any:
         """The dataset of this thread."""
-        import rasterio
-        from rasterio.errors import NotGeoreferencedWarning
-
         if not hasattr(self._local, "source"):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                self._local.source = rasterio.open(self.path)
+            self._local.source = open_raster(self.path)
         return self._local.source
 
 

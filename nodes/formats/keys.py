@@ -56,10 +56,10 @@ class Keys:
             raise self.refuse(key, "a number above 0" if positive else "a number")
         return float(value)
 
-    def integer(self, key: str, default: int | None = None, *, low: int = 0) -> int:
+    def integer(self, key: str, default: int | None = None, *, low: int = 0, high: int = LARGEST) -> int:
         value = self._get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= LARGEST:
-            most = f" and at most {LARGEST}" if isinstance(value, int) and value > LARGEST else ""
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            most = f" and at most {high}" if isinstance(value, int) and value > high else ""
             raise self.refuse(key, f"an integer of at least {low}{most}")
         return value
 
@@ -93,6 +93,14 @@ class Keys:
     def _get(self, key: str, default: Any) -> Any:
         self._read.add(key)
         return self.values.get(key, default)
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is a file or folder; names that the system does not take are not there."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def read_toml(path: Path) -> Keys:

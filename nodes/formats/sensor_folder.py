@@ -17,6 +17,7 @@ from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, Ine
 from ..errors import UserError
 from .keys import Keys, read_toml
 from .table import Column, Table, read_table
+from .time_columns import LATEST_S
 
 Array = NDArray[np.floating]
 
@@ -201,7 +202,14 @@ def _read_imu(path: Path, notes: list[str]) -> tuple[Array | None, Array | None,
         other = "" if increments else f" (or increments: {','.join((*DV, *DTHETA))})"
         raise UserError(f"{path}:1: {missing[0]}: column missing, wanted time_s,{','.join(wanted)}{other}")
     force, rotation = table.stack(*wanted[:3]), table.stack(*wanted[3:])
-    return table["time_s"], rotation, force, bool(increments)
+    return _times(table), rotation, force, bool(increments)
+
+
+def _times(table: Table) -> Array:
+    """Times of the rows, s; those of which ns do not fit into 64 bits are refused."""
+    seconds = table["time_s"]
+    table.refuse(~(np.abs(seconds) < LATEST_S), "time_s", lambda i: f"{seconds[i]:.6g}, wanted seconds")
+    return seconds
 
 
 def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
@@ -221,7 +229,7 @@ def _read_gnss(path: Path, notes: list[str]) -> GnssData | None:
         )
         sigma_v = np.full_like(velocity, _VELOCITY_SIGMA_M_S)
     lat, lon = np.radians(position[:, 0]), np.radians(position[:, 1])
-    return GnssData(table["time_s"], lat, lon, position[:, 2], _parsed(table, SIGMA), velocity, sigma_v)
+    return GnssData(_times(table), lat, lon, position[:, 2], _parsed(table, SIGMA), velocity, sigma_v)
 
 
 def _all_there(path: Path, table: Table, names: tuple[str, ...]) -> bool:
@@ -260,7 +268,7 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
         sigma = table.stack(*SIGMA_ANGLES)
     else:
         notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg are assumed")
-    return AttitudeTable(table["time_s"], angles, np.radians(sigma))
+    return AttitudeTable(_times(table), angles, np.radians(sigma))
 
 
 def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:

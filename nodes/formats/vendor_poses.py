@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import UserError
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
-from .time_columns import same_day
+from .time_columns import LATEST_S, same_day
 from .track import NavigationTrack, checked
 
 _HEADWALL = ("Roll", "Pitch", "Yaw", "Lat", "Lon", "Alt")
@@ -83,6 +83,10 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
         raise UserError(
             one_line([f"{where}: {values[row, 1 + column]:g}, wanted radians; are they degrees?"], len(bad) - 1)
         )
+    bad = np.flatnonzero(~(np.abs(values[:, 0]) < LATEST_S))
+    if len(bad):
+        what = f"{path}:{lines[bad[0]][0]}: {_LCF[0]}: {values[bad[0], 0]:.6g}, wanted seconds since 1970-01-01 UTC"
+        raise UserError(one_line([what], len(bad) - 1))
     whole = np.floor(values[:, 0])
     time_ns = whole.astype(np.int64) * 1_000_000_000 + np.rint((values[:, 0] - whole) * 1e9).astype(np.int64)
     same_day(path, int(time_ns[0]), day)
@@ -99,8 +103,8 @@ def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     whole = pd.to_datetime([w.partition(".")[0] for w in words], format=f"%Y/{month}/%d %H:%M:%S", errors="coerce")
     instants = np.asarray(whole, dtype="datetime64[ns]")
     parts = [w.partition(".")[2] or "0" for w in words]
-    digits = np.array([part.isdigit() for part in parts])
-    fraction_ns = np.array([round(float(f"0.{p}") * 1e9) if p.isdigit() else 0 for p in parts], dtype=np.int64)
+    digits = np.array([part.isdecimal() for part in parts])
+    fraction_ns = np.array([round(float(f"0.{p}") * 1e9) if p.isdecimal() else 0 for p in parts], dtype=np.int64)
     return instants.astype(np.int64) + fraction_ns, np.flatnonzero(np.isnat(instants) | ~digits)
 
 

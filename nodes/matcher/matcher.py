@@ -183,8 +183,7 @@ class Matcher(Node):
         elif topic == "configuration/camera":
             return self._configure(body, message.stamp_ns)
         if topic == "configuration/strip":
-            if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
-                raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+            convert.check_strip(body, message.stamp_ns)
             self._strips[body.id] = body
             if body.ended and self._matcher is not None:
                 return self._ties(self._matcher.end_strip(body.id), body.id)

@@ -135,8 +135,7 @@ class Rectifier(Node):
         elif topic == "configuration/camera":
             self._configure(body, message.stamp_ns)
         elif topic == "configuration/strip":
-            if not body.id or not (np.isfinite(body.line_rate_hz) and body.line_rate_hz > 0):
-                raise ValueError(f"strip {body.id!r} with {body.line_rate_hz} lines a second")
+            convert.check_strip(body, message.stamp_ns)
             self._strips[body.id] = body
             for block in [block for _, block in self._unknown if block.strip == body.id]:
                 self._lines(block.ccd, block)

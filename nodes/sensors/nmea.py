@@ -6,6 +6,7 @@ follows from the quality and the HDOP of the GGA. Sentences are decoded by pynme
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
@@ -143,7 +144,7 @@ class NmeaParser:
         if utc_ns is not None:
             self._epoch_ns = utc_ns
             if s.spd != "" and s.cog != "":
-                speed, course = float(s.spd) * KNOT_M_S, np.radians(float(s.cog))
+                speed, course = _number(s.spd) * KNOT_M_S, np.radians(_number(s.cog))
                 self._motion = utc_ns, (float(speed * np.sin(course)), float(speed * np.cos(course)))
         return []
 
@@ -153,7 +154,7 @@ class NmeaParser:
 
     def _gst(self, s: Any) -> list[Message]:
         utc_ns = self._utc(s.time)
-        east, north, up = float(s.stdLong), float(s.stdLat), float(s.stdAlt)
+        east, north, up = _number(s.stdLong), _number(s.stdLat), _number(s.stdAlt)
         if utc_ns is not None and min(east, north, up) > 0:
             self._stated = utc_ns, (east, north, up)
         return []
@@ -179,12 +180,12 @@ class NmeaParser:
         if self._settings.velocity_sigma_m_s and self._motion is not None and self._motion[0] == utc_ns:
             level = self._settings.velocity_sigma_m_s
             velocity = (*self._motion[1], 0.0), (level, level, UNKNOWN_CLIMB_M_S)
-        place = float(s.lat), float(s.lon), float(s.alt) + float(s.sep)
+        place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
         body = gnss_message(utc_ns, place, sigma, *velocity)
         return [Message("sensor/gnss", self._settings.clock.stamp(utc_ns), body)]
 
     def _hdt(self, s: Any) -> list[Message]:
-        heading_deg = float(s.headingT)
+        heading_deg = _number(s.headingT)
         settings = self._settings
         if not settings.heading_sigma_deg or self._epoch_ns <= self._last_heading_ns:
             return []
@@ -213,8 +214,16 @@ class NmeaParser:
         """East, north, up, m."""
         if self._stated is not None and 0 <= utc_ns - self._stated[0] <= GST_HOLDS_S * SECOND_NS:
             return self._stated[1]
-        level = QUALITY_SIGMA_M[quality] * max(float(hdop or 1.0), 0.5)
+        level = QUALITY_SIGMA_M[quality] * max(_number(hdop or 1.0), 0.5)
         return level, level, 2.0 * level
+
+
+def _number(field: Any) -> float:
+    """A field as a number; raises ValueError where it is none, or not finite."""
+    value = float(field)
+    if not math.isfinite(value):
+        raise ValueError(f"{field!r} is not finite")
+    return value
 
 
 def _at(day: date, time: time_of_day) -> datetime:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 COMMON = ("id", "kind", "clock_offset_s", "delay_s", "imu_noise")
 #: Where a program waits for data it looks this often whether it shall end, s.
 LOOK_S = 0.1
+#: No clock is off by more, s: 100 years.
+_MOST_OFFSET_S = 3.2e9
 #: A strip has ended when no line has come for so long, s.
 SILENT_S = 5.0
 
@@ -44,9 +46,11 @@ class Clock:
 
         Raises
         ------
-        UserError : not numbers, a delay that is negative or above 5 s
+        UserError : not numbers, an offset of more than 100 years, a delay that is negative or above 5 s
         """
         offset_s, delay_s = keys.number("clock_offset_s", 0.0), keys.number("delay_s", 0.0)
+        if not abs(offset_s) <= _MOST_OFFSET_S:
+            raise keys.refuse("clock_offset_s", "100 years at most")
         if not 0.0 <= delay_s <= 5.0:
             raise keys.refuse("delay_s", "0 to 5 seconds")
         return cls(round(offset_s * SECOND_NS), round(delay_s * SECOND_NS))

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
-from ..convert import attitude_message, gnss_message
+from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..node import Message
@@ -38,6 +38,9 @@ RECORDS = {
 }
 #: No line of text is longer, no block of pixels larger, bytes.
 LONGEST, LARGEST = 1024, 64 << 20
+#: Later times (of the year 2261, ns since the Unix epoch) and higher numbers of lines are refused before they leave
+#: their 64 and 32 bits.
+LATEST_NS, MOST_LINES = 9_200_000_000 * SECOND_NS, 2**31
 _PIXELS = {8: np.dtype("u1"), 16: np.dtype("<u2")}
 
 
@@ -136,8 +139,8 @@ class StreamParser:
             return []
         time_ns = self._clock.utc(int(words[0]))
         values = [float(word) for word in words[1:]]
-        if not np.isfinite(values).all() or time_ns < 0:
-            raise ValueError("wanted finite values")
+        if not np.isfinite(values).all() or not 0 <= time_ns <= LATEST_NS:
+            raise ValueError("wanted finite values, and a time from 1970 to 2261")
         stamp = self._clock.stamp(time_ns)
         if kind == b"GNSS":
             return [Message("sensor/gnss", stamp, gnss_message(time_ns, values[:3], values[3:6]))]
@@ -157,10 +160,13 @@ class StreamParser:
         size = lines * samples * bits // 8
         if min(first, time_ns) < 0 or min(period_ns, lines, samples) < 1 or size > LARGEST:
             raise ValueError("wanted at least one line and sample, a period above 0, and 64 MB at most")
+        utc_ns = self._clock.utc(time_ns)
+        if utc_ns < 0 or utc_ns + lines * period_ns > LATEST_NS or first + lines > MOST_LINES:
+            raise ValueError("wanted times from 1970 to 2261, and line numbers of 32 bits")
         self._kind = _PIXELS[bits]
         empty = np.empty((0, samples), self._kind)
         ccd, strip = words[0].decode("ascii", "replace"), words[1].decode("ascii", "replace")
-        block = LineBlock(empty, ccd, strip, first, self._clock.utc(time_ns), period_ns)
+        block = LineBlock(empty, ccd, strip, first, utc_ns, period_ns)
         self._block = block, samples, size
 
 

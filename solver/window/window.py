@@ -46,6 +46,9 @@ IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0
+#: They do not so long after the newest pose, s: what is said to be now may be wrong, and unknowns for all of a time
+#: without poses would take the memory and the time of the others.
+UNKNOWNS_AHEAD_S = 60.0
 #: So long after its last look a point is in the window, s; later it is late.
 USUAL_DELAY_S = 2.0
 #: Rays tested again in one update at most, if there is more than one batch.
@@ -263,7 +266,8 @@ class Window:
         """Unknowns that the strips need by now become present."""
         for strip in self.strips.values():
             if not strip.is_over(self.state):
-                strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S), self.state)
+                known_s = max(self.trajectory.end_s, strip.first_line_time_s) + UNKNOWNS_AHEAD_S
+                strip.activate(min(self._now_s + AHEAD_S, strip.end_s + AHEAD_S, known_s), self.state)
 
     def _arrive(self, result: WindowUpdate) -> list[Batch]:
         """Points with new looks become batches."""

@@ -40,6 +40,8 @@ Array = NDArray[np.floating]
 FILES = ("ephemeris.csv", "attitude.csv", "line_times.csv", "camera.json")
 #: Words of scene.toml for the frames of the solver.
 _FRAMES = {"earth": "e", "gcrs": "i", "eme2000": "i", "orbital": "o"}
+#: No line is imaged so long before or after the epoch of its scene, s: 100 years.
+MOST_S = 3.2e9
 _TIME = (Column("time_utc", "text", optional=True), Column("time_s", optional=True))
 
 
@@ -223,6 +225,7 @@ def _stamps(table: Table, settings: _Settings) -> NDArray[np.int64]:
     if settings.epoch_ns is None:
         where = table.path.parent / "scene.toml"
         raise UserError(f"{where}: time.epoch: missing, wanted the time from which time_s of {table.path.name} counts")
+    table.refuse(~(np.abs(table["time_s"]) < MOST_S), "time_s", lambda i: f"{table['time_s'][i]:.6g} s after the epoch")
     return settings.epoch_ns + np.round(table["time_s"] * 1e9).astype(np.int64)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...errors import UserError
+from ..keys import is_there
 from .csm_isd import read_isd
 from .dimap1 import read_dimap1
 from .dimap2 import read_dimap2
@@ -31,6 +32,8 @@ def read_scene(path: Path) -> SatelliteScene:
     ------
     UserError : one line about what is wrong, where, and what was wanted
     """
+    if not is_there(path):
+        raise UserError(f"{path}: no such file or folder")
     if path.is_dir():
         if not is_scene_folder(path):
             raise UserError(f"{path}: no satellite scene, wanted a {KINDS['folder']}")

@@ -8,7 +8,6 @@ from 1.
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from ....solver.location.rpc import RationalFunctions, Rpc
 from ...errors import UserError
 from ..new_file import new_file
+from ..raster_open import open_raster
 from .xml_file import Element, float_of
 
 #: RPC00B names of offsets and scales, in the order longitude, latitude, height, sample, line.
@@ -71,16 +71,13 @@ def read_rpc_tags(path: Path) -> Rpc:
     ------
     UserError : no image, or one without RPC
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+    from rasterio.errors import RasterioError
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as image:
-                tags, lines, samples = image.rpcs, image.height, image.width
-    except RasterioIOError as error:
-        raise UserError(f"{path}: cannot be read as an image: {error}") from None
+        with open_raster(path) as image:
+            tags, lines, samples = image.rpcs, image.height, image.width
+    except (RasterioError, ValueError) as error:  # the words of a tag may be no numbers
+        raise UserError(f"{path}: cannot be read as an image: {' '.join(str(error).split())}") from None
     if tags is None:
         raise UserError(f"{path}: an image without RPC, wanted RPC tags or a file .RPB or _RPC.TXT beside it")
     values = {

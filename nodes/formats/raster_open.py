@@ -1,0 +1,53 @@
+"""Opens rasters so that nothing but what is raised is shown of one that is damaged."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+_alone = threading.Lock()
+
+
+def open_raster(path: Path) -> Any:
+    """A dataset of rasterio, with or without georeference.
+
+    Raises
+    ------
+    rasterio.errors.RasterioError : not there, or not a raster that can be read
+    """
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    with warnings.catch_warnings(), _without_undecodable_messages():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        return rasterio.open(path)
+
+
+@contextmanager
+def _without_undecodable_messages() -> Iterator[None]:
+    """Drop messages of GDAL that quote bytes of the file which are no UTF-8.
+
+    rasterio decodes messages in a function that GDAL calls; what is raised there cannot reach a caller, and is printed
+    with a traceback, first by `sys.excepthook` and then by `sys.unraisablehook`.
+    """
+    with _alone:  # hooks belong to the process
+        shown, ignored = sys.excepthook, sys.unraisablehook
+
+        def show(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+            if not issubclass(kind, UnicodeDecodeError):
+                shown(kind, error, trace)
+
+        def ignore(error: Any) -> None:
+            if not issubclass(error.exc_type, UnicodeDecodeError):
+                ignored(error)
+
+        sys.excepthook, sys.unraisablehook = show, ignore
+        try:
+            yield
+        finally:
+            sys.excepthook, sys.unraisablehook = shown, ignored
