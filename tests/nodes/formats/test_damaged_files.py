@@ -46,7 +46,7 @@ def _lines(path: Path, n: int) -> bytes:
     return b"\n".join(path.read_bytes().split(b"\n")[:n])
 
 
-def _samples(folder: Path) -> dict[str, bytes]:
+def small_files(folder: Path) -> dict[str, bytes]:
     """Small whole files of every kind."""
     csv = "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n"
     found = {
@@ -82,7 +82,7 @@ def _read(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
-    return _samples(tmp_path_factory.mktemp("samples"))
+    return small_files(tmp_path_factory.mktemp("samples"))
 
 
 _NAMES = [

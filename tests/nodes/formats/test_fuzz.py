@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
 import time
+import warnings
+from dataclasses import replace
+from functools import partial
 
 import fuzzing
 import pytest
-from fuzzing import Campaign, NodeTarget, edited, file_targets, run_files, run_nmea, run_node, sentence_of
+from fuzzing import Campaign, NodeTarget, edited, file_targets, run_files, run_node, run_sentences, sentence_of
 
 from triline.nodes.errors import UserError
 
@@ -34,7 +40,7 @@ def test_good_files_are_read(targets):
 def test_changed_files_are_read_or_refused_in_one_line(targets):
     campaign = Campaign()
     for target in targets:
-        run_files(campaign, target, 12, 3, time.monotonic() + 600)
+        run_files(campaign, target, 12, 3, time.process_time() + 600)
     assert not found(campaign)
     assert campaign.refused.total() > 0.5 * campaign.cases.total() > 100
 
@@ -55,16 +61,17 @@ def test_checksums_are_right_so_that_the_inside_is_reached(targets):
     assert inside > with_damage  # the chunk is read; without its checksum it is left out
 
 
-def test_sentences_with_right_checksums_are_read_or_counted():
+@pytest.mark.parametrize("name", fuzzing.SENTENCES)
+def test_sentences_with_right_checksums_are_read_or_counted(name):
     campaign = Campaign()
-    run_nmea(campaign, 300, 3, time.monotonic() + 600)
-    assert not found(campaign) and campaign.cases["NMEA"] == 300
+    run_sentences(campaign, name, 300, 3, time.process_time() + 600)
+    assert not found(campaign) and campaign.cases[name] == 300
 
 
 @pytest.mark.parametrize("name", fuzzing.node_names())
 def test_nodes_live_through_hostile_messages(name):
     campaign = Campaign()
-    run_node(campaign, NodeTarget(name), 300, 3, time.monotonic() + 600)
+    run_node(campaign, NodeTarget(name), 300, 3, time.process_time() + 600)
     assert not found(campaign) and campaign.cases[name] >= 300
 
 
@@ -86,6 +93,53 @@ def test_the_campaign_finds_what_is_wrong():
     assert sorted(f.times for f in campaign.findings.values()) == [1, 2]
 
 
+def test_cases_that_hang_or_take_memory_are_ended_and_found(monkeypatch):
+    monkeypatch.setattr(fuzzing, "LONGEST_S", 0.2)
+    monkeypatch.setattr(fuzzing, "STOP_S", 0.5)
+    campaign = Campaign()
+
+    def endless() -> None:
+        while True:
+            sum(range(1000))
+
+    assert not campaign.run("x", b"endless", endless)
+    assert campaign.run("y", b"large", lambda: bytes(bytearray(200_000_000)))
+    hangs = next(f for f in campaign.findings.values() if f.target == "x")
+    assert "hangs" in hangs.what and "stopped" in hangs.what and hangs.example == b"endless"
+    assert (
+        any(f.what.startswith("memory beyond") for f in campaign.findings.values())
+        and 150e6 < campaign.most_bytes["y"] < 1e9
+    )
+
+
+def test_what_a_terminal_would_show_beside_the_one_line_is_found():
+    campaign = Campaign()
+
+    class Ignored:
+        def __del__(self) -> None:
+            raise KeyError("traceback out of a library")
+
+    campaign.run("x", b"1", lambda: warnings.warn("of numbers", RuntimeWarning, stacklevel=1))
+    campaign.run("x", b"2", lambda: warnings.warn("of numbers", RuntimeWarning, stacklevel=1), quiet=True)
+    campaign.run("x", b"3", lambda: Ignored() and None)
+    assert [f.example for f in campaign.findings.values()] == [b"1", b"3"]
+
+
+def test_a_process_that_dies_is_a_finding_and_the_next_one_goes_on():
+    campaign = Campaign()
+
+    def work(part: Campaign, cases: int, number: int) -> None:
+        for k in range(cases):
+            number_of_signal = signal.SIGKILL if number == 3 and k == 2 else 0
+            part.run("x", f"{number} {k}".encode(), partial(os.kill, os.getpid(), number_of_signal))
+        part.run("memory", b"24 GB", lambda: bytearray(24_000_000_000))
+
+    fuzzing.in_a_process(campaign, "x", work, 5, 3)
+    died, memory = campaign.findings.values()
+    assert "SIGKILL" in died.what and died.example == b"3 2" and campaign.cases["x"] == 5
+    assert memory.what.startswith("MemoryError")  # by the bound of the address space
+
+
 def test_changes_and_checksums():
     assert edited(b"a,1,b\n", [(6, 0.3, 0.0, b"")]) == b"a,nan,b\n"
     assert edited(b"a\nb\n", [(4, 0.0, 0.0, b"")]) == b"a\na\nb\n"
@@ -105,3 +159,136 @@ def test_a_year_too_large_for_a_date_is_no_sentence():
     )
     assert parser.feed(sentence_of(b"GNZDA,092750.00,22,11,9223372036854775808,00,00")) == []
     assert campaign.cases["field missing"] == 1
+
+
+def _json(target, change):
+    content = json.loads(target.good)
+    change(content)
+    return json.dumps(content).encode()
+
+
+def _pixels(camera):
+    camera["lines"][0]["pixels"] = 2**31
+
+
+def _table(camera):
+    camera["lines"][0]["table"] = "9" * 400
+
+
+def _found_times(target):
+    """The good file, with a time that does not fit into 64 bits in its second row."""
+    head, first, _, *rest = target.good.split(b"\n")
+    return b"\n".join([head, first, b"1e18" + first[first.index(b"," if b"," in first else b"\t") :], *rest])
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("camera.json", lambda t: _json(t, _pixels), r"lines\[0\].pixels: 2147483648, wanted .* at most 1000000"),
+        ("block: camera.json", lambda t: _json(t, _pixels), r"lines\[0\].pixels: 2147483648, wanted"),
+        ("scene folder: camera.json", lambda t: _json(t, _table), r"lines\[0\].table: no file '999"),
+        ("Resonon poses", _found_times, r"flight.lcf:3: time: 1e\+18, wanted seconds since 1970"),
+        ("sensor folder: imu.csv", _found_times, r"imu.csv:3: time_s: 1e\+18, wanted seconds"),
+        ("sensor folder: gnss.csv", _found_times, r"gnss.csv:3: time_s: 1e\+18, wanted seconds"),
+    ],
+)
+def test_files_that_the_campaign_found(targets, name, change, said):
+    target = next(t for t in targets if t.name == name)
+    campaign = Campaign()
+    data = change(target)
+    try:
+        target.path.write_bytes(data)
+        campaign.run(name, data, target.read, len(target.good))
+        with pytest.raises(UserError, match=said):
+            target.read()
+    finally:
+        target.path.write_bytes(target.good)
+    assert not found(campaign) and campaign.refused[name] == 1
+
+
+def test_a_damaged_tiff_shows_no_traceback_of_a_library(targets):
+    tiff = next(t for t in targets if t.name == "TIFF lines")
+    campaign = Campaign()
+    try:
+        for place in range(8, 200):  # among its tags, GDAL quotes some of them
+            data = tiff.good[:place] + b"\x8d\xff" + tiff.good[place + 2 :]
+            tiff.path.write_bytes(data)
+            campaign.run(tiff.name, data, tiff.read, len(tiff.good))
+    finally:
+        tiff.path.write_bytes(tiff.good)
+    assert not found(campaign) and campaign.refused[tiff.name] > 10
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        b"LINES N S1 40 9223372036854775808 5000000 1 1 8\n\x07",
+        b"LINES N S1 40 9199999999999999999 5000000000000 1 1 8\n\x07",
+        b"LINES N S1 4294967295 1795339670000000000 5000000 1 1 8\n\x07",
+        b"GNSS 9223372036854775808 47.9 11.1 1500 0.02 0.03 0.05\n",
+    ],
+)
+def test_records_whose_times_do_not_fit_into_64_bits_are_counted(record):
+    counts: list[str] = []
+    parser = fuzzing.StreamParser(fuzzing.Clock(), lambda kind, text: counts.append(kind))
+    assert not [x for x in parser.feed(record) if x.topic != ""] and "not readable" in counts
+
+
+def _strip(**changes):
+    """The strip of the flight that nodes are given, changed."""
+    message = next(x for x in fuzzing.flown() if x.topic == "configuration/strip")
+    body = type(message.body)()
+    body.CopyFrom(message.body)
+    for name, value in changes.items():
+        setattr(body, name, value)
+    return replace(message, body=body)
+
+
+@pytest.mark.parametrize("name", ["matcher", "adjuster", "rectifier"])
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"line_rate_hz": 2147483647.0}, "2.14748e+09 lines a second, wanted 0.01 to 100000"),
+        ({"line_rate_hz": 1e-300}, "1e-300 lines a second"),
+        ({"line_rate_hz": float("nan")}, "nan lines a second"),
+        ({"first_line_time_ns": 0}, "s after its message"),
+        ({"lines": 2**31 - 1}, "more than a day"),
+    ],
+)
+def test_strips_of_no_flight_take_no_memory(name, changes, said):
+    node = fuzzing._made(name)
+    for message in fuzzing.flown():
+        if message.topic in ("configuration/project", "configuration/camera"):
+            list(node.step(message))
+    list(node.step(_strip(**changes)))
+    assert node.counters["malformed"] == 1 and said in node.last_problem
+
+
+def test_a_message_stamped_an_hour_ahead_takes_no_unknowns_for_the_hour():
+    node = fuzzing._made("adjuster")
+    ahead = None
+    for message in fuzzing.flown():
+        if message.topic in node.inputs:
+            list(node.step(message))
+        if message.topic == "observation/control":
+            ahead = ahead or message
+        if message.topic == "orientation/live" and message.stamp_ns > fuzzing.sample_messages.EPOCH_NS + 2 * 10**9:
+            break
+    before = len(node._window.state.numbers)
+    list(node.step(replace(ahead, stamp_ns=message.stamp_ns + 3600 * 10**9)))
+    assert before <= len(node._window.state.numbers) < before + 400 and not node.counters["failed"]
+
+
+@pytest.mark.parametrize("field", [b"1e999", b"nan", b"-inf"])
+def test_a_field_that_is_not_finite_is_counted(field):
+    counts: list[str] = []
+    keys = fuzzing.Keys(fuzzing.Path("f.toml"), {"address": "udp://:4001"}, "sensor[0]")
+    parser = fuzzing.NmeaParser(fuzzing.NmeaSettings.read(keys, fuzzing.Path()), lambda kind, text: counts.append(kind))
+    campaign = Campaign()
+    for body in (
+        b"GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00," + field + b",221126,,,A",
+        b"GNGST,092750.20,0.9,0.03,0.02,10.0," + field + b",0.034,0.055",
+        b"GNHDT," + field + b",T",
+    ):
+        campaign.run("NMEA", body, lambda body=body: parser.feed(sentence_of(body)))
+    assert not found(campaign) and counts == ["field missing"] * 3
