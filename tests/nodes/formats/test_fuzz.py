@@ -94,15 +94,16 @@ def test_the_campaign_finds_what_is_wrong():
 
 
 def test_cases_that_hang_or_take_memory_are_ended_and_found(monkeypatch):
-    monkeypatch.setattr(fuzzing, "LONGEST_S", 0.2)
-    monkeypatch.setattr(fuzzing, "STOP_S", 0.5)
     campaign = Campaign()
 
     def endless() -> None:
         while True:
             sum(range(1000))
 
-    assert not campaign.run("x", b"endless", endless)
+    with monkeypatch.context() as short:
+        short.setattr(fuzzing, "LONGEST_S", 0.2)
+        short.setattr(fuzzing, "STOP_S", 0.5)
+        assert not campaign.run("x", b"endless", endless)
     assert campaign.run("y", b"large", lambda: bytes(bytearray(200_000_000)))
     hangs = next(f for f in campaign.findings.values() if f.target == "x")
     assert "hangs" in hangs.what and "stopped" in hangs.what and hangs.example == b"endless"
