@@ -63,7 +63,10 @@ class SteadyPositions:
         self._size = n + 1
         self._open.clear()
         if n < 4:
-            self._next = int(np.floor(self._time[0] / POSITION_KNOT_S))
+            if n == 0:
+                self._next = int(np.floor(time_s / POSITION_KNOT_S))
+            elif time_s - self._time[n - 1] > 2.0 * REACH_S:  # so few before it are none about a knot
+                self._next = int(np.floor((time_s - REACH_S) / POSITION_KNOT_S))
             return
         steps = np.diff(self._time[n - 4 : n + 1])
         if np.ptp(steps) <= 0.05 * steps.mean():
