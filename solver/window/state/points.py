@@ -21,6 +21,10 @@ from .strip import WindowStrip
 Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
+#: Sigmas outside this are of no measurement, px: squares of their weights leave the range of numbers, and what is not a
+#: number in one look is in all unknowns afterwards.
+SIGMAS_PX = (1e-6, 1e9)
+
 
 @dataclass
 class ControlPoint:
@@ -154,6 +158,9 @@ class Intake:
             return "value is not finite"
         if not (look.sigma_line_px > 0 and look.sigma_sample_px > 0):
             return "sigma is not positive"
+        least, most = SIGMAS_PX
+        if not (least <= look.sigma_line_px <= most and least <= look.sigma_sample_px <= most):
+            return "sigma of no measurement"
         if look.ccd not in self._camera.line_index:
             return "unknown ccd"
         if look.strip not in self._strips:

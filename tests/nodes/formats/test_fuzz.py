@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 import fuzzing
+import numpy as np
 import pytest
 from fuzzing import Campaign, NodeTarget, edited, file_targets, run_files, run_node, run_sentences, sentence_of
 
@@ -293,3 +294,21 @@ def test_a_field_that_is_not_finite_is_counted(field):
     ):
         campaign.run("NMEA", body, lambda body=body: parser.feed(sentence_of(body)))
     assert not found(campaign) and counts == ["field missing"] * 3
+
+
+@pytest.mark.parametrize("sigma", [1e150, 1e200, 1e-300])
+def test_ties_with_sigmas_of_no_measurement_do_not_spoil_the_others(sigma):
+    node = fuzzing._made("adjuster")
+    driver, ties, final = fuzzing.StepDriver(node), 0, 0
+    for message in fuzzing.flown():
+        if message.topic not in node.inputs:
+            continue
+        if message.topic == "observation/tie":
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            body.images[0].sigma_line = body.images[0].sigma_sample = sigma
+            message, ties = replace(message, body=body), ties + 1
+        driver.step(message)
+    final = [x for x in driver.finish() if x.topic == "orientation/final"]
+    assert ties >= 3 and node.counters["sigma of no measurement"] == ties and not node.counters["failed"]
+    assert final and all(np.isfinite(x.body.covariance).all() for x in final)

@@ -288,6 +288,8 @@ def empty_window(simulation, **options):
         (replace(LOOK, line=float("nan")), "value is not finite"),
         (replace(LOOK, sample=float("inf")), "value is not finite"),
         (replace(LOOK, sigma_line_px=0.0), "sigma is not positive"),
+        (replace(LOOK, sigma_line_px=1e200), "sigma of no measurement"),
+        (replace(LOOK, sigma_sample_px=1e-300), "sigma of no measurement"),
         (replace(LOOK, ccd="X"), "unknown ccd"),
         (replace(LOOK, strip="S9"), "unknown strip"),
         (replace(LOOK, sample=12000.0), "beyond the ccd line"),
