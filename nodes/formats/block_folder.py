@@ -14,6 +14,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import CrsError, Frame, LocalFrame
 from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ...solver.geometry.trajectory import Trajectory
+from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
 from .keys import Keys, is_there, read_toml
@@ -281,6 +282,8 @@ def _strips(
         elif np.isnan(first) or np.isnan(rate):
             column = "first_line_time_s" if np.isnan(first) else "line_rate_hz"
             raise refuse(column, "missing, wanted a number (or a file of line times in line_times)")
+        if lines > LONGEST_STRIP_S * rate:
+            raise refuse("lines", f"{lines:.6g}, {rate:g} a second: more than a day")
         strip = Strip(name, trajectory, first, rate, lines, line_time, lens)
         last = float(max(lines - 1, 0))
         ends = strip.time_of(np.array([0.0, last]))

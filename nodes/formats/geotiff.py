@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
+from .keys import is_there
 from .new_file import new_file
 from .raster_open import open_raster
 
@@ -66,7 +67,7 @@ def read_heights(path: Path) -> Heights:
     """
     from rasterio.errors import RasterioError
 
-    if not path.exists():
+    if not is_there(path):
         raise UserError(f"{path}: no such file")
     try:
         with open_raster(path) as source:

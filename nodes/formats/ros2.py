@@ -221,7 +221,9 @@ def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDA
     """Roll, pitch, heading (n, 3) and their sigmas (n, 3), rad; which samples have them; which sigmas are assumed."""
     q = np.array([(v.x, v.y, v.z, v.w) for v in (s.orientation for s in samples)])
     variance = np.array([s.orientation_covariance for s in samples])[:, _DIAGONAL]
-    oriented = (variance[:, 0] != -1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 1e-3)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(q, axis=1)
+    oriented = (variance[:, 0] != -1) & (np.abs(length - 1.0) < 1e-3)
     q[~oriented] = 0.0, 0.0, 0.0, 1.0
     R_nb = R_ENU_NED.T @ matrix_from_quaternion(q) * _FLU_FRD
     known = np.all(variance > 0, axis=1)
@@ -231,7 +233,8 @@ def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDA
 
 def _sigma(variance: Array) -> Array:
     """One sigma (n,) from the variances (n, 3) of three axes, 0 where they are not given."""
-    mean = variance.mean(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = variance.mean(axis=1)
     return np.sqrt(np.where(np.isfinite(mean) & (mean > 0), mean, 0.0))
 
 

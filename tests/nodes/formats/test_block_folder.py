@@ -110,6 +110,14 @@ BAD = {
         {"strips": FILES["strips.csv"].replace("100.0", "900")},
         "strips.csv:2: first_line_time_s: lines from 900.000",
     ),
+    "strip of no flight": (
+        {"strips": FILES["strips.csv"].replace("2001", "201e18")},
+        "strips.csv:2: lines: 2.01e+20, 200 a second: more than a day",
+    ),
+    "name that no file can have": (
+        {"strips": f"strip,first_line_time_s,line_rate_hz,lines,line_times\nS1,,,,{'9' * 400}\n"},
+        "strips.csv:2: line_times: no file '999",
+    ),
     "time backwards": (
         {"trajectory": TRAJECTORY.replace("S1,101,", "S1,99.5,")},
         "trajectory.csv:4: time_s: 99.500000 of strip S1 does not come after 100.000000",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -150,6 +151,21 @@ def test_intervals_go_on_over_batches_and_times_that_go_back_are_left_out(tmp_pa
     assert [i.interval_ns // STEP_NS for i in imus] == [0, 1, 1, 1, 1, 1, 1, 1, 2]
     assert "/imu: messages left out: 2 not later than the one before" in imported.notes
     assert any("no GNSS fix" in note for note in imported.notes)
+
+
+@pytest.mark.parametrize("huge", [1e200, np.inf, np.nan])
+def test_numbers_of_no_orientation_and_no_noise_are_left_out_without_a_warning(tmp_path, huge):
+    spoilt = imu(START_NS)
+    spoilt.orientation.x = huge
+    spoilt.angular_velocity_covariance[:] = 1e308 if huge == 1e200 else huge
+    imported = read_any(
+        write_bag(tmp_path / "bag", [("/imu", START_NS, spoilt), ("/imu", START_NS + STEP_NS, imu(START_NS + STEP_NS))])
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        found = by_topic(list(imported.messages))
+    assert [x.stamp_ns for x in found["sensor/attitude"]] == [START_NS + STEP_NS]
+    assert found["sensor/imu"][0].body.rate_sigma == 0.0
 
 
 def test_what_a_message_does_not_know_is_left_out_or_assumed_with_a_note(tmp_path):
