@@ -18,8 +18,7 @@ import argparse
 import resource
 import sys
 import tempfile
-import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,7 +37,6 @@ def main() -> int:
     from fuzzing import (
         SENTENCES,
         Campaign,
-        NodeTarget,
         file_targets,
         flown,
         in_a_process,
@@ -57,27 +55,19 @@ def main() -> int:
     campaign = Campaign()
 
     with tempfile.TemporaryDirectory() as folder:
-        works: list[tuple[str, Callable]] = []
-        for target in file_targets(Path(folder)):
-            works.append((target.name, lambda *given, target=target: run_files(given[0], target, *given[1:])))
-        files = sum(args.only in name for name, _ in works)
-        if any(args.only in name for name in node_names()):
+        slow = {target.name: partial(run_files, target) for target in file_targets(Path(folder))}
+        nodes = {name: partial(run_node, name) for name in node_names()}
+        fast = nodes | {name: partial(run_sentences, name) for name in SENTENCES}
+        works = {name: work for name, work in (slow | fast).items() if args.only in name}
+        files = len(works.keys() & slow)
+        if works.keys() & nodes:
             flown()  # once, before processes are made
-        for name in node_names():
-            works.append((name, lambda *given, name=name: run_node(given[0], NodeTarget(name), *given[1:])))
-        for name in SENTENCES:
-            works.append((name, lambda *given, name=name: run_sentences(given[0], name, *given[1:])))
-        works = [(name, work) for name, work in works if args.only in name]
         per_file = args.cases // 10 // files if len(works) > files > 0 else args.cases // max(1, files)
         per_fast = (args.cases - per_file * files) // max(1, len(works) - files)
         print(HEAD, flush=True)
-        for i, (name, work) in enumerate(works):
-            share = (args.seconds - used_s()) / (len(works) - i)
-
-            def bounded(campaign: Campaign, cases: int, number: int, work=work, share=share) -> None:
-                work(campaign, cases, number, time.process_time() + share)
-
-            in_a_process(campaign, name, bounded, per_file if i < files else per_fast, args.seed)
+        for i, (name, work) in enumerate(works.items()):
+            share_s = (args.seconds - used_s()) / (len(works) - i)
+            in_a_process(campaign, name, work, per_file if name in slow else per_fast, args.seed, share_s)
             print(row(campaign, name), flush=True)
             print("".join(told(f) for f in campaign.findings.values() if f.target == name), end="", flush=True)
     most = f"{max(campaign.most_bytes.values(), default=0) / 1e6:.0f}"

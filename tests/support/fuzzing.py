@@ -210,6 +210,10 @@ class Campaign:
             self.findings[key] = Finding(target, what, example[:NOTE_BYTES])
 
 
+#: What is done with a target: a campaign, the number of cases, the seed and the latest `time.process_time` are given.
+Work = Callable[[Campaign, int, int, float], None]
+
+
 def _write_note(note: mmap, number: int, example: bytes) -> None:
     kept = example[:NOTE_BYTES]
     note[: 12 + len(kept)] = struct.pack("<QI", number, len(kept)) + kept
@@ -499,7 +503,7 @@ def file_targets(folder: Path) -> list[FileTarget]:
     return out
 
 
-def run_files(campaign: Campaign, target: FileTarget, cases: int, number: int, until: float) -> None:
+def run_files(target: FileTarget, campaign: Campaign, cases: int, number: int, until: float) -> None:
     """Read so many changed files, or until a time (`time.process_time`)."""
 
     def case(edits: list[tuple[int, float, float, bytes]]) -> None:
@@ -516,7 +520,7 @@ def run_files(campaign: Campaign, target: FileTarget, cases: int, number: int, u
         target.path.write_bytes(target.good)
 
 
-def run_sentences(campaign: Campaign, name: str, cases: int, number: int, until: float) -> None:
+def run_sentences(name: str, campaign: Campaign, cases: int, number: int, until: float) -> None:
     """Sentences whose fields are changed, many in a row into one parser; NMEA's with right checksums and with others.
 
     The other name is that of records of a driver.
@@ -742,8 +746,9 @@ def _matches(name: str, topic: str) -> bool:
     return name == topic or (name.endswith("*") and topic.startswith(name[:-1]))
 
 
-def run_node(campaign: Campaign, target: NodeTarget, cases: int, number: int, until: float) -> None:
+def run_node(name: str, campaign: Campaign, cases: int, number: int, until: float) -> None:
     """Give a node so many messages, some as they should be and most not; many to an example of hypothesis."""
+    target = NodeTarget(name)
     of_one = st.tuples(st.integers(0, 50), CHANGES, ORDER)
 
     def case(messages: list) -> None:
@@ -753,7 +758,7 @@ def run_node(campaign: Campaign, target: NodeTarget, cases: int, number: int, un
             target.case(campaign, which, changes, order)
 
     messages = st.lists(of_one, min_size=MESSAGES, max_size=MESSAGES)
-    _repeat(case, [messages], campaign, target.name, cases, number, MESSAGES * TURNS)
+    _repeat(case, [messages], campaign, name, cases, number, MESSAGES * TURNS)
 
 
 def _repeat(
@@ -780,16 +785,14 @@ def _repeat(
         pass
 
 
-def in_a_process(
-    campaign: Campaign, name: str, work: Callable[[Campaign, int, int], None], cases: int, number: int
-) -> None:
+def in_a_process(campaign: Campaign, name: str, work: Work, cases: int, number: int, seconds: float) -> None:
     """Work on a target in a process with bounded memory; one that dies is a finding, and the next one goes on.
 
     Parameters
     ----------
     campaign : what was done is added to it
-    work : is given a campaign, the number of cases and the seed
     cases, number : of the target, and the seed
+    seconds : processor time of one process at most
     """
     fork = multiprocessing.get_context("fork")  # the flight that nodes are given is there already
     note = mmap(-1, 12 + NOTE_BYTES)
@@ -797,9 +800,8 @@ def in_a_process(
     for attempt in range(TRIES):
         _write_note(note, 0, b"")
         receiver, sender = fork.Pipe(duplex=False)
-        process = fork.Process(
-            target=_work, args=(sender, note, work, end - campaign.cases[name], number + 7919 * attempt)
-        )
+        left, other = end - campaign.cases[name], number + 7919 * attempt
+        process = fork.Process(target=_work, args=(sender, note, work, left, other, seconds))
         process.start()
         sender.close()
         try:
@@ -817,10 +819,10 @@ def in_a_process(
         campaign.add(dead)
 
 
-def _work(sender: Connection, note: mmap, work: Callable[[Campaign, int, int], None], cases: int, number: int) -> None:
+def _work(sender: Connection, note: mmap, work: Work, cases: int, number: int, seconds: float) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     campaign = Campaign(note=note)
-    work(campaign, cases, number)
+    work(campaign, cases, number, seconds)  # the processor time of a process begins at 0
     campaign.note = None
     sender.send(campaign)
 

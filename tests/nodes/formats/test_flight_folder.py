@@ -249,6 +249,7 @@ WRONG = {
     "sigma of zero": ("0.004, 0.004", "0, 0.004", "trajectory.shift_sigma_deg: [0, 0.004, 0.008], wanted 3 positive"),
     "misspelled": ("boresight_deg", "boresigth_deg", "mounting.boresigth_deg: not known, wanted lever_arm_m"),
     "no control file": ('"control.csv"', '"gcp.csv"', "control.file: no gcp.csv in the folder"),
+    "a name that no file can have": ('"control.csv"', f'"{"9" * 400}"', f"control.file: no {'9' * 200} in the folder"),
     "no image": ('"nadir.img"', '"n.img"', "images.N: no n.img in the folder"),
     "CCD line": ('images = {N = "nadir.img"}', 'images = {X = "nadir.img"}', "CCD line 'X' is not in the camera"),
     "no times": ('line_times = "times.csv"', "", "strips[0]: times of the lines missing, wanted line_times"),

@@ -13,9 +13,15 @@ from functools import partial
 import fuzzing
 import numpy as np
 import pytest
-from fuzzing import Campaign, NodeTarget, edited, file_targets, run_files, run_node, run_sentences, sentence_of
+from fuzzing import Campaign, edited, file_targets, run_files, run_node, run_sentences, sentence_of
+from satellite_scenes import Truth, write_folder
+from test_image_lines import cube_of, write_tiff
 
 from triline.nodes.errors import UserError
+from triline.nodes.formats.geotiff import read_heights
+from triline.nodes.formats.height_raster import RasterFile
+from triline.nodes.formats.satellite.read import read_scene
+from triline.nodes.formats.satellite.rpc_files import read_rpc_tags
 
 
 def found(campaign: Campaign) -> list[str]:
@@ -41,7 +47,7 @@ def test_good_files_are_read(targets):
 def test_changed_files_are_read_or_refused_in_one_line(targets):
     campaign = Campaign()
     for target in targets:
-        run_files(campaign, target, 12, 3, time.process_time() + 600)
+        run_files(target, campaign, 12, 3, time.process_time() + 600)
     assert not found(campaign)
     assert campaign.refused.total() > 0.5 * campaign.cases.total() > 100
 
@@ -65,14 +71,14 @@ def test_checksums_are_right_so_that_the_inside_is_reached(targets):
 @pytest.mark.parametrize("name", fuzzing.SENTENCES)
 def test_sentences_with_right_checksums_are_read_or_counted(name):
     campaign = Campaign()
-    run_sentences(campaign, name, 300, 3, time.process_time() + 600)
+    run_sentences(name, campaign, 300, 3, time.process_time() + 600)
     assert not found(campaign) and campaign.cases[name] == 300
 
 
 @pytest.mark.parametrize("name", fuzzing.node_names())
 def test_nodes_live_through_hostile_messages(name):
     campaign = Campaign()
-    run_node(campaign, NodeTarget(name), 300, 3, time.process_time() + 600)
+    run_node(name, campaign, 300, 3, time.process_time() + 600)
     assert not found(campaign) and campaign.cases[name] >= 300
 
 
@@ -94,24 +100,26 @@ def test_the_campaign_finds_what_is_wrong():
     assert sorted(f.times for f in campaign.findings.values()) == [1, 2]
 
 
-def test_cases_that_hang_or_take_memory_are_ended_and_found(monkeypatch):
+def test_a_case_that_hangs_is_ended_and_found(monkeypatch):
+    monkeypatch.setattr(fuzzing, "LONGEST_S", 0.2)
+    monkeypatch.setattr(fuzzing, "STOP_S", 0.5)
     campaign = Campaign()
 
     def endless() -> None:
         while True:
             sum(range(1000))
 
-    with monkeypatch.context() as short:
-        short.setattr(fuzzing, "LONGEST_S", 0.2)
-        short.setattr(fuzzing, "STOP_S", 0.5)
-        assert not campaign.run("x", b"endless", endless)
-    assert campaign.run("y", b"large", lambda: bytes(bytearray(200_000_000)))
-    hangs = next(f for f in campaign.findings.values() if f.target == "x")
+    assert not campaign.run("x", b"endless", endless)
+    (hangs,) = campaign.findings.values()
     assert "hangs" in hangs.what and "stopped" in hangs.what and hangs.example == b"endless"
-    assert (
-        any(f.what.startswith("memory beyond") for f in campaign.findings.values())
-        and 150e6 < campaign.most_bytes["y"] < 1e9
-    )
+
+
+def test_a_case_that_takes_memory_is_found():
+    campaign = Campaign()
+    assert campaign.run("x", b"small", lambda: bytes(bytearray(1_000_000)))
+    assert campaign.run("y", b"large", lambda: bytes(bytearray(200_000_000)))
+    (memory,) = (f for f in campaign.findings.values() if f.what.startswith("memory beyond"))
+    assert memory.target == "y" and 150e6 < campaign.most_bytes["y"] < 1e9
 
 
 def test_what_a_terminal_would_show_beside_the_one_line_is_found():
@@ -130,13 +138,13 @@ def test_what_a_terminal_would_show_beside_the_one_line_is_found():
 def test_a_process_that_dies_is_a_finding_and_the_next_one_goes_on():
     campaign = Campaign()
 
-    def work(part: Campaign, cases: int, number: int) -> None:
+    def work(part: Campaign, cases: int, number: int, until: float) -> None:
         for k in range(cases):
             number_of_signal = signal.SIGKILL if number == 3 and k == 2 else 0
             part.run("x", f"{number} {k}".encode(), partial(os.kill, os.getpid(), number_of_signal))
         part.run("memory", b"24 GB", lambda: bytearray(24_000_000_000))
 
-    fuzzing.in_a_process(campaign, "x", work, 5, 3)
+    fuzzing.in_a_process(campaign, "x", work, 5, 3, 600.0)
     died, memory = campaign.findings.values()
     assert "SIGKILL" in died.what and died.example == b"3 2" and campaign.cases["x"] == 5
     assert memory.what.startswith("MemoryError")  # by the bound of the address space
@@ -208,8 +216,40 @@ def test_files_that_the_campaign_found(targets, name, change, said):
     assert not found(campaign) and campaign.refused[name] == 1
 
 
-def test_a_damaged_tiff_shows_no_traceback_of_a_library(targets):
+@pytest.mark.parametrize("read", [read_scene, RasterFile, read_heights])
+def test_names_that_no_file_can_have_are_not_there(read, tmp_path):
+    with pytest.raises(UserError, match="no such file"):
+        read(tmp_path / ("9" * 400))
+
+
+def test_times_of_a_scene_long_after_its_epoch_are_refused(tmp_path):
+    folder = write_folder(tmp_path / "scene", Truth(lines=4000, samples=500))
+    settings, attitude = folder / "scene.toml", folder / "attitude.csv"
+    settings.write_text("[time]\nepoch = 2026-11-22T09:27:50Z\n" + settings.read_text().replace("[time]\n", ""))
+    head, *rows = attitude.read_text().splitlines()
+    place = head.split(",").index("time_utc")
+    words = [row.split(",") for row in rows]
+    for k, row in enumerate(words):
+        row[place] = f"{k}" if k != 1 else "1e18"
+    text = [head.replace("time_utc", "time_s"), *(",".join(row) for row in words)]
+    attitude.write_text("\n".join(text) + "\n")
+    with pytest.raises(UserError, match=r"attitude.csv:3: time_s: 1e\+18 s after the epoch"):
+        read_scene(folder)
+
+
+def test_tags_of_rpc_that_are_no_numbers_are_refused(tmp_path):
+    tiff = write_tiff(tmp_path / "lines.tif", cube_of("u2"))
+    tags = "".join(f'<MDI key="{key}">x</MDI>' for key in ("LINE_OFF", "SAMP_OFF", "LINE_NUM_COEFF"))
+    (tmp_path / "lines.tif.aux.xml").write_text(f'<PAMDataset><Metadata domain="RPC">{tags}</Metadata></PAMDataset>')
+    with pytest.raises(UserError, match=r"lines.tif: cannot be read as an image: "):
+        read_rpc_tags(tiff)
+
+
+@pytest.mark.parametrize("read", [None, read_heights, read_rpc_tags])
+def test_a_damaged_tiff_shows_no_traceback_of_a_library(targets, read):
     tiff = next(t for t in targets if t.name == "TIFF lines")
+    if read is not None:
+        tiff = replace(tiff, read=partial(read, tiff.path))
     campaign = Campaign()
     try:
         for place in range(8, 200):  # among its tags, GDAL quotes some of them
@@ -267,15 +307,15 @@ def test_strips_of_no_flight_take_no_memory(name, changes, said):
 
 
 def test_a_message_stamped_an_hour_ahead_takes_no_unknowns_for_the_hour():
+    """The strip does not say how many lines it will have."""
     node = fuzzing._made("adjuster")
-    ahead = None
-    for message in fuzzing.flown():
+    flight = fuzzing.flown()
+    for message in flight:
         if message.topic in node.inputs:
-            list(node.step(message))
-        if message.topic == "observation/control":
-            ahead = ahead or message
+            list(node.step(_strip(lines=0) if message.topic == "configuration/strip" else message))
         if message.topic == "orientation/live" and message.stamp_ns > fuzzing.sample_messages.EPOCH_NS + 2 * 10**9:
             break
+    ahead = next(x for x in flight if x.topic == "observation/control")
     before = len(node._window.state.numbers)
     list(node.step(replace(ahead, stamp_ns=message.stamp_ns + 3600 * 10**9)))
     assert before <= len(node._window.state.numbers) < before + 400 and not node.counters["failed"]
@@ -291,9 +331,11 @@ def test_a_field_that_is_not_finite_is_counted(field):
         b"GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00," + field + b",221126,,,A",
         b"GNGST,092750.20,0.9,0.03,0.02,10.0," + field + b",0.034,0.055",
         b"GNHDT," + field + b",T",
+        b"GNGGA,092750.20,5321.6802,N,00630.3372,W,4,12,0.6," + field + b",M,55.2,M,,",
+        b"GNGGA,092750.40,5321.6802,N,00630.3372,W,4,12," + field + b",61.7,M,55.2,M,,",
     ):
         campaign.run("NMEA", body, lambda body=body: parser.feed(sentence_of(body)))
-    assert not found(campaign) and counts == ["field missing"] * 3
+    assert not found(campaign) and counts == ["field missing"] * 5
 
 
 @pytest.mark.parametrize("sigma", [1e150, 1e200, 1e-300])

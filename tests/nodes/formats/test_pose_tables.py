@@ -251,6 +251,11 @@ def test_headwall_damaged(tmp_path):
             r"imu_gps.txt:4: Gps_UTC_Date&Time: '2020/06/01 25:00:02.250000', wan",
         ),
         (good, date(2020, 1, 1), r"--date 2020-01-01, but its times begin on 2020-06-01"),
+        (
+            good.replace("12:00:03.250000", "12:00:03.\u00b2"),
+            None,
+            r"imu_gps.txt:5: Gps_UTC_Date&Time: '2020/06/01 12:00:03.\u00b2",
+        ),
         (HEADWALL + "\n" + rows[0], None, r"imu_gps.txt: 1 poses, wanted at least 2"),
     ):
         path.write_text(text + "\n")
