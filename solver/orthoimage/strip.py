@@ -39,6 +39,9 @@ STRAIGHT_ON = 40
 BAND, CELLS = 256, 32_768
 #: More than so many lines may not wait for others: a strip that turns round sees no new ground.
 MOST_WAITING = 20_000
+#: Cells further from the middle of the newest lines than so many times the pixels and lines at hand have no place: a
+#: cell may be ten times finer than a pixel. Tuned: larger takes more memory for what a wrong pose shows.
+MOST_AWAY, NEWEST = 20, 64
 #: Lines across the flight: nearer to its direction, by the sine between them, they say little of it.
 LEAST_SINE = 0.2
 
@@ -178,6 +181,7 @@ class StripRectifier:
             self._first = first_line
             self._pixels = self._pixels.astype(pixels.dtype)
         point, cells = self._to_ground(position_l, R_lc)
+        self._leave_out_far(cells)
         if self.errors is not None:
             assert covariance is not None
             slope = self.surface.slope(point)
@@ -208,6 +212,18 @@ class StripRectifier:
         if not met.any():
             return point, np.full((*met.shape, 2), np.nan)
         return point, self.grid.cells_of_many(point)
+
+    def _leave_out_far(self, cells: Array) -> None:
+        """Make those of the cells (n, k, 2) NaN that a wrong pose puts far from the others: a table up to them would
+        take the memory and the time of the others."""
+        newest = np.concatenate([self._cells[-NEWEST:], cells]).reshape(-1, 2)
+        newest = newest[np.isfinite(newest).all(axis=1)]
+        if len(newest):
+            away = np.abs(cells - np.median(newest, axis=0)).max(axis=2)
+            with np.errstate(invalid="ignore"):
+                far = away > MOST_AWAY * (self.rays.pixels + len(self._usable) + len(cells))
+            self.missed += int(far.sum())
+            cells[far] = np.nan
 
     def _begin(self, least: int = 8) -> list[Patch]:
         """Lay the axes through the lines at hand."""

@@ -11,6 +11,7 @@ of the whole gives every line and every point the information of the block: it i
 from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -155,7 +156,11 @@ class Archive:
                 continue
             single = SingleLook(batch, i, look, cell)
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
-            self._keep(name, KeptPoint(single.left(), 0, seen, time_s, np.zeros(3), single))
+            try:
+                left = single.left()
+            except np.linalg.LinAlgError:  # line and sample tell the same: a ray along the ground
+                continue
+            self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single))
 
     def linearise_single(self, solution: BlockSolution) -> Parts:
         """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
@@ -175,7 +180,8 @@ class Archive:
                     batch.linearise(theta, reweigh=True)
                     done.add(id(batch))
                     yield REFINED_POINTS
-                kept.left = kept.single.left()
+                with suppress(np.linalg.LinAlgError):  # then it stays as it was
+                    kept.left = kept.single.left()
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""

@@ -285,6 +285,25 @@ def test_missing_lines_stay_empty_and_the_others_in_place():
     assert (b ^ c).sum() < 4 * PIXELS
 
 
+@pytest.mark.parametrize("away_m", [0.0, 1e7, 1e9])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_lines_of_a_wrong_pose_are_left_out_and_take_no_memory(away_m, axis):
+    """A table up to where they were thought to be would be of terabytes."""
+    flight, grid = _Flight(jitter=0.0), GroundGrid(FRAME, 1.2)
+    image, lines = np.full((300, PIXELS), 100, dtype=np.uint16), np.arange(300)
+    position = np.array(flight.position(lines))
+    position[200:203, axis] += away_m
+    strip = StripRectifier(rays_of(CAMERA, 1), Plane(0.0), grid)
+    patches = []
+    for part in np.split(lines, 10):
+        patches += strip.add(part[0], image[part], None, position[part], flight.R(part))
+        assert strip._inverse(0, 1) is None or strip._inverse(0, 1)[1].size < 1e6
+    seen = _mosaic(patches + strip.finish())
+    filled = sum(len(p.values) and int((p.values > 0).sum()) for p in patches)
+    assert (strip.missed > 0) == (away_m > 0)
+    assert filled > 0.5 * 300 * PIXELS * 0.3 and (seen.read(*seen.extent()) > 0).any()
+
+
 def test_bad_calls_are_told():
     flight, grid = _Flight(), GroundGrid(FRAME, 1.0)
     strip = StripRectifier(rays_of(CAMERA, 0), Plane(0.0), grid)
