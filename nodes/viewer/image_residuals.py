@@ -69,7 +69,7 @@ class ImagePart(Part):
         self._drawn_s = self.state.now_s
         width, height = self.state.image_size
         newest = max((line for rays in self._rays.values() for line, *_ in rays.values()), default=0.0)
-        lines = float(strip.lines or _LENGTH_S * strip.line_rate_hz)
+        lines = max(float(strip.lines or _LENGTH_S * strip.line_rate_hz), 1.0)
         while newest > lines:
             lines *= 2
         along = height / lines

@@ -41,7 +41,7 @@ BAND, CELLS = 256, 32_768
 MOST_WAITING = 20_000
 #: Cells further from the middle of the newest lines than so many times the pixels and lines at hand have no place: a
 #: cell may be ten times finer than a pixel. Tuned: larger takes more memory for what a wrong pose shows.
-MOST_AWAY, NEWEST = 20, 64
+MOST_AWAY, NEWEST = 6, 64
 #: Lines across the flight: nearer to its direction, by the sine between them, they say little of it.
 LEAST_SINE = 0.2
 

@@ -354,3 +354,17 @@ def test_ties_with_sigmas_of_no_measurement_do_not_spoil_the_others(sigma):
     final = [x for x in driver.finish() if x.topic == "orientation/final"]
     assert ties >= 3 and node.counters["sigma of no measurement"] == ties and not node.counters["failed"]
     assert final and all(np.isfinite(x.body.covariance).all() for x in final)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0])
+def test_a_strip_without_line_rate_does_not_hold_the_viewer(rate_hz, monkeypatch):
+    monkeypatch.setattr(fuzzing, "STOP_S", 4.0)
+    node, campaign, residuals = fuzzing._made("viewer"), Campaign(), 0
+    for message in fuzzing.flown():
+        if message.topic == "configuration/strip":
+            message = _strip(line_rate_hz=rate_hz, lines=0)
+        if message.topic.startswith(tuple(name.rstrip("*") for name in node.inputs)):
+            residuals += message.topic == "point/object" and len(message.body.residuals)
+            campaign.run("viewer", b"", lambda message=message: node.step(message), 1_000_000, quiet=True)
+    campaign.run("viewer", b"the end", node.finish, 1_000_000, quiet=True)
+    assert residuals > 0 and not campaign.findings
