@@ -390,7 +390,7 @@ BENCHMARKS = (
     Benchmark(
         "fuzz",
         "Do readers and nodes stand hostile files and messages whose checksums are right?",
-        ("python bench/fuzz.py --cases 1000000 --seconds 7200",),
+        ("python bench/fuzz.py --cases 1000000 --seconds 4500",),
         45,
     ),
     Benchmark(
