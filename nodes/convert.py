@@ -28,6 +28,8 @@ Array = NDArray[np.floating]
 
 SECOND_NS = 1_000_000_000
 LOCAL_FRAME_ID = "local"
+#: Times of which ns do not fit into 64 bits, s: of the year 2261. No clock is off by more than a century, s.
+LATEST_S, CENTURY_S = 9.2e9, 3.2e9
 #: Lines a second that a line camera can have; memory for lines is taken by it.
 LINE_RATES_HZ = (0.01, 100_000.0)
 #: Longest strip, s, and how far its first line may lie before or after the message that tells it: what goes beyond is

@@ -14,10 +14,10 @@ from ...solver.navigation.carried import CameraMount
 from ...solver.navigation.error_state import NavigationSettings
 from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
 from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, InertialGrade
+from ..convert import LATEST_S
 from ..errors import UserError
 from .keys import Keys, read_toml
 from .table import Column, Table, read_table
-from .time_columns import LATEST_S
 
 Array = NDArray[np.floating]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..convert import SECOND_NS
+from ..convert import LATEST_S, SECOND_NS
 from ..errors import UserError
 from .gps_time import DAY_S, WEEK_S, unwrap_weeks, utc_ns_from_gps
 from .table import Column, Table
@@ -27,8 +27,6 @@ ISO = ("time", "time_utc", "utc", "timestamp", "datetime")
 #: Names of columns with GPS seconds, of the week or since 1980-01-06.
 GPS = ("gps_s", "gps_time_s", "gps_seconds", "sow_s", "tow_s")
 WEEKS = ("week", "gps_week")
-#: Times of which ns do not fit into 64 bits, s: of the year 2262.
-LATEST_S = 9.2e9
 #: What a file may hold.
 WANTED = "time_s (UTC, since 1970), time (ISO 8601), or gps_s (of the week, with week or --date)"
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..convert import LATEST_S
 from ..errors import UserError
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
-from .time_columns import LATEST_S, same_day
+from .time_columns import same_day
 from .track import NavigationTrack, checked
 
 _HEADWALL = ("Roll", "Pitch", "Yaw", "Lat", "Lon", "Alt")

@@ -8,7 +8,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Any
 
 from ..bus.status import StatusPublisher
-from ..convert import SECOND_NS
+from ..convert import CENTURY_S, SECOND_NS
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..node import Message, Node
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 COMMON = ("id", "kind", "clock_offset_s", "delay_s", "imu_noise")
 #: Where a program waits for data it looks this often whether it shall end, s.
 LOOK_S = 0.1
-#: No clock is off by more, s: 100 years.
-_MOST_OFFSET_S = 3.2e9
 #: A strip has ended when no line has come for so long, s.
 SILENT_S = 5.0
 
@@ -49,7 +47,7 @@ class Clock:
         UserError : not numbers, an offset of more than 100 years, a delay that is negative or above 5 s
         """
         offset_s, delay_s = keys.number("clock_offset_s", 0.0), keys.number("delay_s", 0.0)
-        if not abs(offset_s) <= _MOST_OFFSET_S:
+        if not abs(offset_s) <= CENTURY_S:
             raise keys.refuse("clock_offset_s", "100 years at most")
         if not 0.0 <= delay_s <= 5.0:
             raise keys.refuse("delay_s", "0 to 5 seconds")

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
-from ..convert import SECOND_NS, attitude_message, gnss_message
+from ..convert import LATEST_S, SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..node import Message
@@ -40,7 +40,7 @@ RECORDS = {
 LONGEST, LARGEST = 1024, 64 << 20
 #: Later times (of the year 2261, ns since the Unix epoch) and higher numbers of lines are refused before they leave
 #: their 64 and 32 bits.
-LATEST_NS, MOST_LINES = 9_200_000_000 * SECOND_NS, 2**31
+LATEST_NS, MOST_LINES = round(LATEST_S) * SECOND_NS, 2**31
 _PIXELS = {8: np.dtype("u1"), 16: np.dtype("<u2")}
 
 

@@ -28,6 +28,7 @@ from ....solver.orbit.line_times import LineTimes, TabulatedLineTimes
 from ....solver.orbit.motion import EarthRotation, Motion
 from ....solver.orbit.time_scales import SCALES, parse_time
 from ....solver.scene_adjustment.rigorous import lens_view_of
+from ...convert import CENTURY_S
 from ...errors import UserError
 from ..camera_json import read_camera
 from ..keys import Keys, read_toml
@@ -40,8 +41,6 @@ Array = NDArray[np.floating]
 FILES = ("ephemeris.csv", "attitude.csv", "line_times.csv", "camera.json")
 #: Words of scene.toml for the frames of the solver.
 _FRAMES = {"earth": "e", "gcrs": "i", "eme2000": "i", "orbital": "o"}
-#: No line is imaged so long before or after the epoch of its scene, s: 100 years.
-MOST_S = 3.2e9
 _TIME = (Column("time_utc", "text", optional=True), Column("time_s", optional=True))
 
 
@@ -225,7 +224,9 @@ def _stamps(table: Table, settings: _Settings) -> NDArray[np.int64]:
     if settings.epoch_ns is None:
         where = table.path.parent / "scene.toml"
         raise UserError(f"{where}: time.epoch: missing, wanted the time from which time_s of {table.path.name} counts")
-    table.refuse(~(np.abs(table["time_s"]) < MOST_S), "time_s", lambda i: f"{table['time_s'][i]:.6g} s after the epoch")
+    table.refuse(
+        ~(np.abs(table["time_s"]) < CENTURY_S), "time_s", lambda i: f"{table['time_s'][i]:.6g} s after the epoch"
+    )
     return settings.epoch_ns + np.round(table["time_s"] * 1e9).astype(np.int64)
 
 
