@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..adjustment.network import Strip
 from ..camera.collinearity import project
@@ -96,9 +97,11 @@ def _looks_of_strip(point_l: Array, index: int, strip: Strip, camera: LineCamera
     t = np.arange(max(start - 2.0, truth.start_s), min(end + 2.0, truth.end_s), FINE_S)
     poses = truth.at(t)
     position, R = poses.position_l, matrix_from_angles(*poses.angles.T)
+    near = _within_reach(point_l, position, R, camera)
+    point_l = point_l[near]
     stride = max(1, round(COARSE_S / FINE_S))
     around = np.arange(-round(WINDOW_S / FINE_S), round(WINDOW_S / FINE_S) + 1)
-    found = []
+    found = [(np.empty(0, dtype=int), np.empty(0, dtype=int), *(np.empty(0) for _ in range(3)))]
     for first in range(0, len(point_l), 400):
         chunk = point_l[first : first + 400]
         coarse = np.arange(0, len(t), stride)
@@ -121,7 +124,27 @@ def _looks_of_strip(point_l: Array, index: int, strip: Strip, camera: LineCamera
             seen = camera.lines[k].contains(sample) & (line >= 0) & (line <= strip.lines - 1)
             found.append((first + p[seen], np.full(int(seen.sum()), k), time_s[seen], line[seen], sample[seen]))
     point, ccd, time_s, line, sample = (np.concatenate(a) for a in zip(*found, strict=True))
-    return Looks(point, np.full(len(point), index), ccd, time_s, line, sample)
+    return Looks(near[point], np.full(len(point), index), ccd, time_s, line, sample)
+
+
+def _within_reach(point_l: Array, position_l: Array, R_lc: Array, camera: LineCamera) -> IntArray:
+    """Indices of the points that are no farther from the path, across the ground, than a CCD line can see.
+
+    In a block of many strips the others are most of the points, and need no search. The farthest ray of all poses to
+    the deepest point, a fifth more, is the reach; where a ray looks up, no point is left out.
+    """
+    depth = position_l[:, 2].max() - point_l[:, 2].min()
+    rays = np.concatenate([
+        np.column_stack([xy, np.full(len(xy), -c)])
+        for line, xy0, c in zip(camera.lines, camera.principal_point_mm, camera.focal_length_mm, strict=True)
+        for xy in (line.xy_mm[:: max(1, len(line.xy_mm) // 16)] - xy0, line.xy_mm[-1:] - xy0)
+    ])  # fmt: skip
+    ray_l = np.einsum("tij,kj->tki", R_lc[::10], rays)
+    if depth <= 0 or (ray_l[..., 2] >= 0).any():
+        return np.arange(len(point_l))
+    reach = 1.2 * depth * float((np.hypot(ray_l[..., 0], ray_l[..., 1]) / -ray_l[..., 2]).max())
+    away, _ = cKDTree(position_l[:, :2]).query(point_l[:, :2], distance_upper_bound=reach)
+    return np.flatnonzero(np.isfinite(away))
 
 
 def _first_passage(ahead: Array, below: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
