@@ -252,12 +252,12 @@ def readable(paths: Iterable[Path], folder: Path) -> list[Path]:
 
 
 class LongRig(Rig):
-    """Looks every second at the memory and the open files of its nodes."""
+    """Looks every second at the memory and the open files of its nodes, and prints them at tenths of the flight."""
 
-    patience_s = 7200.0
-
-    def __init__(self, flight: Path, folder: Path, rate: float) -> None:
+    def __init__(self, flight: Path, folder: Path, rate: float, seconds: float) -> None:
         super().__init__(flight, folder, rate)
+        self.patience_s = 600.0 + 3.0 * seconds / rate
+        self.tenth_s = seconds / 10.0
         self.seen: list[tuple[float, dict[str, tuple[float, int]]]] = []  # s of flight; MB and files of each node
 
     def watch(self) -> None:
@@ -265,10 +265,16 @@ class LongRig(Rig):
 
     def _look(self) -> None:
         nodes = {name: node.process for name, node in self.group.processes.items()}
+        printed = 0
         while all(process.poll() is None for process in nodes.values()):
             with contextlib.suppress(OSError):  # one that ends just now
                 now = {name: (frame.resident_mb(p.pid), _open_files(p.pid)) for name, p in nodes.items()}
-                self.seen.append(((self.newest_ns - self.first_ns) * 1e-9, now))
+                flown_s = (self.newest_ns - self.first_ns) * 1e-9
+                self.seen.append((flown_s, now))
+                if flown_s // self.tenth_s > printed:
+                    printed = int(flown_s // self.tenth_s)
+                    cells = "".join(f"{now[name][0]:>7.0f} MB {now[name][1]:>3d}" for name in NODES)
+                    print(f"{flown_s:<12.0f}{cells}", flush=True)
             time.sleep(1.0)
 
 

@@ -2,7 +2,7 @@
 stays within the protection level.
 
     python bench/faults.py [--kind data|images|processes|link] [--only WORD] [--rate 1]
-    python bench/faults.py --long [--seconds 3600] [--rate 10]
+    python bench/faults.py --long [--seconds 3600] [--rate 10] [--attitude-rate 50]
 
 Each fault hits a flight of one strip with control, tie points and truth. Faults of *processes* (recorder, navigator,
 adjuster, in processes of their own, fed by `triline replay`) come in mid-strip, and so do those of the *link* between
@@ -17,8 +17,8 @@ are put into the messages of the flight, which `process` works off: the exact se
 - *told*: alarms, and lines of the event log that the flight without a fault does not have, the first of them
 
 With ``--long`` a flight of an hour goes through recorder, navigator and adjuster at ten times real time, and what is
-printed is the time without final orientation, and of each node memory and open files at a tenth of the time and at the
-end.
+printed is the time without final orientation, and of each node memory and open files at tenths of the time, each
+when it has come.
 """
 
 from __future__ import annotations
@@ -90,17 +90,23 @@ class Outcome:
 
     @classmethod
     def of(cls, paths: Iterable[Path], alarms: Iterable[str] = ()) -> Outcome:
-        final, live, heard, lines, beyond, green = [], [], [], list(alarms), 0, 0
+        heard, lines, beyond, green = [], list(alarms), 0, 0
+        paths = list(paths)
+        final, live = (_times_ns(paths, topic) for topic in ("orientation/final", "orientation/live"))
         for path in paths:
             reader = RecordingReader(path)
-            for topic, times in (("orientation/final", final), ("orientation/live", live)):
-                times += [convert.time_ns(m.body.timestamp) for m in reader.sorted_messages([topic]) if m.body.valid]
             heard += reader.index.receive_ns[reader.select(["orientation/live"])].tolist()
             for m in reader.sorted_messages(["event/log"]):
                 lines.append(f"{m.body.name}: {m.body.message}")
             a, b = _under_green(path)
             beyond, green = beyond + a, green + b
-        return cls(np.unique(final), np.unique(live), np.unique(heard), beyond, green, lines)
+        return cls(final, live, np.unique(heard), beyond, green, lines)
+
+
+def _times_ns(paths: list[Path], topic: str) -> np.ndarray:
+    """Times of the valid poses of a topic in several recordings, ns."""
+    poses = (m.body for path in paths for m in RecordingReader(path).sorted_messages([topic]))
+    return np.unique([convert.time_ns(body.timestamp) for body in poses if body.valid])
 
 
 def _under_green(path: Path) -> tuple[int, int]:
@@ -293,26 +299,22 @@ def of_images(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
 # ---- a long flight
 
 
-def long_flight(folder: Path, seconds: float, rate: float) -> int:
+def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float) -> int:
     """A block of strips with few tie points: final orientation that is missing, memory and open files of the nodes."""
     path = folder / "long.mcap"
     strips = max(1, round(seconds / LONG_STRIP_S))
     plan = ("--strips", str(strips), "--seconds", str(min(seconds, LONG_STRIP_S) - LONG_TURN_S), "--ties", "1")
-    frame.triline("simulate", "-o", str(path), *plan, "--attitude-rate", "50", "--seed", "3", "-q")
-    rig = LongRig(path, _folder(folder, "long"), rate)
+    frame.triline("simulate", "-o", str(path), *plan, "--attitude-rate", str(attitude_rate), "--seed", "3", "-q")
+    rig = LongRig(path, _folder(folder, "long"), rate, seconds)
+    print(f"{'s of flight':<12}" + "".join(f"{name:>14}" for name in NODES), flush=True)
     begun = time.monotonic()
-    paths = readable(rig.fly(LongRig.watch, 0.0), folder)
+    flown = rig.fly(LongRig.watch, 0.0)
     took_s = time.monotonic() - begun
-    times = np.unique(np.concatenate([Outcome.of([p]).final_s for p in paths]))
+    paths = readable(flown, folder)
+    times = _times_ns(paths, "orientation/final")
     lost = [missing_s(times, strip) for strip in strips_of(path)]
-    span_s = rig.seen[-1][0]
-    print(f"{span_s:.0f} s of flight, {len(lost)} strips, at {rate:g} times real time in {took_s:.0f} s; "
+    print(f"{rig.seen[-1][0]:.0f} s of flight, {len(lost)} strips, at {rate:g} times real time in {took_s:.0f} s; "
           f"without final orientation {sum(lost):.1f} s")  # fmt: skip
-    print(f"{'node':<12}{'at 10 %':>14}{'at 50 %':>14}{'at the end':>14}")
-    places = [next(i for i, (s, _) in enumerate(rig.seen) if s >= share * span_s) for share in (0.1, 0.5, 1.0)]
-    for name in NODES:
-        cells = [rig.seen[i][1][name] for i in places]
-        print(f"{name:<12}" + "".join(f"{mb:>6.0f} MB {files:>4d}" for mb, files in cells), flush=True)
     for text in rig.alarms:
         print(f"told: {text}")
     return frame.verdict(sum(lost) < 0.5)
@@ -340,11 +342,12 @@ def main() -> int:
     parser.add_argument("--rate", type=float, help="of the replays, times real time (1; of --long 10)")
     parser.add_argument("--long", action="store_true", help="a flight of an hour instead of faults")
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the flight of --long (3600)")
+    parser.add_argument("--attitude-rate", type=float, default=50.0, help="attitudes a second of --long (50)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="triline-faults-") as name:
         folder = Path(name)
         if args.long:
-            return long_flight(folder, args.seconds, args.rate or 10.0)
+            return long_flight(folder, args.seconds, args.rate or 10.0, args.attitude_rate)
         return campaign(folder, KINDS if args.kind == "all" else (args.kind,), args.only, args.rate or 1.0)
 
 
