@@ -84,7 +84,8 @@ def read_heights(path: Path) -> Heights:
             ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
     except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
-    z = np.ma.filled(band.astype(float), np.nan)
+    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
+        z = np.ma.filled(band.astype(float), np.nan)
     if not np.isfinite(z).any():
         raise UserError(f"{path}: holds no height")
     return Heights(crs, z, t.c + 0.5 * t.a, t.f + 0.5 * t.e, t.a, t.e, ellipsoidal)

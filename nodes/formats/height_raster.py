@@ -244,14 +244,25 @@ class HeightRaster:
 
 
 def _window(file: RasterFile, row: int, column: int, rows: int, columns: int, thin: int = 1) -> NDArray[np.float32]:
-    """Heights of a window of one file, every ``thin``-th."""
+    """Heights of a window of one file, every ``thin``-th.
+
+    Raises
+    ------
+    UserError : the file is damaged there
+    """
+    from rasterio.errors import RasterioError
     from rasterio.windows import Window
 
     source = file.source
     window = Window(column, row, columns, rows)  # type: ignore[call-arg]
     shape = None if thin == 1 else (-(-rows // thin), -(-columns // thin))
-    band = source.read(1, window=window, masked=True, out_shape=shape)
-    z = np.ma.filled(band.astype(np.float32), np.nan)
+    try:
+        band = source.read(1, window=window, masked=True, out_shape=shape)
+    except RasterioError as error:
+        place = f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1}"
+        raise UserError(f"{file.path}: heights of {place} cannot be read: {' '.join(str(error).split())}") from None
+    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
+        z = np.ma.filled(band.astype(np.float32), np.nan)
     if source.scales[0] != 1.0 or source.offsets[0] != 0.0:
         z = z * np.float32(source.scales[0]) + np.float32(source.offsets[0])
     return z

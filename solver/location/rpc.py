@@ -101,14 +101,19 @@ class RationalFunctions:
         return q.T * self.out_scale + self.out_offset, np.moveaxis(derivative, 0, 1)
 
     def smallest_denominator(self) -> float:
-        """Smallest denominator over the box from -1 to 1, relative to the constant term; zero or less is no model."""
+        """Smallest denominator over the box from -1 to 1, relative to the constant term.
+
+        Zero or less is no model, and so is a denominator that is no number somewhere, for which this is 0.
+        """
         axis = np.linspace(-1.0, 1.0, _BOX_NODES)
         x = np.stack([a.ravel() for a in np.meshgrid(axis, axis, axis)])
         smallest = np.inf
         for c in self.coefficients[1::2]:
-            if c[0] == 0:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                relative = c @ terms(x) / c[0]
+            if not np.isfinite(relative).all():
                 return 0.0
-            smallest = min(smallest, float((c @ terms(x) / c[0]).min()))
+            smallest = min(smallest, float(relative.min()))
         return smallest
 
 

@@ -41,7 +41,7 @@ class EarthOrientationTable:
 
     Raises
     ------
-    ValueError : shapes that do not match, days that do not increase
+    ValueError : shapes that do not match, days that do not increase, values that are no numbers
     """
 
     mjd: Array
@@ -56,6 +56,8 @@ class EarthOrientationTable:
             raise ValueError(
                 "Earth orientation: wanted two days or more, and as many values of UT1-UTC and of the pole"
             )
+        if not all(np.isfinite(a).all() for a in (self.mjd, self.ut1_utc_s, self.pole_x, self.pole_y)):
+            raise ValueError("Earth orientation: a day, UT1-UTC or the pole is no number")
         if not (np.diff(self.mjd) > 0).all():
             raise ValueError("Earth orientation: days must increase")
 

@@ -7,6 +7,7 @@ failed inside, more than two seconds of processor time, memory beyond ten times 
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import resource
@@ -28,11 +29,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
+import rasterio
 import sample_messages
 from driven_flight import SETTINGS
 from envi_files import write_image
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
+from rasterio.transform import from_bounds
 from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, write_isd
 from small_block import FILES, write_files
 from test_damaged_files import small_files
@@ -45,13 +49,18 @@ from triline.nodes import config, registry
 from triline.nodes.errors import UserError
 from triline.nodes.formats import detect
 from triline.nodes.formats.camera_json import read_camera
+from triline.nodes.formats.dem import read_dem
 from triline.nodes.formats.envi_image import open_envi
 from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.formats.frame_json import read_frame
 from triline.nodes.formats.geocal_xml import read_glas_camera
+from triline.nodes.formats.geotiff import MOST_HEIGHTS, Heights, write_heights
 from triline.nodes.formats.grey_image import ImageFile
+from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.keys import Keys
+from triline.nodes.formats.satellite.earth_orientation_file import read_c04, read_finals
 from triline.nodes.formats.satellite.read import read_scene
-from triline.nodes.formats.satellite.rpc_files import write_rpb, write_rpc_text
+from triline.nodes.formats.satellite.rpc_files import rasterio_rpc, read_rpc_tags, write_rpb, write_rpc_text
 from triline.nodes.formats.tiff_image import open_tiff
 from triline.nodes.node import Message, Node
 from triline.nodes.ordering import StreamCheck
@@ -387,15 +396,53 @@ RECORDS = (
 )
 
 
+#: The orientation of a frame image, and where a sensor was mounted.
+FRAME = {
+    "interior": {
+        "focal_length_mm": 150.0, "pixel_size_mm": 0.007, "lines": 300, "samples": 400, "distortion": {"k1": 1e-5},
+    },
+    "exterior": {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 6.86e5, "omega_phi_kappa_deg": [3.0, -20.0, 12.0]},
+    "sigma": {"position_m": [5.0, 5.0, 5.0], "attitude_deg": [0.001, 0.001, 0.002]},
+}  # fmt: skip
+#: Rows of Earth orientation in both forms of the IERS.
+IERS_C04 = '# YR  MM  DD  HH       MJD        x(")        y(")  UT1-UTC(s)\n' + "".join(
+    f"2025   1 {i:3d}   0  {60675 + i}.00    0.1{i:02d}000    0.3{i:02d}000   0.04{i:02d}000    0.000000\n"
+    for i in range(1, 31)
+)
+IERS_FINALS = "".join(
+    f"25 1{i:2d} {60675 + i}.00 {'I' if i < 20 else 'P'}  0.1352{i:02d} 0.000027  0.3053{i:02d} 0.000024  "
+    f"{'I' if i < 20 else 'P'} 0.04253{i:02d} 0.0000088\n"
+    for i in range(1, 31)
+)
+PLATFORM = """lever_arm_m = [0.1, 0.2, -1.0]
+lever_arm_sigma_m = 0.02
+boresight_deg = [0.1, 0, 0]
+[imu]
+grade = "tactical"
+gyro_bias_deg_h = 1.0
+[gnss]
+wander_sigma_m = [0.01, 0.01, 0.02]
+wander_time_s = 60
+[initial]
+roll_deg = 0
+pitch_deg = 0
+heading_deg = 90
+"""
+
+
 @dataclass(frozen=True)
 class FileTarget:
-    """A reader: the file that is changed, its good content, and how it is read."""
+    """A reader: the file that is changed, its good content, and how it is read.
+
+    ``values_bytes`` is what the values of such a file may take, however small the file is: rasters leave out tiles.
+    """
 
     name: str
     path: Path
     good: bytes
     read: Callable[[], Any]
     checked: Callable[[bytes], bytes] = bytes
+    values_bytes: int = 0
 
 
 def _read_all(path: Path) -> None:
@@ -413,6 +460,13 @@ def _all_lines(open_image: Callable[[Path], ImageFile], path: Path) -> None:
     image = open_image(path)
     for band in range(min(image.bands, 4)):
         image.read(0, min(image.lines, 64), band)
+
+
+def _terrain(path: Path) -> None:
+    raster = HeightRaster([path], datum="ellipsoid")
+    lat, lon = np.radians([47.95, 47.9]), np.radians([11.05, 11.1])
+    raster.range_over(lat, lon)
+    raster.at(lat, lon)
 
 
 def file_targets(folder: Path) -> list[FileTarget]:
@@ -497,6 +551,28 @@ def file_targets(folder: Path) -> list[FileTarget]:
     )
     (flight / "camera.json").write_text(FILES["camera.json"])
     whole("flight.toml", flight / "flight.toml", partial(read_flight, flight))
+    (sensors / "platform.toml").write_text(PLATFORM)
+    whole("platform.toml", sensors / "platform.toml", partial(_read_all, sensors))
+    frame_file = folder / "frame.json"
+    frame_file.write_text(json.dumps(FRAME))
+    whole("frame.json", frame_file, partial(read_frame, frame_file, []))
+    z = np.linspace(500.0, 600.0, 900).reshape(30, 30)
+    heights, model = folder / "heights.tif", folder / "model.tif"
+    for path in (heights, model):
+        write_heights(path, Heights("EPSG:4326", z, 11.0, 48.0, 0.01, -0.01))
+    whole("height raster", heights, partial(_terrain, heights))
+    read = partial(read_dem, model, "ellipsoid")
+    out.append(FileTarget("elevation model", model, model.read_bytes(), read, values_bytes=2 * 8 * MOST_HEIGHTS))
+    tags = folder / "tags.tif"
+    with rasterio.open(
+        tags, "w", "GTiff", 60, 50, 1, "EPSG:4326", from_bounds(11, 48, 12, 49, 60, 50), "uint8"
+    ) as image:
+        image.rpcs = rasterio_rpc(rpc)
+    whole("RPC tags", tags, partial(read_rpc_tags, tags))
+    for name, text, read in (("IERS C04", IERS_C04, read_c04), ("IERS finals2000A", IERS_FINALS, read_finals)):
+        path = folder / f"{name}.txt"
+        path.write_text(text)
+        whole(name, path, partial(read, path))
     settings_file = folder / "nodes.toml"
     settings_file.write_text('[adjuster]\nmodel = "wander"\nupdate_s = 0.2\n[matcher]\npace = "load"\n')
     whole("nodes.toml", settings_file, partial(config.load, settings_file))
@@ -511,7 +587,7 @@ def run_files(target: FileTarget, campaign: Campaign, cases: int, number: int, u
             raise _Over
         data = target.checked(edited(target.good, edits))
         target.path.write_bytes(data)
-        campaign.run(target.name, data, target.read, len(target.good))
+        campaign.run(target.name, data, target.read, max(len(target.good), target.values_bytes // MEMORY_TIMES))
 
     target.read()  # what a reader imports is not the memory of a file
     try:

@@ -41,9 +41,10 @@ def read_c04(path: Path) -> EarthOrientationTable:
             if line.startswith("#") or not line.strip():
                 continue
             try:
-                rows.append([float(word) for word in line.split()[4:8]])
-            except ValueError:
+                mjd, x, y, ut1_utc = (float(word) for word in line.split()[4:8])
+            except ValueError:  # no numbers, or fewer
                 raise UserError(f"{path}:{number}: no row of the series C04, wanted MJD x y UT1-UTC") from None
+            rows.append([mjd, x, y, ut1_utc])
     return _table(path, rows)
 
 
