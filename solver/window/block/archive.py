@@ -158,7 +158,7 @@ class Archive:
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
             try:
                 left = single.left()
-            except np.linalg.LinAlgError:  # line and sample tell the same: a ray along the ground
+            except np.linalg.LinAlgError:  # a ray along the ground
                 continue
             self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single))
 
@@ -196,9 +196,12 @@ class Archive:
         old = self.points.get(published.name)
         if old is not None and not (batch.ties.active[i] and self.holds(old.functions.columns)):
             old = None
+        if old is not None and old.single is not None:
+            try:
+                old = replace(old, left=old.single.left(batch.points_l[i]))
+            except np.linalg.LinAlgError:  # seen from there the ray runs along the ground
+                old = None
         single = None if old is None else old.single
-        if old is not None and single is not None:
-            old = replace(old, left=single.left(batch.points_l[i]))
         before = np.zeros(3) if old is None else old.control
         control = np.where(before > 0, 0.0, batch.ties.control[i])
         rows = [rays] if old is None else [rays, old.functions.rows(old.place, origin)]
@@ -224,7 +227,10 @@ class Archive:
             place_l = kept.single.place_at(control)
             if place_l is None:
                 return False
-            kept = replace(kept, left=kept.single.left(place_l))
+            try:
+                kept = replace(kept, left=kept.single.left(place_l))
+            except np.linalg.LinAlgError:
+                return False
         self._weigh(name, kept, weight, np.nan_to_num(control.xyz_l), control.role)
         return True
 

@@ -20,6 +20,9 @@ IntArray = NDArray[np.int64]
 #: A single look takes its distance from known coordinates only where these change by at least this much, m, for each
 #: metre along the ray; otherwise, as with a height given for a ray that is level, they do not tell it. Tuned.
 LEAST_ACROSS = 0.1
+#: The line and the sample of a look tell the same where the sine between what they depend on is less; it is 1 but for
+#: rays in the focal plane. Tuned: anything far above rounding and far below 1 is the same.
+LEAST_APART = 1e-9
 
 
 @dataclass
@@ -87,6 +90,10 @@ class SingleLook:
 
         So that there are coordinates, they are held to their place along the ray by their distance from the camera;
         that says nothing beside another look.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError : line and sample tell the same, as of a ray along the ground
         """
         batch, i = self.batch, self.place
         if place_l is not None:
@@ -96,7 +103,10 @@ class SingleLook:
         rows, origin = rows_of(batch, i, self.cell)
         J = rows[2]
         along = np.cross(J[0], J[1])
-        along /= np.linalg.norm(along) * np.linalg.norm(origin - batch.rays.position_l[i])
+        across = float(np.linalg.norm(along))
+        if not across > LEAST_APART * np.linalg.norm(J[0]) * np.linalg.norm(J[1]):
+            raise np.linalg.LinAlgError("line and sample of a look tell the same")
+        along /= across * np.linalg.norm(origin - batch.rays.position_l[i])
         seen = (RayResidual(self.look, 0.0, 0.0, 0.0, False),)
         held = np.outer(along, along)
         covariance = np.linalg.inv(J.T @ J + held)

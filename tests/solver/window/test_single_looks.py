@@ -9,7 +9,7 @@ import pytest
 from three_strips import OPTIONS, PLAN, TIES, flown
 
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
-from triline.solver.window.block import archive
+from triline.solver.window.block import archive, points
 from triline.solver.window.block.points import SingleLook
 from triline.solver.window.results import TAKEN_BACK
 from triline.solver.window.state.maker import BatchMaker
@@ -43,6 +43,30 @@ def test_a_single_look_counts_when_another_strip_sees_its_point(flight, online):
         sigma = np.sqrt(np.diag(wanted.covariance))
         assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
         assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(sigma, rel=0.02)
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_a_look_along_the_ground_is_left_out_and_nothing_else(flight, online, monkeypatch, later):
+    """Its line and sample tell the same: there is no place for its point, at once or when another strip sees it."""
+    spoilt = {name for name, _ in looks_of(online, TAKEN_BACK)[:3]}
+    rows_of, seen = points.rows_of, set()
+
+    def level(batch, i, cell):
+        rows, origin = rows_of(batch, i, cell)
+        name = batch.names[i]
+        if name in spoilt and len(rows[2]) == 2 and (name in seen or not later):
+            rows = (*rows[:2], np.stack([rows[2][0], 2.0 * rows[2][0]]), *rows[3:])
+        seen.add(name)
+        return rows, origin
+
+    monkeypatch.setattr(points, "rows_of", level)
+    flown_on = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    back = {name for name, _ in looks_of(flown_on, TAKEN_BACK)}
+    assert back == {name for name, _ in looks_of(online, TAKEN_BACK)} - spoilt and len(spoilt) == 3
+    for one, other in zip(flown_on.whole, online.whole, strict=True):
+        sigma = np.sqrt(np.einsum("nii->ni", other.covariance))
+        assert np.abs((one.correction - other.correction) / sigma).max() < 1.0
+        assert np.isfinite(one.covariance).all()
 
 
 @pytest.mark.study
