@@ -13,6 +13,7 @@ from functools import partial
 import fuzzing
 import numpy as np
 import pytest
+import rasterio
 from fuzzing import Campaign, edited, file_targets, run_files, run_node, run_sentences, sentence_of
 from satellite_scenes import Truth, write_folder
 from test_image_lines import cube_of, write_tiff
@@ -368,3 +369,88 @@ def test_a_strip_without_line_rate_does_not_hold_the_viewer(rate_hz, monkeypatch
             campaign.run("viewer", b"", lambda message=message: node.step(message), 1_000_000, quiet=True)
     campaign.run("viewer", b"the end", node.finish, 1_000_000, quiet=True)
     assert residuals > 0 and not campaign.findings
+
+
+def test_signalling_numbers_of_a_damaged_raster_are_no_heights(targets):
+    """A NaN of another kind makes numpy warn where it is made a float64."""
+    model = next(t for t in targets if t.name == "elevation model")
+    campaign = Campaign()
+    heights = np.full((30, 30), 500.0, dtype=np.float32)
+    heights.view(np.uint32)[3, 4] = 0x7F800001
+    with rasterio.open(model.path) as image:
+        profile = image.profile | {"tiled": False, "compress": "none"}
+    profile.pop("blockxsize"), profile.pop("blockysize")
+    try:
+        with rasterio.open(model.path, "w", **profile) as image:
+            image.write(heights, 1)
+        campaign.run(model.name, b"signalling", lambda: read_heights(model.path))
+        z = read_heights(model.path).z_m
+    finally:
+        model.path.write_bytes(model.good)
+    assert not found(campaign) and np.isnan(z).sum() == 1
+
+
+def test_a_raster_that_is_damaged_inside_is_told_where(targets):
+    raster = next(t for t in targets if t.name == "height raster")
+    campaign = Campaign()
+    place = raster.good.rfind(b"\x78\x9c")  # the last compressed tile
+    try:
+        raster.path.write_bytes(raster.good[: place + 4] + b"\xff" * 60 + raster.good[place + 64 :])
+        campaign.run(raster.name, b"", raster.read)
+        with pytest.raises(UserError, match=r"heights.tif: heights of rows \d+ to \d+, columns \d+ to \d+ cannot be"):
+            raster.read()
+    finally:
+        raster.path.write_bytes(raster.good)
+    assert not found(campaign)
+
+
+@pytest.mark.parametrize("coefficient", [1e308, -1e308])
+def test_polynomials_beyond_numbers_are_no_model(targets, coefficient):
+    """The ratio of the largest coefficient to the smallest is no number, and no smallest denominator either."""
+    functions = read_rpc_tags(next(t for t in targets if t.name == "RPC tags").path).to_image
+    denominators = functions.coefficients.copy()
+    denominators[1, :4] = 1e-300, coefficient, coefficient, -coefficient
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert replace(functions, coefficients=denominators).smallest_denominator() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("2025   1  13   0  60688.00    0.113000    0.313000\n", ":14: no row of the series C04"),
+        ("2025   1  13   0  60688.00    nan         0.313000   0.0413000\n", "is no number"),
+    ],
+)
+def test_days_without_a_value_of_earth_orientation_are_refused(targets, row, said):
+    c04 = next(t for t in targets if t.name == "IERS C04")
+    lines = c04.good.decode().splitlines(keepends=True)
+    assert lines[13].split()[4] == "60688.00"
+    lines[13] = row
+    try:
+        c04.path.write_text("".join(lines))
+        with pytest.raises(UserError, match=said):
+            c04.read()
+    finally:
+        c04.path.write_bytes(c04.good)
+
+
+def test_a_strip_that_the_window_refused_is_not_followed():
+    node = fuzzing._made("adjuster")
+    for message in fuzzing.flown():
+        if message.topic in node.inputs:
+            list(node.step(message))
+    strips, window = node._strips, node._window
+    body = _strip(id="S9", line_rate_hz=-1.0).body
+    with pytest.raises(ValueError, match="S9: line rate -1"):
+        strips.begin(body, window.strips["S1"].end_s + 1.0, window)
+    assert strips.hand_over(window) >= 0 and not node.counters["failed"]
+    assert "S9" not in window.strips and "S1" in window.strips
+
+
+@pytest.mark.parametrize("key", ["clock_offset_s", "delay_s"])
+@pytest.mark.parametrize("value", [1e300, -1e300, 4e9, float("nan")])
+def test_clocks_off_by_more_than_a_century_are_refused(key, value):
+    keys = fuzzing.Keys(fuzzing.Path("flight.toml"), {key: value}, "sensor[0]")
+    with pytest.raises(UserError, match=rf"flight.toml: sensor\[0\].{key}"):
+        fuzzing.Clock.of(keys)
