@@ -32,9 +32,8 @@ def run(args: argparse.Namespace) -> int:
     part = args.output.with_name(args.output.name + ".part")
     try:
         with RecordingWriter(part) as writer:
-            for number in numbers:
-                channel = reader.channels[int(reader.index.channel[number])]
-                writer.write_raw(reader.raw(int(number)), channel.platform or None)
+            for channel, raw in zip(reader.index.channel[numbers].tolist(), reader.raws(numbers), strict=True):
+                writer.write_raw(raw, reader.channels[channel].platform or None)
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None

@@ -93,14 +93,11 @@ def play(
     """
     result = PlayResult()
     leave_out = set() if everything else regenerated(reader)
-    numbers = []
-    for number in reader.select():
-        channel = int(reader.index.channel[number])
-        if channel in leave_out:
-            result.left_out[reader.channels[channel].topic] += 1
-        else:
-            numbers.append(int(number))
-    head, body = _split(reader, np.array(numbers, dtype=np.int64), from_ns, to_ns)
+    numbers = reader.select()
+    channel = reader.index.channel[numbers]
+    for id, count in zip(*np.unique(channel[np.isin(channel, list(leave_out))], return_counts=True), strict=True):
+        result.left_out[reader.channels[int(id)].topic] += int(count)
+    head, body = _split(reader, numbers[~np.isin(channel, list(leave_out))], from_ns, to_ns)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):

@@ -117,7 +117,8 @@ class RecordingReader:
     @property
     def index(self) -> Index:
         """Where the messages stand, and when they were sent."""
-        self._know(np.arange(len(self._index)))
+        if self._ranged is not None:
+            self._know(np.arange(len(self._index)))
         return self._index
 
     # ---- what stands where

@@ -48,9 +48,10 @@ def show_recordings(readers: Iterable[RecordingReader], canvas: Canvas) -> int:
     scene, readers = FleetScene(canvas), list(readers)
     names = {reader.path: {c.platform for c in reader.channels.values()} for reader in readers}
     rows = sorted(
-        (int(reader.index.receive_ns[number]), k, int(number))
+        (receive_ns, k, number)
         for k, reader in enumerate(readers)
-        for number in reader.select(TOPICS)
+        for numbers in (reader.select(TOPICS),)
+        for receive_ns, number in zip(reader.index.receive_ns[numbers].tolist(), numbers.tolist(), strict=True)
     )
     next_ns = 0
     for receive_ns, k, number in rows:
