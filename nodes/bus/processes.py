@@ -35,15 +35,23 @@ class NodeProcess:
     def running(self) -> bool:
         return self.process.poll() is None
 
-    def stop(self, timeout_s: float = 10.0) -> int:
-        """Ask it to finish (SIGINT) and wait; kill it after the time-out. Returns the exit code."""
+    def stop(self, timeout_s: float = 10.0, writes_to: Path | None = None) -> int:
+        """Ask it to finish (SIGINT) and wait; kill it after the time-out. Returns the exit code.
+
+        While files in the folder ``writes_to`` grow it still writes what has waited for a slow disk, and is waited for.
+        """
         if self.running:
             self.process.send_signal(signal.SIGINT)
-        try:
-            return self.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            return self.process.wait()
+        written = -1
+        while True:
+            try:
+                return self.process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                before, written = written, _bytes_in(writes_to)
+                if written > before and writes_to is not None:
+                    continue
+                self.process.kill()
+                return self.process.wait()
 
     def last_line(self) -> str:
         """The last line it wrote, for messages about why it ended."""
@@ -102,3 +110,8 @@ class NodeGroup:
                 p.process.wait()
         for log in self._logs:
             log.close()
+
+
+def _bytes_in(folder: Path | None) -> int:
+    """Size of the recordings of a folder."""
+    return 0 if folder is None else sum(path.stat().st_size for path in folder.glob("*.mcap"))

@@ -237,7 +237,7 @@ class LiveFlight:
         self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         for name in (*self.estimators, "viewer", "recorder"):
             if name in group.processes:
-                group.processes[name].stop(30.0)
+                group.processes[name].stop(30.0, self.folder if name == "recorder" else None)
                 time.sleep(0.7)  # its last messages still have to reach the other nodes
                 show()
 

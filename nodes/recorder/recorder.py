@@ -32,6 +32,10 @@ from ..recording.writer import COMPRESSIONS, RecordingWriter
 FLUSH_S = 0.3
 #: Bytes that wait for the disk before publishers are slowed down.
 WAITING_BYTES = 256 << 20
+#: So many messages are written before the recorder looks at its disk, its status and its orders again.
+PORTION = 500
+#: The disk is too slow when something has waited for it for so long, s.
+SLOW_S = 3.0
 #: What comes in this time after the start is sorted: configuration and control to the head of the file.
 HEAD_S = 0.4
 #: A recorder that begins while a flight is under way takes what was said in so long before, s: one that was killed is
@@ -208,10 +212,18 @@ class Recorder(Node):
         end = RawMessage(INVENTORY, Envelope(self.newest_ns, self.name, 0), b"")
         return [*self._reread.read(Stream(topic, source, start), runs, every), end]
 
-    def tend(self) -> None:
-        """Close the open chunk when it is time, change files when one is large enough, try a full disk again."""
+    def tend(self, waited_s: float = 0.0, waiting: int = 0) -> None:
+        """Close the open chunk when it is time, change files when one is large enough, try a full disk again.
+
+        Something has waited to be written for ``waited_s``, and as many bytes wait now.
+        """
         now = time.monotonic()
         self._tell_disk()
+        self.alarms["slow disk"] = (
+            f"the disk is too slow: {waiting / 1e6:.1f} MB wait to be written, since {waited_s:.0f} s; they are kept, "
+            "and publishers are held back when too much waits"
+            if waited_s > SLOW_S else ""
+        )  # fmt: skip
         if self._lost and self._writer is not None:
             self.alarms["lost"] = f"{self._lost} messages were not recorded"
         self.alarms["gaps"] = f"{self.missing} messages never came to the recorder" if self.missing else ""
@@ -352,33 +364,44 @@ class _Backlog:
     """Messages on their way to the disk, bounded by bytes; who puts one waits, but the thread that made the backlog.
 
     That thread takes them, and what it publishes itself comes back to it: it would wait for itself.
+
+    Attributes
+    ----------
+    bytes : how many wait
     """
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._messages: deque[RawMessage] = deque()
-        self._bytes = 0
+        self.bytes = 0
         self._open = True
         self._taker = threading.get_ident()
+        self._emptied_s = time.monotonic()
 
     def put(self, raw: RawMessage) -> None:
         with self._condition:
-            while self._bytes >= WAITING_BYTES and self._open and threading.get_ident() != self._taker:
+            while self.bytes >= WAITING_BYTES and self._open and threading.get_ident() != self._taker:
                 self._condition.wait(0.5)
             self._messages.append(raw)
-            self._bytes += len(raw.data)
+            self.bytes += len(raw.data)
             if len(self._messages) == 1:
                 self._condition.notify_all()
 
-    def take(self, timeout_s: float) -> list[RawMessage]:
+    def take(self, timeout_s: float, most: int = PORTION) -> list[RawMessage]:
+        """The oldest messages, ``most`` of them; waits for one."""
         with self._condition:
             if not self._messages:
                 self._condition.wait(timeout_s)
-            taken = list(self._messages)
-            self._messages.clear()
-            self._bytes = 0
+            taken = [self._messages.popleft() for _ in range(min(most, len(self._messages)))]
+            self.bytes -= sum(len(raw.data) for raw in taken)
+            if not self._messages:
+                self._emptied_s = time.monotonic()
             self._condition.notify_all()
             return taken
+
+    def waited_s(self) -> float:
+        """For how long something has waited all the time, s."""
+        return time.monotonic() - self._emptied_s if self._messages else 0.0
 
     def close(self) -> None:
         with self._condition:
@@ -452,9 +475,12 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     bus.answer_messages("inventory", recorder.inventory)
     bus.answer_messages("recorded", recorder.recorded)
     recall.come_round()
+    round_s = 0.0
     while not options.stop.is_set():
+        begun = time.monotonic()
         recorder.take(recall.complete(backlog.take(0.05)))
-        recorder.tend()
+        recorder.tend(max(backlog.waited_s(), round_s), backlog.bytes)
+        round_s = time.monotonic() - begun
         if recorder.last_problem != problem:
             problem = recorder.last_problem
             options.report(f"recorder: {problem}")
@@ -463,5 +489,6 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
         recall.come_round()
     _take_last_words(recorder, backlog)
     backlog.close()
-    recorder.take(backlog.take(0.0))  # a disk that is slow has left some
+    while raws := backlog.take(0.0):  # a disk that is slow has left some
+        recorder.take(raws)
     status.publish("stopping", dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
