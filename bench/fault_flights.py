@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -111,7 +112,7 @@ class Rig:
             for name in ("navigator", "adjuster", "recorder"):
                 process = self.group.processes.get(name)
                 if process is not None:
-                    process.stop(20.0)
+                    process.stop(20.0, self.output.parent if name == "recorder" else None)
         return sorted(self.output.parent.glob(f"{self.output.stem}*.mcap"))
 
     def _follow(self, raw: Any) -> None:
@@ -236,6 +237,51 @@ def disk_full(flight: Path, folder: Path, rate: float) -> tuple[list[Path], list
         return kept, rig.alarms
     finally:
         subprocess.run(["umount", "-l", str(disk)], capture_output=True)
+
+
+class SlowDiskRig(Rig):
+    """The recorder on a file system of its own, whose device takes so many bytes a second."""
+
+    group_folder = Path("/sys/fs/cgroup/blkio/triline-slow-disk")
+
+    def __init__(self, flight: Path, folder: Path, rate: float, bytes_s: float) -> None:
+        self._disk, self._image = folder / "disk", folder / "disk.img"
+        self._disk.mkdir()
+        super().__init__(flight, folder, rate, self._disk / "live.mcap")
+        with open(self._image, "wb") as image:
+            image.truncate(1 << 30)
+        for command in (
+            ["mkfs.ext4", "-q", "-O", "^has_journal", str(self._image)],
+            ["mount", "-o", "loop,sync", str(self._image), str(self._disk)],
+        ):
+            subprocess.run(command, check=True, capture_output=True)
+        self.group_folder.mkdir(exist_ok=True)
+        device = self._disk.stat().st_dev
+        limit = f"{os.major(device)}:{os.minor(device)} {bytes_s:.0f}"
+        (self.group_folder / "blkio.throttle.write_bps_device").write_text(limit)
+
+    def start(self, name: str, **named: str) -> None:
+        super().start(name, **named)
+        if name == "recorder":
+            (self.group_folder / "cgroup.procs").write_text(str(self.group.processes[name].process.pid))
+
+    def close(self) -> None:
+        subprocess.run(["umount", "-l", str(self._disk)], capture_output=True)
+        with contextlib.suppress(OSError):
+            self.group_folder.rmdir()
+
+
+def slow_disk(flight: Path, folder: Path, rate: float, bytes_s: float) -> tuple[list[Path], list[str]] | None:
+    """The recorder on a disk that is too slow; None where none can be made."""
+    try:
+        rig = SlowDiskRig(flight, folder, rate, bytes_s)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    try:
+        paths = rig.fly(None)
+        return [Path(shutil.copy(path, folder / f"kept_{path.name}")) for path in paths], rig.alarms
+    finally:
+        rig.close()
 
 
 def readable(paths: Iterable[Path], folder: Path) -> list[Path]:

@@ -45,6 +45,7 @@ from fault_flights import (
     of_processes,
     of_the_link,
     readable,
+    slow_disk,
 )
 
 from triline.nodes import convert
@@ -376,7 +377,9 @@ def campaign(folder: Path, kinds: tuple[str, ...], only: str, rate: float) -> in
     if not {"processes", "link"} & set(kinds):
         return _verdict(rows)
 
-    live = Outcome.of(Rig(flight.path, _folder(folder, "live"), rate).fly(None))
+    rig = Rig(flight.path, _folder(folder, "live"), rate)
+    live = Outcome.of(rig.fly(None))
+    bytes_s = rig.output.stat().st_size * rate / ((flight.strip[1] - flight.strip[0]) * 1e-9)
     done(flight, "none (live)", live, live)
 
     def flown(fault: str, rig: Rig, happens: Callable[[Any], None] | None) -> None:
@@ -394,6 +397,14 @@ def campaign(folder: Path, kinds: tuple[str, ...], only: str, rate: float) -> in
                 print("disk full: no tmpfs can be mounted here")
             else:
                 done(flight, "disk full", Outcome.of(readable(found[0], place), found[1]), live)
+        name = "disk takes half of what is recorded"
+        if only in name:
+            place = _folder(folder, name)
+            found = slow_disk(flight.path, place, rate, 0.5 * bytes_s)
+            if found is None:
+                print(f"{name}: no slow disk can be made here")
+            else:
+                done(flight, name, Outcome.of(readable(found[0], place), found[1]), live)
     if "link" in kinds:
         for name, (delay_s, happens) in of_the_link().items():
             if only in name:
