@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import frame
+from packet_link import HERE, PacketLink
 from tcp_link import TcpLink, free_port
 
 from triline.nodes.bus.processes import NodeGroup
@@ -62,6 +63,7 @@ class Rig:
     """A flight over the bus, as it is flown."""
 
     patience_s = 300.0  # with a replay, from the fault on
+    prefix: tuple[str, ...] | list[str] = ()  # before the replay's command
 
     def __init__(self, flight: Path, folder: Path, rate: float, recorder_output: Path | None = None) -> None:
         self.folder, self.rate = folder, rate
@@ -94,7 +96,7 @@ class Rig:
             until = time.monotonic() + 60
             while not bus.alive() >= set(NODES) and time.monotonic() < until:
                 time.sleep(0.1)
-            command = [*frame.TRILINE, "replay", str(self.flight), "--rate", str(self.rate), "-q"]
+            command = [*self.prefix, *frame.TRILINE, "replay", str(self.flight), "--rate", str(self.rate), "-q"]
             command += ["--wait-for", "navigator,adjuster", *self.where()]
             replay = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
@@ -165,37 +167,56 @@ def second_replay(rig: Rig) -> None:
 # ---- the link between the sensors and the nodes
 
 
-class LinkedRig(Rig):
+class RemoteRig(Rig):
     """The same with the replay on the other side of a link. Nodes find each other as ever; the replay calls each of
-    them, and this program, over a `TcpLink` of its own, is called by nobody, and is told of nobody."""
+    them, and this program, over the link, is called by nobody, and is told of nobody."""
 
-    def __init__(self, flight: Path, folder: Path, rate: float, delay_s: float, stack: ExitStack) -> None:
+    def __init__(self, flight: Path, folder: Path, rate: float) -> None:
         super().__init__(flight, folder, rate)
         self._ports = {name: free_port() for name in ("campaign", *NODES)}
-        self.links = [stack.enter_context(TcpLink(port, delay_s)) for port in self._ports.values()]
-        self.group = NodeGroup(folder / "log", "demo", 0, self._file("campaign", self._ports["campaign"]))
+        self.group = NodeGroup(folder / "log", "demo", 0, self._file("campaign"))
+
+    def far_ends(self) -> list[str]:
+        """What the replay calls."""
+        raise NotImplementedError
+
+    def listening(self, port: int) -> list[str]:
+        """Where a program with a port listens."""
+        return [f"tcp/127.0.0.1:{port}"]
 
     def start(self, name: str, **named: str) -> None:
         more = ["-o", str(self.output)] if name == "recorder" else []
-        self.group.start(name, *more, "--bus", str(self._file(name, self._ports[name])), **named)
+        self.group.start(name, *more, "--bus", str(self._file(name)), **named)
 
     def bus(self) -> Bus:
-        return Bus(source="campaign", file=self._file("campaign", self._ports["campaign"]))
+        return Bus(source="campaign", file=self._file("campaign"))
 
     def where(self) -> list[str]:
-        return ["--bus", str(self._file("replay", None))]
+        return ["--bus", str(self._file("replay"))]
 
-    def _file(self, name: str, listens: int | None) -> Path:
+    def _file(self, name: str) -> Path:
         """Zenoh configuration of a program: the usual one with its own port, or that of the replay."""
         config = configuration(self._ports["campaign"])
-        endpoints = [f"tcp/127.0.0.1:{link.port}" for link in self.links] if listens is None else None
-        if endpoints is not None:
-            config.insert_json5("connect/endpoints", json.dumps(endpoints))
+        if name in self._ports:
+            config.insert_json5("listen/endpoints", json.dumps(self.listening(self._ports[name])))
+        else:
+            config.insert_json5("listen/endpoints", "[]")
+            config.insert_json5("connect/endpoints", json.dumps(self.far_ends()))
             config.insert_json5("scouting/gossip/enabled", "false")
-        config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{listens}"] if listens else []))
         path = self.folder / f"{name}.json5"
         path.write_text(str(config))
         return path
+
+
+class TcpRig(RemoteRig):
+    """Over a `TcpLink` to each node."""
+
+    def __init__(self, flight: Path, folder: Path, rate: float, delay_s: float, stack: ExitStack) -> None:
+        super().__init__(flight, folder, rate)
+        self.links = [stack.enter_context(TcpLink(port, delay_s)) for port in self._ports.values()]
+
+    def far_ends(self) -> list[str]:
+        return [f"tcp/127.0.0.1:{link.port}" for link in self.links]
 
     def silent(self, seconds: float) -> None:
         for link in self.links:
@@ -212,6 +233,20 @@ class LinkedRig(Rig):
         self.fault_ns = time.time_ns()
 
 
+class PacketRig(RemoteRig):
+    """Over a `PacketLink`, the replay in a network namespace of its own."""
+
+    def __init__(self, flight: Path, folder: Path, rate: float, link: PacketLink) -> None:
+        super().__init__(flight, folder, rate)
+        self.prefix = link.prefix
+
+    def far_ends(self) -> list[str]:
+        return [f"tcp/{HERE}:{port}" for port in self._ports.values()]
+
+    def listening(self, port: int) -> list[str]:
+        return [f"tcp/127.0.0.1:{port}", f"tcp/{HERE}:{port}"]
+
+
 def of_the_link() -> dict[str, tuple[float, Callable[[Any], None] | None]]:
     """Delay of the link, s, and what happens to it, by name."""
     return {
@@ -220,6 +255,16 @@ def of_the_link() -> dict[str, tuple[float, Callable[[Any], None] | None]]:
         "link silent for 10 s": (0.0, lambda rig: rig.silent(10.0)),
         "link closed for 3 s": (0.0, lambda rig: rig.closed(3.0)),
         "link of 500 ms closed for 3 s": (0.5, lambda rig: rig.closed(3.0)),
+    }
+
+
+def of_packets() -> dict[str, tuple[float, float, float]]:
+    """Share of the packets that are lost, delay and spread of the delay, s, by name."""
+    return {
+        "1 % of packets lost": (0.01, 0.0, 0.0),
+        "5 % of packets lost": (0.05, 0.0, 0.0),
+        "packets overtake each other, up to 50 ms": (0.0, 0.0, 0.05),
+        "0.2 % of packets lost at 500 ms": (0.002, 0.25, 0.0),
     }
 
 

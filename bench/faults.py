@@ -1,12 +1,13 @@
 """Fault campaign: what is lost, how long until all is right again, what the operator is told, and whether the error
 stays within the protection level.
 
-    python bench/faults.py [--kind data|images|processes|link] [--only WORD] [--rate 1]
-    python bench/faults.py --long [--seconds 3600] [--rate 10] [--attitude-rate 50]
+    python bench/faults.py [--kind data|images|processes|link|packets] [--only WORD] [--rate 1]
+    python bench/faults.py --long [--seconds 3600] [--rate 10] [--attitude-rate 50] [--ties 1]
 
 Each fault hits a flight of one strip with control, tie points and truth. Faults of *processes* (recorder, navigator,
 adjuster, in processes of their own, fed by `triline replay`) come in mid-strip, and so do those of the *link* between
-the sensors (the replay) and the nodes: a program in between hands on what comes when its time is due. Faults of *data*
+the sensors (the replay) and the nodes: a program in between hands on what comes when its time is due; it loses or
+shuffles single *packets*, the sensors being in a network namespace of their own. Faults of *data*
 are put into the messages of the flight, which `process` works off: the exact sequence, whatever the machine. Those of
 *images* are the same on a flight with image lines, from which the matcher measures the tie points.
 
@@ -23,6 +24,7 @@ when it has come.
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 import time
@@ -38,15 +40,18 @@ from fault_flights import (
     FAULT_S,
     NODES,
     Flown,
-    LinkedRig,
     LongRig,
+    PacketRig,
     Rig,
+    TcpRig,
     disk_full,
+    of_packets,
     of_processes,
     of_the_link,
     readable,
     slow_disk,
 )
+from packet_link import PacketLink
 
 from triline.nodes import convert
 from triline.nodes.node import Message
@@ -300,11 +305,11 @@ def of_images(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
 # ---- a long flight
 
 
-def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float) -> int:
+def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float, ties: float) -> int:
     """A block of strips with few tie points: final orientation that is missing, memory and open files of the nodes."""
     path = folder / "long.mcap"
     strips = max(1, round(seconds / LONG_STRIP_S))
-    plan = ("--strips", str(strips), "--seconds", str(min(seconds, LONG_STRIP_S) - LONG_TURN_S), "--ties", "1")
+    plan = ("--strips", str(strips), "--seconds", str(min(seconds, LONG_STRIP_S) - LONG_TURN_S), "--ties", str(ties))
     frame.triline("simulate", "-o", str(path), *plan, "--attitude-rate", str(attitude_rate), "--seed", "3", "-q")
     rig = LongRig(path, _folder(folder, "long"), rate, seconds)
     print(f"{'s of flight':<12}" + "".join(f"{name:>14}" for name in NODES), flush=True)
@@ -333,7 +338,7 @@ def strips_of(path: Path) -> list[tuple[int, int]]:
     return found
 
 
-KINDS = ("data", "images", "processes", "link")
+KINDS = ("data", "images", "processes", "link", "packets")
 
 
 def main() -> int:
@@ -343,12 +348,13 @@ def main() -> int:
     parser.add_argument("--rate", type=float, help="of the replays, times real time (1; of --long 10)")
     parser.add_argument("--long", action="store_true", help="a flight of an hour instead of faults")
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the flight of --long (3600)")
+    parser.add_argument("--ties", type=float, default=1.0, help="tie points a second of --long (1)")
     parser.add_argument("--attitude-rate", type=float, default=50.0, help="attitudes a second of --long (50)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="triline-faults-") as name:
         folder = Path(name)
         if args.long:
-            return long_flight(folder, args.seconds, args.rate or 10.0, args.attitude_rate)
+            return long_flight(folder, args.seconds, args.rate or 10.0, args.attitude_rate, args.ties)
         return campaign(folder, KINDS if args.kind == "all" else (args.kind,), args.only, args.rate or 1.0)
 
 
@@ -374,7 +380,7 @@ def campaign(folder: Path, kinds: tuple[str, ...], only: str, rate: float) -> in
     flight = Flown.simulated(folder / "flight.mcap")
     if "data" in kinds:
         processed(flight, "process", of_data(flight.start_ns))
-    if not {"processes", "link"} & set(kinds):
+    if not {"processes", "link", "packets"} & set(kinds):
         return _verdict(rows)
 
     rig = Rig(flight.path, _folder(folder, "live"), rate)
@@ -409,7 +415,15 @@ def campaign(folder: Path, kinds: tuple[str, ...], only: str, rate: float) -> in
         for name, (delay_s, happens) in of_the_link().items():
             if only in name:
                 with ExitStack() as stack:
-                    flown(name, LinkedRig(flight.path, _folder(folder, name), rate, delay_s, stack), happens)
+                    flown(name, TcpRig(flight.path, _folder(folder, name), rate, delay_s, stack), happens)
+    if "packets" in kinds:
+        for name, (loss, delay_s, spread_s) in of_packets().items():
+            if only in name:
+                try:
+                    with PacketLink(loss, delay_s, spread_s) as link:
+                        flown(name, PacketRig(flight.path, _folder(folder, name), rate, link), None)
+                except (OSError, subprocess.CalledProcessError) as error:
+                    print(f"{name}: no such link can be made here ({error})")
     return _verdict(rows)
 
 

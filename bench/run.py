@@ -376,6 +376,12 @@ BENCHMARKS = (
         7,
     ),
     Benchmark(
+        "faults-packets",
+        "The same of single packets of that link: lost, late, in another order",
+        ("python bench/faults.py --kind packets",),
+        6,
+    ),
+    Benchmark(
         "fleet",
         "Four aircraft, three routers: what of a cut link, a slow one and forgeries comes to the ground?",
         ("python bench/fleet.py",),
@@ -386,6 +392,12 @@ BENCHMARKS = (
         "What do live nodes lose in half an hour at ten times real time, and how does their memory grow?",
         ("python bench/faults.py --long --seconds 1655",),
         5,
+    ),
+    Benchmark(
+        "faults-day",
+        "And in a day of flight, thirty times real time?",
+        ("python bench/faults.py --long --seconds 86400 --rate 30 --attitude-rate 5 --ties 0.2",),
+        60,
     ),
     Benchmark(
         "fuzz",

@@ -9,7 +9,15 @@ from places import ROOT
 
 BENCH, DOCS = ROOT / "bench", ROOT / "docs"
 #: Files of bench/ that other programs import and nobody runs.
-MODULES = {"constants_flights.py", "fault_flights.py", "frame.py", "run.py", "tcp_link.py", "tie_latency_computed.py"}
+MODULES = {
+    "constants_flights.py",
+    "fault_flights.py",
+    "frame.py",
+    "packet_link.py",
+    "run.py",
+    "tcp_link.py",
+    "tie_latency_computed.py",
+}
 
 
 @pytest.fixture(scope="module")

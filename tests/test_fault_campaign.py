@@ -1,6 +1,8 @@
 """Of the fault campaign (`bench/faults.py`): the link it puts between sensors and nodes, and what it counts."""
 
 import socket
+import subprocess
+import sys
 import threading
 import time
 
@@ -85,6 +87,32 @@ def ended(one):
         return one.recv(1) == b""
     except ConnectionError:
         return True
+
+
+def test_a_link_between_namespaces_loses_packets_and_tcp_sends_them_again(bench, tmp_path):
+    from packet_link import HERE, PacketLink
+
+    try:
+        with PacketLink(loss=0.1, delay_s=0.002, spread_s=0.004) as link:
+            server = socket.create_server((HERE, 0))
+            client = "import socket, sys; s = socket.create_connection((sys.argv[1], int(sys.argv[2])), 60)\n"
+            client += "s.sendall(bytes(range(256)) * 200); s.shutdown(1); print(len(s.recv(99)))"
+            command = [*link.prefix, sys.executable, "-c", client, HERE, str(server.getsockname()[1])]
+            other = subprocess.Popen(command, stdout=subprocess.PIPE)
+            server.settimeout(60)
+            connection, _ = server.accept()
+            heard = b""
+            while data := connection.recv(65536):
+                heard += data
+            connection.sendall(b"seen")
+            assert other.communicate(timeout=60)[0] == b"4\n" and heard == bytes(range(256)) * 200
+            assert link.passed > 30 and link.lost > 0
+            connection.close()
+            server.close()
+    except (OSError, subprocess.CalledProcessError) as error:
+        if isinstance(error, TimeoutError):
+            raise
+        pytest.skip(f"no such link can be made here: {error}")
 
 
 def test_green_lights_are_counted_in_what_a_live_recorder_writes(bench, tmp_path):
