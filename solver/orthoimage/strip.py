@@ -37,10 +37,12 @@ ROWS = 3
 STRAIGHT_ON = 40
 #: Lines (p) that are rectified at once, at most, and cells that are worked on at once.
 BAND, CELLS = 256, 32_768
+#: More bands than these ahead are looked at for gaps without a line. Tuned: only what a wrong pose shows depends on it.
+SEVERAL = 4
 #: More than so many lines may not wait for others: a strip that turns round sees no new ground.
 MOST_WAITING = 20_000
-#: Cells further from the middle of the newest lines than so many times the pixels and lines at hand have no place: a
-#: cell may be ten times finer than a pixel. Tuned: larger takes more memory for what a wrong pose shows.
+#: Places further from the middle of the newest lines than so many times the pixels and lines at hand have no place.
+#: Tuned: larger takes more memory for what a wrong pose shows.
 MOST_AWAY, NEWEST = 6, 64
 #: Lines across the flight: nearer to its direction, by the sine between them, they say little of it.
 LEAST_SINE = 0.2
@@ -216,12 +218,15 @@ class StripRectifier:
     def _leave_out_far(self, cells: Array) -> None:
         """Make those of the cells (n, k, 2) NaN that a wrong pose puts far from the others: a table up to them would
         take the memory and the time of the others."""
-        newest = np.concatenate([self._cells[-NEWEST:], cells]).reshape(-1, 2)
+        lines = np.concatenate([self._cells[-NEWEST:], cells])
+        newest = lines.reshape(-1, 2)
         newest = newest[np.isfinite(newest).all(axis=1)]
         if len(newest):
+            step = np.hypot(*np.moveaxis(np.diff(lines, axis=1), 2, 0)) / np.diff(self.rays.sample)
+            cells_a_pixel = float(np.median(step[np.isfinite(step)])) if np.isfinite(step).any() else 1.0
             away = np.abs(cells - np.median(newest, axis=0)).max(axis=2)
             with np.errstate(invalid="ignore"):
-                far = away > MOST_AWAY * (self.rays.pixels + len(self._usable) + len(cells))
+                far = away > MOST_AWAY * max(cells_a_pixel, 1.0) * (self.rays.pixels + len(self._usable) + len(cells))
             self.missed += int(far.sum())
             cells[far] = np.nan
 
@@ -247,7 +252,10 @@ class StripRectifier:
         if len(self._usable) > MOST_WAITING:
             self._forget(len(self._usable) - MOST_WAITING)
         while ahead - self._done >= least:
+            self._done += self._empty_ahead(ahead)
             end = min(self._done + max(self.band, least), ahead)
+            if end <= self._done:
+                break
             patch = self._band(self._done, end)
             if patch is not None:
                 out.append(patch)
@@ -257,6 +265,16 @@ class StripRectifier:
         taps = TAPS[self.resampling][1]
         self._forget(max(int(np.argmax(needed)) - taps, 0))
         return out
+
+    def _empty_ahead(self, ahead: int) -> int:
+        """How many p from the first that is not rectified on no line is near, in whole bands: a wrong pose leaves such
+        a gap, in which there is nothing to see."""
+        if ahead - self._done <= SEVERAL * self.band:
+            return 0
+        p = self._place[..., 0]
+        p = p[p >= self._done - self.band]
+        gap = max(int(p.min() - self._done) // self.band - 1, 0) * self.band if len(p) else 0
+        return min(gap, ahead - self._done)
 
     def _forget(self, lines: int) -> None:
         self._first += lines

@@ -285,6 +285,39 @@ def test_missing_lines_stay_empty_and_the_others_in_place():
     assert (b ^ c).sum() < 4 * PIXELS
 
 
+def test_between_lines_that_a_wrong_pose_puts_apart_nothing_is_worked_on(monkeypatch):
+    """Not so far that they are left out, but many bands of 8 lines: each would take as long as one with lines."""
+    flight, grid = _Flight(jitter=0.0), GroundGrid(FRAME, 1.2)
+    image, lines = np.full((300, PIXELS), 100, dtype=np.uint16), np.arange(300)
+
+    def patches_of(away_m):
+        position = np.array(flight.position(lines))
+        position[290:] += away_m * (flight.position([9])[0] - flight.position([8])[0])[None] / (SPEED / RATE)
+        strip, bands = StripRectifier(rays_of(CAMERA, 1), Plane(0.0), grid, band=8), []
+        monkeypatch.setattr(strip, "_band", lambda b, e, band=strip._band: (bands.append((b, e)), band(b, e))[1])
+        found = []
+        for part in np.split(lines, 10):
+            found += strip.add(part[0], image[part], None, position[part], flight.R(part))
+        return found + strip.finish(), bands, strip
+
+    near, bands, _ = patches_of(0.0)
+    apart, more, strip = patches_of(1000.0)
+    assert strip.missed == 0 and strip._done - more[0][0] > 700  # they were not left out
+    assert len(more) < len(bands) + 12
+    filled = [sum(int((p.values > 0).sum()) for p in found) for found in (near, apart)]
+    assert filled[1] > 0.85 * filled[0]
+
+
+@pytest.mark.parametrize("cell_m", [1.2, 0.12, 0.03])
+def test_cells_much_finer_than_pixels_leave_out_no_line(cell_m):
+    flight, grid = _Flight(jitter=0.0), GroundGrid(FRAME, cell_m)
+    lines = np.arange(40)
+    strip = StripRectifier(rays_of(CAMERA, 1), Plane(0.0), grid)
+    strip.add(0, np.full((40, PIXELS), 100, dtype=np.uint16), None, flight.position(lines), flight.R(lines))
+    strip.finish()
+    assert strip.missed == 0
+
+
 @pytest.mark.parametrize("away_m", [0.0, 1e7, 1e9])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_lines_of_a_wrong_pose_are_left_out_and_take_no_memory(away_m, axis):
