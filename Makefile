@@ -59,7 +59,7 @@ bench: $(VENV)/.bench
 
 study: $(VENV)/.bench
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m study
-	$(BIN)/python bench/fuzz.py --cases 1000000 --seconds 4500
+	$(BIN)/python bench/fuzz.py --cases 1000000 --seconds 5400
 	$(BIN)/triline study all
 
 # the oldest dependencies that pyproject.toml names, in an environment of their own
