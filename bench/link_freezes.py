@@ -27,7 +27,7 @@ from triline.nodes.node import Message, Node
 from triline.schemas import codec
 
 #: After so long without hearing the publisher a node that goes on counts as deaf, s.
-WAIT_S = 12.0
+WAIT_S = 60.0
 EPOCH_NS = 1_790_000_000_000_000_000
 
 

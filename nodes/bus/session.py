@@ -49,6 +49,8 @@ Answer = Callable[[dict[str, str]], Any]
 Recipe = Callable[[Any, int], Any]
 #: For so long a session stays open beside the one that takes its place, s.
 BOTH_S = 1.0
+#: A program that ends waits for so long for a session that is still being closed, s.
+CLOSED_S = 5.0
 #: What a router answers, of any platform, to who wants to know whether his link carries anything.
 LINK = "link"
 #: Names of topics that others tell are shorter than this.
@@ -169,6 +171,7 @@ class Bus:
         self._generation = 0  # of the session: what comes from an earlier one is not handed on
         self._latched: deque[RawMessage] = deque(maxlen=LATCHED_KEPT)
         self._links = LinkWatch()
+        self._closing: list[threading.Thread] = []  # of sessions that others have replaced
         self._ended = threading.Event()
         #: Why this session was opened anew, the newest last.
         self.opened_anew: list[str] = []
@@ -475,6 +478,8 @@ class Bus:
         self._ended.set()
         with self._opening:
             pass  # a session that is being opened anew is closed here, too
+        for closing in self._closing:
+            closing.join(CLOSED_S)
         _withdraw(self._session, (*self._declared, *self._publishers.values()))
         self._declared.clear()
         self._publishers.clear()
@@ -535,8 +540,8 @@ class Bus:
     def _open_anew(self, why: str, wait: bool = True) -> None:
         """Open another session, declare everything there, change over, and close the one before.
 
-        A session with much to send over a link that is gone can take minutes to close: without ``wait`` it is left to a
-        thread.
+        A session with much to send over a link that is gone can take minutes to close: that is left to a thread, so
+        that the links of the new one are watched meanwhile. With ``wait`` it begins a little later.
         """
         with self._opening:
             if self._ended.is_set():
@@ -552,12 +557,15 @@ class Bus:
                     publishers[raw.topic].put(bytes(raw.data), attachment=pack(raw.envelope))
                 self._links.opened(time.monotonic())
                 self.opened_anew.append(why)
-            if not wait:
-                threading.Thread(target=_withdraw, args=(old, withdrawn), name="old session", daemon=True).start()
-                return
-            # others are just learning of both sessions; one that is closed now can stay linked as a ghost
+            closing = threading.Thread(target=self._close_old, args=(old, withdrawn, wait), daemon=True)
+            self._closing = [thread for thread in self._closing if thread.is_alive()] + [closing]
+            closing.start()
+
+    def _close_old(self, old: Any, withdrawn: Iterable[Any], wait: bool) -> None:
+        """Close a session that another one has replaced."""
+        if wait:  # others are just learning of both sessions; one that is closed now can stay linked as a ghost
             self._ended.wait(BOTH_S)
-            _withdraw(old, withdrawn)
+        _withdraw(old, withdrawn)
 
 
 def is_kept(topic: str) -> bool:

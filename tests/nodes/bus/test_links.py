@@ -9,7 +9,7 @@ import time
 import sample_messages as sample
 from bus_rig import Rig, free_port, wait_for
 
-from triline.nodes.bus import live
+from triline.nodes.bus import live, session
 from triline.nodes.bus.links import BEAT_S, LOOK_S, MISSED_S, REST_S, TOLD, LinkWatch
 from triline.nodes.bus.live import BusRunner, in_thread
 from triline.nodes.bus.session import Bus
@@ -113,6 +113,17 @@ def test_a_session_that_was_opened_anew_misses_nothing_that_was_declared():
     assert [message.topic for message in node.given[:2]] == ["configuration/camera", "sensor/attitude"]
     assert late.given[0].topic == "configuration/camera"
     assert node.counters["session opened anew"] == 1
+
+
+def test_a_session_that_takes_long_to_close_does_not_stop_the_watch(monkeypatch):
+    """What waits to be sent over a link that is gone can hold it for minutes; meanwhile the new session is watched."""
+    closed, reasons = threading.Event(), ["one", "another"]
+    withdraw = session._withdraw
+    monkeypatch.setattr(session, "_withdraw", lambda old, declared: (closed.wait(60), withdraw(old, declared)))
+    with Bus(port=free_port()) as bus:
+        monkeypatch.setattr(bus._links, "beat", lambda now_s, peers: reasons.pop(0) if reasons else "")
+        wait_for(lambda: bus.opened_anew == ["one", "another"], 10, "the second session")
+        closed.set()
 
 
 def test_a_node_that_was_stopped_for_longer_than_the_lease_hears_its_sensors_again(tmp_path):
