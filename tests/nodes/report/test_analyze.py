@@ -144,6 +144,7 @@ def test_partial_recordings_are_evaluated_as_far_as_they_go(messages, absent, tm
         assert line.split(":")[0] in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_poses_that_are_not_valid_are_left_out_and_counted(messages, tmp_path):
     whole = evaluate_flight(collect(messages))
     copies = []

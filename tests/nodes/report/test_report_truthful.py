@@ -39,6 +39,7 @@ def recording(messages, tmp_path_factory):
 # ---- damage
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_damage_is_named_on_the_terminal_in_the_json_and_at_the_top_of_the_report(recording, tmp_path, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(recording.read_bytes()[: recording.stat().st_size * 2 // 3])
@@ -64,6 +65,7 @@ def test_nothing_but_configuration_is_said_to_be_too_little(messages, tmp_path, 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["head.mcap"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_sensors_alone_give_what_is_missing_instead_of_an_empty_line(messages, tmp_path, capsys):
     path = write_recording(
         tmp_path / "raw.mcap", [x for x in messages if x.topic.startswith(("configuration/", "sensor/"))]
@@ -94,6 +96,7 @@ def test_an_old_report_stays_when_the_new_one_fails(tmp_path, capsys):
 # ---- one kind of figure
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_terminal_headline_tile_and_highlighted_row_say_the_same(recording):
     flight, held = read(recording)
     result = analyse(flight, held)
@@ -145,6 +148,7 @@ def test_without_truth_the_table_is_of_check_points(messages, tmp_path):
 # ---- a flight that was not flown to its end
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_flight_that_ended_early_is_named(messages, tmp_path):
     longer = []
     for x in messages:
@@ -166,6 +170,7 @@ def test_a_flight_that_ended_early_is_named(messages, tmp_path):
 # ---- info and the report
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_info_and_report_say_the_same_of_messages_rates_and_duration(messages, tmp_path, capsys):
     stamp = messages[-1].stamp_ns
     image = m.RawImage(width=4, height=1, encoding="mono8", step=4, data=b"1234")
@@ -247,6 +252,7 @@ def test_rays_that_were_taken_back_are_not_rejected(messages):
     }
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_parameters_are_said_to_be_undetermined_for_good_with_the_criterion(messages, tmp_path):
     changed = []
     for x in messages:
@@ -262,6 +268,7 @@ def test_parameters_are_said_to_be_undetermined_for_good_with_the_criterion(mess
     assert "not yet" not in text and "at most 0.7 of the a-priori one" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_long_counters_wrap(messages, tmp_path):
     status = next(x for x in messages if x.topic == "status/adjuster")
     body = type(status.body).FromString(status.body.SerializeToString())
