@@ -14,7 +14,6 @@ import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
-from places import ROOT
 from recording_file import write_recording
 
 import triline
@@ -142,7 +141,9 @@ def test_the_usual_pace_of_process_keeps_that_of_the_results_in_a_recording(caps
         assert code == 0
         return json.loads(out)["pace"], (tmp_path / name).read_bytes()
 
-    flight = ROOT / "recordings" / "strip.mcap"
+    flight = tmp_path / "flight.mcap"
+    short = ["--seconds", 8, "--lead-in", 1, "--lead-out", 0.5, "--seed", 2]
+    assert run(capsys, "simulate", "-o", flight, *short, "-q")[0] == 0
     pace, fast = processed(flight, "fast.mcap")
     assert (pace, fast) == ("throughput", processed(flight, "asked.mcap", "--pace", "throughput")[1])
     assert processed(tmp_path / "fast.mcap", "again.mcap") == ("throughput", fast)
