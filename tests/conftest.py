@@ -1,5 +1,6 @@
 """Before NumPy is loaded: matrices are small and tests run side by side, so BLAS threads only get in the way."""
 
+import gc
 import os
 import sys
 
@@ -9,3 +10,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # them would compile the package anew, and each worker of pytest-xdist would rewrite the assertions of all tests.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# Modules and tests are some 360 000 objects that stay: the garbage collector need not look for them again and again.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()
+    gc.enable()
