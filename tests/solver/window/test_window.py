@@ -39,6 +39,12 @@ def flight():
     return simulation, navigate(simulation)
 
 
+@pytest.fixture(scope="module")
+def adjusted(flight):
+    """The flight adjusted with the usual options."""
+    return adjust_online(*flight)
+
+
 class Same(ModelOptions):
     """Options that give a model that is there already."""
 
@@ -120,9 +126,9 @@ def test_marginalisation_loses_nothing_and_invents_nothing(flight):
 
 def test_the_backward_pass_gives_every_time_what_the_whole_strip_knows(flight):
     simulation, poses = flight
-    online = adjust_online(simulation, poses, WindowOptions(window_s=20.0, snoop=False), live=False)
+    online = adjust_online(simulation, poses, WindowOptions(window_s=20.0, snoop=False), live=False, update_s=0.5)
     batch = adjust_online(
-        simulation, poses, WindowOptions(window_s=NEVER, settle_s=NEVER, snoop=False), live=False
+        simulation, poses, WindowOptions(window_s=NEVER, settle_s=NEVER, snoop=False), live=False, update_s=0.5
     )  # the same, with nothing let go before the end
     joined = [
         [np.concatenate([getattr(o, name) for o in run]) for name in ("time_s", "correction", "covariance", "angles")]
@@ -199,7 +205,7 @@ def test_consistent_over_seeds_and_better_than_direct_georeferencing(seeds):
 
 def test_without_control_there_is_a_result_with_large_honest_sigma():
     simulation = simulate(PLAN, 5, observation_plan=replace(TIES, control=0))
-    result = adjust_online(simulation, navigate(simulation))
+    result = adjust_online(simulation, navigate(simulation), update_s=0.5)
     errors = orientation_errors(simulation, result.final)
     sigma = np.sqrt(np.einsum("nii->ni", errors.covariance))
     assert sigma[:, 0].min() > 0.3  # the datum rests on the a-priori offset
@@ -210,7 +216,7 @@ def test_without_control_there_is_a_result_with_large_honest_sigma():
 def test_without_any_tie_point_the_measured_trajectory_comes_back_with_its_sigma(flight):
     simulation, poses = flight
     nothing = replace(simulation, images=simulation.images.select(np.zeros(len(simulation.images), dtype=bool)))
-    result = adjust_online(nothing, poses)
+    result = adjust_online(nothing, poses, update_s=0.5)
     errors = orientation_errors(simulation, result.final)
     slow = slow_errors_of(simulation.errors)
     sigma = np.sqrt(errors.covariance[:, 0, 0])
@@ -262,14 +268,13 @@ def test_outliers_are_found_and_the_result_is_as_good_as_without_them(seeds):
         assert 0.85 < np.mean(ratio) < 1.1 and ratio.max() < 1.25, ratio
 
 
-def test_a_wrong_control_coordinate_is_left_out(flight):
+def test_a_wrong_control_coordinate_is_left_out(flight, adjusted):
     simulation, poses = flight
     wrong = np.flatnonzero(simulation.points.role == "control")[2]
     surveyed = simulation.surveyed_l.copy()
     surveyed[wrong, 2] += 5.0
-    result = adjust_online(replace(simulation, surveyed_l=surveyed), poses, live=False)
-    right = adjust_online(simulation, poses, live=False)
-    height = [orientation_errors(simulation, r.final).rmse[2] for r in (result, right)]
+    result = adjust_online(replace(simulation, surveyed_l=surveyed), poses, live=False, update_s=0.5)
+    height = [orientation_errors(simulation, r.final).rmse[2] for r in (result, adjusted)]
     assert height[0] < 2.0 * height[1] + 0.1
 
 
@@ -320,22 +325,23 @@ def test_duplicates_single_looks_and_looks_without_orientation_are_refused(fligh
     assert sorted(reasons) == ["duplicate", "no orientation", "too few looks"]
 
 
-def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight):
+def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight, adjusted):
     """A filter that has aligned itself in motion says later what was before its first filtered pose."""
     simulation, poses = flight
     begin_s = 12.0
     late = [p for p in poses if p.pose.smoothed or p.pose.time_s > begin_s]
     late = [replace(p, known_s=max(p.known_s, begin_s + 0.5)) if p.pose.smoothed else p for p in late]
-    used = {}
-    for which in (poses, late):
-        result = adjust_online(simulation, sorted(which, key=lambda p: p.known_s), live=False)
-        used[which is late] = sum(r.reason == "no orientation" for r in result.refused), len(result.final_points)
-    assert used[True] == used[False] and used[True][1] > 100
+    waited = adjust_online(simulation, sorted(late, key=lambda p: p.known_s), live=False)
+    usual, used = (
+        (sum(r.reason == "no orientation" for r in result.refused), len(result.final_points))
+        for result in (adjusted, waited)
+    )
+    assert used == usual and used[1] > 100
 
 
 def test_what_is_final_stays_final(flight):
     simulation, poses = flight
-    result = adjust_online(simulation, poses)
+    result = adjust_online(simulation, poses)  # an own one: looks are added to its window
     times = np.concatenate([o.time_s for o in result.final])
     assert (np.diff(times) > 0).all() and np.diff(times).max() == pytest.approx(0.05)
     strip = simulation.flight.strips[0]

@@ -145,7 +145,7 @@ def test_the_effect_of_an_undetected_error_is_what_the_adjustment_makes_of_it(fl
         state.solve()
         seen["said"], seen["is"] = said, state.theta - before
 
-    adjust_online(simulation, poses, live=False, watch=watch)
+    adjust_online(simulation, poses, live=False, watch=watch, update_s=0.5)
     scale = np.abs(seen["is"]).max()
     assert scale > 0
     np.testing.assert_allclose(seen["said"], seen["is"], atol=1e-6 * scale)

@@ -33,7 +33,7 @@ OPTIONS = WindowOptions(grid_hz=4.0)
 def flown(row: str, strip_s: float = 40.0, seed: int = 4):
     """A flight with carrier-phase GNSS in a world of the study, through the window."""
     simulation = simulate(FlightPlan(strip_s=strip_s), seed, SETTINGS["rtk"], OBSERVED, world=ROWS[row].world)
-    return simulation, adjust_online(simulation, navigate(simulation), OPTIONS, live=False)
+    return simulation, adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
 
 
 def rejected(online) -> int:
