@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,14 @@ from .network import Network
 from .network_weakness import PART, describe
 
 Array = NDArray[np.floating]
+
+#: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
+#: rounding.
+LEAST_PIVOT = 1e-6
+
+#: Sigmas from zero up to which a parameter is taken out of the cofactors. Tuned: how far the observation equations of
+#: the others move with it hangs on it, and with that digits of the evidence; not the adjustment, which is made anew.
+FAR = 10.0
 
 
 @dataclass(frozen=True)
@@ -35,34 +43,142 @@ def ground_sample_distance(network: Network) -> float:
     return float(np.median(pitch / rays.focal_length_mm * height))
 
 
+@dataclass(frozen=True)
+class Reduced:
+    """A linearised solution whose additional parameters are held at zero one after another.
+
+    With the cofactors ``q`` between a parameter and all unknowns, and its own one ``q_ii``, holding it at zero leaves
+    ``x - q x_i / q_ii`` of the unknowns and ``Q - q q^T / q_ii`` of their cofactors, and adds ``x_i^2 / q_ii`` to the
+    cost.
+
+    Attributes
+    ----------
+    solution : with all parameters
+    places : (m,) those that are left, among the parameters of the solution
+    cofactors : (n_unknowns, m) between all reduced unknowns and these parameters
+    to_points : (3 p, m) between coordinates of object points and these parameters
+    orientation, of_points : (n_model,) and (3 p,) variances of the orientation and of the coordinates of object points
+    theta, points_l : (n_unknowns,) and (3 p,) values
+    cost, redundancy : as in `Solution`
+    information : (n_camera,) of the parameters before anything is eliminated
+    gsd_m : ground sample distance
+    """
+
+    solution: Solution
+    places: NDArray[np.int64]
+    cofactors: Array
+    to_points: Array
+    orientation: Array
+    of_points: Array
+    theta: Array
+    points_l: Array
+    cost: float
+    redundancy: int
+    information: Array
+    gsd_m: float
+
+    @classmethod
+    def of(cls, solution: Solution) -> Reduced:
+        layout = solution.layout
+        m, first = layout.n_camera, layout.n_model
+        columns = np.arange(first, first + m)
+        unit = np.zeros((layout.n_unknowns, m))
+        unit[columns, np.arange(m)] = 1.0
+        return cls(
+            solution,
+            np.arange(m),
+            solution.factor.solve(unit),
+            point_unknown_cofactors(solution, columns).reshape(-1, m),
+            solution.factor.variances()[:first],
+            np.einsum("pii->pi", point_cofactors(solution)).ravel(),
+            solution.state.theta,
+            solution.state.points_l.ravel(),
+            solution.cost,
+            max(solution.redundancy, 0),
+            own_information(solution)[columns],
+            ground_sample_distance(solution.network),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        first = self.solution.layout.n_model
+        return tuple(self.solution.layout.names[first + k] for k in self.places.tolist())
+
+    @property
+    def state(self) -> State:
+        """Values without the parameters that are held at zero."""
+        layout = self.solution.layout
+        gone = layout.n_model + np.setdiff1d(np.arange(layout.n_camera), self.places)
+        return State(np.delete(self.theta, gone), self.points_l.reshape(-1, 3))
+
+    @property
+    def evidence(self) -> Evidence:
+        """What is known of the parameters that are left."""
+        layout, columns = self.solution.layout, self.solution.layout.n_model + self.places
+        inner = self.cofactors[columns]
+        q = np.maximum(np.diagonal(inner), 0.0)
+        cross = np.concatenate([self.cofactors[: layout.n_model], self.to_points])
+        strongest, r = strongest_correlations(cross, np.concatenate([self.orientation, self.of_points]), q)
+        names = self.names
+        return Evidence(
+            names,
+            self.theta[columns],
+            inner,
+            self._pivots(q),
+            _partners(self.solution, self.places, strongest),
+            r,
+            point_sigmas(self.to_points.reshape(len(self.to_points) // 3, 3, len(q)), q),
+            float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else 1.0,
+            self.redundancy,
+            self.gsd_m,
+            ranks(names, self.solution.network.camera),
+        )
+
+    def without(self, name: str) -> Reduced | None:
+        """One parameter less; None where the network has to be adjusted anew for that.
+
+        So it is where nothing but the pivot tells a parameter from the other unknowns, and where it is so far from zero
+        that observation equations become others without it.
+        """
+        i, problem = self.names.index(name), self.solution.problem
+        column = problem.layout.n_model + int(self.places[i])
+        q, value = self.cofactors[column, i], self.theta[column]
+        prior = problem.prior.matrix.tocsc()[:, [column]]
+        apart = self.solution.factor.undetermined.vectors.shape[1] == 0 and q * self.information[self.places[i]] > 0
+        if not apart or 1.0 / (q * self.information[self.places[i]]) < LEAST_PIVOT:
+            return None
+        if value**2 / q > FAR**2 or problem.prior.value[prior.indices].any():
+            return None
+        keep = np.arange(len(self.places)) != i
+        column_q, point_q = self.cofactors[:, i], self.to_points[:, i]
+        share = self.cofactors[column, keep] / q
+        return replace(
+            self,
+            places=self.places[keep],
+            cofactors=self.cofactors[:, keep] - column_q[:, None] * share,
+            to_points=self.to_points[:, keep] - point_q[:, None] * share,
+            orientation=self.orientation - column_q[: len(self.orientation)] ** 2 / q,
+            of_points=self.of_points - point_q**2 / q,
+            theta=self.theta - column_q * (value / q),
+            points_l=self.points_l - point_q * (value / q),
+            cost=self.cost + float(value**2 / q),
+            redundancy=self.redundancy + 1 - prior.nnz,
+        )
+
+    def _pivots(self, q: Array) -> Array:
+        """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where
+        singular."""
+        own = self.information[self.places]
+        pivot = np.divide(1.0, own * q, out=np.ones_like(q), where=(own > 0) & (q > 0))
+        pivot[own == 0] = 0.0
+        null = np.abs(self.solution.factor.undetermined.vectors[self.solution.layout.n_model + self.places])
+        pivot[(null > 0.3).any(axis=1)] = 0.0
+        return np.minimum(pivot, 1.0)
+
+
 def gather_evidence(solution: Solution) -> Evidence:
     """What a solution says about its additional parameters."""
-    layout = solution.layout
-    m, first = layout.n_camera, layout.n_model
-    columns = np.arange(first, first + m)
-    unit = np.zeros((layout.n_unknowns, m))
-    unit[columns, np.arange(m)] = 1.0
-    Q = solution.factor.solve(unit)
-    q = np.maximum(np.diagonal(Q[columns]), 0.0)
-    to_points = point_unknown_cofactors(solution, columns)
-    of_points = np.einsum("pii->pi", point_cofactors(solution)).ravel()
-    cross = np.concatenate([Q[:first], to_points.reshape(-1, m)])
-    strongest, r = strongest_correlations(cross, np.concatenate([solution.factor.variances()[:first], of_points]), q)
-    sigma0 = solution.sigma0 if solution.redundancy > 0 else 1.0
-    names = layout.names[first : first + m]
-    return Evidence(
-        names,
-        solution.camera_parameters,
-        Q[columns],
-        _pivots(solution, q),
-        _partners(solution, strongest),
-        r,
-        point_sigmas(to_points, q),
-        sigma0,
-        max(solution.redundancy, 0),
-        ground_sample_distance(solution.network),
-        ranks(names, solution.network.camera),
-    )
+    return Reduced.of(solution).evidence
 
 
 def eliminate(
@@ -74,6 +190,9 @@ def eliminate(
 ) -> Elimination:
     """Remove parameters that are not determinable, one at a time, the worst first.
 
+    What is left is computed from the cofactors of the solution as far as that goes, and adjusted and examined again
+    when nothing more is to be removed.
+
     Parameters
     ----------
     solution : with the full set
@@ -84,27 +203,41 @@ def eliminate(
     removed: list[Removal] = []
     kept: dict[str, str] = {}
     while solution.layout.n_camera:
-        verdict = examine(gather_evidence(solution), limits)
-        kept = verdict.kept
-        if verdict.removal is None:
+        known: Reduced | None = Reduced.of(solution)
+        left, gone = known, list[str]()
+        while known is not None:
+            left = known
+            verdict = examine(known.evidence, limits)
+            kept = verdict.kept
+            if verdict.removal is None:
+                break
+            removed.append(verdict.removal)
+            if progress:
+                progress(verdict.removal)
+            gone.append(verdict.removal.name)
+            known = known.without(verdict.removal.name)
+        if not gone:
             break
-        removed.append(verdict.removal)
-        if progress:
-            progress(verdict.removal)
-        solution = without(solution, verdict.removal.name, options, adapt)
+        solution = without(left, gone, options, adapt)
     return Elimination(solution, tuple(removed), kept)
 
 
-def without(solution: Solution, name: str, options: AdjustmentOptions, adapt: Callable[[Problem], Problem]) -> Solution:
-    """The adjustment without one additional parameter, from the values of the one with it."""
-    old = solution.problem
+def without(
+    left: Reduced, gone: Sequence[str], options: AdjustmentOptions, adapt: Callable[[Problem], Problem]
+) -> Solution:
+    """The adjustment without some additional parameters, from the values of what is left."""
+    old = left.solution.problem
     assert old.self_calibration is not None
-    smaller = old.self_calibration.without([name])
+    smaller = old.self_calibration.without(gone)
     problem = adapt(pose_problem(old.network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
     problem = replace(problem, control=old.control, earlier=old.earlier)
-    place = old.layout.names.index(name, old.layout.n_model)
-    start = State(np.delete(solution.state.theta, place), solution.state.points_l)
-    return solve(problem, start, solution.ray_weight, options)
+    start = left.state
+    if last := [k for k, name in enumerate(left.names) if name in gone]:  # it could not be taken out of the cofactors
+        start = State(np.delete(start.theta, old.layout.n_model + np.array(last)), start.points_l)
+    weight = left.solution.ray_weight
+    found = solve(problem, start, weight, options)
+    # places and weights of the rays are those of the start; once more where they are now
+    return solve(found.problem, found.state, weight, options)
 
 
 def own_information(solution: Solution) -> Array:
@@ -127,19 +260,9 @@ def own_information(solution: Solution) -> Array:
     return own
 
 
-def _pivots(solution: Solution, q: Array) -> Array:
-    """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where singular."""
-    parameters = slice(solution.layout.n_model, solution.layout.n_model + len(q))
-    own = own_information(solution)[parameters]
-    pivot = np.divide(1.0, own * q, out=np.ones_like(q), where=(own > 0) & (q > 0))
-    pivot[own == 0] = 0.0
-    null = np.abs(solution.factor.undetermined.vectors[parameters])
-    pivot[(null > 0.3).any(axis=1)] = 0.0
-    return np.minimum(pivot, 1.0)
-
-
-def _partners(solution: Solution, strongest: NDArray[np.int64]) -> tuple[str, ...]:
-    """Names of the unknowns (m,) that the parameters are most correlated with: of the orientation, then coordinates."""
+def _partners(solution: Solution, places: NDArray[np.int64], strongest: NDArray[np.int64]) -> tuple[str, ...]:
+    """Names of the unknowns (m,) that the parameters at places (m,) are most correlated with: of the orientation, then
+    coordinates."""
     first, m = solution.layout.n_model, len(strongest)
     names, points = solution.layout.names, solution.network.point_ids
     partner = [
@@ -148,10 +271,10 @@ def _partners(solution: Solution, strongest: NDArray[np.int64]) -> tuple[str, ..
     ]
     null = solution.factor.undetermined.vectors
     for i in range(m):  # where the system is singular, what the parameter cannot be told from
-        own = np.abs(null[first + i])
+        own = np.abs(null[first + places[i]])
         if own.max(initial=0.0) > 0.3:
             part = np.abs(null[:, int(np.argmax(own))])
-            part[first + i] = 0.0
+            part[first + places[i]] = 0.0
             members = [k for k in np.argsort(-part, kind="stable")[:3] if part[k] > PART]
             partner[i] = describe(tuple(names[k] for k in members), 0) if members else "nothing"
     return tuple(partner)

@@ -1,0 +1,71 @@
+"""Parameters taken out of the cofactors one after another, against the network adjusted anew without each."""
+
+import numpy as np
+import pytest
+from adjustment_networks import CAMERA, simulate
+
+from triline.solver.adjustment.adjustment import AdjustmentOptions, pose_problem, solve
+from triline.solver.adjustment.determinability import Limits, examine
+from triline.solver.adjustment.parameter_elimination import Reduced, eliminate, gather_evidence
+from triline.solver.camera.self_calibration import tls
+from triline.solver.models.dgr import DgrOptions
+
+MODEL, PARAMETERS = DgrOptions(), tls(CAMERA)
+#: True values of parameters; those of the others are zero.
+ERRORS = {"k1": 3e-6, "xp_F": 0.004, "sy_B": 1e-4}
+
+
+@pytest.fixture(scope="module")
+def full():
+    network = simulate(
+        4, MODEL, points=150, strips=2, cross=1, length_m=4000.0, self_calibration=PARAMETERS, camera_parameters=ERRORS
+    ).network
+    return solve(pose_problem(network, MODEL, PARAMETERS))
+
+
+def anew(full, gone):
+    """The evidence of the network adjusted without parameters, places and weights of rays taken where they are then."""
+    found = solve(pose_problem(full.network, MODEL, PARAMETERS.without(gone)))
+    return gather_evidence(solve(found.problem, found.state))
+
+
+def test_what_is_left_is_what_an_adjustment_without_the_parameters_says(full):
+    known, gone = Reduced.of(full), []
+    for _ in range(6):
+        verdict = examine(known.evidence, Limits())
+        assert verdict.removal is not None
+        gone.append(verdict.removal.name)
+        known = known.without(gone[-1])
+        assert known is not None
+    ours, theirs = known.evidence, anew(full, gone)
+    assert ours.names == theirs.names and ours.redundancy == theirs.redundancy and ours.partner == theirs.partner
+    assert ours.sigma0 == pytest.approx(theirs.sigma0, rel=1e-5)
+    assert np.abs(ours.t - theirs.t).max() < 0.02
+    np.testing.assert_allclose(ours.sigma, theirs.sigma, rtol=1e-3)
+    np.testing.assert_allclose(ours.correlation, theirs.correlation, rtol=1e-3)
+    np.testing.assert_allclose(ours.pivot, theirs.pivot, rtol=2e-3)
+    np.testing.assert_allclose(ours.point_sigma_m, theirs.point_sigma_m, rtol=1e-3)
+
+
+def test_the_parameters_that_go_are_those_that_adjustments_after_each_would_name(full):
+    outcome = eliminate(full)
+    gone = []
+    while (verdict := examine(anew(full, gone) if gone else gather_evidence(full))).removal is not None:
+        gone.append(verdict.removal.name)
+    assert [r.name for r in outcome.removed] == gone and len(gone) > 6
+    assert outcome.kept.keys() == verdict.kept.keys()
+    # and the adjustment is that without them
+    end = solve(outcome.solution.problem, outcome.solution, options=AdjustmentOptions())
+    found = solve(pose_problem(full.network, MODEL, PARAMETERS.without(gone)))
+    for _ in range(4):  # places and weights are those of the start
+        found = solve(found.problem, found.state)
+    sigma = np.sqrt(found.factor.variances())
+    assert np.abs((end.state.theta - found.state.theta) / sigma).max() < 1e-4
+    assert end.cost == pytest.approx(found.cost, rel=1e-5)
+
+
+def test_what_only_the_pivot_tells_apart_or_lies_far_from_zero_is_adjusted_anew(full):
+    known = Reduced.of(full)
+    t = np.abs(known.theta[known.solution.layout.n_model :]) / np.sqrt(np.diag(gather_evidence(full).cofactors))
+    near, far = known.names[int(np.argmin(t))], known.names[int(np.argmax(t))]
+    assert t.max() > 10.0 and known.without(near) is not None and known.without(far) is None
