@@ -137,9 +137,9 @@ class AircraftRecorder(Recorder):
         share = self._share(topic)
         return 1 if share is None else share.every
 
-    def tend(self) -> None:
+    def tend(self, waited_s: float = 0.0, waiting: int = 0) -> None:
         with self._here:
-            super().tend()
+            super().tend(waited_s, waiting)
 
     def lacks(self, inventory: Any) -> list[Gap]:
         """What the aircraft has for some time and is not here, what is wanted first before the rest.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..adjustment.network import Strip
 from ..camera.collinearity import project
@@ -101,7 +101,8 @@ def _looks_of_strip(point_l: Array, index: int, strip: Strip, camera: LineCamera
     point_l = point_l[near]
     stride = max(1, round(COARSE_S / FINE_S))
     around = np.arange(-round(WINDOW_S / FINE_S), round(WINDOW_S / FINE_S) + 1)
-    found = [(np.empty(0, dtype=int), np.empty(0, dtype=int), *(np.empty(0) for _ in range(3)))]
+    nothing, no_number = np.empty(0, dtype=int), np.empty(0)
+    found: list[tuple[IntArray, IntArray, Array, Array, Array]] = [(nothing, nothing, no_number, no_number, no_number)]
     for first in range(0, len(point_l), 400):
         chunk = point_l[first : first + 400]
         coarse = np.arange(0, len(t), stride)
@@ -143,7 +144,7 @@ def _within_reach(point_l: Array, position_l: Array, R_lc: Array, camera: LineCa
     if depth <= 0 or (ray_l[..., 2] >= 0).any():
         return np.arange(len(point_l))
     reach = 1.2 * depth * float((np.hypot(ray_l[..., 0], ray_l[..., 1]) / -ray_l[..., 2]).max())
-    away, _ = cKDTree(position_l[:, :2]).query(point_l[:, :2], distance_upper_bound=reach)
+    away, _ = KDTree(position_l[:, :2]).query(point_l[:, :2], distance_upper_bound=reach)
     return np.flatnonzero(np.isfinite(away))
 
 
