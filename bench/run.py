@@ -395,9 +395,9 @@ BENCHMARKS = (
     ),
     Benchmark(
         "faults-day",
-        "And in a day of flight, thirty times real time?",
-        ("python bench/faults.py --long --seconds 86400 --rate 30 --attitude-rate 5 --ties 0.2",),
-        60,
+        "And in a day of flight, fifteen times real time?",
+        ("python bench/faults.py --long --seconds 86400 --rate 15 --attitude-rate 10 --ties 0.2",),
+        105,
     ),
     Benchmark(
         "fuzz",

@@ -34,7 +34,7 @@ FLUSH_S = 0.3
 WAITING_BYTES = 256 << 20
 #: So many messages are written before the recorder looks at its disk, its status and its orders again.
 PORTION = 500
-#: The disk is too slow when something has waited for it for so long, s.
+#: The disk, or the machine, is too slow when something has waited for so long, s.
 SLOW_S = 3.0
 #: What comes in this time after the start is sorted: configuration and control to the head of the file.
 HEAD_S = 0.4
@@ -220,8 +220,8 @@ class Recorder(Node):
         now = time.monotonic()
         self._tell_disk()
         self.alarms["slow disk"] = (
-            f"the disk is too slow: {waiting / 1e6:.1f} MB wait to be written, since {waited_s:.0f} s; they are kept, "
-            "and publishers are held back when too much waits"
+            f"the disk or the machine is too slow: {waiting / 1e6:.1f} MB wait to be recorded, since {waited_s:.0f} s; "
+            "they are kept, and publishers are held back when too much waits"
             if waited_s > SLOW_S else ""
         )  # fmt: skip
         if self._lost and self._writer is not None:

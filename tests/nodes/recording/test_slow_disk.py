@@ -76,7 +76,7 @@ def test_a_slow_disk_is_told_and_nothing_is_lost(tmp_path, bodies):
         recorder = rig.start("node", "recorder", "-o", tmp_path / "pipe.mcap")
         wait_for(lambda: "recorder" in bus.alive(), 30, "the recorder")
         sensors = Sensors(bus, bodies)
-        slow = "the disk is too slow: "
+        slow = "the disk or the machine is too slow: "
         wait_for(
             lambda: any(slow in s.alarm and "MB wait" in s.alarm for s in statuses), 20, "the slow disk to be told"
         )
