@@ -10,6 +10,7 @@ import signal
 import subprocess
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -167,7 +168,7 @@ def second_replay(rig: Rig) -> None:
 # ---- the link between the sensors and the nodes
 
 
-class RemoteRig(Rig):
+class RemoteRig(Rig, ABC):
     """The same with the replay on the other side of a link. Nodes find each other as ever; the replay calls each of
     them, and this program, over the link, is called by nobody, and is told of nobody."""
 
@@ -176,9 +177,9 @@ class RemoteRig(Rig):
         self._ports = {name: free_port() for name in ("campaign", *NODES)}
         self.group = NodeGroup(folder / "log", "demo", 0, self._file("campaign"))
 
+    @abstractmethod
     def far_ends(self) -> list[str]:
         """What the replay calls."""
-        raise NotImplementedError
 
     def listening(self, port: int) -> list[str]:
         """Where a program with a port listens."""
@@ -293,6 +294,15 @@ class SlowDiskRig(Rig):
         self._disk, self._image = folder / "disk", folder / "disk.img"
         self._disk.mkdir()
         super().__init__(flight, folder, rate, self._disk / "live.mcap")
+        self._bytes_s = bytes_s
+
+    def mount(self) -> None:
+        """Make the file system.
+
+        Raises
+        ------
+        OSError, subprocess.CalledProcessError : not on this machine, or not for this user
+        """
         with open(self._image, "wb") as image:
             image.truncate(1 << 30)
         for command in (
@@ -302,7 +312,7 @@ class SlowDiskRig(Rig):
             subprocess.run(command, check=True, capture_output=True)
         self.group_folder.mkdir(exist_ok=True)
         device = self._disk.stat().st_dev
-        limit = f"{os.major(device)}:{os.minor(device)} {bytes_s:.0f}"
+        limit = f"{os.major(device)}:{os.minor(device)} {self._bytes_s:.0f}"
         (self.group_folder / "blkio.throttle.write_bps_device").write_text(limit)
 
     def start(self, name: str, **named: str) -> None:
@@ -318,11 +328,12 @@ class SlowDiskRig(Rig):
 
 def slow_disk(flight: Path, folder: Path, rate: float, bytes_s: float) -> tuple[list[Path], list[str]] | None:
     """The recorder on a disk that is too slow; None where none can be made."""
+    rig = SlowDiskRig(flight, folder, rate, bytes_s)
     try:
-        rig = SlowDiskRig(flight, folder, rate, bytes_s)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    try:
+        try:
+            rig.mount()
+        except (OSError, subprocess.CalledProcessError):
+            return None
         paths = rig.fly(None)
         return [Path(shutil.copy(path, folder / f"kept_{path.name}")) for path in paths], rig.alarms
     finally:

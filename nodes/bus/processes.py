@@ -42,13 +42,13 @@ class NodeProcess:
         """
         if self.running:
             self.process.send_signal(signal.SIGINT)
-        written = -1
+        written = _bytes_in(writes_to)
         while True:
             try:
                 return self.process.wait(timeout_s)
             except subprocess.TimeoutExpired:
                 before, written = written, _bytes_in(writes_to)
-                if written > before and writes_to is not None:
+                if written > before:
                     continue
                 self.process.kill()
                 return self.process.wait()

@@ -95,9 +95,10 @@ def play(
     leave_out = set() if everything else regenerated(reader)
     numbers = reader.select()
     channel = reader.index.channel[numbers]
-    for id, count in zip(*np.unique(channel[np.isin(channel, list(leave_out))], return_counts=True), strict=True):
+    left = np.isin(channel, list(leave_out))
+    for id, count in zip(*np.unique(channel[left], return_counts=True), strict=True):
         result.left_out[reader.channels[int(id)].topic] += int(count)
-    head, body = _split(reader, numbers[~np.isin(channel, list(leave_out))], from_ns, to_ns)
+    head, body = _split(reader, numbers[~left], from_ns, to_ns)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):

@@ -4,8 +4,10 @@ import subprocess
 import sys
 import time
 
+import pytest
 from bus_rig import free_port
 
+from triline.nodes.bus.processes import NodeProcess
 from triline.nodes.recording.reader import RecordingReader
 
 PARENT = """
@@ -38,3 +40,37 @@ def test_nodes_end_cleanly_when_their_parent_is_killed(tmp_path):
         time.sleep(0.2)
     assert "messages in" in log.read_text(), "the recorder did not end by itself"
     assert RecordingReader(recording).complete
+
+
+@pytest.mark.parametrize("portions", [0, 3])
+def test_a_recorder_that_still_writes_is_waited_for(tmp_path, portions):
+    """It is killed when its file has not grown in the time that it is given."""
+    path, killed = tmp_path / "flight.mcap", []
+
+    class Writing:
+        """Of a process that takes more than the time-out for each portion, and then hangs or ends."""
+
+        def poll(self):
+            return None
+
+        def send_signal(self, number):
+            path.write_bytes(b"x")
+            self.left = portions
+
+        def wait(self, timeout_s=None):
+            if killed:
+                return -9
+            if self.left:
+                self.left -= 1
+                path.write_bytes(path.read_bytes() + b"x")
+                raise subprocess.TimeoutExpired("recorder", timeout_s)
+            if portions:
+                return 0
+            raise subprocess.TimeoutExpired("recorder", timeout_s)
+
+        def kill(self):
+            killed.append(True)
+
+    path.write_bytes(b"x")
+    node = NodeProcess("recorder", Writing(), tmp_path / "recorder.log")
+    assert node.stop(1.0, tmp_path) == (0 if portions else -9) and bool(killed) == (not portions)
