@@ -374,7 +374,7 @@ def test_others_go_on_while_recorder_and_adjuster_are_frozen(tmp_path):
         recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
         adjuster, navigator = rig.start("node", "adjuster"), rig.start("node", "navigator")
         wait_for(lambda: bus.alive() >= {"recorder", "navigator", "adjuster"}, 40, "the nodes")
-        replay = rig.start("replay", simulated_flight(12), "--rate", 1.5, "--wait-for", "navigator,adjuster")
+        replay = rig.start("replay", simulated_flight(90), "--rate", 1.5, "--wait-for", "navigator,adjuster")
         wait_for(lambda: len(heard.get("adjustment/report", ())) > 3, 30, "reports")
         for process_ in (recorder, adjuster):
             process_.send_signal(signal.SIGSTOP)
@@ -407,7 +407,7 @@ def test_a_recorder_without_room_says_so_and_goes_on_when_there_is_room(tmp_path
         bus.subscribe("sensor/attitude", lambda raw: heard.append(time.monotonic()))
         recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
         wait_for(lambda: "recorder" in bus.alive(), 40, "the recorder")
-        replay = rig.start("replay", simulated_flight(12), "--rate", 1.5, "--wait-for", "navigator,adjuster")
+        replay = rig.start("replay", simulated_flight(90), "--rate", 1.5, "--wait-for", "navigator,adjuster")
         wait_for(lambda: len(heard) > 900, 30, "some chunks")
         whole = (tmp_path / "a.mcap").stat().st_size
         _, hard = resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE)

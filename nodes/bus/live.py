@@ -99,7 +99,6 @@ class BusRunner:
         self._looked_s = 0.0
         self._busy_s = 0.0  # so far on messages
         self._opened_anew = 0
-        self._recall = Recall(bus, self._driver.inputs, self._check)
         self._said_ns = 0  # up to here somebody of this name has spoken before
         self._heard_s: dict[str, float] = {}  # when something of a topic was worked on
         self._open_strip = ""
@@ -108,6 +107,9 @@ class BusRunner:
         results = any(topics.find(name).family is Family.RESULT for name in node.inputs)
         # Who publishes nothing needs no order, and must not slow down those who do.
         self._ordered = bool(node.outputs)
+        listened = self._driver.inputs
+        asked = listened if self._ordered else [name for name in listened if topics.find(name).latched]
+        self._recall = Recall(bus, asked, self._check)
         self._idle_s = IDLE_RESULTS_S if results else IDLE_S
 
     def stop(self) -> None:
@@ -151,8 +153,9 @@ class BusRunner:
         arrived: list[RawMessage] = []
         while time.monotonic() < until and not self._stop.is_set():
             arrived += self._inbox.take(0.05)
+        arrived = self._under_way(arrived)
         latched = [raw for raw in arrived if topics.find(raw.topic).latched]
-        rest = self._under_way([raw for raw in arrived if not topics.find(raw.topic).latched])
+        rest = [raw for raw in arrived if not topics.find(raw.topic).latched]
         for raw in sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)):
             for accepted in self._check.accept(raw.topic, raw.envelope, raw):
                 message = self._decode(accepted)
@@ -168,10 +171,9 @@ class BusRunner:
     def _under_way(self, arrived: list[RawMessage]) -> list[RawMessage]:
         """What has come, and before it what was said lately, if a flight is under way when this node begins.
 
-        What another one of its name has said before, which is gone now, is not said again.
+        What another one of its name has said before, which is gone now, is not said again. A node that only looks on
+        asks for what is latched alone.
         """
-        if not self._ordered:
-            return arrived
         joined = self._recall.joined(arrived)
         if self._recall.recalled:
             heard = self.bus.query("heard", "observation/progress", source=self.node.name)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable
 from typing import TypeVar
 
+from ...schemas import topics
 from ...schemas.envelope import Envelope, RawMessage
 from ..ordering import StreamCheck, order_key
 from .session import KEPT_S, Bus, is_kept
@@ -23,6 +24,8 @@ STOOD_STILL_S = 1.0
 ON_ITS_WAY_S = 10.0
 #: Missing numbers are asked for at most so often, s: what nobody keeps any more stays missing.
 AGAIN_S = 1.0
+#: A configuration that has not come is asked for so often, s.
+CONFIGURATION_AGAIN_S = 5.0
 
 
 class Recall:
@@ -36,14 +39,16 @@ class Recall:
 
     Attributes
     ----------
-    recalled : how many messages were asked for again and came
+    recalled : how many messages of a flight were asked for again and came; what is latched is not counted
     """
 
     def __init__(self, bus: Bus, names: Iterable[str], check: StreamCheck[T]) -> None:
         self._bus, self._names, self._check = bus, tuple(names), check
+        self._under_way = tuple(name for name in self._names if not topics.find(name).latched)
         self._opened = len(bus.opened_anew)
         self._round_s = self._recalled_s = time.monotonic()
         self._asked_s = -AGAIN_S  # because of missing numbers
+        self._configured_s = self._round_s  # when configuration was asked for
         self._given: set[tuple[str, Envelope]] = set()  # by the last recall; what was on its way comes once more
         self.recalled = 0
 
@@ -60,24 +65,41 @@ class Recall:
                 self._given.clear()
         stood_still = now_s - self._round_s > STOOD_STILL_S
         missing = now_s - self._asked_s > AGAIN_S and self._skip(raws)
+        lacking = self._lacking(now_s)
         if not stood_still and not missing and opened == self._opened:
-            return raws
+            return self._joined(raws, lacking, KEPT_S) if lacking else raws
+        names = self._names if opened != self._opened else (*lacking, *self._under_way)
         self._opened = opened
         if missing:
             self._asked_s = now_s
-        return self.joined(raws)
+        return self._joined(raws, names, KEPT_S)
 
     def joined(self, raws: list[RawMessage], seconds: float = KEPT_S) -> list[RawMessage]:
-        """What has come and what publishers have said lately, less what was there before, in order."""
+        """What has come and what publishers have said lately, less what was there before, in order.
+
+        All that is latched is asked for as well: a node that lacks its configuration would wait for ever.
+        """
+        return self._joined(raws, self._names, seconds)
+
+    def _joined(self, raws: list[RawMessage], names: Iterable[str], seconds: float) -> list[RawMessage]:
         had = {(raw.topic, raw.envelope) for raw in raws}
         missed = [
             raw
-            for raw in self._bus.recall(self._names, seconds)
+            for raw in self._bus.recall(names, seconds)
             if (raw.topic, raw.envelope) not in had and self._check.lacks(raw.topic, raw.envelope)
         ]
-        self._recalled_s, self._given = time.monotonic(), {(raw.topic, raw.envelope) for raw in missed}
-        self.recalled += len(missed)
+        if missed:
+            self._recalled_s, self._given = time.monotonic(), {(raw.topic, raw.envelope) for raw in missed}
+        self.recalled += sum(not topics.find(raw.topic).latched for raw in missed)
         return sorted([*missed, *raws], key=lambda raw: order_key(raw.topic, raw.envelope)) if missed else raws
+
+    def _lacking(self, now_s: float) -> tuple[str, ...]:
+        """Configuration that is to be asked for now, because none has come: without it a node stays mute."""
+        if now_s - self._configured_s < CONFIGURATION_AGAIN_S:
+            return ()
+        self._configured_s = now_s
+        names = (name for name in self._names if name.startswith("configuration/"))
+        return tuple(name for name in names if name not in self._check.counts)
 
     def _skip(self, raws: list[RawMessage]) -> bool:
         """Whether numbers are missing before or between messages that have come."""
@@ -87,7 +109,7 @@ class Recall:
             last = newest.get(stream)
             if last is None:
                 last = self._check.last(topic, envelope)
-            if last is not None and number > last + 1 and is_kept(topic):
+            if last is not None and number > last + 1 and is_kept(topic) and not topics.find(topic).latched:
                 return True
             newest[stream] = number if last is None else max(last, number)
         return False

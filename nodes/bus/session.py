@@ -294,8 +294,9 @@ class Bus:
     def recall(self, names: Iterable[str], seconds: float = KEPT_S, timeout_s: float = 3.0) -> list[RawMessage]:
         """What others have said lately on topics (names of the table), as far as they live and keep it, in any order.
 
-        Topics that are latched are left out: whoever subscribes to them gets all of it. Where a publisher does not
-        answer in time, as on a busy machine, all are asked again, until `ASKED_S` have passed.
+        Of topics that are latched it is all that was ever said. Whoever subscribes to one gets that, too, but is asked
+        for once alone: on a busy machine the answer may come too late. Where a publisher does not answer here in time,
+        all are asked again, until `ASKED_S` have passed.
         """
         found: dict[tuple[str, Envelope], RawMessage] = {}
         until_s = time.monotonic() + ASKED_S
@@ -308,8 +309,9 @@ class Bus:
         self, name: str, seconds: float, timeout_s: float, found: dict[tuple[str, Envelope], RawMessage]
     ) -> bool:
         """Add what was said lately on a topic; whether all who keep it have answered."""
+        lately = "" if topics.find(name).latched else f"?_time=[now(-{seconds:.3f}s)..]"
         replies = self._session.get(
-            f"{self.key(name)}/@adv/**?_time=[now(-{seconds:.3f}s)..]",  # where `zenoh.ext` answers from its cache
+            f"{self.key(name)}/@adv/**{lately}",  # where `zenoh.ext` answers from its cache
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
@@ -570,8 +572,7 @@ class Bus:
 
 def is_kept(topic: str) -> bool:
     """Whether what is said on a topic can be recalled."""
-    row = topics.find(topic)
-    return not row.latched and _kept(row) > 0
+    return _kept(topics.find(topic)) > 0
 
 
 def _kept(row: topics.Topic) -> int:

@@ -467,10 +467,11 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     until = time.monotonic() + HEAD_S
     while time.monotonic() < until and not options.stop.is_set():
         head += backlog.take(0.05)
+    recall = recorder.recall(bus)
+    head = recall.joined(head, BEFORE_S)
     latched = [raw for raw in head if topics.find(raw.topic).latched]
     recorder.take(sorted(latched, key=lambda raw: order_key(raw.topic, raw.envelope)))
-    recall = recorder.recall(bus)
-    recorder.take(recall.joined([raw for raw in head if not topics.find(raw.topic).latched], BEFORE_S))
+    recorder.take([raw for raw in head if not topics.find(raw.topic).latched])
     bus.answer("heard", recorder.heard)
     bus.answer_messages("inventory", recorder.inventory)
     bus.answer_messages("recorded", recorder.recorded)

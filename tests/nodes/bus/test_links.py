@@ -9,7 +9,7 @@ import time
 import sample_messages as sample
 from bus_rig import Rig, free_port, wait_for
 
-from triline.nodes.bus import live, session
+from triline.nodes.bus import live, recall, session
 from triline.nodes.bus.links import BEAT_S, LOOK_S, MISSED_S, REST_S, TOLD, LinkWatch
 from triline.nodes.bus.live import BusRunner, in_thread
 from triline.nodes.bus.session import Bus
@@ -113,6 +113,30 @@ def test_a_session_that_was_opened_anew_misses_nothing_that_was_declared():
     assert [message.topic for message in node.given[:2]] == ["configuration/camera", "sensor/attitude"]
     assert late.given[0].topic == "configuration/camera"
     assert node.counters["session opened anew"] == 1
+
+
+def test_a_node_whose_question_for_the_configuration_was_lost_asks_again(monkeypatch):
+    """On a busy machine the answer that a subscriber waits for once can come too late: it must not be mute for ever."""
+
+    def without_history(session, key, handler, history):
+        return session.declare_subscriber(key, handler)
+
+    monkeypatch.setattr(session.zenoh.ext, "declare_advanced_subscriber", without_history)
+    monkeypatch.setattr(recall, "CONFIGURATION_AGAIN_S", 0.5)
+    for at_once in (True, False):  # what is said before the node begins, and after that where nobody hears it
+        port, node = free_port(), Keeps()
+        with Bus(port=port, source="test") as sender:
+            if at_once:
+                sender.publish(sample.message("configuration/camera"))
+            with Bus(port=port, source="chain") as bus, in_thread(BusRunner(node, bus)):
+                wait_for(lambda sender=sender: sender.alive() == {"keeps"}, 10, "the node")
+                if not at_once:
+                    wait_for(lambda bus=bus: bus.peers() == 1, 10, "the link")
+                    bus._generation += 1  # nothing that comes by itself is handed on
+                    sender.publish(sample.message("configuration/camera"))
+                wait_for(lambda node=node: node.given, 10, "the camera")
+                time.sleep(1.2)  # it is asked for no more
+        assert [message.topic for message in node.given] == ["configuration/camera"]
 
 
 def test_a_session_that_takes_long_to_close_does_not_stop_the_watch(monkeypatch):

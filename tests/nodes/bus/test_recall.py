@@ -90,14 +90,21 @@ def test_what_speaks_no_more_and_what_is_too_much_is_not_recalled():
 
 
 def test_a_flight_whose_recorder_and_adjuster_were_killed_is_whole(tmp_path):
-    """The flight stands still while the nodes are started again, so that it is not over by then on a busy machine."""
-    flight, paused = simulated_flight(12), threading.Event()
+    """The flight goes on by parts, so that it is not over before the nodes are killed on a busy machine."""
+    recorded = RecordingReader(simulated_flight(12))
+    said = allowed = 0
 
     def hold() -> float:
+        nonlocal said
         begun = time.monotonic()
-        while paused.is_set():
+        while said >= allowed:
             time.sleep(0.01)
+        said += 1
         return time.monotonic() - begun
+
+    def go_on_to(share: float) -> None:
+        nonlocal allowed
+        allowed = round(share * len(recorded.index))
 
     with Rig(tmp_path) as rig, Bus(port=rig.port, source="listener") as bus:
         nodes = {name: rig.start("node", name) for name in ("navigator", "adjuster")}
@@ -106,27 +113,29 @@ def test_a_flight_whose_recorder_and_adjuster_were_killed_is_whole(tmp_path):
         starts: list[int] = []
         bus.subscribe("orientation/live", lambda raw: starts.append(raw.envelope.start))
         options = {"rate": 3.0, "start": bus.start + 1, "hold": hold}
-        arguments = (RecordingReader(flight), bus.publish_raw, threading.Event())
-        flying = threading.Thread(target=play, args=arguments, kwargs=options)
+        arguments = (recorded, bus.publish_raw, threading.Event())
+        flying = threading.Thread(target=play, args=arguments, kwargs=options, daemon=True)
         flying.start()
+        go_on_to(0.5)
         wait_for(lambda: len(starts) > 20, 60, "live orientation")
-        for name in ("recorder", "adjuster"):
+        for name, share in (("recorder", 0.55), ("adjuster", 0.6)):
             nodes[name].kill()
             nodes[name].wait()
-            paused.set()  # what was said between is missed, too
+            go_on_to(share)  # what is said meanwhile is missed
+            wait_for(lambda: said == allowed, 60, "the next part of the flight")
             more = ["-o", tmp_path / "live.mcap"] if name == "recorder" else []
             nodes[name] = rig.start("node", name, *more)
             wait_for(lambda name=name: name in bus.alive(), 40, name)
             if name == "recorder":  # it says how far the adjuster was heard
                 wait_for(lambda: bus.query("heard", "observation/progress", source="adjuster"), 40, "the recorder")
-        paused.clear()
+        go_on_to(1.0)
         flying.join()
         wait_for(lambda: len(set(starts)) == 2, 40, "the adjuster that took over")
         time.sleep(2.5)
         stopped = [rig.stop(nodes[name]) for name in ("navigator", "adjuster", "recorder")]
         assert stopped == [0, 0, 0], rig.log("adjuster")
         assert "begins with" in rig.log("adjuster") and "; 0 missing" in rig.log("recorder")
-    done = triline("process", flight, "-o", tmp_path / "processed.mcap")
+    done = triline("process", simulated_flight(12), "-o", tmp_path / "processed.mcap")
     assert done.returncode == 0, done.stderr
     triline("recover", tmp_path / "live.mcap", "-o", tmp_path / "first.mcap")
     parts = [RecordingReader(tmp_path / name) for name in ("first.mcap", "live_0001.mcap")]
