@@ -14,7 +14,8 @@ from ...schemas import codec
 from ...schemas.envelope import RawMessage
 from .session import Bus
 
-#: A node that is so far behind, s, slows the flight down until it is less far behind.
+#: A node that has so much to work off, s on the clock, slows the flight down until it has less. A load control
+#: (`governor.HURTS_S`) sheds work beyond that.
 HOLD_S, RELEASE_S = 2.0, 1.4
 #: ... by so much a message, s, and by more where a node is this many times as far behind. The flight never stands
 #: still: nodes take silence for the end and work off what they hold back.
@@ -31,9 +32,12 @@ class Brake:
     bus : an open bus
     names : nodes that are waited for, with commas between them; "" for none
     stop : ends every waiting
+    rate : seconds of the flight a second on the clock; nodes say how far behind they are in seconds of the flight.
+        Below 1 it counts as 1, so that nothing that is slower than life is further behind
     """
 
-    def __init__(self, bus: Bus, names: str, stop: threading.Event) -> None:
+    def __init__(self, bus: Bus, names: str, stop: threading.Event, rate: float = 1.0) -> None:
+        self._rate = max(rate, 1.0)
         self._names = frozenset(name.strip() for name in names.split(",") if name.strip())
         self._stop = stop
         self._lock = threading.Lock()
@@ -73,7 +77,7 @@ class Brake:
         except ValueError:
             return
         with self._lock:
-            self._lag_s[name], self._heard_s[name] = body.lag_s, time.monotonic()
+            self._lag_s[name], self._heard_s[name] = body.lag_s / self._rate, time.monotonic()
 
     def _changed(self, name: str, alive: bool) -> None:
         if not alive:

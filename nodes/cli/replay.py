@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         nobody = bus.why_alone() or _nobody(bus)
         bus.announce("player")
         bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
-        brake = Brake(bus, args.wait_for, stop)
+        brake = Brake(bus, args.wait_for, stop, args.rate)
         report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
         if nobody:
             report(nobody)

@@ -366,7 +366,7 @@ def run(options: ProgramOptions) -> int:
         bus.announce(simulator.name)
         epoch_ns = time.time_ns() - BEFORE_NS
         status = StatusPublisher(bus, simulator.name)
-        brake = Brake(bus, waited_for, options.stop)
+        brake = Brake(bus, waited_for, options.stop, rate)
         publish_paced(bus, _telling(simulator, epoch_ns, status, brake), rate, options.stop, hold=brake.wait)
         options.stop.wait(0.5)  # what is still on its way
     return 0
