@@ -356,11 +356,18 @@ def readable(paths: Iterable[Path], folder: Path) -> list[Path]:
 class LongRig(Rig):
     """Looks every second at the memory and the open files of its nodes, and prints them at tenths of the flight."""
 
-    def __init__(self, flight: Path, folder: Path, rate: float, seconds: float) -> None:
+    def __init__(self, flight: Path, folder: Path, rate: float, seconds: float, grid_hz: float) -> None:
         super().__init__(flight, folder, rate)
+        self.grid_hz = grid_hz
         self.patience_s = 600.0 + 3.0 * seconds / rate
         self.tenth_s = seconds / 10.0
         self.seen: list[tuple[float, dict[str, tuple[float, int]]]] = []  # s of flight; MB and files of each node
+
+    def start(self, name: str, **named: str) -> None:
+        if name == "adjuster":
+            self.group.start(name, "--set", f"grid_hz={self.grid_hz:g}", **named)
+        else:
+            super().start(name, **named)
 
     def watch(self) -> None:
         threading.Thread(target=self._look, daemon=True).start()

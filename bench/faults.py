@@ -305,13 +305,13 @@ def of_images(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
 # ---- a long flight
 
 
-def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float, ties: float) -> int:
+def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float, ties: float, grid_hz: float) -> int:
     """A block of strips with few tie points: final orientation that is missing, memory and open files of the nodes."""
     path = folder / "long.mcap"
     strips = max(1, round(seconds / LONG_STRIP_S))
     plan = ("--strips", str(strips), "--seconds", str(min(seconds, LONG_STRIP_S) - LONG_TURN_S), "--ties", str(ties))
     frame.triline("simulate", "-o", str(path), *plan, "--attitude-rate", str(attitude_rate), "--seed", "3", "-q")
-    rig = LongRig(path, _folder(folder, "long"), rate, seconds)
+    rig = LongRig(path, _folder(folder, "long"), rate, seconds, grid_hz)
     print(f"{'s of flight':<12}" + "".join(f"{name:>14}" for name in NODES), flush=True)
     begun = time.monotonic()
     flown = rig.fly(LongRig.watch, 0.0)
@@ -350,11 +350,12 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the flight of --long (3600)")
     parser.add_argument("--ties", type=float, default=1.0, help="tie points a second of --long (1)")
     parser.add_argument("--attitude-rate", type=float, default=50.0, help="attitudes a second of --long (50)")
+    parser.add_argument("--grid", type=float, default=10.0, help="orientations a second of --long (10)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="triline-faults-") as name:
         folder = Path(name)
         if args.long:
-            return long_flight(folder, args.seconds, args.rate or 10.0, args.attitude_rate, args.ties)
+            return long_flight(folder, args.seconds, args.rate or 10.0, args.attitude_rate, args.ties, args.grid)
         return campaign(folder, KINDS if args.kind == "all" else (args.kind,), args.only, args.rate or 1.0)
 
 

@@ -396,7 +396,7 @@ BENCHMARKS = (
     Benchmark(
         "faults-day",
         "And in a day of flight, fifteen times real time?",
-        ("python bench/faults.py --long --seconds 86400 --rate 15 --attitude-rate 10 --ties 0.2",),
+        ("python bench/faults.py --long --seconds 86400 --rate 15 --attitude-rate 10 --ties 0.2 --grid 4",),
         105,
     ),
     Benchmark(
