@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.simulator.flight_settings import DEFAULT_EPOCH_NS
 
 DEMO = [sys.executable, "-m", "triline.nodes.cli", "demo", "--headless", "--json"]
 RESULTS = (
@@ -94,6 +95,33 @@ def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path)
         live, again = bodies(folder / "flight.mcap", topic), bodies(processed, topic)
         assert len(live) > 100
         assert live == again, f"{topic} differs"
+
+
+def test_a_flight_that_waits_for_its_nodes_has_a_time_of_its_own(demo):
+    """So that a seed gives the same results each time: they follow from the sensors' messages alone (see above)."""
+    folder, _ = demo
+    stamps = [stamp_ns for stamp_ns, _ in bodies(folder / "flight.mcap", "sensor/attitude")]
+    assert stamps[0] == DEFAULT_EPOCH_NS
+    assert {stamp_ns - stamps[0] for stamp_ns in stamps} == {round(i / 200 * 1e9) for i in range(len(stamps))}
+
+
+@pytest.mark.study
+def test_the_same_seed_gives_the_same_results_on_a_busy_machine(tmp_path):
+    busy = [sys.executable, "-c", "while True: pass"]
+    for name, loops in (("idle", 0), ("busy", 2)):
+        others = [subprocess.Popen(busy) for _ in range(loops)]
+        try:
+            command = [*DEMO, "--seconds", "20", "--seed", "4", "-o", str(tmp_path / name)]
+            subprocess.run(command, check=True, capture_output=True, timeout=900)
+        finally:
+            for other in others:
+                other.kill()
+    for topic in (*RESULTS, "orientation/whole", "orthoimage/final", "event/log"):
+        idle, loaded = (
+            bodies(tmp_path / "idle" / "flight.mcap", topic),
+            bodies(tmp_path / "busy" / "flight.mcap", topic),
+        )
+        assert idle and idle == loaded, topic
 
 
 @pytest.mark.study

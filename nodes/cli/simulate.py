@@ -19,7 +19,16 @@ from ..errors import UserError
 from ..formats.geotiff import write_heights
 from ..formats.new_file import new_file, refuse_unless_folder
 from ..recording.writer import COMPRESSIONS, RecordingWriter
-from ..simulator.flight_settings import GRADES, OPTIONS, Option, SimulatedFlight, shown_default, simulated_flight
+from ..simulator.flight_settings import (
+    DEFAULT_EPOCH,
+    DEFAULT_EPOCH_NS,
+    GRADES,
+    OPTIONS,
+    Option,
+    SimulatedFlight,
+    shown_default,
+    simulated_flight,
+)
 from ..simulator.simulator import Simulator
 from ..simulator.world_settings import HELP, world_terms
 from .progress import progress
@@ -32,7 +41,6 @@ EXAMPLE = """triline simulate -o flight.mcap --sensor ads40 --strips 6 --cross 2
   triline simulate -o pair --satellite spot5-hrs --seed 1
   triline simulate -o triplet.mcap --satellite alos-prism --seed 1"""
 
-DEFAULT_EPOCH = "2026-05-01T10:00:00Z"
 _GROUPS = {
     "general": "flight",
     "plan": "planned flight",
@@ -102,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     if any(value is not None for value in (args.place, args.points, args.overpasses)):
         raise UserError("--place, --points and --overpasses go with --satellite")
     flight = simulated_flight({name: _single(value) for name, value in given.items() if value is not None})
-    epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or _utc_ns(DEFAULT_EPOCH)
+    epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or DEFAULT_EPOCH_NS
     simulator = Simulator(flight.simulation, flight.imager)
     with (
         new_file(Path(args.output)) as part,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,16 @@ from ...solver.simulation.inertial_sensors import InertialPlan
 from ...solver.simulation.misstated import World
 from ...solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for, real_motion
 from ...solver.simulation.scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
+from .. import convert
 from ..errors import UserError
 from .motion_track import motion_track
 from .world_settings import world_from
 
 GRADES = {"tactical": TACTICAL, "mems": MEMS}
 DEFAULT_SENSOR = "ads40"
+#: When a simulated flight begins that nobody dates.
+DEFAULT_EPOCH = "2026-05-01T10:00:00Z"
+DEFAULT_EPOCH_NS = int(datetime.fromisoformat(DEFAULT_EPOCH).timestamp()) * convert.SECOND_NS
 #: Of a real motion: height of the ground above the ellipsoid, and height above it from which camera and errors are
 #: those of high altitude, m.
 GROUND_M, HIGH_M = 200.0, 5000.0

@@ -345,13 +345,14 @@ def _at_least(values: tuple[float, ...], least: float) -> list[float]:
 def run(options: ProgramOptions) -> int:
     """Fly on the bus in real time: [simulator] takes the settings of ``triline simulate``, rate, and wait_for.
 
-    The stamps are wall-clock time (at rate 1); the flight begins when it has been computed. It waits for nodes of
-    ``wait_for`` (names with commas) that are too far behind.
+    The stamps are wall-clock time (at rate 1); the flight begins when it has been computed. A flight that waits for
+    nodes that are too far behind, those of ``wait_for`` (names with commas), has a time of its own: it begins when
+    simulated recordings do, so that its results are the same each time.
     """
     from ..bus.brake import Brake
     from ..bus.pacing import publish_paced
     from ..bus.status import StatusPublisher
-    from .flight_settings import simulated_flight
+    from .flight_settings import DEFAULT_EPOCH_NS, simulated_flight
 
     settings = dict(options.table)
     try:
@@ -364,7 +365,7 @@ def run(options: ProgramOptions) -> int:
     options.report(f"{len(simulator)} messages over {simulator.duration_s:.0f} s")
     with options.open_bus() as bus:
         bus.announce(simulator.name)
-        epoch_ns = time.time_ns() - BEFORE_NS
+        epoch_ns = DEFAULT_EPOCH_NS if waited_for else time.time_ns() - BEFORE_NS
         status = StatusPublisher(bus, simulator.name)
         brake = Brake(bus, waited_for, options.stop, rate)
         publish_paced(bus, _telling(simulator, epoch_ns, status, brake), rate, options.stop, hold=brake.wait)
