@@ -77,8 +77,12 @@ class ControlWeights:
 
     weight: Array
     xyz_l: Array
-    n_observations: int
     surface: SurfaceRows | None = None
+
+    @property
+    def n_observations(self) -> int:
+        """Coordinates with weight."""
+        return int(np.count_nonzero(self.weight > 0))
 
     def residual(self, points_l: Array) -> Array:
         """Whitened (p, 3): given minus estimated."""
@@ -98,7 +102,7 @@ def weigh_control(control: Control, n_points: int) -> ControlWeights:
     w = np.where(given, 1.0 / np.where(given, control.sigma_m, 1.0) ** 2, 0.0)
     np.add.at(weight, control.point, w)
     np.add.at(moment, control.point, w * np.where(given, control.xyz_l, 0.0))
-    return ControlWeights(weight, moment / np.where(weight > 0, weight, 1.0), int((weight > 0).sum()))
+    return ControlWeights(weight, moment / np.where(weight > 0, weight, 1.0))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,9 @@ from .block.backward import LeftOrientation, LeftPoints, Step
 from .block.block import Block
 from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
-from .output import OrientationOutput, adjusted_points
+from .output import OrientationOutput
 from .quality.quality_control import QualityControl
-from .results import AdjustedPoint, RefinedOrientation, Refusal, WholeStrips, WindowOptions
+from .results import RefinedOrientation, Refusal, Update, WindowOptions
 from .screening.snooping import snoop
 from .screening.ties import snoop_ties
 from .state.batch import Batch
@@ -38,27 +37,6 @@ LEAVING_S, LEAST_LEAVING = 1.0, 100
 MOST_STEPS = 600
 
 
-@dataclass
-class Left:
-    """What became final in an update.
-
-    Attributes
-    ----------
-    final, points : orientation and points that have left the window
-    whole : orientation and points with the information of whole strips, from the backward pass
-    refused : looks left out at the last test, those that found no partner, and those that count after all
-    alone : points that do not agree with what earlier strips say of them
-    events : lines for the operator
-    """
-
-    final: list[RefinedOrientation] = field(default_factory=list)
-    points: list[AdjustedPoint] = field(default_factory=list)
-    whole: WholeStrips | None = None
-    refused: list[Refusal] = field(default_factory=list)
-    alone: list[str] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
-
-
 class Leaving:
     """Makes final what is older than the window, and hands it to the block."""
 
@@ -78,29 +56,29 @@ class Leaving:
         self._left: list[LeftPoints] = []
         self._let_go_s = -np.inf
 
-    def let_go(self, now_s: float, limit_s: float, length_s: float, serial: int, at_the_end: bool = False) -> Left:
+    def let_go(self, update: Update, limit_s: float, length_s: float, at_the_end: bool = False) -> None:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
-        found, network = Left(), self._network
+        network, now_s = self._network, update.now_s
         limits = self._limits(now_s, limit_s)
         leaving = self._older_than(list(limits.values()))
         if self.options.snoop and leaving:
-            self._last_test(leaving, now_s, serial, found)
+            self._last_test(leaving, update)
         gone = [(strip, *strip.leaving(limits[strip.id], network.state)) for strip in network.strips.values()]
-        found.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
-        self._release_points(leaving, limit_s - length_s, found)
+        update.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
+        self._release_points(leaving, limit_s - length_s, update)
         for strip, numbers, to_s in gone:
             if len(numbers):
-                self._release_orientation(strip, numbers, to_s, found)
+                self._release_orientation(strip, numbers, to_s, update)
         over = min(limits.values(), default=limit_s)
         modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in network.batches))
         if len(modes):
             self._marginalise(modes)
-        found.whole = self._block.refined(now_s, self._steps, at_the_end)
+        update.whole = self._block.refined(now_s, self._steps, at_the_end)
         if self._block.quiet:
-            found.events += self._block.take_events()
+            update.events += self._block.take_events()
+        update.refused += network.intake.take_refused()
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s)
-        return found
 
     def _limits(self, now_s: float, limit_s: float) -> dict[str, float]:
         """By strip, the time before which all leaves."""
@@ -118,40 +96,38 @@ class Leaving:
         old = [b for b in self._network.batches if b.oldest_s <= latest]
         return [b for b in old if b.oldest_s <= max(limits[i] for i in b.strips)]
 
-    def _last_test(self, leaving: list[Batch], now_s: float, serial: int, found: Left) -> None:
-        snooped = snoop(leaving, self._network, self._control, now_s, serial)
-        self._block.reweigh_control(snooped.control)
-        failed = snoop_ties([b for b in leaving if b.ties is not None], self._network)
-        self._network.intake.set_apart(failed)
-        found.refused += snooped.refused
-        found.alone = snooped.alone + failed
+    def _last_test(self, leaving: list[Batch], update: Update) -> None:
+        rounds = snoop(leaving, self._network, self._control, self._block, update)
+        failed = snoop_ties(leaving, self._network, update)
+        update.tell_alone()
         if failed:
             self._network.state.solve()
-        if snooped.rounds or failed:
+        if rounds or failed:
             self._orientation.forget()
 
-    def _release_points(self, leaving: list[Batch], forget_s: float, found: Left) -> None:
+    def _release_points(self, leaving: list[Batch], forget_s: float, update: Update) -> None:
         """Publish the points of batches, and fix what these know."""
         network, sources = self._network, self._control.sources
         cells = sources.cells(leaving)
         for batch in leaving:
-            points = adjusted_points(batch, network, True, sources.on_points(batch, self._orientation.drift))
-            found.points += points
-            found.refused += network.intake.without_place(batch, {p.name for p in points})
-            self._left.append(LeftPoints.of(batch, points))
-            found.refused += self._block.leave(batch, points, cells.get(id(batch)))
+            points = self._orientation.points_of(batch, final=True)
+            update.points += points
+            update.refused += network.intake.without_place(batch, {p.name for p in points})
+            left = LeftPoints.of(batch, points)
+            self._left.append(left)
+            update.refused += self._block.leave(batch, left, cells.get(id(batch)))
         self._quality.integrity.leave(leaving, forget_s)
         self._control.leaving(leaving, sources.leave(leaving))
         for batch in leaving:
             network.batches.leave(batch)
             network.intake.finish(batch)
 
-    def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, found: Left) -> None:
+    def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, update: Update) -> None:
         """Publish the orientation of a strip up to a time, and marginalise unknowns that no later time needs."""
         final = self._final(strip, to_s)
         left = None
         if final is not None:
-            found.final.append(final)
+            update.final.append(final)
             noise = self._orientation.noise(strip, final.time_s) + self._network.sigmas.doubt
             left = LeftOrientation(final, strip.design(final.time_s), noise)
             self._block.orientation(strip, left)

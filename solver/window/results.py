@@ -201,6 +201,37 @@ class WholeStrips:
     points: list[AdjustedPoint]
 
 
+@dataclass
+class Update:
+    """An update: when it is, and what its phases have to tell.
+
+    Attributes
+    ----------
+    now_s, number : platform time, and how many there were
+    final, points : orientation and points that have left the window, and points that have come
+    whole : when strips have ended
+    refused : looks and known coordinates left out, and those that count again
+    events, warnings : for the operator
+    alone : points that do not agree with what earlier strips say of them, not told yet
+    """
+
+    now_s: float
+    number: int
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    whole: WholeStrips | None = None
+    refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    alone: list[str] = field(default_factory=list)
+
+    def tell_alone(self) -> None:
+        """Put into words which points do not agree with earlier strips."""
+        if self.alone:
+            self.events.append(f"do not agree with earlier strips: {', '.join(self.alone)}")
+            self.alone = []
+
+
 def checks(rays: int, looks: int, known: bool) -> str:
     """What `AdjustedPoint.checked` is for a point of so many looks of which so many take part."""
     if 2 * rays <= looks and looks > 2:

@@ -26,7 +26,7 @@ from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
 from .datum.surface import SurfaceTests
 from .leaving import Leaving, grid
-from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, adjusted_points, parameters
+from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, parameters
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
 from .results import Look, RefinedOrientation, WindowOptions
@@ -141,7 +141,7 @@ class Window:
         self._duties = Duties()
         self._length_s = options.window_s
         self._now_s = self._newest_ray_s = self._learnt_s = -np.inf
-        self._serial = 0
+        self._number = 0
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -219,11 +219,11 @@ class Window:
         now_s : platform time, s; one that lies before the last counts as the last
         """
         self._now_s = max(self._now_s, now_s)
-        self._serial += 1
-        result = WindowUpdate()
+        self._number += 1
+        result = WindowUpdate(self._now_s, self._number)
         self._extend_strips()
         fresh = self._arrive(result)
-        joined = self._follow_trajectory()
+        joined = self._relinearisation.replace_filtered()
         duties = self._duties.take(self._now_s, busy=bool(joined))
         if LOOK_AFTER in duties:
             self._relinearisation.look_after(self._now_s)
@@ -236,7 +236,7 @@ class Window:
         self._judge(joined)
         self._learn_noise()
         self._publish(fresh, result)
-        self._let_go(self._limit_s(), result)
+        self._leaving.let_go(result, self._limit_s(), self._length_s)
         result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
         return result
 
@@ -246,9 +246,9 @@ class Window:
         The phases of `update` but those that only matter while the flight goes on: no sigma is questioned, no noise is
         learnt, and what leaves is final at once.
         """
-        result = WindowUpdate()
+        result = WindowUpdate(self._now_s, self._number)
         fresh = self._arrive(result)
-        joined = self._follow_trajectory(all_at_once=True)
+        joined = self._relinearisation.replace_filtered(all_at_once=True)
         iterations = self._solve(fresh) + self._weigh_surface(fresh, True, result)
         if self.options.snoop:
             due = joined or self._due_for_test()
@@ -256,7 +256,7 @@ class Window:
         self._judge(joined)
         for strip in self.strips.values():
             strip.end(0)
-        self._let_go(np.inf, result, at_the_end=True)
+        self._leaving.let_go(result, np.inf, self._length_s, at_the_end=True)
         result.report = self._report(iterations, joined, True, result)
         return result
 
@@ -271,21 +271,13 @@ class Window:
 
     def _arrive(self, result: WindowUpdate) -> list[Batch]:
         """Points with new looks become batches."""
-        arrived = self._arrivals.take(self._now_s)
-        self._quality.integrity.drop(arrived.apart)
-        result.refused += arrived.refused
-        result.tell_alone(arrived.alone)
-        for batch in arrived.fresh:
+        fresh = self._arrivals.take(result)
+        result.tell_alone()
+        for batch in fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-        if not self._length_s and arrived.fresh and not any(lens_of(self.camera, id) for id in self.strips):
-            self._length_s = self.options.window_looks * look_time(self.camera, arrived.fresh[0])
-        return arrived.fresh
-
-    def _follow_trajectory(self, all_at_once: bool = False) -> list[Batch]:
-        """Smoothed orientation takes the place of the filtered one under rays; the batches that came about that way."""
-        replaced = self._relinearisation.replace_filtered(all_at_once)
-        self._quality.integrity.drop(replaced.apart)
-        return replaced.joined
+        if not self._length_s and fresh and not any(lens_of(self.camera, id) for id in self.strips):
+            self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
+        return fresh
 
     def _solve(self, fresh: list[Batch]) -> int:
         """One or two Gauss-Newton steps from the warm state; number of solutions computed."""
@@ -301,9 +293,8 @@ class Window:
     def _weigh_surface(self, fresh: list[Batch], everything: bool, result: WindowUpdate) -> int:
         """Heights of the surface that points lie on: which count, and whether it agrees; number of solutions
         computed."""
-        solutions, change = self._surface.weigh(fresh, everything)
+        solutions, change = self._surface.weigh(fresh, everything, result)
         self._block.reweigh_surface(change)
-        result.warnings += self._surface.take_warnings()
         if solutions:
             self._orientation.forget()
         return solutions
@@ -334,20 +325,16 @@ class Window:
 
     def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
         """Test batches; number of solutions computed."""
-        found = snoop(batches, self.network, self._control, self._now_s, self._serial)
-        self._block.reweigh_control(found.control)
-        result.refused += found.refused
-        result.tell_alone(found.alone)
-        return found.rounds
+        solutions = snoop(batches, self.network, self._control, self._block, result)
+        result.tell_alone()
+        return solutions
 
     def _weigh_control(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Weigh all control where there is news of it; number of solutions computed."""
         changed = False
         if self._control.is_due(self._now_s, fresh):
-            found = self._control.weigh(self._now_s)
-            self._block.reweigh_control(found.of_final)
-            result.refused += found.refused
-            changed = found.changed
+            changed, of_final = self._control.weigh(result)
+            self._block.reweigh_control(of_final)
         result.warnings += self._control.take_warnings()
         return int(changed)
 
@@ -379,18 +366,7 @@ class Window:
     def _publish(self, fresh: list[Batch], result: WindowUpdate) -> None:
         """The points of new batches, as they come out at once."""
         for batch in fresh:
-            drift = self._sources.on_points(batch, self._orientation.drift)
-            result.points += adjusted_points(batch, self.network, False, drift)
-
-    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
-        """What is older than the window becomes final."""
-        left = self._leaving.let_go(self._now_s, limit_s, self._length_s, self._serial, at_the_end)
-        result.final += left.final
-        result.points += left.points
-        result.whole = left.whole
-        result.refused += left.refused + self.network.intake.take_refused()
-        result.tell_alone(left.alone)
-        result.events += left.events
+            result.points += self._orientation.points_of(batch, final=False)
 
     def _limit_s(self) -> float:
         """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the

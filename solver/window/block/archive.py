@@ -116,7 +116,7 @@ class Archive:
             prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(kept.entered))
             self.add(kept.entered, prior.normal.toarray(), prior.matrix.T @ prior.value)
 
-    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> list[Refusal]:
+    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None) -> list[Refusal]:
         """A batch became final; returns the single looks of earlier strips that count now.
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
@@ -124,16 +124,15 @@ class Archive:
 
         Parameters
         ----------
-        published : its points, those of full rank
+        left : its points, those of full rank
         cell : equations of the drifts of its strip, None if there are none
         """
         if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
             return []
         placed = np.flatnonzero(batch.normals.rank == 3)
         if batch.ties is not None:
-            returned = [self._tie(batch, i, point, cell) for i, point in zip(placed.tolist(), published, strict=True)]
+            returned = [self._tie(batch, i, point, cell) for i, point in zip(placed.tolist(), left.points, strict=True)]
             return [refusal for refusal in returned if refusal is not None]
-        left = LeftPoints.of(batch, published)
         columns, matrix, rhs = batch.columns, batch.information.matrix, batch.information.rhs
         if cell is not None:
             b = cell.border
@@ -143,7 +142,7 @@ class Archive:
             left = LeftPoints(replace(left.functions, columns=columns, coupling=coupling), left.points)
         self.add(columns, matrix, rhs)
         time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
-        for i, (at, point) in enumerate(zip(placed.tolist(), published, strict=True)):
+        for i, (at, point) in enumerate(zip(placed.tolist(), left.points, strict=True)):
             seen = frozenset(r.look.strip for r in point.residuals)
             self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), batch.control.weight[at]))
         return []

@@ -23,7 +23,7 @@ from ..state.network import LiveNetwork
 from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
-from .backward import LeftOrientation, Step, backward
+from .backward import LeftOrientation, LeftPoints, Step, backward
 from .ties import EarlierStrips
 
 Array = NDArray[np.floating]
@@ -68,12 +68,12 @@ class Block:
         """A strip begins."""
         self._archive.strips[strip.id] = KeptStrip(self._network.index(strip), strip.numbers)
 
-    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> list[Refusal]:
+    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None) -> list[Refusal]:
         """A batch became final; see `Archive.leave`."""
         self.conclude()
         names = list(self._network.strips)
         self._touched.update(names[i] for i in batch.strips)
-        return self._archive.leave(batch, points, cell)
+        return self._archive.leave(batch, left, cell)
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
         """Keep looks that found no partner in their strip, a batch of one each."""

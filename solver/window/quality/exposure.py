@@ -29,7 +29,7 @@ from ...adjustment.protection import protection_factor
 from ...adjustment.reliability import CRITICAL_W, noncentrality
 from ..results import RefinedOrientation
 from ..state.batch import Batch, Information
-from ..state.surface import LiveSurface
+from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal, WindowState
 
 Array = NDArray[np.floating]
@@ -229,15 +229,17 @@ class Integrity:
     most_exposed : batch of the observation that the newest position was most exposed to
     """
 
-    def __init__(self, critical: float, surface: LiveSurface | None = None) -> None:
-        self._surface = surface
+    def __init__(self, critical: float, network: LiveNetwork) -> None:
+        self._network = network
         self._critical, self._delta = critical, noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
         self._left = LeftObservations()
         self.most_exposed: Batch | None = None
 
     def note(self, batches: Iterable[Batch]) -> None:
-        """Find the most exposed observations of batches that have been judged since."""
+        """Find the most exposed observations of batches that have been judged since; forget those taken apart."""
+        present = self._network.batches
+        self._of_batch = {key: known for key, known in self._of_batch.items() if known.batch in present}
         for batch in batches:
             if batch.judged is None:
                 continue
@@ -258,11 +260,6 @@ class Integrity:
     def marginalised(self, marginal: Marginal) -> None:
         """Unknowns have left the window."""
         self._left.border.marginalise(marginal)
-
-    def drop(self, batches: Iterable[Batch]) -> None:
-        """Batches have been taken apart."""
-        for batch in batches:
-            self._of_batch.pop(id(batch), None)
 
     def _most_exposed_of(self, batch: Batch) -> tuple[list[Exposed], float]:
         """The most exposed observations, and the largest lambda of the others."""
@@ -318,7 +315,7 @@ class Integrity:
         h = np.concatenate([*h, border.G.T @ Qg[state.places(border.numbers)]]).reshape(-1, 2, k)
         inverse = np.array([e.inverse for e in observations]).reshape(-1, 2, 2)
         squares = np.maximum(np.einsum("nik,nij,njk->nk", h, inverse, h), 0.0)  # rounding
-        shifted = np.zeros((0, k)) if self._surface is None else self._surface.hidden(Qg, self._delta)
+        shifted = self._network.surface.hidden(Qg, self._delta)
         effect = np.vstack([bound, self._delta * np.sqrt(squares), shifted])
         size = effect[:, 6:].max(axis=1) if k > 6 else np.linalg.norm(effect[:, :3], axis=1)
         of_surface = bool(size.argmax() > len(observations))

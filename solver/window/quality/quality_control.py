@@ -44,7 +44,7 @@ class QualityControl:
         self._parameters: Determinability | None = None
         if network.self_calibration is not None and options.determine:
             self._parameters = Determinability(network.self_calibration, network.camera_columns, network.camera)
-        self.integrity = Integrity(options.critical, network.surface)
+        self.integrity = Integrity(options.critical, network)
         self.last: QualityFindings | None = None
 
     def protected(self, strip: WindowStrip, orientation: RefinedOrientation, final: bool = False) -> RefinedOrientation:

@@ -303,7 +303,7 @@ class Batch:
         weights[point, axis] = weight
         if self.ties is not None:
             self.ties.control[point, axis] = weight
-        self.control = replace(self.control, weight=weights, n_observations=int((weights > 0).sum()))
+        self.control = replace(self.control, weight=weights)
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""

@@ -130,12 +130,7 @@ class Intake:
                 weight[i], xyz[i] = self.control[name].weight, np.nan_to_num(self.control[name].xyz_l)
                 weight[i, list(self.points[name].out)] = 0.0
         weight[used] = 0.0
-        return ControlWeights(weight, xyz, int((weight > 0).sum()))
-
-    def set_apart(self, names: Iterable[str]) -> None:
-        """Points that do not agree with earlier strips are points of their own."""
-        for name in names:
-            self.points[name].alone, self.points[name].spent = True, False
+        return ControlWeights(weight, xyz)
 
     def sources_of(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""

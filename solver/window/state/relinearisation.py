@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...camera.line_camera import finest_pixel
 from .batch import Batch
 from .maker import BatchMaker
 from .network import LiveNetwork
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-
 
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
 #: the linear equations then miss goes with its square: two hundredths of a pixel.
@@ -35,14 +29,6 @@ MOST_REPLACED = 600
 #: Batches of one time are joined up to so many rays when they get their smoothed orientation. None waits for others: of
 #: two batches of one time, one with filtered and one with smoothed orientation, good rays would fail their tests.
 JOINED_RAYS = 160
-
-
-@dataclass(frozen=True)
-class Replaced:
-    """Batches that came about when smoothed orientation took the place of the filtered one, and those taken apart."""
-
-    joined: list[Batch]
-    apart: list[Batch]
 
 
 class Relinearisation:
@@ -65,10 +51,11 @@ class Relinearisation:
 
     # -- smoothed orientation ------------------------------------------------------------------------------------------
 
-    def replace_filtered(self, all_at_once: bool = False) -> Replaced:
+    def replace_filtered(self, all_at_once: bool = False) -> list[Batch]:
         """Put smoothed orientation under batches that had to do with the filtered one, the oldest first.
 
-        Small ones are joined then, so that a window into which rays come a few at a time costs no more than others.
+        Small ones are joined then, so that a window into which rays come a few at a time costs no more than others;
+        returns the batches that came about that way.
 
         Parameters
         ----------
@@ -92,11 +79,9 @@ class Relinearisation:
                 chunks.append([])
             chunks[-1].append(batch)
         joined: list[Batch] = []
-        apart: list[Batch] = []
         for chunk in chain.from_iterable(groups.values()):
             if len(chunk) > 1:
                 joined.append(self._join(chunk))
-                apart += chunk
             else:
                 alone += chunk
         if alone:
@@ -105,7 +90,7 @@ class Relinearisation:
                 self._network.batches.linearise(batch, self._network.state.values(batch.columns), reweigh=True)
         for batch in (*alone, *joined):
             batch.provisional = False  # in a gap of the smoothed poses it stays with the filtered ones
-        return Replaced(joined, apart)
+        return joined
 
     def _join(self, parts: Sequence[Batch]) -> Batch:
         """One batch in place of several."""
