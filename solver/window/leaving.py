@@ -186,7 +186,7 @@ class Leaving:
         end = self._network.trajectory.end_s
         if not np.isfinite(end):
             return None
-        times = grid(self.options.grid_hz, strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
+        times = self.options.grid(strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
         times = times[self._network.trajectory.covers(times)] if len(times) else times
         if not len(times):
             return None
@@ -203,11 +203,6 @@ class Leaving:
             (s.final_to_s for s in self._network.strips.values() if not s.is_gone(self._network.state)), default=np.inf
         )
         self._network.trajectory.forget(min(limit_s - length_s, used, waiting, finals) - 1.0)
-
-
-def grid(hz: float, from_s: float, to_s: float) -> Array:
-    """Times of the published orientation in [from, to)."""
-    return np.arange(np.ceil(from_s * hz - 1e-6), np.ceil(to_s * hz - 1e-6)) / hz
 
 
 #: Time between two looks for looks that wait in vain, s, unless unknowns leave.

@@ -58,6 +58,11 @@ class WindowOptions:
         """Whether the model has a place for what wanders."""
         return self.model != "dgr"
 
+    def grid(self, from_s: float, to_s: float) -> Array:
+        """Times of the published orientation in [from, to)."""
+        first, end = np.ceil(np.array([from_s, to_s]) * self.grid_hz - 1e-6)
+        return np.arange(first, end) / self.grid_hz
+
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise ValueError(f"unknown trajectory model {self.model!r}; known: {', '.join(MODELS)}")

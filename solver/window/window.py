@@ -25,7 +25,7 @@ from .block.block import Block
 from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
 from .datum.surface import SurfaceTests
-from .leaving import Leaving, grid
+from .leaving import Leaving
 from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, parameters
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
@@ -396,10 +396,7 @@ class Window:
         strip = self.strip_at(time_s)
         if strip is None or not self.trajectory.covers([time_s])[0]:
             return None
-        if strip.activate(time_s, self.state):
-            self.state.solve()
-            self._orientation.forget()
-        orientation = self._orientation.at(strip, np.array([time_s]))
+        orientation = self._ahead(strip, np.array([time_s]))
         exposure = self._quality.last.exposure if self._quality.last is not None else None
         return orientation if exposure is None else exposure.protected(orientation)
 
@@ -411,18 +408,18 @@ class Window:
             last_s = min(to_s, strip.end_s)
             if first_s >= last_s or strip.is_over(self.state):
                 continue
-            times = self.grid(first_s, last_s)
+            times = self.options.grid(first_s, last_s)
             times = times[self.trajectory.covers(times)] if len(times) else times
             if len(times):
-                if strip.activate(float(times[-1]), self.state):
-                    self.state.solve()
-                    self._orientation.forget()
-                found.append(self._quality.protected(strip, self._orientation.at(strip, times)))
+                found.append(self._quality.protected(strip, self._ahead(strip, times)))
         return found
 
-    def grid(self, from_s: float, to_s: float) -> Array:
-        """Times of the published orientation in [from, to)."""
-        return grid(self.options.grid_hz, from_s, to_s)
+    def _ahead(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
+        """Orientation at times (n,), the last of which may need unknowns that are not present yet."""
+        if strip.activate(float(times[-1]), self.state):
+            self.state.solve()
+            self._orientation.forget()
+        return self._orientation.at(strip, times)
 
     def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
         """Orientation at times of a strip, none of them final, that have a measured one."""
@@ -452,18 +449,17 @@ class Window:
             if state.solution != solution:
                 self._orientation.forget()
         result.events += findings.events
-        tally = batches.tally()
-        unknowns = len(state) + tally.determined
+        unknowns = len(state) + sum(b.determined for b in batches)
         return WindowReport(
             **vars(fit),
-            observations=unknowns + tally.rows,
+            observations=unknowns + sum(b.information.rows for b in batches),
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in flown), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=tally.rays,
-            points=tally.points,
-            control=tally.control,
+            rays=sum(b.active_rays for b in batches),
+            points=sum(b.n_points for b in batches),
+            control=sum(b.active_control for b in batches),
             strip=newest.id if newest else "",
             parameters=parameters(self.network, newest, findings.standing) if newest else (),
             quality=findings,

@@ -187,7 +187,7 @@ class DriftMonitor:
         v = np.einsum("nij,nj->ni", pixels, batch.residuals_px(state))
         W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(batch.inverse_factors, 1, 2)[rays.point]
         coupling = np.add.reduceat(np.swapaxes(W, 1, 2) @ effect, batch.first_ray[:-1], axis=0)
-        rows = (batch.full_rows(np.arange(n)) - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
+        rows = (batch.full_rows - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
         flat, of_points = effect.reshape(2 * n, k), coupling.reshape(-1, k)
         G = rows.T @ flat
         score = flat.T @ v.ravel() + state.values(batch.columns) @ G

@@ -276,7 +276,7 @@ class Integrity:
         leverages[:n][(batch.weight == 0) | (batch.normals.rank[rays.point] < 3)] = 0.0
         order = np.argsort(-leverages)
         chosen = order[: max(1, int((leverages[order[:OF_BATCH]] > SMALL).sum()))]
-        full, found = batch.full_rows(np.arange(n)), []
+        full, found = batch.full_rows, []
         for i, inverse in zip(chosen.tolist(), inverses_of(C[chosen]), strict=True):
             if i < n:
                 place, p, a, sigma_m = i, int(rays.point[i]), -1, 0.0

@@ -55,7 +55,7 @@ class Arrivals:
         network.state.solve()  # what is known of the orientation says where points are, and judges them
         drafts = [self._draft(names, tied) for (_, tied), names in shares.items()]
         made = self._maker.make_each([d for d in drafts if d.names], known)
-        fresh = [batch for batch, _ in made if batch is not None]
+        fresh = [batch for batch in made if batch is not None]
         for batch in fresh:
             for name in batch.names:
                 intake.place(name, batch)

@@ -176,7 +176,7 @@ class _Conditions:
         misclosures: list[Array] = [np.empty(0)]
         for i, batch in enumerate(batches):
             every, u, place = np.arange(len(batch.rays)), len(batch.columns), state.places(batch.columns)
-            A, J = batch.full_rows(every), batch.lin.point.transpose(2, 0, 1)
+            A, J = batch.full_rows, batch.lin.point.transpose(2, 0, 1)
             e = batch.lin.residual.T + A @ batch.theta
             root, off = np.sqrt(batch.control.weight), batch.control.residual(batch.origin_l)
             for p in range(batch.n_points):

@@ -124,7 +124,7 @@ class EntryEquations:
         k = int(slot.max()) + 1
         present = np.zeros((p, k), dtype=bool)
         present[of_point, slot] = True
-        rows = batch.full_rows(np.arange(n))
+        rows = batch.full_rows
         A, J, e = np.zeros((p, k, 2, u)), np.zeros((p, k, 2, 3)), np.zeros((p, k, 2))
         A[of_point, slot] = rows
         J[of_point, slot] = batch.lin.point.transpose(2, 0, 1)

@@ -102,7 +102,7 @@ def _disputed(batch: Batch, state: WindowState, wider: float) -> Bools:
     """Rays (n,) of known points that have three looks or more which agree with each other: what they contradict are
     the known coordinates or the trajectory. Those are weighed as a whole (`datum.control`, `sigma_check`)."""
     point, theta = batch.rays.point, state.values(batch.columns)
-    residual = batch.lin.residual.T - batch.full_rows(np.arange(len(point))) @ (theta - batch.theta)
+    residual = batch.lin.residual.T - batch.full_rows @ (theta - batch.theta)
     derivative = batch.lin.point.transpose(2, 0, 1)
     out = np.zeros(len(point), dtype=bool)
     for p in np.flatnonzero((batch.control.weight > 0).any(axis=1) & (batch.points_left >= 3)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,17 +25,6 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 
 
-class Tally(NamedTuple):
-    """What there is in all batches: observations less object coordinates, rays and control points with weight, points,
-    and determined object coordinates."""
-
-    rows: int
-    rays: int
-    control: int
-    points: int
-    determined: int
-
-
 class Batches:
     """The batches whose information is in the live part of the state, in the order in which they came.
 
@@ -55,17 +43,6 @@ class Batches:
 
     def __contains__(self, batch: Batch) -> bool:
         return id(batch) in self._by_id
-
-    def tally(self) -> Tally:
-        """What there is in all of them."""
-        rows = rays = control = points = determined = 0
-        for batch in self._by_id.values():
-            rows += batch.information.rows
-            rays += batch.active_rays
-            control += batch.active_control
-            points += batch.n_points
-            determined += batch.determined
-        return Tally(rows, rays, control, points, determined)
 
     def enter(self, batch: Batch) -> None:
         """A batch comes."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...camera.line_camera import finest_pixel
 from .batch import Batch
-from .maker import BatchMaker
+from .maker import BatchMaker, Draft
 from .network import LiveNetwork
 
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
@@ -96,8 +96,8 @@ class Relinearisation:
         """One batch in place of several."""
         known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
         names = list(known)
-        joined, lost = self._maker.make(names, [self._network.intake.points[name] for name in names], known)
-        assert joined is not None and not lost
+        joined = self._maker.make(Draft(names, [self._network.intake.points[name] for name in names]), known)
+        assert joined is not None and joined.names == names
         joined.tested = min(b.tested for b in parts)
         for batch in parts:
             self._network.batches.remove(batch)

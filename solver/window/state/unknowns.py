@@ -375,9 +375,12 @@ class WindowState:
     def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
         """Factor and values (n,) with other unknowns held at zero."""
         matrix, rhs = self.normal()
-        _hold(matrix, self.places(held))
+        places = self.places(held)
+        matrix[places, :] = 0.0
+        matrix[:, places] = 0.0
+        matrix[places, places] = HELD_WEIGHT  # cut off from the others: zero and certain
+        rhs[places] = 0.0
         factor = DenseFactor(matrix)
-        rhs[self.places(held)] = 0.0
         return factor, factor.solve(rhs)
 
     @property
@@ -468,10 +471,3 @@ def _add(matrix: Array, places: IntArray, more: Array, sign: int = 1) -> None:
     """Add to rows and columns of a large matrix whose rows stand one after the other; by one index that takes half the
     time of two."""
     matrix.reshape(-1)[places[:, None] * len(matrix) + places] += sign * more
-
-
-def _hold(matrix: Array, places: IntArray) -> None:
-    """Cut unknowns off from the others, so that they are zero and certain."""
-    matrix[places, :] = 0.0
-    matrix[:, places] = 0.0
-    matrix[places, places] = HELD_WEIGHT
