@@ -108,7 +108,7 @@ class OrientationOutput:
     def noise(self, strip: WindowStrip, times: Array) -> Array:
         """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
         noise = self._network.pose_noise.at(self._network.trajectory.at(times), strip.followed)
-        return noise + strip.left_out_variance(times)[:, :, None] * np.eye(6)
+        return noise + strip.model.left_out_variance(times)[:, :, None] * np.eye(6)
 
     def points_of(self, batch: Batch, final: bool) -> list[AdjustedPoint]:
         """The points of a batch that are determined, with covariance and residuals."""

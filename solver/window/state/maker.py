@@ -76,7 +76,7 @@ class BatchMaker:
         ids = list(self.network.strips)
         for i in np.unique(strip):
             mine = strip == i
-            extra = self.network.strips[ids[i]].left_out_variance(time_s[mine])
+            extra = self.network.strips[ids[i]].model.left_out_variance(time_s[mine])
             covariance[mine] += extra[:, :, None] * np.eye(6)
         return measured, covariance
 

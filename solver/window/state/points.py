@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from math import isfinite
 
 import numpy as np
@@ -90,8 +90,7 @@ class Intake:
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
-        self._done: deque[tuple[float, str, str]] = deque()
-        self._is_done: set[tuple[str, str]] = set()
+        self._done: dict[tuple[str, str], float] = {}  # points that are final in a strip, and the time of their batch
         self._refused: list[Refusal] = []
         self._missing_s = -np.inf  # when poses were missing last
         self._out_before: dict[str, set[int]] = {}
@@ -144,12 +143,10 @@ class Intake:
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""
         strip = self._strips.get(look.strip)
-        return float("nan") if strip is None else strip.time_of_line(look.line)
+        return float("nan") if strip is None else float(strip.time_of(look.line))
 
     def _judge(self, look: Look) -> str:
-        if not (isfinite(look.line) and isfinite(look.sample)):
-            return "value is not finite"
-        if not (isfinite(look.sigma_line_px) and isfinite(look.sigma_sample_px)):
+        if not all(map(isfinite, (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px))):
             return "value is not finite"
         if not (look.sigma_line_px > 0 and look.sigma_sample_px > 0):
             return "sigma is not positive"
@@ -169,7 +166,7 @@ class Intake:
     def _judge_time(self, name: str, look: Look, time_s: float) -> str:
         if time_s < self._strips[look.strip].final_to_s:
             return "too late"
-        if (name, look.strip) in self._is_done:
+        if (name, look.strip) in self._done:
             return "point is final"
         if name in self.points and look in self.points[name].looks:
             return "duplicate"
@@ -227,9 +224,7 @@ class Intake:
                 self._out_before[name] = self.points[name].out
             del self.points[name]
             self._arrived.pop(name, None)
-            for strip in strips:
-                self._done.append((batch.newest_s, name, strip))
-                self._is_done.add((name, strip))
+            self._done |= {(name, strip): batch.newest_s for strip in strips}
 
     def without_partner(self, limits_s: Mapping[str, float]) -> list[str]:
         """Points that wait for another look in vain: theirs are older than the limits of their strips."""
@@ -258,9 +253,8 @@ class Intake:
 
     def forget(self, before_s: float) -> None:
         """Forget which points became final before a time."""
-        while self._done and self._done[0][0] < before_s:
-            _, name, strip = self._done.popleft()
-            self._is_done.discard((name, strip))
+        for key in list(takewhile(lambda key: self._done[key] < before_s, self._done)):
+            del self._done[key]
 
     @property
     def oldest_waiting_s(self) -> float:

@@ -43,8 +43,7 @@ class Relinearisation:
         self._network, self._maker, self._step_s = network, BatchMaker(network), step_s
         self._moved = min(MOVED, float(np.sqrt(MISSED_PX * finest_pixel(network.camera))))
         self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
-        self._following = False  # whether they are what was left when new data moved far
-        self._reweighing = False  # whether they are what was left when weights changed
+        self._pace: tuple[int, float] | None = None  # of what was left when new data moved far, or weights changed
         self._turn = 0
         self._looked_s = -np.inf
         self._passed_s = 0.0  # between the last two turns
@@ -112,24 +111,17 @@ class Relinearisation:
         """Linearise again what has moved, in turn; before the solution, for which it then counts."""
         self._passed_s, self._looked_s = now_s - self._looked_s, now_s
         if not self._suspects:
-            self._following = self._reweighing = False
+            self._pace = None
             self._turn += 1
             turn = list(self._network.batches)[self._turn % LOOKED_AFTER :: LOOKED_AFTER]
             self._suspects = {id(b): b for b in turn}
-        if self._following:
-            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
-        else:
-            self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ) if self._reweighing else 0.0)
+        self._again(self._pace)
 
     def reweigh(self) -> None:
         """Other noise of poses has become known: all batches are linearised again, the oldest first."""
         self._suspects = {id(b): b for b in self._network.batches}
-        self._reweighing = True
-        self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ))
-
-    def _bearable(self, least: int, rays_hz: float) -> float:
-        """Rays of a turn."""
-        return max(least, rays_hz * self._passed_s)
+        self._pace = self._pace or (LEAST_REWEIGHED, REWEIGHED_HZ)
+        self._again((LEAST_REWEIGHED, REWEIGHED_HZ))
 
     def follow(self, fresh: list[Batch]) -> bool:
         """After a solution, linearise again new batches that have moved far; whether there were any.
@@ -144,13 +136,14 @@ class Relinearisation:
         if far:
             new = {id(b) for b in fresh}
             self._suspects = {id(b): b for b in self._network.batches if id(b) not in new}
-            self._following = True
-            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
+            self._pace = LEAST_AGAIN, AGAIN_HZ
+            self._again(self._pace)
         return bool(due)
 
-    def _again(self, most_rays: float) -> None:
-        """Linearise suspects again that have moved, up to a number of rays, or of batches if that is 0."""
+    def _again(self, pace: tuple[int, float] | None) -> None:
+        """Linearise suspects again that have moved, up to so many rays, at least and a second; None: some batches."""
         rays = batches = 0
+        most_rays = max(pace[0], pace[1] * self._passed_s) if pace else 0.0
         for key, batch in list(self._suspects.items()):
             if rays > most_rays if most_rays else batches >= MOST_AGAIN:
                 break
