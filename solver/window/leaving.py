@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from ..geometry.measured_trajectory import SMOOTHED_LATE_S
 from .block.backward import LeftOrientation, LeftPoints, Step
 from .block.block import Block
@@ -22,9 +22,6 @@ from .state.lens_sets import stays_to
 from .state.maker import BatchMaker
 from .state.network import LiveNetwork
 from .state.strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
 MOST_LEAVING = 1000

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..adjustment.layout import SURFACE_SHIFT
+from ..arrays import Array, IntArray
 from ..camera.self_calibration import unit_of
 from ..geometry.rotation import corrected_angles
 from ..geometry.trajectory import Poses
@@ -22,9 +22,6 @@ from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, 
 from .state.batch import Batch
 from .state.network import LiveNetwork
 from .state.strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Times worked on at once.
 CHUNK = 64

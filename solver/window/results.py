@@ -6,13 +6,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..adjustment.reliability import CRITICAL_W
+from ..arrays import Array
 from ..models import MODELS
-
-Array = NDArray[np.floating]
-
 
 #: Whose datum can be published.
 DATUMS = ("control", "gnss")

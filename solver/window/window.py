@@ -13,10 +13,11 @@ know of it (`block.ties`), and after each strip by a solution of the block as a 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..adjustment.pose_noise import ray_information
 from ..adjustment.surface_control import SurfaceControl
+from ..arrays import Array
 from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import SelfCalibration
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
@@ -40,9 +41,6 @@ from .state.network import LiveNetwork
 from .state.points import ControlPoint
 from .state.relinearisation import Relinearisation
 from .state.strip import WindowStrip, segment_length
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0

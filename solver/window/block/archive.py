@@ -15,13 +15,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.dense_in_parts import Cost, Parts
 from ...adjustment.drift_hypotheses import EACH
 from ...adjustment.eliminated_points import eliminated
 from ...adjustment.growing_normals import BlockNormals
 from ...adjustment.normal_equations import whiten_prior
+from ...arrays import Array, IntArray
 from ...models.base import PseudoObservations
 from ..datum.drifts import MOST_GROUPS, Cell, Named, of_block
 from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, WholeStrips, checks
@@ -30,9 +30,6 @@ from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .backward import BlockSolution, LeftOrientation, LeftPoints
 from .points import KeptPoint, SingleLook, rows_of
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
 #: two seconds of one core; with the equations it takes 210 MB, which are kept.

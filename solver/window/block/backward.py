@@ -11,19 +11,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.eliminated_points import EliminatedPoints
 from ...adjustment.reliability import CRITICAL_W
+from ...arrays import Array, IntArray
 from ...geometry.rotation import corrected_angles
 from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
 from ..state.unknowns import Marginal, WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
 LARGER = 1.01

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.dense_in_parts import Parts
+from ...arrays import Array
 from ..datum.biases import Coordinate
 from ..datum.drifts import Cell, Named
 from ..results import AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
@@ -25,9 +25,6 @@ from ..state.strip import WindowStrip
 from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
 from .backward import LeftOrientation, LeftPoints, Step, backward
 from .ties import EarlierStrips
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Floating point operations of the work on the block for each second of platform time: about a tenth of a core. Tuned.
 RATE = 4e9

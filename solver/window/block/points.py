@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.eliminated_points import EliminatedPoints, Rows, eliminated
+from ...arrays import Array
 from ..datum.drifts import Cell
 from ..results import AdjustedPoint, Look, RayResidual
 from ..state.batch import Batch
 from ..state.points import ControlPoint
 from .backward import LeftPoints
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: A single look takes its distance from known coordinates only where these change by at least this much, m, for each
 #: metre along the ray; otherwise, as with a height given for a ray that is level, they do not tell it. Tuned.

@@ -13,9 +13,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.bias_search import Verdict, biases
+from ...arrays import Array, Bools
 from ...quantiles import chi2
 from ..results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal, Update
 from ..state.batch import Batch
@@ -26,9 +26,6 @@ from .biases import AXES, Biases, Coordinate, Discrepancies, LeftControl, biases
 from .drift_monitor import DriftMonitor
 from .drifts import Cell
 from .hypotheses import Weighed, weigh
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Coordinates that have left the window and can still be judged. Bounds the time of the search.
 MOST_LEFT = 36

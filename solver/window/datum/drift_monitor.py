@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import (
     EACH,
@@ -35,14 +34,13 @@ from ...adjustment.drift_hypotheses import (
 )
 from ...adjustment.ray_statistics import whitened_pixels
 from ...adjustment.reduced_system import DenseFactor
+from ...arrays import Array, IntArray
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from ..state.batch import Batch, Information
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal
 from .drifts import MOST_GROUPS, Cell, Compensation, Named, estimated
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 #: Age at which a batch is taken in, s: by then data snooping has removed its gross errors. Tuned.
 JUDGED_S = 3.0
 #: Rays of batches taken in at one update, about; bounds the time of an update. Tuned.

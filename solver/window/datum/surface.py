@@ -10,14 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.surface_control import SurfaceShift
+from ...arrays import Array
 from ..results import Update
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
-
-Array = NDArray[np.floating]
 
 #: Rounds of weights, each with a solution, in one update; and change of a weight that is worth one. Tuned, for speed.
 ROUNDS, CHANGED = 3, 0.02

@@ -23,17 +23,14 @@ from functools import cached_property
 from heapq import nlargest
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.protection import protection_factor
 from ...adjustment.reliability import CRITICAL_W, noncentrality
+from ...arrays import Array, IntArray
 from ..results import RefinedOrientation
 from ..state.batch import Batch, Information
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal, WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Risk that a component of the orientation is further off than its protection level (statistical level).
 RISK = 1e-3

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...camera.line_camera import LineCamera
 from ..block.block import Block
 from ..results import Update
@@ -15,8 +15,6 @@ from .entry import EntryEquations, disagreement
 from .sigma_check import SigmaCheck
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, set_apart
-
-Array = NDArray[np.floating]
 
 
 class Arrivals:

@@ -6,9 +6,9 @@ What was left out is tested as a prediction from all others, and is taken back o
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.snooping import TOGETHER, failing_w, largest_of_group
+from ...arrays import Array, Bools, IntArray
 from ...quantiles import chi2
 from ..block.block import Block
 from ..datum.control import ControlTests
@@ -18,10 +18,6 @@ from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
 from .entry import DECISIVE, SUSPECTED, EntryEquations, entry_weight
 from .ties import contradicting, set_apart
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 #: Rounds of one update, which bounds its time; what still fails then comes up again when the batch is due.
 ROUNDS_OF_UPDATE = 8

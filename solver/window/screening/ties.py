@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import TOGETHER
+from ...arrays import Array, Bools
 from ...quantiles import chi2
 from ..results import Update
 from ..state.batch import Batch, PointTies
 from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Probability that a good tie fails the test on entry, and the one in the window.
 ON_ENTRY, INSIDE = 1e-5, 1e-3

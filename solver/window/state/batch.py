@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.covariance import Cofactors
 from ...adjustment.layout import Layout
@@ -18,11 +17,8 @@ from ...adjustment.network import Rays
 from ...adjustment.normal_equations import ControlWeights, inverse_factors, point_normals
 from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
 from ...adjustment.surface_control import SurfaceControl
+from ...arrays import Array, Bools, IntArray
 from .unknowns import Information, WindowState
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.layout import Layout
 from ...adjustment.network import Rays
+from ...arrays import Array, Bools, IntArray
 from ...geometry.measured_trajectory import MeasuredPoses
 from ...geometry.ray_intersection import intersect_rays
 from ...geometry.rotation import corrected_angles, matrix_from_angles
@@ -17,10 +17,6 @@ from ...models.base import Design, PseudoObservations
 from .batch import Batch, PointTies
 from .network import LiveNetwork
 from .points import PointLooks
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-
 
 _NO_PRIOR = PseudoObservations(np.empty((0, 1), np.int32), np.empty((0, 1)), np.empty(0), np.empty(0), ())
 
@@ -174,7 +170,7 @@ class BatchMaker:
         batch.linearise(theta, reweigh=True)
         return batch
 
-    def _on_surface(self, names: list[str], points: list[PointLooks], ties: PointTies | None) -> NDArray[np.bool_]:
+    def _on_surface(self, names: list[str], points: list[PointLooks], ties: PointTies | None) -> Bools:
         """Points (p,) that a height of the surface is wanted for: seen twice, without coordinates of their own, and
         without what an earlier strip says of them, which has it."""
         control = self.network.intake.control

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.pose_noise import PoseNoise
 from ...adjustment.surface_control import SurfaceControl
+from ...arrays import Array, IntArray
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredTrajectory
@@ -20,9 +20,6 @@ from .sigma_factors import SigmaFactors
 from .strip import WindowStrip
 from .surface import LiveSurface
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 
 class Batches:

@@ -8,18 +8,15 @@ from itertools import takewhile
 from math import isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import Group
 from ...adjustment.normal_equations import ControlWeights
+from ...arrays import Array, Bools
 from ...camera.line_camera import LineCamera
 from ...geometry.measured_trajectory import SMOOTHED_LATE_S, MeasuredTrajectory
 from ..results import Look, Refusal
 from .batch import Batch
 from .strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Sigmas outside this are of no measurement, px: squares of their weights leave the range of numbers, and what is not a
 #: number in one look is in all unknowns afterwards.
@@ -120,7 +117,7 @@ class Intake:
             self._waiting[name] = None
         return ""
 
-    def known_coordinates(self, names: Sequence[str], used: NDArray[np.bool_]) -> ControlWeights:
+    def known_coordinates(self, names: Sequence[str], used: Bools) -> ControlWeights:
         """Known coordinates of points; those that are refused, and those ``used`` (p,) by earlier strips, take no
         weight."""
         weight, xyz = np.zeros((len(names), 3)), np.zeros((len(names), 3))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Array, IntArray
 from ...geometry.trajectory import Poses
 from ...models import MODELS
 from ...models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
@@ -16,9 +17,6 @@ from ...models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
 from ..results import WindowOptions
 from .platform import LivePlatform
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
 UNKNOWN_LENGTH_S = 600.0
