@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ..arrays import Array, IntArray
+from ..arrays import IntArray
 from ..geometry.measured_trajectory import SMOOTHED_LATE_S
 from .block.backward import LeftOrientation, LeftPoints, Step
 from .block.block import Block
@@ -83,7 +83,9 @@ class Leaving:
         self._let_go_s = now_s
         limits = {}
         for strip in self._network.strips.values():
-            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
+            settled_s = -np.inf
+            if self._is_settled(strip, now_s):
+                settled_s = _until(self._network.of_strip(strip), MOST_LEAVING + 1, np.inf)
             limits[strip.id] = max(settled_s, bearable_s)
         return limits
 
@@ -112,7 +114,7 @@ class Leaving:
             update.refused += network.intake.without_place(batch, {p.name for p in points})
             left = LeftPoints.of(batch, points)
             self._left.append(left)
-            update.refused += self._block.leave(batch, left, cells.get(id(batch)))
+            self._block.leave(batch, left, cells.get(id(batch)), update)
         self._quality.integrity.leave(leaving, forget_s)
         self._control.leaving(leaving, sources.leave(leaving))
         for batch in leaving:
@@ -151,23 +153,8 @@ class Leaving:
         """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
             return limit_s
-        old = sorted((b for b in self._network.batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
-        most = max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S)
-        rays = 0
-        for batch in old:
-            rays += len(batch.rays)
-            if rays >= most:
-                return batch.oldest_s
-        return limit_s
-
-    def _settled_to(self, strip: WindowStrip) -> float:
-        """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
-        rays = 0
-        for batch in sorted(self._network.of_strip(strip), key=lambda b: b.oldest_s):
-            rays += len(batch.rays)
-            if rays > MOST_LEAVING:
-                return batch.oldest_s
-        return np.inf
+        old = [b for b in self._network.batches if b.oldest_s <= limit_s]
+        return _until(old, max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S), limit_s)
 
     def _marginalise(self, numbers: IntArray, final: LeftOrientation | None = None) -> None:
         """Marginalise unknowns, with all that stands beside them, and keep what leads back to them."""
@@ -257,13 +244,18 @@ class SingleLooks:
         ):
             return
         ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
-        near = _placed(ground[:GROUND_BATCHES])
+        near = np.concatenate([b.points_l[b.normals.rank == 3] for b in ground[:GROUND_BATCHES]])
         batch = self._maker.make_single(names, points, near) if len(near) else None
         if batch is not None:
             looks = [p.looks[0] for p in points]
             self._block.keep_single(batch, looks, self._sources.cell_of_single(batch))
 
 
-def _placed(batches: Iterable[Batch]) -> Array:
-    """The points (m, 3) of batches that have a place."""
-    return np.concatenate([b.points_l[b.normals.rank == 3] for b in batches])
+def _until(batches: Iterable[Batch], most_rays: float, otherwise_s: float) -> float:
+    """Up to when of some batches may leave now: up to the one with which they have so many rays, the oldest first."""
+    rays = 0
+    for batch in sorted(batches, key=lambda b: b.oldest_s):
+        rays += len(batch.rays)
+        if rays >= most_rays:
+            return batch.oldest_s
+    return otherwise_s

@@ -17,7 +17,7 @@ from ...adjustment.dense_in_parts import Parts
 from ...arrays import Array
 from ..datum.biases import Coordinate
 from ..datum.drifts import Cell, Named
-from ..results import AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
+from ..results import AdjustedPoint, Look, RefinedOrientation, Update, WholeStrips
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.points import ControlPoint
@@ -65,12 +65,12 @@ class Block:
         """A strip begins."""
         self._archive.strips[strip.id] = KeptStrip(self._network.index(strip), strip.numbers)
 
-    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None) -> list[Refusal]:
+    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None, update: Update) -> None:
         """A batch became final; see `Archive.leave`."""
         self.conclude()
         names = list(self._network.strips)
         self._touched.update(names[i] for i in batch.strips)
-        return self._archive.leave(batch, left, cell)
+        self._archive.leave(batch, left, cell, update)
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
         """Keep looks that found no partner in their strip, a batch of one each."""

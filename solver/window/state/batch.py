@@ -344,7 +344,8 @@ class Batch:
             theta = state.values(self.columns)
             self.back_substitute(theta)
             cofactors = self.cofactors(state.covariance(self.columns))
-            self.judged = state.solution, cofactors, self.statistics(theta, cofactors)
+            statistics = statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
+            self.judged = state.solution, cofactors, statistics
         return self.judged[1], self.judged[2]
 
     def residuals_px(self, state: WindowState) -> Array:
@@ -354,10 +355,6 @@ class Batch:
         theta = state.values(self.columns)
         self.back_substitute(theta)
         return residuals_px(self.rays, self._at(theta), self.whitening)
-
-    def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
-        """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
-        return statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
 
     def _at(self, theta: Array) -> Linearisation:
         """The linear equations with their residuals at values (u,) of the unknowns and the present points.

@@ -114,13 +114,13 @@ class LiveNetwork:
         self.pose_noise = PoseNoise(self.trajectory)
         self.sigmas = SigmaFactors()
         self.platform = LivePlatform(platform, self.trajectory, self.state)
-        self.camera_columns: IntArray = np.empty(0, dtype=np.int64)
-        if self_calibration is not None:
-            m = self_calibration.n_unknowns
-            self.camera_columns = self.state.new_numbers(m)
+        self._camera_sigma = np.empty(0) if self_calibration is None else self_calibration.apriori_sigma
+        m = len(self._camera_sigma)
+        self.camera_columns = self.state.new_numbers(m)
+        if m:
             columns = self.camera_columns[:, None].astype(np.int32)
             self.state.enter(self.camera_columns)
-            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self._camera_sigma)
         self.surface = LiveSurface(surface, self.state)
 
     @property
@@ -131,8 +131,7 @@ class LiveNetwork:
     @property
     def shared_sigma(self) -> Array:
         """What is known of these beforehand."""
-        camera = self.self_calibration.apriori_sigma if self.self_calibration is not None else np.empty(0)
-        return np.concatenate([self.platform.errors.sigma, camera, self.surface.sigma])
+        return np.concatenate([self.platform.errors.sigma, self._camera_sigma, self.surface.sigma])
 
     @property
     def noise_version(self) -> int:

@@ -83,7 +83,6 @@ class Intake:
     def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
         self.points: dict[str, PointLooks] = {}
         self.control: dict[str, ControlPoint] = {}
-        self._ccds = [line.id for line in camera.lines]
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
@@ -130,12 +129,9 @@ class Intake:
 
     def sources_of(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""
-        rays = batch.rays
         looks = [self.points[name].looks for name in batch.names]
-        return [
-            (looks[p][s].source, self._ccds[c])
-            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
-        ]
+        of_rays = (looks[p][k] for p, k in zip(batch.rays.point.tolist(), batch.rays.source.tolist(), strict=True))
+        return [(look.source, look.ccd) for look in of_rays]
 
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""
