@@ -21,6 +21,7 @@ from triline.solver.camera.self_calibration import tls
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.leaving import Leaving
 from triline.solver.window.results import WindowOptions
 from triline.solver.window.state.relinearisation import Relinearisation
 from triline.solver.window.window import Window
@@ -29,7 +30,7 @@ from triline.solver.window.window import Window
 PHASES = (
     ("extend the strips", Window, "_extend_strips"),
     ("arrive", Window, "_arrive"),
-    ("follow the trajectory", Window, "_follow_trajectory"),
+    ("follow the trajectory", Relinearisation, "replace_filtered"),
     ("linearise what has moved", Relinearisation, "look_after"),
     ("solve", Window, "_solve"),
     ("screen", Window, "_screen"),
@@ -37,7 +38,7 @@ PHASES = (
     ("judge what is new", Window, "_judge"),
     ("learn the noise of poses", Window, "_learn_noise"),
     ("publish points", Window, "_publish"),
-    ("let go", Window, "_let_go"),
+    ("let go", Leaving, "let_go"),
     ("report", Window, "_report"),
 )
 

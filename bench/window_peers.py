@@ -59,7 +59,7 @@ class Recorded:
                 continue
             self._known.add(id(batch))
             self._kept.append(batch)  # so that no other gets its id
-            rows = batch.full_rows(np.arange(len(batch.rays)))
+            rows = batch.full_rows
             for p, name in enumerate(batch.names):
                 if name in self._points:  # of a batch that joins others
                     continue

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
 from .equations import BlockEquations
@@ -36,8 +36,6 @@ __all__ = [
     "pose_problem",
     "solve",
 ]
-
-Array = NDArray[np.floating]
 
 
 def adjust(

@@ -13,10 +13,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
+from ..arrays import Array, Bools, IntArray
 
 #: A set is told from another if its score is lower by so much: a little less than the price of one bias. Tuned.
 TOLD = 9.0
@@ -51,7 +49,7 @@ class Verdict:
 
 
 def judge(
-    C: Array, v: Array, axis: NDArray[np.int64], price: float, before: Bools, shifted: Collection[int] | None = None
+    C: Array, v: Array, axis: IntArray, price: float, before: Bools, shifted: Collection[int] | None = None
 ) -> Verdict:
     """Find the biases that explain the discrepancies.
 
@@ -95,7 +93,7 @@ def judge(
     return Verdict(best, out, tuple(rivals), scores[best])
 
 
-def _search(M: Array, m: Array, usable: NDArray[np.int64], price: float) -> dict[frozenset[int], float]:
+def _search(M: Array, m: Array, usable: IntArray, price: float) -> dict[frozenset[int], float]:
     """Scores of the hypotheses worth a look, the lower the better; that of none is 0."""
     scores: dict[frozenset[int], float] = {frozenset(): 0.0}
     beam = [frozenset[int]()]

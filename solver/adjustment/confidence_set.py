@@ -9,11 +9,10 @@ alone, and nothing is told apart.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Bools
 from ..quantiles import norm, student
-
-Array = NDArray[np.floating]
 
 #: Confidence that the adjustment with the smallest expected loss is in the set; a statistical level.
 CONFIDENCE = 0.95
@@ -26,7 +25,7 @@ LEAST_POINTS = 6
 RESAMPLINGS = 2000
 
 
-def confidence_set(loss: ArrayLike, confidence: float = CONFIDENCE) -> NDArray[np.bool_]:
+def confidence_set(loss: ArrayLike, confidence: float = CONFIDENCE) -> Bools:
     """Which adjustments (m,) are not told from the best one by their losses (m, n) at the same n points.
 
     The points are resampled with repetition. Of all adjustments the one with the largest mean loss, against its

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from .adjustment import Solution
 from .elimination import Cluster
 from .normal_equations import couplings
-
-Array = NDArray[np.floating]
 
 #: Rays for which dense rows are held at a time.
 ROWS = 1024
@@ -71,7 +69,7 @@ def point_cofactors(solution: Solution) -> Array:
     return points
 
 
-def point_unknown_cofactors(solution: Solution, columns: NDArray[np.int64]) -> Array:
+def point_unknown_cofactors(solution: Solution, columns: IntArray) -> Array:
     """Cofactors (p, 3, m) between object points and some reduced unknowns (m,)."""
     result = np.empty((solution.network.n_points, 3, len(columns)))
     unit = np.zeros((solution.layout.n_unknowns, len(columns)))

@@ -11,11 +11,10 @@ from collections.abc import Generator, Iterator
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs, solve_triangular
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
+from ..arrays import Array
+
 Cost = float
 Parts = Generator[Cost, None, None]
 

@@ -19,12 +19,10 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bools, IntArray
 from ..camera.line_camera import LineCamera
 from .statistics import correlations, fisher_limit, fisher_value, student_limit
-
-Array = NDArray[np.floating]
 
 
 class Criterion(StrEnum):
@@ -86,7 +84,7 @@ class Evidence:
     sigma0: float
     redundancy: int
     gsd_m: float
-    rank: NDArray[np.int64]
+    rank: IntArray
 
     @property
     def sigma(self) -> Array:
@@ -100,7 +98,7 @@ class Evidence:
         return np.divide(self.values, s, out=np.zeros_like(s), where=s > 0)
 
 
-def strongest_correlations(cross: Array, variance: Array, q: Array) -> tuple[NDArray[np.int64], Array]:
+def strongest_correlations(cross: Array, variance: Array, q: Array) -> tuple[IntArray, Array]:
     """With which of k other unknowns each of m parameters is most correlated: its place (m,), and r (m,).
 
     Parameters
@@ -122,7 +120,7 @@ def point_sigmas(cross: Array, q: Array) -> Array:
     return np.sqrt(effect.mean(axis=0)).T
 
 
-def ranks(names: Sequence[str], camera: LineCamera) -> NDArray[np.int64]:
+def ranks(names: Sequence[str], camera: LineCamera) -> IntArray:
     """See `Evidence.rank`: the parameter of the nadir line of a lens, to which those of its other lines then refer, and
     of powers the highest."""
     nadir = camera.nadir_line.id if len(camera.lenses) == 1 else None
@@ -221,7 +219,7 @@ def _insignificant(e: Evidence, i: int, t_limit: float, alpha: float) -> Removal
     return _removal(e, i, Criterion.STUDENT, t, t_limit, text)
 
 
-def _strongest(e: Evidence, significant: NDArray[np.bool_]) -> tuple[Array, list[str]]:
+def _strongest(e: Evidence, significant: Bools) -> tuple[Array, list[str]]:
     """Largest correlation of each parameter with anything.
 
     Of two additional parameters that go with each other only one is held to it, as the other can stay without it: the

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ..arrays import Array, Bools, IntArray
 from ..models.base import ModelOptions
 from .adjustment import State, pose_problem
 from .layout import Layout
 from .linearisation import linearise_and_weigh
 from .network import Network
 from .normal_equations import Prior
-
-Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -71,17 +69,17 @@ def georeference_posed(network: Network, layout: Layout, prior: Prior, ray_weigh
     return Georeferenced(xyz, _root(image, known), _root(total, known))
 
 
-def _root(variance: Array, known: NDArray[np.bool_]) -> Array:
+def _root(variance: Array, known: Bools) -> Array:
     return np.where(known[:, None], np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
-def _per_point(values: Array, point: NDArray[np.int64], count: int) -> Array:
+def _per_point(values: Array, point: IntArray, count: int) -> Array:
     total = np.zeros((count, *values.shape[1:]))
     np.add.at(total, point, values)
     return total
 
 
-def _inverse(normal: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _inverse(normal: Array) -> tuple[Array, Bools]:
     """Inverses (p, 3, 3), zero where singular, and which are not."""
     scale = np.einsum("pii->p", normal)
     known = np.linalg.eigvalsh(normal)[:, 0] > 1e-10 * scale

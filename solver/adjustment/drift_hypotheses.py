@@ -19,11 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..quantiles import chi2
 
-Array = NDArray[np.floating]
 #: Source of image measurements (its publisher, may be empty) and CCD line.
 Group = tuple[str, str]
 

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
+from ..arrays import Array, IntArray
+
 #: Equations of one point: numbers (u,) of the unknowns, A (m, u), J (m, 3), r (m,).
 Rows = tuple[IntArray, Array, Array, Array]
 

@@ -8,14 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ..arrays import IntArray
 from .layout import Layout
 from .nested_dissection import Dissection
 from .normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
-
-IntArray = NDArray[np.int64]
 
 #: Costs that decide how points are clustered: seconds per multiply-add in a dense product, per element added to the
 #: normal matrix, per value scattered, and per cluster. Only their ratios matter.

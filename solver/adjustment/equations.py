@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from .layout import Layout
 from .linearisation import (
     Linearisation,
@@ -28,8 +28,6 @@ from .normal_matrix import NormalMatrix
 from .problem import Iteration, Problem, Solution, State, cost_of, start_state
 from .reduced_system import Factor
 from .robust import WeightFunction
-
-Array = NDArray[np.floating]
 
 
 class Normals(NamedTuple):

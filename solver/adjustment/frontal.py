@@ -9,15 +9,12 @@ points need them; libraries of sparse Cholesky factors leave them to the user.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
+from ..arrays import Array, IntArray
 from .nested_dissection import Dissection
 from .reduced_system import RAISED, ROUNDING, Undetermined, cholesky, inverse_of, null_vectors, scale_of
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 
 class FrontalMatrix:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .equations import Equations, Outcome
 from .problem import AdjustmentOptions, Iteration
-
-Array = NDArray[np.floating]
 
 #: The image motion is taken anew for the weights after every step that lowers the cost by more than this share of it.
 WEIGHTS_CHANGE = 1e-5

@@ -11,14 +11,11 @@ from __future__ import annotations
 from collections.abc import Generator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ..arrays import Array, IntArray
 from .dense_in_parts import Cost, Parts, factorised, inverted, reduced, solved
 from .reduced_system import DenseFactor
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Unknowns that there is room for at first, and the factor by which the room grows. Memory that nothing was written to
 #: is not taken from the system.

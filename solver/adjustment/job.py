@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bools
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
@@ -29,8 +29,6 @@ from .snooping import Rejected, Round, Snooping, image_scale, joint_limit, snoop
 from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
 from .surface_control import SurfaceFit, SurfaceRows, SurfaceShift
 from .variance_components import LEAST_REDUNDANCY, Component, Scales, estimate_components, group_sums, scaled
-
-Array = NDArray[np.floating]
 
 #: Reduced unknowns up to which a network is searched for undetermined combinations (an eigenproblem of this size).
 MOST_UNKNOWNS = 1000
@@ -401,7 +399,7 @@ class _Stage:
         return whiten_prior(layout.prior, layout.n_unknowns)
 
     @property
-    def _on_surface(self) -> NDArray[np.bool_]:
+    def _on_surface(self) -> Bools:
         """Points (p,) that a height of the surface is wanted for: seen twice, without coordinates of their own."""
         network = self.solution.network
         wanted = network.rays_per_point >= 2

@@ -13,16 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from ..geometry.frames import LocalFrame
 from ..geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from ..geometry.trajectory import Trajectory
 from .block_data import BlockData, ImagePoints, KnownPoints, network_from_block
 from .network import Strip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Tie points of one name farther apart than this share of the height above ground are different points. Measured
 #: orientation errs by less, and a single look says no more; a name that comes again by chance lies anywhere.

@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import CameraDesign, SelfCalibration
 from ..models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, join_observations
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .network import Network, Strip
 from .surface_control import SurfaceControl
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: The shift of a surface that points lie on, as an unknown in words.
 SURFACE_SHIFT = "shift of the surface"

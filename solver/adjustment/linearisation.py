@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..camera.collinearity import collinearity
 from ..geometry.rotation import corrected_angles
 from .layout import Layout, RayShift
 from .network import Rays
-
-Array = NDArray[np.floating]
 
 #: Rays worked on at a time: so many that a call's overhead is small, so few that the arrays stay in the cache.
 CHUNK = 4096

@@ -14,12 +14,10 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
+from ..arrays import IntArray
 
 #: Unknowns of a part that is cut no more. Tuned: smaller parts save work, and cost calls.
 PART = 160

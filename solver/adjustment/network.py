@@ -9,14 +9,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Bools, IntArray
 from ..camera.line_camera import LineCamera
 from ..geometry.ray_intersection import intersect_rays
 from ..geometry.rotation import matrix_from_angles
 from ..geometry.trajectory import Trajectory, noise_between
 from .surface_control import SurfaceControl
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Roles of ground points.
 ROLES = ("control", "planimetric", "height", "check")
@@ -62,7 +60,7 @@ class Strip:
             return np.full(u.shape, 1.0 / self.line_rate_hz)
         return np.diff(self.line_time_s)[self._below(u)]
 
-    def contains(self, line: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, line: ArrayLike) -> Bools:
         """Which lines lie on the strip and below its trajectory."""
         u = np.asarray(line, dtype=float)
         count = self.lines if self.line_time_s is None else len(self.line_time_s)

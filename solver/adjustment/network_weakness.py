@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
-Array = NDArray[np.floating]
+from ..arrays import Array
 
 #: Share of the information below which the observations do not determine a combination.
 SHARE = 0.02

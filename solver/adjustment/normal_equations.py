@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ..arrays import Array, Bools, IntArray
 from ..models.base import PseudoObservations
 from .elimination import Cell, Cluster, Elimination
 from .layout import Layout
@@ -21,8 +21,6 @@ from .network import Control
 from .normal_matrix import NormalMatrix
 from .reliability import normalised_residuals
 from .surface_control import SurfaceRows
-
-Array = NDArray[np.floating]
 
 #: A pivot of a point's 3x3 matrix below this share of its diagonal counts as zero: that direction is not determined.
 POINT_PIVOT = 1e-10
@@ -77,8 +75,12 @@ class ControlWeights:
 
     weight: Array
     xyz_l: Array
-    n_observations: int
     surface: SurfaceRows | None = None
+
+    @property
+    def n_observations(self) -> int:
+        """Coordinates with weight."""
+        return int(np.count_nonzero(self.weight > 0))
 
     def residual(self, points_l: Array) -> Array:
         """Whitened (p, 3): given minus estimated."""
@@ -98,7 +100,7 @@ def weigh_control(control: Control, n_points: int) -> ControlWeights:
     w = np.where(given, 1.0 / np.where(given, control.sigma_m, 1.0) ** 2, 0.0)
     np.add.at(weight, control.point, w)
     np.add.at(moment, control.point, w * np.where(given, control.xyz_l, 0.0))
-    return ControlWeights(weight, moment / np.where(weight > 0, weight, 1.0), int((weight > 0).sum()))
+    return ControlWeights(weight, moment / np.where(weight > 0, weight, 1.0))
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class PointNormals:
 
     inverse_factor: Array
     y: Array
-    rank: NDArray[np.int64]
+    rank: IntArray
     surface: Array | None = None
 
     def back(self, t: Array) -> Array:
@@ -156,7 +158,7 @@ class Reduced:
 
 def point_normals(
     lin: Linearisation,
-    index: NDArray[np.int64],
+    index: IntArray,
     p: int,
     control: ControlWeights,
     points_l: Array,
@@ -181,7 +183,7 @@ def point_normals(
     for axis, diagonal in enumerate((0, 2, 5)):
         v[diagonal] = (v[diagonal] + control.weight[:, axis]) * (1.0 + damping)
 
-    def pivot(value: Array, whole: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def pivot(value: Array, whole: Array) -> tuple[Array, Bools]:
         good = value > POINT_PIVOT * whole
         return np.where(good, 1.0 / np.sqrt(np.where(good, value, 1.0)), 0.0), good
 
@@ -305,9 +307,7 @@ def couplings(
         first = last
 
 
-def _coupling_terms(
-    lin: Linearisation, layout: Layout, points: PointNormals, point: NDArray[np.int64], rays: slice
-) -> Array:
+def _coupling_terms(lin: Linearisation, layout: Layout, points: PointNormals, point: IntArray, rays: slice) -> Array:
     """``L^-1 Jp^T J`` of rays: (3, q, n) by the terms they have."""
     T, slots = len(layout.node), lin.camera.shape[1]
     a, b, c, d, e, f = points.inverse_factor.take(point[rays], axis=1)

@@ -8,16 +8,13 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from ..arrays import Array, IntArray
 from .frontal import FrontalMatrix
 from .nested_dissection import Dissection, find_fronts
 from .reduced_system import BandedFactor, DenseFactor, Factor
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Systems up to this size are dense whatever their structure.
 DENSE_UP_TO = 600

@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from .adjustment import AdjustmentOptions, Problem, Solution, State, pose_problem, solve
 from .covariance import point_cofactors, point_unknown_cofactors
 from .determinability import Evidence, Limits, Removal, examine, point_sigmas, ranks, strongest_correlations
 from .network import Network
 from .network_weakness import PART, describe
-
-Array = NDArray[np.floating]
 
 #: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
 #: rounding.
@@ -65,7 +63,7 @@ class Reduced:
     """
 
     solution: Solution
-    places: NDArray[np.int64]
+    places: IntArray
     cofactors: Array
     to_points: Array
     orientation: Array
@@ -260,7 +258,7 @@ def own_information(solution: Solution) -> Array:
     return own
 
 
-def _partners(solution: Solution, places: NDArray[np.int64], strongest: NDArray[np.int64]) -> tuple[str, ...]:
+def _partners(solution: Solution, places: IntArray, strongest: IntArray) -> tuple[str, ...]:
     """Names of the unknowns (m,) that the parameters at places (m,) are most correlated with: of the orientation, then
     coordinates."""
     first, m = solution.layout.n_model, len(strongest)

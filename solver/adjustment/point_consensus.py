@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bools, IntArray
 from ..quantiles import chi2
 from .adjustment import Solution
 from .linearisation import linearise
 
-Array = NDArray[np.floating]
-Places = NDArray[np.int64]
+Places = IntArray
 
 #: The orientation, which is taken as known here, adds so much to the sigma of a prediction.
 ORIENTATION_SHARE = 1.3
@@ -123,7 +122,7 @@ def _grown(start: Places, residual: Array, design: Array, limit: float) -> tuple
         inside[nearest] = True
 
 
-def _fit(inside: NDArray[np.bool_], residual: Array, design: Array) -> tuple[Array, Array] | None:
+def _fit(inside: Bools, residual: Array, design: Array) -> tuple[Array, Array] | None:
     A = design[:, :, inside].transpose(0, 2, 1).reshape(-1, 3)
     N = A.T @ A
     values = np.linalg.eigvalsh(N)
@@ -133,7 +132,7 @@ def _fit(inside: NDArray[np.bool_], residual: Array, design: Array) -> tuple[Arr
     return Q @ (A.T @ residual[:, inside].reshape(-1)), Q
 
 
-def _joint(v: Array, AQA: Array, inside: NDArray[np.bool_]) -> Array:
+def _joint(v: Array, AQA: Array, inside: Bools) -> Array:
     """Squared residuals (k,) in their own sigmas, those of rays outside as predictions."""
     C = np.eye(2) + np.where(inside, -1.0, 1.0)[:, None, None] * AQA
     values, vectors = np.linalg.eigh(C)

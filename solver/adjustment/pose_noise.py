@@ -22,8 +22,9 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array, IntArray
 from ..geometry.measured_trajectory import MeasuredPoses, MeasuredTrajectory
 from ..models.base import ModelOptions
 from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
@@ -32,9 +33,6 @@ from .network import Network, Rays, Strip
 from .normal_equations import PointNormals, inverse_factors
 from .options_by_strip import slow_errors_of_strip
 from .problem import Solution
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Bandwidths of corrections over that of the noise for which the share left is computed; linear between.
 _LOWEST, _HIGHEST, _STEPS = 1e-2, 1e2, 81

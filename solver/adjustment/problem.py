@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
@@ -19,8 +19,6 @@ from .network import Network
 from .normal_equations import ControlWeights, PointNormals, Prior, weigh_control, whiten_prior
 from .reduced_system import Factor
 from .robust import WeightFunction
-
-Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ class Parts(Protocol):
         """Points, and sigmas, of `direct_georeferencing.georeference`."""
         ...
 
-    def consensus(self, solution: Solution, points: NDArray[np.int64], limit: float) -> dict[int, Any]:
+    def consensus(self, solution: Solution, points: IntArray, limit: float) -> dict[int, Any]:
         """`point_consensus.consensus_of_points`."""
         ...
 

@@ -12,12 +12,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..quantiles import norm
 from .reliability import noncentrality
-
-Array = NDArray[np.floating]
 
 #: Outer reliability at which the factors are tabled.
 OUTER = np.concatenate([np.arange(0.0, 4.0, 0.125), np.arange(4.0, 20.1, 0.5)])

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from .adjustment import Solution
 from .covariance import Cofactors
 from .linearisation import Linearisation, Whitening
 from .network import Rays
 from .reliability import UNCONTROLLED
-
-Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve, get_lapack_funcs, solve_triangular
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
+from ..arrays import Array, Bools, IntArray
+
 Blocks = list[Array]
 
 _potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
@@ -107,11 +106,11 @@ class DenseFactor:
             self._inverse *= self.scale
         return self._inverse
 
-    def cofactors(self, columns: NDArray[np.int64]) -> Array:
+    def cofactors(self, columns: IntArray) -> Array:
         """Block (m, m) of the cofactor matrix."""
         return self.inverse()[np.ix_(columns, columns)]
 
-    def few_cofactors(self, columns: NDArray[np.int64]) -> Array:
+    def few_cofactors(self, columns: IntArray) -> Array:
         """Block (m, m) of the cofactor matrix for few columns, ``(L^-1 E)^T (L^-1 E)``, without all of it."""
         if self._factor is None or self._inverse is not None:
             return self.cofactors(columns)
@@ -323,6 +322,6 @@ def inverse_of(factor: Array | None) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _upper(n: int) -> NDArray[np.bool_]:
+def _upper(n: int) -> Bools:
     """Which elements of an (n, n) matrix stand above its diagonal."""
     return ~np.tri(n, dtype=bool)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..models.base import Design
 from .adjustment import Solution
 from .layout import CorrectionSet, platform_design
-
-Array = NDArray[np.floating]
 
 
 def corrections_at(solution: Solution, strip: int, time_s: ArrayLike, lens: int | None = None) -> Array:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..quantiles import norm
-
-Array = NDArray[np.floating]
 
 #: Critical value of the normalised residual for alpha = 0.001 [K A.17].
 CRITICAL_W = 3.29

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
+from ..arrays import Array
 
 
 class WeightFunction(Protocol):

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, IntArray
 from ..quantiles import chi2, norm
 from .adjustment import AdjustmentOptions, Solution, solve
 from .covariance import Cofactors, cofactors
@@ -25,8 +25,6 @@ from .normal_equations import weigh_control
 from .point_consensus import consensus_of_points
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
-
-Array = NDArray[np.floating]
 
 #: A failing observation goes in the same round as the largest only if it has at least this share of it.
 TOGETHER = 0.5
@@ -105,7 +103,7 @@ def failing_w(largest_w: Array, joint: Array, critical: float) -> Array:
     return np.where(joint > joint_limit(critical), largest_w, 0.0)
 
 
-def largest_of_group(group: NDArray[np.int64], value: Array) -> NDArray[np.int64]:
+def largest_of_group(group: IntArray, value: Array) -> IntArray:
     """Places of the largest value in each group."""
     order = np.lexsort((-value, group))
     return order[np.diff(group[order], prepend=-1) != 0]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array, IntArray
 from ..quantiles import chi2, fisher, student
-
-Array = NDArray[np.floating]
 
 #: Significance level of the global test, and of the tests of single parameters.
 ALPHA = 0.05
@@ -68,7 +67,7 @@ class PointAccuracy:
     """
 
     n: int
-    n_xyz: NDArray[np.int64]
+    n_xyz: IntArray
     rmse_m: Array
     mean_m: Array
     max_m: Array

@@ -18,13 +18,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bools
 from .reliability import CRITICAL_W
 from .robust import igg3
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Distances from the surface, in its sigmas, up to which a height counts in full, and from which it does not count at
 #: all (weight function IGG III). Tuned: of heights with normal errors one in a hundred loses some weight.

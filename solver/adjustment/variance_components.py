@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ..arrays import Array, IntArray
 from ..models.base import ERROR_GROUPS, error_groups
 from ..quantiles import chi2
 from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
@@ -23,8 +23,6 @@ from .covariance import Cofactors, cofactors, point_unknown_cofactors
 from .linearisation import Whitening
 from .normal_equations import Prior
 from .normal_matrix import DENSE_UP_TO
-
-Array = NDArray[np.floating]
 
 GROUPS = ("image", "control", *ERROR_GROUPS)
 
@@ -94,7 +92,7 @@ class Scales:
         return replace(problem, prior=prior, control=control)
 
 
-def prior_groups(problem: Problem) -> dict[str, NDArray[np.int64]]:
+def prior_groups(problem: Problem) -> dict[str, IntArray]:
     """Rows of the a-priori equations that belong to each group of slow errors, by the words of their labels."""
     given = problem.layout.prior
     labels = [label for label, s in zip(given.labels, given.sigma, strict=True) if np.isfinite(s)]

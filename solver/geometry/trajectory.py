@@ -40,7 +40,7 @@ class Poses:
     velocity_l: Array
     angle_rate: Array
 
-    def part(self, which: slice) -> Poses:
+    def part(self, which: slice | NDArray[np.int64]) -> Poses:
         """Some of them."""
         return Poses(*(value[which] for value in vars(self).values()))
 

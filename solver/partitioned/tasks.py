@@ -453,7 +453,7 @@ def _load(store: Store, key: int, version: int) -> tuple[Part, BlockEquations]:
     equations = BlockEquations.__new__(BlockEquations)
     control = part.problem.control
     if saved.control is not control.weight:
-        control = replace(control, weight=saved.control, n_observations=int((saved.control > 0).sum()))
+        control = replace(control, weight=saved.control)
     equations.problem = replace(part.problem, control=control)
     equations.given, equations.weight = saved.given, saved.weight
     equations.keep_weights, equations.weights_given = saved.keep_weights, True

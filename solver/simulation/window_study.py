@@ -268,7 +268,7 @@ def _update(
     update = window.update(now)
     result.update_s.append(process_time() - begun)
     _collect(update, result, now)
-    for time in window.grid(now - live_s + 1e-6, now + 1e-6) if live_s else ():
+    for time in window.options.grid(now - live_s + 1e-6, now + 1e-6) if live_s else ():
         orientation = window.live(float(time))
         if orientation is not None:
             result.live.append(orientation)

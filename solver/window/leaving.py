@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import IntArray
 from ..geometry.measured_trajectory import SMOOTHED_LATE_S
 from .block.backward import LeftOrientation, LeftPoints, Step
 from .block.block import Block
 from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
-from .output import OrientationOutput, adjusted_points
+from .output import OrientationOutput
 from .quality.quality_control import QualityControl
-from .results import AdjustedPoint, RefinedOrientation, Refusal, WholeStrips, WindowOptions
+from .results import RefinedOrientation, Refusal, Update, WindowOptions
 from .screening.snooping import snoop
 from .screening.ties import snoop_ties
 from .state.batch import Batch
@@ -23,9 +22,6 @@ from .state.lens_sets import stays_to
 from .state.maker import BatchMaker
 from .state.network import LiveNetwork
 from .state.strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Rays of a strip that is over which leave in one update, about; the others follow in the next ones.
 MOST_LEAVING = 1000
@@ -36,27 +32,6 @@ LEAVING_S, LEAST_LEAVING = 1.0, 100
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
-
-
-@dataclass
-class Left:
-    """What became final in an update.
-
-    Attributes
-    ----------
-    final, points : orientation and points that have left the window
-    whole : orientation and points with the information of whole strips, from the backward pass
-    refused : looks left out at the last test, those that found no partner, and those that count after all
-    alone : points that do not agree with what earlier strips say of them
-    events : lines for the operator
-    """
-
-    final: list[RefinedOrientation] = field(default_factory=list)
-    points: list[AdjustedPoint] = field(default_factory=list)
-    whole: WholeStrips | None = None
-    refused: list[Refusal] = field(default_factory=list)
-    alone: list[str] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
 
 
 class Leaving:
@@ -78,29 +53,29 @@ class Leaving:
         self._left: list[LeftPoints] = []
         self._let_go_s = -np.inf
 
-    def let_go(self, now_s: float, limit_s: float, length_s: float, serial: int, at_the_end: bool = False) -> Left:
+    def let_go(self, update: Update, limit_s: float, length_s: float, at_the_end: bool = False) -> None:
         """Batches and unknowns older than the limit, and those of strips that are over, become final."""
-        found, network = Left(), self._network
+        network, now_s = self._network, update.now_s
         limits = self._limits(now_s, limit_s)
         leaving = self._older_than(list(limits.values()))
         if self.options.snoop and leaving:
-            self._last_test(leaving, now_s, serial, found)
+            self._last_test(leaving, update)
         gone = [(strip, *strip.leaving(limits[strip.id], network.state)) for strip in network.strips.values()]
-        found.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
-        self._release_points(leaving, limit_s - length_s, found)
+        update.refused += self._single.leave(now_s, limits, at_once=any(len(numbers) for _, numbers, _ in gone))
+        self._release_points(leaving, limit_s - length_s, update)
         for strip, numbers, to_s in gone:
             if len(numbers):
-                self._release_orientation(strip, numbers, to_s, found)
+                self._release_orientation(strip, numbers, to_s, update)
         over = min(limits.values(), default=limit_s)
         modes = self._block.earlier.leaving(max(over, limit_s), (b.columns for b in network.batches))
         if len(modes):
             self._marginalise(modes)
-        found.whole = self._block.refined(now_s, self._steps, at_the_end)
+        update.whole = self._block.refined(now_s, self._steps, at_the_end)
         if self._block.quiet:
-            found.events += self._block.take_events()
+            update.events += self._block.take_events()
+        update.refused += network.intake.take_refused()
         del self._steps[: max(len(self._steps) - MOST_STEPS, 0)]
         self._forget(limit_s, length_s)
-        return found
 
     def _limits(self, now_s: float, limit_s: float) -> dict[str, float]:
         """By strip, the time before which all leaves."""
@@ -108,7 +83,9 @@ class Leaving:
         self._let_go_s = now_s
         limits = {}
         for strip in self._network.strips.values():
-            settled_s = self._settled_to(strip) if self._is_settled(strip, now_s) else -np.inf
+            settled_s = -np.inf
+            if self._is_settled(strip, now_s):
+                settled_s = _until(self._network.of_strip(strip), MOST_LEAVING + 1, np.inf)
             limits[strip.id] = max(settled_s, bearable_s)
         return limits
 
@@ -118,40 +95,38 @@ class Leaving:
         old = [b for b in self._network.batches if b.oldest_s <= latest]
         return [b for b in old if b.oldest_s <= max(limits[i] for i in b.strips)]
 
-    def _last_test(self, leaving: list[Batch], now_s: float, serial: int, found: Left) -> None:
-        snooped = snoop(leaving, self._network, self._control, now_s, serial)
-        self._block.reweigh_control(snooped.control)
-        failed = snoop_ties([b for b in leaving if b.ties is not None], self._network)
-        self._network.intake.set_apart(failed)
-        found.refused += snooped.refused
-        found.alone = snooped.alone + failed
+    def _last_test(self, leaving: list[Batch], update: Update) -> None:
+        rounds = snoop(leaving, self._network, self._control, self._block, update)
+        failed = snoop_ties(leaving, self._network, update)
+        update.tell_alone()
         if failed:
             self._network.state.solve()
-        if snooped.rounds or failed:
+        if rounds or failed:
             self._orientation.forget()
 
-    def _release_points(self, leaving: list[Batch], forget_s: float, found: Left) -> None:
+    def _release_points(self, leaving: list[Batch], forget_s: float, update: Update) -> None:
         """Publish the points of batches, and fix what these know."""
         network, sources = self._network, self._control.sources
         cells = sources.cells(leaving)
         for batch in leaving:
-            points = adjusted_points(batch, network, True, sources.on_points(batch, self._orientation.drift))
-            found.points += points
-            found.refused += network.intake.without_place(batch, {p.name for p in points})
-            self._left.append(LeftPoints.of(batch, points))
-            found.refused += self._block.leave(batch, points, cells.get(id(batch)))
+            points = self._orientation.points_of(batch, final=True)
+            update.points += points
+            update.refused += network.intake.without_place(batch, {p.name for p in points})
+            left = LeftPoints.of(batch, points)
+            self._left.append(left)
+            self._block.leave(batch, left, cells.get(id(batch)), update)
         self._quality.integrity.leave(leaving, forget_s)
         self._control.leaving(leaving, sources.leave(leaving))
         for batch in leaving:
             network.batches.leave(batch)
             network.intake.finish(batch)
 
-    def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, found: Left) -> None:
+    def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, update: Update) -> None:
         """Publish the orientation of a strip up to a time, and marginalise unknowns that no later time needs."""
         final = self._final(strip, to_s)
         left = None
         if final is not None:
-            found.final.append(final)
+            update.final.append(final)
             noise = self._orientation.noise(strip, final.time_s) + self._network.sigmas.doubt
             left = LeftOrientation(final, strip.design(final.time_s), noise)
             self._block.orientation(strip, left)
@@ -178,23 +153,8 @@ class Leaving:
         """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
             return limit_s
-        old = sorted((b for b in self._network.batches if b.oldest_s <= limit_s), key=lambda b: b.oldest_s)
-        most = max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S)
-        rays = 0
-        for batch in old:
-            rays += len(batch.rays)
-            if rays >= most:
-                return batch.oldest_s
-        return limit_s
-
-    def _settled_to(self, strip: WindowStrip) -> float:
-        """Up to when a strip that is over may leave now: all of it, or as much as one update can bear."""
-        rays = 0
-        for batch in sorted(self._network.of_strip(strip), key=lambda b: b.oldest_s):
-            rays += len(batch.rays)
-            if rays > MOST_LEAVING:
-                return batch.oldest_s
-        return np.inf
+        old = [b for b in self._network.batches if b.oldest_s <= limit_s]
+        return _until(old, max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S), limit_s)
 
     def _marginalise(self, numbers: IntArray, final: LeftOrientation | None = None) -> None:
         """Marginalise unknowns, with all that stands beside them, and keep what leads back to them."""
@@ -210,7 +170,7 @@ class Leaving:
         end = self._network.trajectory.end_s
         if not np.isfinite(end):
             return None
-        times = grid(self.options.grid_hz, strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
+        times = self.options.grid(strip.final_to_s, min(to_s, strip.end_s, end + 1e-3))
         times = times[self._network.trajectory.covers(times)] if len(times) else times
         if not len(times):
             return None
@@ -227,11 +187,6 @@ class Leaving:
             (s.final_to_s for s in self._network.strips.values() if not s.is_gone(self._network.state)), default=np.inf
         )
         self._network.trajectory.forget(min(limit_s - length_s, used, waiting, finals) - 1.0)
-
-
-def grid(hz: float, from_s: float, to_s: float) -> Array:
-    """Times of the published orientation in [from, to)."""
-    return np.arange(np.ceil(from_s * hz - 1e-6), np.ceil(to_s * hz - 1e-6)) / hz
 
 
 #: Time between two looks for looks that wait in vain, s, unless unknowns leave.
@@ -289,13 +244,18 @@ class SingleLooks:
         ):
             return
         ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
-        near = _placed(ground[:GROUND_BATCHES])
+        near = np.concatenate([b.points_l[b.normals.rank == 3] for b in ground[:GROUND_BATCHES]])
         batch = self._maker.make_single(names, points, near) if len(near) else None
         if batch is not None:
             looks = [p.looks[0] for p in points]
             self._block.keep_single(batch, looks, self._sources.cell_of_single(batch))
 
 
-def _placed(batches: Iterable[Batch]) -> Array:
-    """The points (m, 3) of batches that have a place."""
-    return np.concatenate([b.points_l[b.normals.rank == 3] for b in batches])
+def _until(batches: Iterable[Batch], most_rays: float, otherwise_s: float) -> float:
+    """Up to when of some batches may leave now: up to the one with which they have so many rays, the oldest first."""
+    rays = 0
+    for batch in sorted(batches, key=lambda b: b.oldest_s):
+        rays += len(batch.rays)
+        if rays >= most_rays:
+            return batch.oldest_s
+    return otherwise_s

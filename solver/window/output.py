@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..adjustment.layout import SURFACE_SHIFT
+from ..arrays import Array, IntArray
 from ..camera.self_calibration import unit_of
 from ..geometry.rotation import corrected_angles
 from ..geometry.trajectory import Poses
@@ -17,14 +17,11 @@ from ..models.base import COMPONENTS
 from .datum.drift_monitor import DriftMonitor
 from .datum.drifts import Compensation
 from .quality.determinability import ESTIMATED, NOT_YET, Standing
-from .quality.light import QualityFindings
-from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, Refusal, WholeStrips, checks
+from .quality.light import Fit, QualityFindings
+from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, Update, checks
 from .state.batch import Batch
 from .state.network import LiveNetwork
 from .state.strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Times worked on at once.
 CHUNK = 64
@@ -35,22 +32,16 @@ BETTER = 0.7
 
 
 @dataclass(frozen=True)
-class WindowReport:
-    """Figures of one update; sigma0 is 1 a priori.
+class WindowReport(Fit):
+    """Figures of one update, beside how well observations and sigmas agree.
 
     Attributes
     ----------
-    sigma0, redundancy : over about the length of the window; NaN without redundancy
-    sigma0_total, redundancy_total : since the start
     observations, unknowns : in the window, what was marginalised counting as one observation an unknown
     start_s, end_s : orientation before the start is final; newest ray
     quality : light, protection levels and sources that drift
     """
 
-    sigma0: float
-    redundancy: int
-    sigma0_total: float
-    redundancy_total: int
     observations: int
     unknowns: int
     iterations: int
@@ -65,25 +56,14 @@ class WindowReport:
 
 
 @dataclass
-class WindowUpdate:
-    """What one update gave; ``whole`` when strips have ended; ``events`` and ``warnings`` are for the operator."""
+class WindowUpdate(Update):
+    """What one update gave, with its report."""
 
     report: WindowReport | None = None
-    final: list[RefinedOrientation] = field(default_factory=list)
-    points: list[AdjustedPoint] = field(default_factory=list)
-    refused: list[Refusal] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    whole: WholeStrips | None = None
-
-    def tell_alone(self, names: list[str]) -> None:
-        """Points were found that do not agree with what earlier strips say of them."""
-        if names:
-            self.events.append(f"do not agree with earlier strips: {', '.join(names)}")
 
 
 class OrientationOutput:
-    """Refined orientation at any time; keeps the cofactors of the unknowns asked for last.
+    """Refined orientation at any time, and points; keeps the cofactors of the unknowns asked for last.
 
     Parameters
     ----------
@@ -125,7 +105,32 @@ class OrientationOutput:
     def noise(self, strip: WindowStrip, times: Array) -> Array:
         """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
         noise = self._network.pose_noise.at(self._network.trajectory.at(times), strip.followed)
-        return noise + strip.left_out_variance(times)[:, :, None] * np.eye(6)
+        return noise + strip.model.left_out_variance(times)[:, :, None] * np.eye(6)
+
+    def points_of(self, batch: Batch, final: bool) -> list[AdjustedPoint]:
+        """The points of a batch that are determined, with covariance and residuals."""
+        points, control = self._network.intake.points, self._network.intake.control
+        drift = self._sources.on_points(batch, self.drift)
+        cofactors, statistics = batch.judge(self._network.state)
+        xyz_l, covariance = batch.points_l, cofactors.points
+        if drift is not None:
+            xyz_l, covariance = xyz_l + drift[0], covariance + drift[1]
+        v_line, v_sample = statistics.v_px.T.tolist()
+        w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
+        source, first = batch.rays.source.tolist(), batch.first_ray.tolist()
+        known, earlier = np.all(batch.control.weight > 0, axis=1), np.zeros(batch.n_points, dtype=np.int64)
+        if batch.ties is not None:
+            known, earlier = known | batch.ties.placed, earlier + (batch.ties.active & batch.ties.single)
+        out = []
+        for i in np.flatnonzero(batch.normals.rank == 3).tolist():
+            name, mine = batch.names[i], slice(first[i], first[i + 1])
+            seen = [points[name].looks[k] for k in source[mine]]
+            residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
+            role = control[name].role if name in control else "tie"
+            rays, single = int(batch.points_left[i]), int(earlier[i])  # single looks of earlier strips
+            checked = checks(rays + single, len(residuals) + single, bool(known[i]))
+            out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
+        return out
 
     def _chunk(self, strip: WindowStrip, times: Array, poses: Poses) -> tuple[Array, Array]:
         """Corrections (n, 6) and their covariance, with what the model leaves out."""
@@ -141,41 +146,6 @@ class OrientationOutput:
             change, of_drift = self.drift.change(A, self._network.state.places(columns))
             correction, covariance = correction + change, covariance + of_drift
         return correction, covariance
-
-
-def adjusted_points(
-    batch: Batch, network: LiveNetwork, final: bool, drift: tuple[Array, Array] | None
-) -> list[AdjustedPoint]:
-    """The points of a batch that are determined, with covariance and residuals.
-
-    ``drift``: what to add to coordinates (p, 3) and covariance (p, 3, 3) for tie points that drift.
-    """
-    points, control = network.intake.points, network.intake.control
-    cofactors, statistics = batch.judge(network.state)
-    xyz_l, covariance = batch.points_l, cofactors.points
-    if drift is not None:
-        xyz_l, covariance = xyz_l + drift[0], covariance + drift[1]
-    v_line, v_sample = statistics.v_px.T.tolist()
-    w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
-    source = batch.rays.source.tolist()
-    first, used = batch.first_ray.tolist(), np.bincount(batch.rays.point, batch.weight != 0.0, batch.n_points)
-    known = np.all(batch.control.weight > 0, axis=1)
-    earlier = np.zeros(batch.n_points, dtype=np.int64)  # single looks of earlier strips
-    if batch.ties is not None:
-        known, earlier = known | batch.ties.placed, earlier + (batch.ties.active & batch.ties.single)
-    out = []
-    for i, name in enumerate(batch.names):
-        if batch.normals.rank[i] < 3:
-            continue
-        looks = points[name].looks
-        mine = slice(first[i], first[i + 1])
-        seen = [looks[k] for k in source[mine]]
-        residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
-        role = control[name].role if name in control else "tie"
-        rays = int(used[i])
-        checked = checks(rays + int(earlier[i]), len(residuals) + int(earlier[i]), bool(known[i]))
-        out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
-    return out
 
 
 class CostHistory:

@@ -6,13 +6,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..adjustment.reliability import CRITICAL_W
+from ..arrays import Array
 from ..models import MODELS
-
-Array = NDArray[np.floating]
-
 
 #: Whose datum can be published.
 DATUMS = ("control", "gnss")
@@ -57,6 +54,11 @@ class WindowOptions:
     def follows_wander(self) -> bool:
         """Whether the model has a place for what wanders."""
         return self.model != "dgr"
+
+    def grid(self, from_s: float, to_s: float) -> Array:
+        """Times of the published orientation in [from, to)."""
+        first, end = np.ceil(np.array([from_s, to_s]) * self.grid_hz - 1e-6)
+        return np.arange(first, end) / self.grid_hz
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -199,6 +201,37 @@ class WholeStrips:
 
     orientation: list[RefinedOrientation]
     points: list[AdjustedPoint]
+
+
+@dataclass
+class Update:
+    """An update: when it is, and what its phases have to tell.
+
+    Attributes
+    ----------
+    now_s, number : platform time, and how many there were
+    final, points : orientation and points that have left the window, and points that have come
+    whole : when strips have ended
+    refused : looks and known coordinates left out, and those that count again
+    events, warnings : for the operator
+    alone : points that do not agree with what earlier strips say of them, not told yet
+    """
+
+    now_s: float
+    number: int
+    final: list[RefinedOrientation] = field(default_factory=list)
+    points: list[AdjustedPoint] = field(default_factory=list)
+    whole: WholeStrips | None = None
+    refused: list[Refusal] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    alone: list[str] = field(default_factory=list)
+
+    def tell_alone(self) -> None:
+        """Put into words which points do not agree with earlier strips."""
+        if self.alone:
+            self.events.append(f"do not agree with earlier strips: {', '.join(self.alone)}")
+            self.alone = []
 
 
 def checks(rays: int, looks: int, known: bool) -> str:

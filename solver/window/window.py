@@ -13,10 +13,11 @@ know of it (`block.ties`), and after each strip by a solution of the block as a 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..adjustment.pose_noise import ray_information
 from ..adjustment.surface_control import SurfaceControl
+from ..arrays import Array
 from ..camera.line_camera import LineCamera
 from ..camera.self_calibration import SelfCalibration
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
@@ -25,8 +26,8 @@ from .block.block import Block
 from .datum.control import ControlTests
 from .datum.drift_monitor import DriftMonitor
 from .datum.surface import SurfaceTests
-from .leaving import Leaving, grid
-from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, adjusted_points, parameters
+from .leaving import Leaving
+from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, parameters
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
 from .results import Look, RefinedOrientation, WindowOptions
@@ -40,9 +41,6 @@ from .state.network import LiveNetwork
 from .state.points import ControlPoint
 from .state.relinearisation import Relinearisation
 from .state.strip import WindowStrip, segment_length
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Unknowns become present so long before a time needs them, s.
 AHEAD_S = 1.0
@@ -141,7 +139,7 @@ class Window:
         self._duties = Duties()
         self._length_s = options.window_s
         self._now_s = self._newest_ray_s = self._learnt_s = -np.inf
-        self._serial = 0
+        self._number = 0
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -219,11 +217,11 @@ class Window:
         now_s : platform time, s; one that lies before the last counts as the last
         """
         self._now_s = max(self._now_s, now_s)
-        self._serial += 1
-        result = WindowUpdate()
+        self._number += 1
+        result = WindowUpdate(self._now_s, self._number)
         self._extend_strips()
         fresh = self._arrive(result)
-        joined = self._follow_trajectory()
+        joined = self._relinearisation.replace_filtered()
         duties = self._duties.take(self._now_s, busy=bool(joined))
         if LOOK_AFTER in duties:
             self._relinearisation.look_after(self._now_s)
@@ -236,7 +234,7 @@ class Window:
         self._judge(joined)
         self._learn_noise()
         self._publish(fresh, result)
-        self._let_go(self._limit_s(), result)
+        self._leaving.let_go(result, self._limit_s(), self._length_s)
         result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
         return result
 
@@ -246,9 +244,9 @@ class Window:
         The phases of `update` but those that only matter while the flight goes on: no sigma is questioned, no noise is
         learnt, and what leaves is final at once.
         """
-        result = WindowUpdate()
+        result = WindowUpdate(self._now_s, self._number)
         fresh = self._arrive(result)
-        joined = self._follow_trajectory(all_at_once=True)
+        joined = self._relinearisation.replace_filtered(all_at_once=True)
         iterations = self._solve(fresh) + self._weigh_surface(fresh, True, result)
         if self.options.snoop:
             due = joined or self._due_for_test()
@@ -256,7 +254,7 @@ class Window:
         self._judge(joined)
         for strip in self.strips.values():
             strip.end(0)
-        self._let_go(np.inf, result, at_the_end=True)
+        self._leaving.let_go(result, np.inf, self._length_s, at_the_end=True)
         result.report = self._report(iterations, joined, True, result)
         return result
 
@@ -271,21 +269,13 @@ class Window:
 
     def _arrive(self, result: WindowUpdate) -> list[Batch]:
         """Points with new looks become batches."""
-        arrived = self._arrivals.take(self._now_s)
-        self._quality.integrity.drop(arrived.apart)
-        result.refused += arrived.refused
-        result.tell_alone(arrived.alone)
-        for batch in arrived.fresh:
+        fresh = self._arrivals.take(result)
+        result.tell_alone()
+        for batch in fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-        if not self._length_s and arrived.fresh and not any(lens_of(self.camera, id) for id in self.strips):
-            self._length_s = self.options.window_looks * look_time(self.camera, arrived.fresh[0])
-        return arrived.fresh
-
-    def _follow_trajectory(self, all_at_once: bool = False) -> list[Batch]:
-        """Smoothed orientation takes the place of the filtered one under rays; the batches that came about that way."""
-        replaced = self._relinearisation.replace_filtered(all_at_once)
-        self._quality.integrity.drop(replaced.apart)
-        return replaced.joined
+        if not self._length_s and fresh and not any(lens_of(self.camera, id) for id in self.strips):
+            self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
+        return fresh
 
     def _solve(self, fresh: list[Batch]) -> int:
         """One or two Gauss-Newton steps from the warm state; number of solutions computed."""
@@ -301,9 +291,8 @@ class Window:
     def _weigh_surface(self, fresh: list[Batch], everything: bool, result: WindowUpdate) -> int:
         """Heights of the surface that points lie on: which count, and whether it agrees; number of solutions
         computed."""
-        solutions, change = self._surface.weigh(fresh, everything)
+        solutions, change = self._surface.weigh(fresh, everything, result)
         self._block.reweigh_surface(change)
-        result.warnings += self._surface.take_warnings()
         if solutions:
             self._orientation.forget()
         return solutions
@@ -334,20 +323,16 @@ class Window:
 
     def _snoop(self, batches: list[Batch], result: WindowUpdate) -> int:
         """Test batches; number of solutions computed."""
-        found = snoop(batches, self.network, self._control, self._now_s, self._serial)
-        self._block.reweigh_control(found.control)
-        result.refused += found.refused
-        result.tell_alone(found.alone)
-        return found.rounds
+        solutions = snoop(batches, self.network, self._control, self._block, result)
+        result.tell_alone()
+        return solutions
 
     def _weigh_control(self, fresh: list[Batch], result: WindowUpdate) -> int:
         """Weigh all control where there is news of it; number of solutions computed."""
         changed = False
         if self._control.is_due(self._now_s, fresh):
-            found = self._control.weigh(self._now_s)
-            self._block.reweigh_control(found.of_final)
-            result.refused += found.refused
-            changed = found.changed
+            changed, of_final = self._control.weigh(result)
+            self._block.reweigh_control(of_final)
         result.warnings += self._control.take_warnings()
         return int(changed)
 
@@ -379,18 +364,7 @@ class Window:
     def _publish(self, fresh: list[Batch], result: WindowUpdate) -> None:
         """The points of new batches, as they come out at once."""
         for batch in fresh:
-            drift = self._sources.on_points(batch, self._orientation.drift)
-            result.points += adjusted_points(batch, self.network, False, drift)
-
-    def _let_go(self, limit_s: float, result: WindowUpdate, at_the_end: bool = False) -> None:
-        """What is older than the window becomes final."""
-        left = self._leaving.let_go(self._now_s, limit_s, self._length_s, self._serial, at_the_end)
-        result.final += left.final
-        result.points += left.points
-        result.whole = left.whole
-        result.refused += left.refused + self.network.intake.take_refused()
-        result.tell_alone(left.alone)
-        result.events += left.events
+            result.points += self._orientation.points_of(batch, final=False)
 
     def _limit_s(self) -> float:
         """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the
@@ -420,10 +394,7 @@ class Window:
         strip = self.strip_at(time_s)
         if strip is None or not self.trajectory.covers([time_s])[0]:
             return None
-        if strip.activate(time_s, self.state):
-            self.state.solve()
-            self._orientation.forget()
-        orientation = self._orientation.at(strip, np.array([time_s]))
+        orientation = self._ahead(strip, np.array([time_s]))
         exposure = self._quality.last.exposure if self._quality.last is not None else None
         return orientation if exposure is None else exposure.protected(orientation)
 
@@ -435,18 +406,18 @@ class Window:
             last_s = min(to_s, strip.end_s)
             if first_s >= last_s or strip.is_over(self.state):
                 continue
-            times = self.grid(first_s, last_s)
+            times = self.options.grid(first_s, last_s)
             times = times[self.trajectory.covers(times)] if len(times) else times
             if len(times):
-                if strip.activate(float(times[-1]), self.state):
-                    self.state.solve()
-                    self._orientation.forget()
-                found.append(self._quality.protected(strip, self._orientation.at(strip, times)))
+                found.append(self._quality.protected(strip, self._ahead(strip, times)))
         return found
 
-    def grid(self, from_s: float, to_s: float) -> Array:
-        """Times of the published orientation in [from, to)."""
-        return grid(self.options.grid_hz, from_s, to_s)
+    def _ahead(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
+        """Orientation at times (n,), the last of which may need unknowns that are not present yet."""
+        if strip.activate(float(times[-1]), self.state):
+            self.state.solve()
+            self._orientation.forget()
+        return self._orientation.at(strip, times)
 
     def orientation_at(self, strip: str, times: ArrayLike) -> RefinedOrientation:
         """Orientation at times of a strip, none of them final, that have a measured one."""
@@ -476,18 +447,17 @@ class Window:
             if state.solution != solution:
                 self._orientation.forget()
         result.events += findings.events
-        tally = batches.tally()
-        unknowns = len(state) + tally.determined
+        unknowns = len(state) + sum(b.determined for b in batches)
         return WindowReport(
             **vars(fit),
-            observations=unknowns + tally.rows,
+            observations=unknowns + sum(b.information.rows for b in batches),
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in flown), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=tally.rays,
-            points=tally.points,
-            control=tally.control,
+            rays=sum(b.active_rays for b in batches),
+            points=sum(b.n_points for b in batches),
+            control=sum(b.active_control for b in batches),
             strip=newest.id if newest else "",
             parameters=parameters(self.network, newest, findings.standing) if newest else (),
             quality=findings,

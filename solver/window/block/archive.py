@@ -11,28 +11,24 @@ of the whole gives every line and every point the information of the block: it i
 from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.dense_in_parts import Cost, Parts
 from ...adjustment.drift_hypotheses import EACH
 from ...adjustment.eliminated_points import eliminated
 from ...adjustment.growing_normals import BlockNormals
 from ...adjustment.normal_equations import whiten_prior
+from ...arrays import Array, IntArray
 from ...models.base import PseudoObservations
 from ..datum.drifts import MOST_GROUPS, Cell, Named, of_block
-from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, WholeStrips, checks
+from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, Update, WholeStrips, checks
 from ..state.batch import Batch
 from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .backward import BlockSolution, LeftOrientation, LeftPoints
 from .points import KeptPoint, SingleLook, rows_of
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
 #: two seconds of one core; with the equations it takes 210 MB, which are kept.
@@ -116,24 +112,24 @@ class Archive:
             prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(kept.entered))
             self.add(kept.entered, prior.normal.toarray(), prior.matrix.T @ prior.value)
 
-    def leave(self, batch: Batch, published: Sequence[AdjustedPoint], cell: Cell | None = None) -> list[Refusal]:
-        """A batch became final; returns the single looks of earlier strips that count now.
+    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None, update: Update) -> None:
+        """A batch became final; single looks of earlier strips that count now are told.
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
         and of the earlier strip's coordinates, with all unknowns of that strip instead of the modes that stood for it.
 
         Parameters
         ----------
-        published : its points, those of full rank
+        left : its points, those of full rank
         cell : equations of the drifts of its strip, None if there are none
         """
         if not self.holds(batch.columns[: len(batch.columns) - batch.n_tied]):
-            return []
+            return
         placed = np.flatnonzero(batch.normals.rank == 3)
         if batch.ties is not None:
-            returned = [self._tie(batch, i, point, cell) for i, point in zip(placed.tolist(), published, strict=True)]
-            return [refusal for refusal in returned if refusal is not None]
-        left = LeftPoints.of(batch, published)
+            for i, point in zip(placed.tolist(), left.points, strict=True):
+                self._tie(batch, i, point, cell, update)
+            return
         columns, matrix, rhs = batch.columns, batch.information.matrix, batch.information.rhs
         if cell is not None:
             b = cell.border
@@ -143,10 +139,9 @@ class Archive:
             left = LeftPoints(replace(left.functions, columns=columns, coupling=coupling), left.points)
         self.add(columns, matrix, rhs)
         time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
-        for i, (at, point) in enumerate(zip(placed.tolist(), published, strict=True)):
+        for i, (at, point) in enumerate(zip(placed.tolist(), left.points, strict=True)):
             seen = frozenset(r.look.strip for r in point.residuals)
             self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), batch.control.weight[at]))
-        return []
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
         """Keep looks that found no partner in their strip: a batch of points with one each."""
@@ -156,11 +151,8 @@ class Archive:
                 continue
             single = SingleLook(batch, i, look, cell)
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
-            try:
-                left = single.left()
-            except np.linalg.LinAlgError:  # a ray along the ground
-                continue
-            self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single))
+            if (left := single.left()) is not None:
+                self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single))
 
     def linearise_single(self, solution: BlockSolution) -> Parts:
         """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
@@ -180,34 +172,29 @@ class Archive:
                     batch.linearise(theta, reweigh=True)
                     done.add(id(batch))
                     yield REFINED_POINTS
-                with suppress(np.linalg.LinAlgError):  # then it stays as it was
-                    kept.left = kept.single.left()
+                kept.left = kept.single.left() or kept.left
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""
         self.points.pop(name, None)
         self.points[name] = kept
 
-    def _tie(self, batch: Batch, i: int, published: AdjustedPoint, cell: Cell | None) -> Refusal | None:
-        """A point of a batch that ties strips became final; returns its single look of an earlier strip if it counts
-        now."""
+    def _tie(self, batch: Batch, i: int, published: AdjustedPoint, cell: Cell | None, update: Update) -> None:
+        """A point of a batch that ties strips became final."""
         assert batch.ties is not None
         rays, origin = rows_of(batch, i, cell)
         old = self.points.get(published.name)
         if old is not None and not (batch.ties.active[i] and self.holds(old.functions.columns)):
             old = None
         if old is not None and old.single is not None:
-            try:
-                old = replace(old, left=old.single.left(batch.points_l[i]))
-            except np.linalg.LinAlgError:  # seen from there the ray runs along the ground
-                old = None
-        single = None if old is None else old.single
+            left = old.single.left(batch.points_l[i])
+            old = None if left is None else replace(old, left=left)
         before = np.zeros(3) if old is None else old.control
         control = np.where(before > 0, 0.0, batch.ties.control[i])
         rows = [rays] if old is None else [rays, old.functions.rows(old.place, origin)]
         point, matrix, rhs, _ = eliminated(rows, np.diag(control), batch.control.xyz_l[i], origin)
         if np.linalg.cond(point.factor[0]) ** 2 > PLACED:
-            return None
+            return
         self.add(point.columns, matrix, rhs)
         seen = frozenset(r.look.strip for r in published.residuals)
         if old is not None:
@@ -216,7 +203,8 @@ class Archive:
             published = replace(published, rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(published.name, KeptPoint(LeftPoints(point, (published,)), 0, seen, time_s, before + control))
-        return None if single is None else Refusal(published.name, single.look, TAKEN_BACK)
+        if old is not None and old.single is not None:
+            update.refused.append(Refusal(published.name, old.single.look, TAKEN_BACK))
 
     def add_control(self, name: str, control: ControlPoint) -> bool:
         """Known coordinates of a point that is final; whether they count."""
@@ -225,12 +213,10 @@ class Archive:
             return False
         if kept.single is not None:
             place_l = kept.single.place_at(control)
-            if place_l is None:
+            left = None if place_l is None else kept.single.left(place_l)
+            if left is None:
                 return False
-            try:
-                kept = replace(kept, left=kept.single.left(place_l))
-            except np.linalg.LinAlgError:
-                return False
+            kept = replace(kept, left=left)
         self._weigh(name, kept, weight, np.nan_to_num(control.xyz_l), control.role)
         return True
 

@@ -11,19 +11,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.eliminated_points import EliminatedPoints
 from ...adjustment.reliability import CRITICAL_W
+from ...arrays import Array, IntArray
 from ...geometry.rotation import corrected_angles
 from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
 from ..state.unknowns import Marginal, WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
 LARGER = 1.01
@@ -126,11 +123,8 @@ class Step:
 
 
 def backward(steps: list[Step], state: WindowState) -> WholeStrips:
-    """Go back through the steps from the present state of the window."""
-    orientation: list[RefinedOrientation] = []
-    points: list[AdjustedPoint] = []
-    if not steps:
-        return WholeStrips(orientation, points)
+    """Go back through the steps, one or more, from the present state of the window."""
+    found = WholeStrips([], [])
     stayed = np.sort(steps[-1].marginal.stayed)
     cofactors = state.covariance(stayed) if len(stayed) else np.empty((0, 0))
     solution = BlockSolution(stayed, state.values(stayed), cofactors)
@@ -146,7 +140,7 @@ def backward(steps: list[Step], state: WindowState) -> WholeStrips:
         order = np.argsort(numbers)
         solution = BlockSolution(numbers[order], values[order], Q[np.ix_(order, order)])
         if step.orientation is not None:
-            orientation.append(step.orientation.refined(solution))
+            found.orientation.append(step.orientation.refined(solution))
         for left in reversed(step.left):
-            points += left.refined(solution)
-    return WholeStrips(orientation[::-1], points[::-1])
+            found.points.extend(left.refined(solution))
+    return WholeStrips(found.orientation[::-1], found.points[::-1])

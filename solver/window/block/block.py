@@ -12,22 +12,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.dense_in_parts import Parts
+from ...arrays import Array
 from ..datum.biases import Coordinate
 from ..datum.drifts import Cell, Named
-from ..results import AdjustedPoint, Look, RefinedOrientation, Refusal, WholeStrips
+from ..results import AdjustedPoint, Look, RefinedOrientation, Update, WholeStrips
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
-from .backward import LeftOrientation, Step, backward
+from .backward import LeftOrientation, LeftPoints, Step, backward
 from .ties import EarlierStrips
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Floating point operations of the work on the block for each second of platform time: about a tenth of a core. Tuned.
 RATE = 4e9
@@ -68,12 +65,12 @@ class Block:
         """A strip begins."""
         self._archive.strips[strip.id] = KeptStrip(self._network.index(strip), strip.numbers)
 
-    def leave(self, batch: Batch, points: Sequence[AdjustedPoint], cell: Cell | None) -> list[Refusal]:
+    def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None, update: Update) -> None:
         """A batch became final; see `Archive.leave`."""
         self.conclude()
         names = list(self._network.strips)
         self._touched.update(names[i] for i in batch.strips)
-        return self._archive.leave(batch, points, cell)
+        self._archive.leave(batch, left, cell, update)
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
         """Keep looks that found no partner in their strip, a batch of one each."""

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.eliminated_points import EliminatedPoints, Rows, eliminated
+from ...arrays import Array
 from ..datum.drifts import Cell
 from ..results import AdjustedPoint, Look, RayResidual
 from ..state.batch import Batch
 from ..state.points import ControlPoint
 from .backward import LeftPoints
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: A single look takes its distance from known coordinates only where these change by at least this much, m, for each
 #: metre along the ray; otherwise, as with a height given for a ray that is level, they do not tell it. Tuned.
@@ -85,33 +83,32 @@ class SingleLook:
         off = control.xyz_l[known] - point_l[known]
         return point_l + ray * (ray[known] @ off) / (ray[known] @ ray[known])
 
-    def left(self, place_l: Array | None = None) -> LeftPoints:
+    def left(self, place_l: Array | None = None) -> LeftPoints | None:
         """Its point as a function of the unknowns, linearised anew where the point (3,) is if that is known.
+
+        None where line and sample tell the same, as of a ray along the ground.
 
         So that there are coordinates, they are held to their place along the ray by their distance from the camera;
         that says nothing beside another look.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError : line and sample tell the same, as of a ray along the ground
         """
         batch, i = self.batch, self.place
-        if place_l is not None:
-            batch.points_l = batch.points_l.copy()
-            batch.points_l[i] = place_l
-            batch.linearise(batch.theta, reweigh=True)
-        rows, origin = rows_of(batch, i, self.cell)
-        J = rows[2]
-        along = np.cross(J[0], J[1])
-        across = float(np.linalg.norm(along))
-        if not across > LEAST_APART * np.linalg.norm(J[0]) * np.linalg.norm(J[1]):
-            raise np.linalg.LinAlgError("line and sample of a look tell the same")
-        along /= across * np.linalg.norm(origin - batch.rays.position_l[i])
-        seen = (RayResidual(self.look, 0.0, 0.0, 0.0, False),)
-        held = np.outer(along, along)
-        covariance = np.linalg.inv(J.T @ J + held)
-        point = AdjustedPoint(batch.names[i], "tie", origin, covariance, 1, True, seen, "across")
-        return LeftPoints(eliminated([rows], held, origin, origin)[0], (point,))
+        with suppress(np.linalg.LinAlgError):
+            if place_l is not None:
+                batch.points_l = batch.points_l.copy()
+                batch.points_l[i] = place_l
+                batch.linearise(batch.theta, reweigh=True)
+            rows, origin = rows_of(batch, i, self.cell)
+            J = rows[2]
+            along = np.cross(J[0], J[1])
+            across = float(np.linalg.norm(along))
+            if across > LEAST_APART * np.linalg.norm(J[0]) * np.linalg.norm(J[1]):
+                along /= across * np.linalg.norm(origin - batch.rays.position_l[i])
+                seen = (RayResidual(self.look, 0.0, 0.0, 0.0, False),)
+                held = np.outer(along, along)
+                covariance = np.linalg.inv(J.T @ J + held)
+                point = AdjustedPoint(batch.names[i], "tie", origin, covariance, 1, True, seen, "across")
+                return LeftPoints(eliminated([rows], held, origin, origin)[0], (point,))
+        return None
 
 
 def rows_of(batch: Batch, point: int, cell: Cell | None) -> tuple[Rows, Array]:

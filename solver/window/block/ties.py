@@ -18,19 +18,16 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.dense_in_parts import Parts
 from ...adjustment.eliminated_points import EliminatedPoints, eliminated, spread
+from ...arrays import Array, IntArray
 from ..state.batch import PointTies
 from ..state.points import ControlPoint
 from ..state.unknowns import Information, WindowState
 from .archive import PLACED, Archive
 from .backward import BlockSolution
 from .points import KeptPoint
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Length of a patch along the strip, s. Tuned: the errors of the orientation hardly change within it.
 PATCH_S = 10.0

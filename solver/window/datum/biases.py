@@ -15,17 +15,13 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.bias_search import Verdict, judge
+from ...arrays import Array, Bools, IntArray
 from ..state.batch import Batch, Information
 from ..state.unknowns import Border, Marginal, WindowState
 from .drifts import Cell
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 AXES = "XYZ"
 

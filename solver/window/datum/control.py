@@ -10,14 +10,14 @@ that explanation is weighed, too (`hypotheses`).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.bias_search import Verdict, biases
+from ...arrays import Array, Bools
 from ...quantiles import chi2
-from ..results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal
+from ..results import CONTRADICTS, NO_LOOK, TAKEN_BACK, Refusal, Update
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.relinearisation import MOVED
@@ -26,9 +26,6 @@ from .biases import AXES, Biases, Coordinate, Discrepancies, LeftControl, biases
 from .drift_monitor import DriftMonitor
 from .drifts import Cell
 from .hypotheses import Weighed, weigh
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Coordinates that have left the window and can still be judged. Bounds the time of the search.
 MOST_LEFT = 36
@@ -45,22 +42,6 @@ FAR = 2.0
 ALONG, SLOWEST_M_S, OTHER_WAY, AVERAGED_S = 0.3, 5.0, 0.5, 4.0
 #: Hypotheses named in a line for the operator at most.
 NAMED = 3
-
-
-@dataclass
-class Weighing:
-    """Result of weighing all control.
-
-    Attributes
-    ----------
-    changed : whether the state has changed; then it has been solved again
-    refused : coordinates refused now, and those taken back
-    of_final : those of points that are final, which the block keeps, with the weight that they have from now on
-    """
-
-    changed: bool = False
-    refused: list[Refusal] = field(default_factory=list)
-    of_final: list[Coordinate] = field(default_factory=list)
 
 
 class ControlTests:
@@ -118,9 +99,13 @@ class ControlTests:
         """Whether there is new control, or it is time to look again."""
         return now_s > self._looked_s + LOOK_S or any(self._of_batch(batch) for batch in fresh)
 
-    def weigh(self, now_s: float) -> Weighing:
-        """Weigh all control: that of the window and that of the strip that has left it."""
-        network, found = self._network, Weighing()
+    def weigh(self, update: Update) -> tuple[bool, list[Coordinate]]:
+        """Weigh all control: that of the window and that of the strip that has left it.
+
+        Whether the state has changed, then it has been solved again; coordinates of points that are final, which the
+        block keeps, with the weight that they have from now on if that has changed.
+        """
+        network, now_s = self._network, update.now_s
         self._looked_s = max(now_s, self._looked_s)
         network.state.solve()
         self._left.drop_strips({i for i, s in enumerate(network.strips.values()) if s.is_over(network.state)})
@@ -132,23 +117,23 @@ class ControlTests:
         if d is None or verdict is None:
             self._weighed = None
             self._tell_differences([])
-            return found
+            return False, []
         weighed = self._weighed_lately(now_s, d, verdict)
         if weighed is None:
             weighed = self._weigh(now_s, d, verdict)
             self._weighed_s = now_s
         if weighed is self._weighed:
-            return found
+            return False, []
         self._weighed = weighed
         verdict, d = weighed.verdict, weighed.discrepancies
-        found.changed = bool((verdict.out != d.out).any())
-        if found.changed:
-            found.refused = self._tell_changes(d, verdict)
-            found.of_final = self._apply(of_batches, d, verdict.out)
+        changed, of_final = bool((verdict.out != d.out).any()), list[Coordinate]()
+        if changed:
+            self._tell_changes(d, verdict, update)
+            of_final = self._apply(of_batches, d, verdict.out)
         reasons = [_either(d, verdict)] if len(verdict.rivals) > 1 else []
         self._against_gnss(d, verdict)
         self._tell_differences(reasons)
-        return found
+        return changed, of_final
 
     def _tell_differences(self, reasons: list[str]) -> None:
         """Put into words what control contradicts."""
@@ -263,9 +248,9 @@ class ControlTests:
 
     # -- words ---------------------------------------------------------------------------------------------------------
 
-    def _tell_changes(self, d: Discrepancies, verdict: Verdict) -> list[Refusal]:
+    def _tell_changes(self, d: Discrepancies, verdict: Verdict, update: Update) -> None:
         """Coordinates refused and taken back, with lines for the operator."""
-        refused, told = [], len(verdict.rivals) == 1
+        refused, told = update.refused, len(verdict.rivals) == 1
         off, sigma = np.zeros(len(d.v)), np.ones(len(d.v))
         off[verdict.out], sigma[verdict.out] = biases(d.C, d.v, verdict.out)
         for i in np.flatnonzero(verdict.out != d.out).tolist():
@@ -282,7 +267,6 @@ class ControlTests:
             self.warnings.append(f"control counts again: {d.names(back)}")
         if not told:
             self.warnings.append(f"{_either(d, verdict)} until more control tells")
-        return refused
 
     def _against_gnss(self, d: Discrepancies, verdict: Verdict) -> None:
         """Notes the axes in which all control differs from the GNSS, and whether one of them does by far.

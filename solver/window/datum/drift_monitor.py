@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import (
     EACH,
@@ -35,14 +34,13 @@ from ...adjustment.drift_hypotheses import (
 )
 from ...adjustment.ray_statistics import whitened_pixels
 from ...adjustment.reduced_system import DenseFactor
+from ...arrays import Array, IntArray
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from ..state.batch import Batch, Information
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal
 from .drifts import MOST_GROUPS, Cell, Compensation, Named, estimated
 
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 #: Age at which a batch is taken in, s: by then data snooping has removed its gross errors. Tuned.
 JUDGED_S = 3.0
 #: Rays of batches taken in at one update, about; bounds the time of an update. Tuned.
@@ -187,7 +185,7 @@ class DriftMonitor:
         v = np.einsum("nij,nj->ni", pixels, batch.residuals_px(state))
         W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(batch.inverse_factors, 1, 2)[rays.point]
         coupling = np.add.reduceat(np.swapaxes(W, 1, 2) @ effect, batch.first_ray[:-1], axis=0)
-        rows = (batch.full_rows(np.arange(n)) - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
+        rows = (batch.full_rows - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
         flat, of_points = effect.reshape(2 * n, k), coupling.reshape(-1, k)
         G = rows.T @ flat
         score = flat.T @ v.ravel() + state.values(batch.columns) @ G

@@ -23,14 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import EACH
+from ...arrays import Array, IntArray
 from ..state.batch import Information
 from ..state.unknowns import Border
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Groups of a strip at most; rays of further groups are not watched. Bounds the border to 64 quantities.
 MOST_GROUPS = 16

@@ -13,12 +13,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.bias_search import TOLD, Verdict
+from ...arrays import Array
 from .biases import Discrepancies
-
-Array = NDArray[np.floating]
 
 #: Drifts that are weighed together with biases of control: those that alone explain most. Bounds the time.
 MOST_WEIGHED = 3

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.surface_control import SurfaceShift
+from ...arrays import Array
+from ..results import Update
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
-
-Array = NDArray[np.floating]
 
 #: Rounds of weights, each with a solution, in one update; and change of a weight that is worth one. Tuned, for speed.
 ROUNDS, CHANGED = 3, 0.02
@@ -30,10 +29,6 @@ class SurfaceTests:
     Parameters
     ----------
     critical : of Baarda's |w|
-
-    Attributes
-    ----------
-    warnings : lines for the operator since they were taken last
     """
 
     def __init__(self, network: LiveNetwork, critical: float) -> None:
@@ -41,9 +36,8 @@ class SurfaceTests:
         self._scale_m = 0.0
         self._shift: SurfaceShift | None = None
         self._without: int | None = 0  # points so far that have no height below them; None: some have one
-        self.warnings: list[str] = []
 
-    def weigh(self, fresh: Sequence[Batch], everything: bool) -> tuple[int, Array]:
+    def weigh(self, fresh: Sequence[Batch], everything: bool, update: Update) -> tuple[int, Array]:
         """Weigh the heights of points, and test the shift; number of solutions computed, and by how much (m, m) the
         weight of the shift has changed.
 
@@ -58,7 +52,7 @@ class SurfaceTests:
             return 0, released
         batches = [b for b in (network.batches if everything else fresh) if (b.surface_rows.weight > 0).any()]
         if self._without is not None:
-            self._look_for_heights(fresh, bool(batches))
+            self._look_for_heights(fresh, bool(batches), update)
         solutions = 0
         for _ in range(ROUNDS if batches else 0):
             changed = self._reweigh(batches, everything)
@@ -66,7 +60,7 @@ class SurfaceTests:
                 shift = surface.test(self._critical)
                 if shift.free != surface.free:
                     released += surface.release(shift.free)
-                    self._tell(shift)
+                    self._tell(shift, update)
                     changed = True
                 elif not shift.free or self._shift is None:
                     self._shift = shift
@@ -102,18 +96,18 @@ class SurfaceTests:
                 changed = True
         return changed
 
-    def _look_for_heights(self, fresh: Sequence[Batch], some: bool) -> None:
+    def _look_for_heights(self, fresh: Sequence[Batch], some: bool, update: Update) -> None:
         before = self._without or 0
         self._without = None if some else before + sum(int(b.on_surface.sum()) for b in fresh)
         if before < NONE_BELOW <= (self._without or 0):
-            self.warnings.append("the elevation model has no height below the tie points: it does not count")
+            update.warnings.append("the elevation model has no height below the tie points: it does not count")
 
-    def _tell(self, shift: SurfaceShift) -> None:
+    def _tell(self, shift: SurfaceShift, update: Update) -> None:
         self._shift = shift
         if shift.free:
-            self.warnings.append(f"{self._words(shift)} its relief counts, its height does not")
+            update.warnings.append(f"{self._words(shift)} its relief counts, its height does not")
         else:
-            self.warnings.append("the elevation model agrees with GNSS and control: its height counts again")
+            update.warnings.append("the elevation model agrees with GNSS and control: its height counts again")
 
     @staticmethod
     def _words(shift: SurfaceShift) -> str:
@@ -131,8 +125,3 @@ class SurfaceTests:
     def holds(self) -> bool:
         """Whether the surface holds the height."""
         return self._shift is not None and not self._network.surface.free
-
-    def take_warnings(self) -> list[str]:
-        """Lines for the operator since the last call."""
-        lines, self.warnings = self.warnings, []
-        return lines

@@ -19,16 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.determinability import Evidence, Limits, examine, point_sigmas, ranks, strongest_correlations
+from ...arrays import IntArray
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
 from ..state.batch import Batch
 from ..state.unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 ESTIMATED, NOT_YET = "estimated", "not yet determined"
 #: Critical values; a level of 1 % (statistical level), as the tests are made again and again.

@@ -23,17 +23,14 @@ from functools import cached_property
 from heapq import nlargest
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.protection import protection_factor
 from ...adjustment.reliability import CRITICAL_W, noncentrality
+from ...arrays import Array, IntArray
 from ..results import RefinedOrientation
 from ..state.batch import Batch, Information
-from ..state.surface import LiveSurface
+from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal, WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Risk that a component of the orientation is further off than its protection level (statistical level).
 RISK = 1e-3
@@ -229,15 +226,17 @@ class Integrity:
     most_exposed : batch of the observation that the newest position was most exposed to
     """
 
-    def __init__(self, critical: float, surface: LiveSurface | None = None) -> None:
-        self._surface = surface
+    def __init__(self, critical: float, network: LiveNetwork) -> None:
+        self._network = network
         self._critical, self._delta = critical, noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
         self._left = LeftObservations()
         self.most_exposed: Batch | None = None
 
     def note(self, batches: Iterable[Batch]) -> None:
-        """Find the most exposed observations of batches that have been judged since."""
+        """Find the most exposed observations of batches that have been judged since; forget those taken apart."""
+        present = self._network.batches
+        self._of_batch = {key: known for key, known in self._of_batch.items() if known.batch in present}
         for batch in batches:
             if batch.judged is None:
                 continue
@@ -259,11 +258,6 @@ class Integrity:
         """Unknowns have left the window."""
         self._left.border.marginalise(marginal)
 
-    def drop(self, batches: Iterable[Batch]) -> None:
-        """Batches have been taken apart."""
-        for batch in batches:
-            self._of_batch.pop(id(batch), None)
-
     def _most_exposed_of(self, batch: Batch) -> tuple[list[Exposed], float]:
         """The most exposed observations, and the largest lambda of the others."""
         assert batch.judged is not None
@@ -279,7 +273,7 @@ class Integrity:
         leverages[:n][(batch.weight == 0) | (batch.normals.rank[rays.point] < 3)] = 0.0
         order = np.argsort(-leverages)
         chosen = order[: max(1, int((leverages[order[:OF_BATCH]] > SMALL).sum()))]
-        full, found = batch.full_rows(np.arange(n)), []
+        full, found = batch.full_rows, []
         for i, inverse in zip(chosen.tolist(), inverses_of(C[chosen]), strict=True):
             if i < n:
                 place, p, a, sigma_m = i, int(rays.point[i]), -1, 0.0
@@ -318,7 +312,7 @@ class Integrity:
         h = np.concatenate([*h, border.G.T @ Qg[state.places(border.numbers)]]).reshape(-1, 2, k)
         inverse = np.array([e.inverse for e in observations]).reshape(-1, 2, 2)
         squares = np.maximum(np.einsum("nik,nij,njk->nk", h, inverse, h), 0.0)  # rounding
-        shifted = np.zeros((0, k)) if self._surface is None else self._surface.hidden(Qg, self._delta)
+        shifted = self._network.surface.hidden(Qg, self._delta)
         effect = np.vstack([bound, self._delta * np.sqrt(squares), shifted])
         size = effect[:, 6:].max(axis=1) if k > 6 else np.linalg.norm(effect[:, :3], axis=1)
         of_surface = bool(size.argmax() > len(observations))

@@ -16,12 +16,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...camera.line_camera import LineCamera
 from ..state.batch import Batch
-
-Array = NDArray[np.floating]
 
 #: Functions of the orientation on the ground, in words: X, Y, Z below the camera, and the ends of the swath.
 WHERE = ("position in X", "position in Y", "height", "ends of the swath")

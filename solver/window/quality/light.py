@@ -15,17 +15,15 @@ from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import BiasedSource, Group
 from ...adjustment.reliability import CRITICAL_W
+from ...arrays import Array
 from ...models.base import ERROR_GROUPS
 from ...quantiles import chi2
 from .determinability import Standing
 from .exposure import Exposure
 from .ground import WHERE
-
-Array = NDArray[np.floating]
 
 GOOD, WEAK, FAILED = "good", "weak", "failed"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...models.base import OFFSET, POSITION_WANDER, SHIFT
 from ..datum.control import ControlTests
 from ..datum.surface import SurfaceTests
@@ -17,8 +17,6 @@ from .determinability import Determinability
 from .exposure import Exposure, Integrity
 from .ground import GroundBelow
 from .light import Fit, LightDisplay, QualityFindings
-
-Array = NDArray[np.floating]
 
 
 class QualityControl:
@@ -44,7 +42,7 @@ class QualityControl:
         self._parameters: Determinability | None = None
         if network.self_calibration is not None and options.determine:
             self._parameters = Determinability(network.self_calibration, network.camera_columns, network.camera)
-        self.integrity = Integrity(options.critical, network.surface)
+        self.integrity = Integrity(options.critical, network)
         self.last: QualityFindings | None = None
 
     def protected(self, strip: WindowStrip, orientation: RefinedOrientation, final: bool = False) -> RefinedOrientation:

@@ -2,41 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...camera.line_camera import LineCamera
 from ..block.block import Block
-from ..results import Refusal
+from ..results import Update
 from ..state.batch import Batch
 from ..state.maker import BatchMaker, Draft
 from ..state.network import LiveNetwork
 from .entry import EntryEquations, disagreement
 from .sigma_check import SigmaCheck
 from .snooping import admit
-from .ties import ON_ENTRY, contradicting, drop_ties, drop_weak
-
-Array = NDArray[np.floating]
-
-
-@dataclass
-class Arrived:
-    """What has come.
-
-    Attributes
-    ----------
-    fresh : new batches
-    apart : batches that were taken apart, because one of their points got another look
-    refused : looks left out
-    alone : points that do not agree with what earlier strips say of them
-    """
-
-    fresh: list[Batch] = field(default_factory=list)
-    apart: list[Batch] = field(default_factory=list)
-    refused: list[Refusal] = field(default_factory=list)
-    alone: list[str] = field(default_factory=list)
+from .ties import ON_ENTRY, contradicting, drop_weak, set_apart
 
 
 class Arrivals:
@@ -52,47 +30,45 @@ class Arrivals:
         self._network, self._block, self._check, self._maker = network, block, check, BatchMaker(network)
         self._step_s, self._snoop = step_s, snoop
 
-    def take(self, now_s: float) -> Arrived:
+    def take(self, update: Update) -> list[Batch]:
         """Batches of the points that have new looks with a measured orientation; others wait."""
-        found, network, intake = Arrived(), self._network, self._network.intake
-        news = {name: intake.points[name] for name in intake.ready(now_s)}
+        network, intake = self._network, self._network.intake
+        news = {name: intake.points[name] for name in intake.ready(update.now_s)}
         if not news:
-            return found
+            return []
         self._block.conclude()  # points are about to be looked up among those of earlier strips
         names = [name for name, point in news.items() if point.batch is None and point.looks]
-        found.apart = list({id(p.batch): p.batch for p in news.values() if p.batch is not None}.values())
         known: dict[str, Array] = {}
-        for batch in found.apart:
+        for batch in {id(p.batch): p.batch for p in news.values() if p.batch is not None}.values():
             known |= dict(zip(batch.names, batch.points_l, strict=True))
             network.batches.remove(batch)
             for name in batch.names:
                 intake.place(name, None)
             names += batch.names
         if not names:
-            return found
+            return []
         shares: dict[tuple[int, bool], list[str]] = {}
         for name in names:
             shares.setdefault(self._share(name), []).append(name)
         network.state.solve()  # what is known of the orientation says where points are, and judges them
         drafts = [self._draft(names, tied) for (_, tied), names in shares.items()]
         made = self._maker.make_each([d for d in drafts if d.names], known)
-        found.fresh = [batch for batch, _ in made if batch is not None]
-        for batch in found.fresh:
+        fresh = [batch for batch in made if batch is not None]
+        for batch in fresh:
             for name in batch.names:
                 intake.place(name, batch)
             drop_weak(batch)
         if self._snoop:
-            network.state.expect(sum(len(batch.columns) for batch in found.fresh))
-            equations = [EntryEquations.of(batch, network.state) for batch in found.fresh]
+            network.state.expect(sum(len(batch.columns) for batch in fresh))
+            equations = [EntryEquations.of(batch, network.state) for batch in fresh]
             for of_batch in equations:
                 self._check.entered(disagreement(of_batch))
-            for batch, of_batch in zip(found.fresh, equations, strict=True):
-                found.refused += admit(batch, of_batch, network)
-                found.alone += drop_ties(batch, contradicting(batch, network.state, ON_ENTRY))
-        intake.set_apart(found.alone)
-        for batch in found.fresh:
+            for batch, of_batch in zip(fresh, equations, strict=True):
+                update.refused += admit(batch, of_batch, network)
+                set_apart(batch, contradicting(batch, network.state, ON_ENTRY), network, update)
+        for batch in fresh:
             network.batches.enter(batch)
-        return found
+        return fresh
 
     def _draft(self, names: list[str], tied: bool) -> Draft:
         """Of the points of a share, those that two looks, known coordinates or an earlier strip place."""

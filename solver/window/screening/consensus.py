@@ -17,16 +17,13 @@ from itertools import combinations
 from operator import attrgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import largest_of_group
+from ...arrays import Array, Bools, IntArray
 from ...quantiles import chi2
 from ..state.batch import Batch
 from ..state.unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Numbers of points of a strip at which they are judged together, each 1.6 times the one before; later points are
 #: tested against many others.
@@ -176,7 +173,7 @@ class _Conditions:
         misclosures: list[Array] = [np.empty(0)]
         for i, batch in enumerate(batches):
             every, u, place = np.arange(len(batch.rays)), len(batch.columns), state.places(batch.columns)
-            A, J = batch.full_rows(every), batch.lin.point.transpose(2, 0, 1)
+            A, J = batch.full_rows, batch.lin.point.transpose(2, 0, 1)
             e = batch.lin.residual.T + A @ batch.theta
             root, off = np.sqrt(batch.control.weight), batch.control.residual(batch.origin_l)
             for p in range(batch.n_points):
@@ -211,7 +208,7 @@ class _Conditions:
         """The set of each point with the least squares, where a look left out costs a price."""
         return largest_of_group(self.point, -(square - self.rows + price * self.n_out))
 
-    def agreeing(self, theta: Array) -> NDArray[np.bool_]:
+    def agreeing(self, theta: Array) -> Bools:
         """(m,) the sets that agree with an orientation, one of a point at most."""
         square = self.squares(theta)
         chosen = self.choose(square, NARROWEST)

@@ -12,15 +12,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.reliability import normalised_residuals
+from ...arrays import Array, Bools, IntArray
 from ...quantiles import chi2
 from ..state.batch import Batch
 from ..state.unknowns import WindowState
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Probability that the looks at a good point are suspected; data snooping tests more sharply afterwards.
 SUSPECTED = 1e-5
@@ -108,7 +105,7 @@ class EntryEquations:
     off : (p, 3) how far the points are from known coordinates
     """
 
-    slot: NDArray[np.int64]
+    slot: IntArray
     present: Bools
     residual: Array
     point: Array
@@ -124,7 +121,7 @@ class EntryEquations:
         k = int(slot.max()) + 1
         present = np.zeros((p, k), dtype=bool)
         present[of_point, slot] = True
-        rows = batch.full_rows(np.arange(n))
+        rows = batch.full_rows
         A, J, e = np.zeros((p, k, 2, u)), np.zeros((p, k, 2, 3)), np.zeros((p, k, 2))
         A[of_point, slot] = rows
         J[of_point, slot] = batch.lin.point.transpose(2, 0, 1)

@@ -5,25 +5,19 @@ What was left out is tested as a prediction from all others, and is taken back o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.snooping import TOGETHER, failing_w, largest_of_group
+from ...arrays import Array, Bools, IntArray
 from ...quantiles import chi2
-from ..datum.biases import Coordinate
+from ..block.block import Block
 from ..datum.control import ControlTests
-from ..results import TAKEN_BACK, Refusal
+from ..results import TAKEN_BACK, Refusal, Update
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
 from .entry import DECISIVE, SUSPECTED, EntryEquations, entry_weight
-from .ties import contradicting, drop_ties
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from .ties import contradicting, set_apart
 
 #: Rounds of one update, which bounds its time; what still fails then comes up again when the batch is due.
 ROUNDS_OF_UPDATE = 8
@@ -31,24 +25,6 @@ ROUNDS_OF_UPDATE = 8
 RETURNING = 0.01
 #: Variance of the prediction of a ray, in units of the ray's own, up to which a gross error of it would show. Tuned.
 SHARP = 30.0
-
-
-@dataclass
-class Snooped:
-    """Result of testing batches.
-
-    Attributes
-    ----------
-    refused : looks left out, those taken back, and known coordinates likewise
-    alone : points that do not agree with what earlier strips say of them
-    control : known coordinates of final points that count otherwise from now on
-    rounds : solutions computed
-    """
-
-    refused: list[Refusal] = field(default_factory=list)
-    alone: list[str] = field(default_factory=list)
-    control: list[Coordinate] = field(default_factory=list)
-    rounds: int = 0
 
 
 class _Tested:
@@ -122,7 +98,7 @@ def _disputed(batch: Batch, state: WindowState, wider: float) -> Bools:
     """Rays (n,) of known points that have three looks or more which agree with each other: what they contradict are
     the known coordinates or the trajectory. Those are weighed as a whole (`datum.control`, `sigma_check`)."""
     point, theta = batch.rays.point, state.values(batch.columns)
-    residual = batch.lin.residual.T - batch.full_rows(np.arange(len(point))) @ (theta - batch.theta)
+    residual = batch.lin.residual.T - batch.full_rows @ (theta - batch.theta)
     derivative = batch.lin.point.transpose(2, 0, 1)
     out = np.zeros(len(point), dtype=bool)
     for p in np.flatnonzero((batch.control.weight > 0).any(axis=1) & (batch.points_left >= 3)):
@@ -133,8 +109,9 @@ def _disputed(batch: Batch, state: WindowState, wider: float) -> Bools:
     return out
 
 
-def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, now_s: float, serial: int) -> Snooped:
-    """Leave out looks and control coordinates that fail; take back looks that agree with the rest after all.
+def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, block: Block, update: Update) -> int:
+    """Leave out looks and control coordinates that fail; take back looks that agree with the rest after all. Number of
+    solutions computed.
 
     A look goes if it fails (`failing_w`); of several at one point the one with the largest joint value. Looks left out
     come back once, when their prediction does not fail. Points of which nothing was left are judged again as on entry
@@ -144,16 +121,15 @@ def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, now
     ----------
     batches : to be tested; those that change go through further rounds
     control : weighs all control
-    serial : number of the update, noted in the batches
+    block : keeps known coordinates of points that are final
     """
-    state, found = network.state, Snooped()
+    state, solutions = network.state, 0
     critical = control.critical * network.sigmas.disagreement
     for batch in batches:
-        if batch.tested >= 0 and _try_again(batch, network, found):
-            found.rounds = 1
-        batch.tested = serial
-    network.intake.set_apart(found.alone)
-    if found.rounds:
+        if batch.tested >= 0 and _try_again(batch, network, update):
+            solutions = 1
+        batch.tested = update.number
+    if solutions:
         state.solve()
     pending, weighed = batches, False
     for _ in range(ROUNDS_OF_UPDATE):
@@ -161,12 +137,11 @@ def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, now
         tested = [_Tested(batch, state, critical, network.sigmas.disagreement) for batch in pending]
         worst = max((float(t.w[t.used].max(initial=0.0)) for t in tested), default=0.0)
         if max((t.control_w for t in tested), default=0.0) > max(critical, worst) and not weighed:
-            weighing = control.weigh(now_s)
-            found.refused += weighing.refused
-            found.control += weighing.of_final
-            weighed = not weighing.changed
+            changed, of_final = control.weigh(update)
+            block.reweigh_control(of_final)
+            weighed = not changed
             if not weighed:
-                found.rounds += 1
+                solutions += 1
                 continue
         changed, pending = False, []
         for t in tested:
@@ -179,13 +154,13 @@ def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, now
                 weight = before.copy()
                 weight[out], weight[back] = 0.0, 1.0
                 network.batches.reweigh(batch, weight)
-                found.refused += _note(batch, network, before, t.w)
+                update.refused += _note(batch, network, before, t.w)
                 changed = True
         if not changed:
             break
         state.solve()
-        found.rounds += 1
-    return found
+        solutions += 1
+    return solutions
 
 
 def admit(batch: Batch, equations: EntryEquations, network: LiveNetwork) -> list[Refusal]:
@@ -216,7 +191,7 @@ def reweigh(batches: list[Batch], weights: list[Array], network: LiveNetwork) ->
     return changes
 
 
-def _try_again(batch: Batch, network: LiveNetwork, found: Snooped) -> bool:
+def _try_again(batch: Batch, network: LiveNetwork, update: Update) -> bool:
     """Let points in that were left out as a whole if the orientation as known now agrees with them.
 
     Looks that agree with each other, but not with what earlier strips say of their point, come without that; a single
@@ -235,9 +210,9 @@ def _try_again(batch: Batch, network: LiveNetwork, found: Snooped) -> bool:
     if batch.ties is not None and (batch.ties.active & lost).any():
         batch.eliminate()
         wrong, several = contradicting(batch, state, which=lost), batch.points_left >= 2
-        found.alone += drop_ties(batch, wrong & several)
+        set_apart(batch, wrong & several, network, update)
         batch.weight = np.where((wrong & ~several)[point], 0.0, batch.weight)
-    found.refused += _note(batch, network, before, w)
+    update.refused += _note(batch, network, before, w)
     batch.eliminate()
     if not (batch.weight > before).any():  # nothing of these points is in the state
         batch.information = information

@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.normal_equations import without_point
 from ...adjustment.snooping import TOGETHER
+from ...arrays import Array, Bools
 from ...quantiles import chi2
+from ..results import Update
 from ..state.batch import Batch, PointTies
 from ..state.network import LiveNetwork
 from ..state.unknowns import WindowState
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
 
 #: Probability that a good tie fails the test on entry, and the one in the window.
 ON_ENTRY, INSIDE = 1e-5, 1e-3
@@ -78,18 +76,19 @@ def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE, which
     return fails
 
 
-def snoop_ties(batches: Sequence[Batch], network: LiveNetwork) -> list[str]:
-    """Drop ties of batches in the state that fail; names of their points. The state has to be solved again if any."""
+def snoop_ties(batches: Sequence[Batch], network: LiveNetwork, update: Update) -> bool:
+    """Drop ties of batches in the state that fail; whether there are any: then the state has to be solved again."""
     tests = [(b, b.ties, _joint(b, b.ties, network.state)) for b in batches if b.ties is not None]
     worst = max((float(value.max(initial=0.0)) for *_, value in tests), default=0.0)
-    names = []
+    failed = False
     for batch, ties, value in tests:
         before = batch.information
         limit = chi2.isf(INSIDE, ties.observations)
-        if failed := drop_ties(batch, value > np.maximum(limit, TOGETHER * worst)):
+        set_apart(batch, value > np.maximum(limit, TOGETHER * worst), network, update)
+        if batch.information is not before:
             network.state.exchange(batch.columns, before, batch.information)
-            names += failed
-    return names
+            failed = True
+    return failed
 
 
 def _joint(batch: Batch, ties: PointTies, state: WindowState) -> Array:
@@ -105,12 +104,20 @@ def _joint(batch: Batch, ties: PointTies, state: WindowState) -> Array:
     return np.where(rows.active & (batch.normals.rank == 3), value, 0.0)
 
 
-def drop_ties(batch: Batch, fails: Bools) -> list[str]:
-    """Take the weight from ties; known coordinates that they stood for count themselves. Names of their points."""
+def set_apart(batch: Batch, fails: Bools, network: LiveNetwork, update: Update) -> None:
+    """Points (p,) that do not agree with earlier strips are points of their own, without ties."""
+    drop_ties(batch, fails)
+    for i in np.flatnonzero(fails):
+        point = network.intake.points[batch.names[i]]
+        point.alone, point.spent = True, False
+        update.alone.append(batch.names[i])
+
+
+def drop_ties(batch: Batch, fails: Bools) -> None:
+    """Take the weight from ties of points (p,); known coordinates that they stood for count themselves."""
     if batch.ties is None or not fails.any():
-        return []
+        return
     batch.ties = replace(batch.ties, active=batch.ties.active & ~fails)
     weight = np.where(fails[:, None], batch.ties.control, batch.control.weight)
-    batch.control = replace(batch.control, weight=weight, n_observations=int((weight > 0).sum()))
+    batch.control = replace(batch.control, weight=weight)
     batch.eliminate()
-    return [batch.names[i] for i in np.flatnonzero(fails)]

@@ -9,20 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.covariance import Cofactors
 from ...adjustment.layout import Layout
-from ...adjustment.linearisation import Linearisation, Whitening, linearise, linearise_and_weigh
+from ...adjustment.linearisation import Linearisation, linearise, linearise_and_weigh
 from ...adjustment.network import Rays
-from ...adjustment.normal_equations import ControlWeights, PointNormals, inverse_factors, point_normals
+from ...adjustment.normal_equations import ControlWeights, inverse_factors, point_normals
 from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
-from ...adjustment.surface_control import SurfaceControl, SurfaceRows
+from ...adjustment.surface_control import SurfaceControl
+from ...arrays import Array, Bools, IntArray
 from .unknowns import Information, WindowState
-
-Array = NDArray[np.floating]
-Bools = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -120,11 +116,17 @@ class Batch:
     image_factor : what the sigmas of its lines and samples have been multiplied by
     counted : whether its rays are counted there
     tested : number of the update that tested it last
+    judged : cofactors and statistics of the last test, and the solution of the window they are for
     n_points : p
-    active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    first_ray : (p + 1,) where the rays of each point begin
+    newest_s, oldest_s, strips, height_m : times of its rays, places of their strips, and how high these were flown
+    theta, origin_l : where it is linearised
+    lin, whitening : the linear equations of its rays
+    normals : of its points
     inverse_factors : (p, 3, 3) ``L^-1`` of the points' normal matrices ``L L^T``
     coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
-    judged : cofactors and statistics of the last test, and the solution of the window they are for
+    information : about the unknowns
+    active_rays, active_control, determined : rays and control points with weight, determined object coordinates
     """
 
     names: list[str]
@@ -143,26 +145,7 @@ class Batch:
     image_factor: float = 1.0
     counted: bool = False
     tested: int = -1
-    n_points: int = field(init=False)
-    active_rays: int = field(init=False, default=0)
-    active_control: int = field(init=False, default=0)
-    determined: int = field(init=False, default=0)
     judged: tuple[int, Cofactors, RayStatistics] | None = field(init=False, repr=False, default=None)
-    origin_l: Array = field(init=False, repr=False)
-    theta: Array = field(init=False)
-    lin: Linearisation = field(init=False)
-    whitening: Whitening = field(init=False)
-    normals: PointNormals = field(init=False)
-    inverse_factors: Array = field(init=False, repr=False)
-    information: Information = field(init=False)
-    _rows: Array = field(init=False, repr=False)
-    _places: tuple[IntArray, IntArray] = field(init=False, repr=False)
-    _coefficients: Array = field(init=False, repr=False)
-    _incomplete: bool = field(init=False, repr=False)
-    _first_terms: IntArray | None = field(init=False, repr=False)
-    coupling: Array = field(init=False, repr=False)
-    surface_factor: Array = field(init=False, repr=False)
-    surface_rows: SurfaceRows = field(init=False, repr=False)
     _left: tuple[Array, IntArray] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
@@ -303,7 +286,7 @@ class Batch:
         weights[point, axis] = weight
         if self.ties is not None:
             self.ties.control[point, axis] = weight
-        self.control = replace(self.control, weight=weights, n_observations=int((weights > 0).sum()))
+        self.control = replace(self.control, weight=weights)
 
     def cofactors(self, Q: Array) -> Cofactors:
         """Cofactor blocks of points and rays from those of the unknowns (u, u)."""
@@ -314,38 +297,35 @@ class Batch:
         points = np.swapaxes(L, 1, 2) @ inner @ L
         j = self.lin.point.transpose(2, 0, 1)  # (n, 2, 3), of full weight
         W = j @ np.swapaxes(L, 1, 2)[self.rays.point]
-        own = self._rows if (self.weight == 1.0).all() else self._design_rows(self.lin)
-        rows = own - W @ D[self.rays.point]
+        rows = self.full_rows - W @ D[self.rays.point]
         through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
         observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
         return Cofactors(np.diagonal(Q).copy(), points, observed)
 
-    def full_rows(self, which: IntArray) -> Array:
-        """Rows (m, 2, u) of rays at full weight."""
-        if len(which) == len(self.rays) and (self.weight == 1.0).all():
-            return self._rows
-        return self._design_rows(self.lin)[which]
+    @property
+    def full_rows(self) -> Array:
+        """Rows (n, 2, u) of the rays at full weight."""
+        return self._rows if (self.weight == 1.0).all() else self._design_rows(self.lin)
 
     def _design_rows(self, lin: Linearisation) -> Array:
         """Derivatives (n, 2, u) of all rays to the unknowns, with the weights of a linearisation."""
         n, u = len(self.rays), len(self.columns)
         place, of_camera = self._places
-        rows = np.zeros(2 * n * u + 1)  # the last one takes what a ray does not have
+        rows = np.zeros(2 * n * u + u + 1)  # the last ones take what a ray does not have
         for axis in range(2):
-            step = np.where(place < 2 * n * u, place + axis * u, place) if self._incomplete else place + axis * u
             terms = self._coefficients * lin.orientation[axis].take(self.layout.component, axis=0)
-            rows[step] = terms if self._first_terms is None else np.add.reduceat(terms, self._first_terms, axis=0)
+            if self._first_terms is not None:
+                terms = np.add.reduceat(terms, self._first_terms, axis=0)
+            rows[place + axis * u] = terms
             if self.layout.camera is not None:
-                end = of_camera >= 2 * n * u
-                rows[np.where(end, of_camera, of_camera + axis * u)] = lin.camera[axis]
-        return rows[:-1].reshape(n, 2, u)
+                rows[of_camera + axis * u] = lin.camera[axis]
+        return rows[: 2 * n * u].reshape(n, 2, u)
 
     def _template(self) -> None:
         """Where the terms of the design stand in the rows of all rays, one row after the other."""
         layout, n, u = self.layout, len(self.rays), len(self.columns)
         first = 2 * u * np.arange(n)
         nowhere = 2 * n * u
-        self._incomplete = bool((layout.columns < 0).any())
         # terms of one unknown that acts on several components stand one after the other
         new = np.append(True, (layout.columns[1:] != layout.columns[:-1]).any(axis=1))
         self._first_terms = None if new.all() else np.flatnonzero(new)
@@ -364,7 +344,8 @@ class Batch:
             theta = state.values(self.columns)
             self.back_substitute(theta)
             cofactors = self.cofactors(state.covariance(self.columns))
-            self.judged = state.solution, cofactors, self.statistics(theta, cofactors)
+            statistics = statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
+            self.judged = state.solution, cofactors, statistics
         return self.judged[1], self.judged[2]
 
     def residuals_px(self, state: WindowState) -> Array:
@@ -375,17 +356,13 @@ class Batch:
         self.back_substitute(theta)
         return residuals_px(self.rays, self._at(theta), self.whitening)
 
-    def statistics(self, theta: Array, cofactors: Cofactors) -> RayStatistics:
-        """Residuals of the rays at values (u,) of the unknowns and the present points, in lines and samples."""
-        return statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
-
     def _at(self, theta: Array) -> Linearisation:
         """The linear equations with their residuals at values (u,) of the unknowns and the present points.
 
         They are as good as the linearisation, which follows the unknowns (`relinearisation`).
         """
         n = len(self.rays)
-        rows = self.full_rows(np.arange(n)).reshape(2 * n, -1)
+        rows = self.full_rows.reshape(2 * n, -1)
         shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
         moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
         return replace(self.lin, residual=self.lin.residual - moved)

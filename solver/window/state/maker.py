@@ -6,24 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.layout import Layout
 from ...adjustment.network import Rays
-from ...camera.self_calibration import SelfCalibration
+from ...arrays import Array, Bools, IntArray
 from ...geometry.measured_trajectory import MeasuredPoses
 from ...geometry.ray_intersection import intersect_rays
 from ...geometry.rotation import corrected_angles, matrix_from_angles
-from ...geometry.trajectory import Poses
 from ...models.base import Design, PseudoObservations
 from .batch import Batch, PointTies
 from .network import LiveNetwork
 from .points import PointLooks
-from .strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-
 
 _NO_PRIOR = PseudoObservations(np.empty((0, 1), np.int32), np.empty((0, 1)), np.empty(0), np.empty(0), ())
 
@@ -46,9 +39,8 @@ class BatchMaker:
 
     network: LiveNetwork
 
-    def rays(self, points: list[PointLooks]) -> tuple[Rays, Array, Array, NDArray[np.bool_]]:
-        """Rays of points with the measured orientation, its white noise (n, 6, 6), weights (n,), and which of them
-        (n,) have the smoothed one."""
+    def rays(self, points: list[PointLooks]) -> tuple[Rays, Array, Array, MeasuredPoses]:
+        """Rays of points, the white noise (n, 6, 6) of their orientation, weights (n,), and the orientation itself."""
         place = {id: i for i, id in enumerate(self.network.strips)}
         line_index = self.network.camera.line_index
         rows = []
@@ -71,7 +63,7 @@ class BatchMaker:
             point_, strip, ccd, source, line, sample, sigma_line, sigma_sample, time, period,
             poses.position_l, poses.angles, poses.velocity_l, poses.angle_rate, xy, pitch, focal,
         )  # fmt: skip
-        return rays, covariance, weight, measured.smoothed
+        return rays, covariance, weight, measured
 
     def _measured(self, time_s: Array, strip: IntArray) -> tuple[MeasuredPoses, Array]:
         """Measured orientation of rays, and the covariance (n, 6, 6) of its noise with what the model leaves out."""
@@ -80,20 +72,18 @@ class BatchMaker:
         ids = list(self.network.strips)
         for i in np.unique(strip):
             mine = strip == i
-            extra = self.network.strips[ids[i]].left_out_variance(time_s[mine])
+            extra = self.network.strips[ids[i]].model.left_out_variance(time_s[mine])
             covariance[mine] += extra[:, :, None] * np.eye(6)
         return measured, covariance
 
-    def make(
-        self, names: list[str], points: list[PointLooks], known: dict[str, Array]
-    ) -> tuple[Batch | None, list[str]]:
-        """A batch of points, linearised where they are now, and the points that cannot be placed yet.
+    def make(self, draft: Draft, known: dict[str, Array]) -> Batch | None:
+        """A batch of those points that can be placed, linearised where they are now; None if there are none.
 
         Parameters
         ----------
         known : coordinates of points that were placed before
         """
-        return self.make_each([Draft(names, points)], known)[0]
+        return self.make_each([draft], known)[0]
 
     def make_single(self, names: list[str], points: list[PointLooks], ground_l: Array) -> Batch | None:
         """A batch of points of one look each, linearised where its ray meets the ground at the height of the nearest
@@ -113,23 +103,24 @@ class BatchMaker:
             apart = ((ground_l[:, :2] - place[:, None, :2]) ** 2).sum(axis=2)
             height = ground_l[np.argmin(apart, axis=1), 2]
         place = rays.position_l + (height - rays.position_l[:, 2])[:, None] * direction
-        batch, _ = self.make_each([Draft(names, points)], dict(zip(names, place, strict=True)))[0]
+        batch = self.make(Draft(names, points), dict(zip(names, place, strict=True)))
         if batch is not None:  # onto the ray as it is corrected
             theta = self.network.state.values(batch.columns)
             batch.back_substitute(theta)
             batch.linearise(theta, reweigh=True)
         return batch
 
-    def make_each(self, drafts: list[Draft], known: dict[str, Array]) -> list[tuple[Batch | None, list[str]]]:
+    def make_each(self, drafts: list[Draft], known: dict[str, Array]) -> list[Batch | None]:
         """Batches as `make` makes them, one of each draft; what their rays need is looked up for all at once."""
         if not drafts:
             return []
-        rays, covariance, weight, smoothed = self.rays([point for draft in drafts for point in draft.points])
+        rays, covariance, weight, measured = self.rays([point for draft in drafts for point in draft.points])
         ids = list(self.network.strips)
-        groups = [np.flatnonzero(rays.strip == i) for i in np.unique(rays.strip)]
-        parts = [
-            (mine, self._design(self.network.strips[ids[rays.strip[mine[0]]]], rays.part(mine))) for mine in groups
-        ]
+        parts = []
+        for i in np.unique(rays.strip):
+            mine = np.flatnonzero(rays.strip == i)
+            poses = measured.poses.part(mine)
+            parts.append((mine, self.network.strips[ids[i]].design(rays.time_s[mine], poses)))
         design = join_designs(parts, len(rays))
         made, point = [], 0
         for draft in drafts:
@@ -138,15 +129,10 @@ class BatchMaker:
             own = rays.part(part)
             own = replace(own, point=own.point - point)
             columns = Design(design.columns[part], design.coefficients[part])
-            provisional = not bool(smoothed[part].all())
+            provisional = not bool(measured.smoothed[part].all())
             made.append(self._batch(draft, known, own, columns, covariance[part], weight[part], provisional))
             point += len(draft.names)
         return made
-
-    def _design(self, strip: WindowStrip, rays: Rays) -> Design:
-        """Of rays of a strip."""
-        poses = Poses(rays.time_s, rays.position_l, rays.angles, rays.velocity_l, rays.angle_rate)
-        return strip.design(rays.time_s, poses)
 
     def _batch(
         self,
@@ -157,13 +143,10 @@ class BatchMaker:
         covariance: Array,
         weight: Array,
         provisional: bool,
-    ) -> tuple[Batch | None, list[str]]:
+    ) -> Batch | None:
         """One of `make_each`."""
         names, points, ties = draft.names, draft.points, draft.ties
-        columns, layout = local_layout(
-            design, rays.strip, self.network.self_calibration, self.network.camera_columns, rays,
-            self.network.surface.numbers,
-        )  # fmt: skip
+        columns, layout = self._layout(rays, design)
         used = np.array([p.spent for p in points])
         if ties is not None:
             columns, used = np.concatenate([columns, ties.columns]), ties.used
@@ -172,28 +155,22 @@ class BatchMaker:
             known = {n: xyz for n, xyz, k in zip(names, ties.xyz_l, seen, strict=True) if k < 2} | known
         control = self.network.intake.known_coordinates(names, used)
         theta = self.network.state.values(columns)
-        in_doubt = {n for n, p in zip(names, points, strict=True) if p.out}
-        points_l = self._place(
-            names, rays, weight, layout.corrections(theta), layout.displacement(theta), known, in_doubt
-        )
-        placed = np.isfinite(points_l)
-        lost = [name for i, name in enumerate(names) if not placed[i].all()]
-        if lost:
-            good = np.flatnonzero(placed.all(axis=1))
-            if not len(good):
-                return None, lost
-            part = ties.part(good) if ties is not None else None
-            rest = Draft([names[i] for i in good], [points[i] for i in good], part)
-            return self.make_each([rest], known)[0][0], lost
+        points_l = self._place(draft, rays, weight, layout, theta, known)
+        placed = np.flatnonzero(np.isfinite(points_l).all(axis=1))
+        if not len(placed):
+            return None
+        if len(placed) < len(names):
+            part = ties.part(placed) if ties is not None else None
+            return self.make(Draft([names[i] for i in placed], [points[i] for i in placed], part), known)
         batch = Batch(
             list(names), rays, covariance, columns, layout, control, weight, points_l, provisional, ties,
             self.network.surface.control, self._on_surface(names, points, ties),
         )  # fmt: skip
         batch.noise_version, batch.image_factor = self.network.noise_version, self.network.sigmas.image
         batch.linearise(theta, reweigh=True)
-        return batch, []
+        return batch
 
-    def _on_surface(self, names: list[str], points: list[PointLooks], ties: PointTies | None) -> NDArray[np.bool_]:
+    def _on_surface(self, names: list[str], points: list[PointLooks], ties: PointTies | None) -> Bools:
         """Points (p,) that a height of the surface is wanted for: seen twice, without coordinates of their own, and
         without what an earlier strip says of them, which has it."""
         control = self.network.intake.control
@@ -202,27 +179,40 @@ class BatchMaker:
             return new & ties.single
         return new & np.array([len(p.looks) >= 2 for p in points])
 
+    def _layout(self, rays: Rays, design: Design) -> tuple[IntArray, Layout]:
+        """The unknowns that rays touch, by their number in the window, and a layout that counts them from 0.
+
+        All additional parameters and the shift of the surface count as touched.
+        """
+        touched = np.unique(design.columns)
+        touched = touched[touched >= 0].astype(np.int64)
+        local = np.where(design.columns >= 0, np.searchsorted(touched, design.columns), -1)
+        node, component = np.nonzero((design.columns >= 0).any(axis=0))
+        camera, of_camera, of_surface = None, self.network.camera_columns, self.network.surface.numbers
+        if self.network.self_calibration is not None:
+            camera = self.network.self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
+        layout = Layout(
+            (), rays.strip, node, component, np.ascontiguousarray(local[:, node, component].T.astype(np.int32)),
+            np.ascontiguousarray(design.coefficients.T), camera, len(touched), len(of_camera), (), _NO_PRIOR,
+            heading=True, n_surface=len(of_surface),
+        )  # fmt: skip
+        return np.concatenate([touched, of_camera, of_surface]), layout
+
     def _place(
-        self,
-        names: list[str],
-        rays: Rays,
-        weight: Array,
-        correction: Array,
-        displacement: Array | float,
-        known: dict[str, Array],
-        in_doubt: set[str],
+        self, draft: Draft, rays: Rays, weight: Array, layout: Layout, theta: Array, known: dict[str, Array]
     ) -> Array:
         """Where points are (p, 3): as known, at full control not in doubt, or where their rays meet; else NaN."""
+        names, correction, displacement = draft.names, layout.corrections(theta), layout.displacement(theta)
         angles = corrected_angles(rays.angles, correction[3:].T)
         image = np.column_stack([(rays.xy_mm.T - displacement).T, -rays.focal_length_mm])
         direction = np.einsum("nij,nj->ni", matrix_from_angles(*angles.T), image)
         use = np.flatnonzero(weight > 0)
         xyz, _ = intersect_rays((rays.position_l + correction[:3].T)[use], direction[use], rays.point[use], len(names))
         control = self.network.intake.control
-        for i, name in enumerate(names):
+        for i, (name, point) in enumerate(zip(names, draft.points, strict=True)):
             if name in known:
                 xyz[i] = known[name]
-            elif name in control and (control[name].weight > 0).all() and name not in in_doubt:
+            elif name in control and (control[name].weight > 0).all() and not point.out:
                 xyz[i] = control[name].xyz_l
         return xyz
 
@@ -245,50 +235,6 @@ class BatchMaker:
                 sigma_sample_px=image * batch.rays.sigma_sample_px,
             )  # fmt: skip
             batch.provisional = not bool(measured.smoothed[part].all())
-
-
-def local_layout(
-    design: Design,
-    strip: IntArray,
-    self_calibration: SelfCalibration | None,
-    camera_columns: IntArray,
-    rays: Rays,
-    surface_columns: IntArray,
-) -> tuple[IntArray, Layout]:
-    """The unknowns that rays touch, by their number in the window, and a layout that counts them from 0.
-
-    Parameters
-    ----------
-    design : columns by their number in the window
-    strip : (n,) set of each ray
-    self_calibration : additional parameters, all of which count as touched
-    camera_columns : (m,) their numbers
-    surface_columns : (1,) number of the shift of the surface, or (0,)
-    """
-    touched = np.unique(design.columns)
-    touched = touched[touched >= 0].astype(np.int64)
-    local = np.where(design.columns >= 0, np.searchsorted(touched, design.columns), -1)
-    node, component = np.nonzero((design.columns >= 0).any(axis=0))
-    camera = None
-    if self_calibration is not None:
-        camera = self_calibration.design(rays.ccd, rays.sample, rays.xy_mm, rays.focal_length_mm)
-    layout = Layout(
-        (),
-        strip,
-        node,
-        component,
-        np.ascontiguousarray(local[:, node, component].T.astype(np.int32)),
-        np.ascontiguousarray(design.coefficients.T),
-        camera,
-        len(touched),
-        len(camera_columns) if camera is not None else 0,
-        (),
-        _NO_PRIOR,
-        heading=True,
-        n_surface=len(surface_columns),
-    )
-    of_camera = camera_columns if camera is not None else camera_columns[:0]
-    return np.concatenate([touched, of_camera, surface_columns]), layout
 
 
 def join_designs(parts: Sequence[tuple[IntArray, Design]], n: int) -> Design:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.pose_noise import PoseNoise
 from ...adjustment.surface_control import SurfaceControl
+from ...arrays import Array, IntArray
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredTrajectory
@@ -21,20 +20,6 @@ from .sigma_factors import SigmaFactors
 from .strip import WindowStrip
 from .surface import LiveSurface
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-
-
-class Tally(NamedTuple):
-    """What there is in all batches: observations less object coordinates, rays and control points with weight, points,
-    and determined object coordinates."""
-
-    rows: int
-    rays: int
-    control: int
-    points: int
-    determined: int
 
 
 class Batches:
@@ -55,17 +40,6 @@ class Batches:
 
     def __contains__(self, batch: Batch) -> bool:
         return id(batch) in self._by_id
-
-    def tally(self) -> Tally:
-        """What there is in all of them."""
-        rows = rays = control = points = determined = 0
-        for batch in self._by_id.values():
-            rows += batch.information.rows
-            rays += batch.active_rays
-            control += batch.active_control
-            points += batch.n_points
-            determined += batch.determined
-        return Tally(rows, rays, control, points, determined)
 
     def enter(self, batch: Batch) -> None:
         """A batch comes."""
@@ -140,13 +114,13 @@ class LiveNetwork:
         self.pose_noise = PoseNoise(self.trajectory)
         self.sigmas = SigmaFactors()
         self.platform = LivePlatform(platform, self.trajectory, self.state)
-        self.camera_columns: IntArray = np.empty(0, dtype=np.int64)
-        if self_calibration is not None:
-            m = self_calibration.n_unknowns
-            self.camera_columns = self.state.new_numbers(m)
+        self._camera_sigma = np.empty(0) if self_calibration is None else self_calibration.apriori_sigma
+        m = len(self._camera_sigma)
+        self.camera_columns = self.state.new_numbers(m)
+        if m:
             columns = self.camera_columns[:, None].astype(np.int32)
             self.state.enter(self.camera_columns)
-            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self_calibration.apriori_sigma)
+            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self._camera_sigma)
         self.surface = LiveSurface(surface, self.state)
 
     @property
@@ -157,8 +131,7 @@ class LiveNetwork:
     @property
     def shared_sigma(self) -> Array:
         """What is known of these beforehand."""
-        camera = self.self_calibration.apriori_sigma if self.self_calibration is not None else np.empty(0)
-        return np.concatenate([self.platform.errors.sigma, camera, self.surface.sigma])
+        return np.concatenate([self.platform.errors.sigma, self._camera_sigma, self.surface.sigma])
 
     @property
     def noise_version(self) -> int:

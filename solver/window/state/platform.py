@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...geometry.measured_trajectory import MeasuredTrajectory
 from ...geometry.trajectory import Poses
 from ...models.base import Design
 from ...models.platform import PlatformErrors
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
 
 #: Least standard deviation of a value's departure from what was known beforehand, as a share of its sigma: where the
 #: data say hardly anything of it, nothing speaks against the sigma either. Tuned.

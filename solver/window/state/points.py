@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from math import isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjustment.drift_hypotheses import Group
 from ...adjustment.normal_equations import ControlWeights
+from ...arrays import Array, Bools
 from ...camera.line_camera import LineCamera
 from ...geometry.measured_trajectory import SMOOTHED_LATE_S, MeasuredTrajectory
 from ..results import Look, Refusal
 from .batch import Batch
 from .strip import WindowStrip
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Sigmas outside this are of no measurement, px: squares of their weights leave the range of numbers, and what is not a
 #: number in one look is in all unknowns afterwards.
@@ -86,12 +83,10 @@ class Intake:
     def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
         self.points: dict[str, PointLooks] = {}
         self.control: dict[str, ControlPoint] = {}
-        self._ccds = [line.id for line in camera.lines]
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
-        self._done: deque[tuple[float, str, str]] = deque()
-        self._is_done: set[tuple[str, str]] = set()
+        self._done: dict[tuple[str, str], float] = {}  # points that are final in a strip, and the time of their batch
         self._refused: list[Refusal] = []
         self._missing_s = -np.inf  # when poses were missing last
         self._out_before: dict[str, set[int]] = {}
@@ -121,7 +116,7 @@ class Intake:
             self._waiting[name] = None
         return ""
 
-    def known_coordinates(self, names: Sequence[str], used: NDArray[np.bool_]) -> ControlWeights:
+    def known_coordinates(self, names: Sequence[str], used: Bools) -> ControlWeights:
         """Known coordinates of points; those that are refused, and those ``used`` (p,) by earlier strips, take no
         weight."""
         weight, xyz = np.zeros((len(names), 3)), np.zeros((len(names), 3))
@@ -130,31 +125,21 @@ class Intake:
                 weight[i], xyz[i] = self.control[name].weight, np.nan_to_num(self.control[name].xyz_l)
                 weight[i, list(self.points[name].out)] = 0.0
         weight[used] = 0.0
-        return ControlWeights(weight, xyz, int((weight > 0).sum()))
-
-    def set_apart(self, names: Iterable[str]) -> None:
-        """Points that do not agree with earlier strips are points of their own."""
-        for name in names:
-            self.points[name].alone, self.points[name].spent = True, False
+        return ControlWeights(weight, xyz)
 
     def sources_of(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""
-        rays = batch.rays
         looks = [self.points[name].looks for name in batch.names]
-        return [
-            (looks[p][s].source, self._ccds[c])
-            for p, s, c in zip(rays.point.tolist(), rays.source.tolist(), rays.ccd.tolist(), strict=True)
-        ]
+        of_rays = (looks[p][k] for p, k in zip(batch.rays.point.tolist(), batch.rays.source.tolist(), strict=True))
+        return [(look.source, look.ccd) for look in of_rays]
 
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""
         strip = self._strips.get(look.strip)
-        return float("nan") if strip is None else strip.time_of_line(look.line)
+        return float("nan") if strip is None else float(strip.time_of(look.line))
 
     def _judge(self, look: Look) -> str:
-        if not (isfinite(look.line) and isfinite(look.sample)):
-            return "value is not finite"
-        if not (isfinite(look.sigma_line_px) and isfinite(look.sigma_sample_px)):
+        if not all(map(isfinite, (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px))):
             return "value is not finite"
         if not (look.sigma_line_px > 0 and look.sigma_sample_px > 0):
             return "sigma is not positive"
@@ -174,7 +159,7 @@ class Intake:
     def _judge_time(self, name: str, look: Look, time_s: float) -> str:
         if time_s < self._strips[look.strip].final_to_s:
             return "too late"
-        if (name, look.strip) in self._is_done:
+        if (name, look.strip) in self._done:
             return "point is final"
         if name in self.points and look in self.points[name].looks:
             return "duplicate"
@@ -232,9 +217,7 @@ class Intake:
                 self._out_before[name] = self.points[name].out
             del self.points[name]
             self._arrived.pop(name, None)
-            for strip in strips:
-                self._done.append((batch.newest_s, name, strip))
-                self._is_done.add((name, strip))
+            self._done |= {(name, strip): batch.newest_s for strip in strips}
 
     def without_partner(self, limits_s: Mapping[str, float]) -> list[str]:
         """Points that wait for another look in vain: theirs are older than the limits of their strips."""
@@ -263,9 +246,8 @@ class Intake:
 
     def forget(self, before_s: float) -> None:
         """Forget which points became final before a time."""
-        while self._done and self._done[0][0] < before_s:
-            _, name, strip = self._done.popleft()
-            self._is_done.discard((name, strip))
+        for key in list(takewhile(lambda key: self._done[key] < before_s, self._done)):
+            del self._done[key]
 
     @property
     def oldest_waiting_s(self) -> float:

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...camera.line_camera import finest_pixel
 from .batch import Batch
-from .maker import BatchMaker
+from .maker import BatchMaker, Draft
 from .network import LiveNetwork
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
-
 
 #: Change of a correction, rad, and m for each metre of flying height, beyond which a batch is linearised again. What
 #: the linear equations then miss goes with its square: two hundredths of a pixel.
@@ -37,14 +31,6 @@ MOST_REPLACED = 600
 JOINED_RAYS = 160
 
 
-@dataclass(frozen=True)
-class Replaced:
-    """Batches that came about when smoothed orientation took the place of the filtered one, and those taken apart."""
-
-    joined: list[Batch]
-    apart: list[Batch]
-
-
 class Relinearisation:
     """Keeps the batches where the window is.
 
@@ -57,18 +43,18 @@ class Relinearisation:
         self._network, self._maker, self._step_s = network, BatchMaker(network), step_s
         self._moved = min(MOVED, float(np.sqrt(MISSED_PX * finest_pixel(network.camera))))
         self._suspects: dict[int, Batch] = {}  # batches that may have moved, by id, the oldest first
-        self._following = False  # whether they are what was left when new data moved far
-        self._reweighing = False  # whether they are what was left when weights changed
+        self._pace: tuple[int, float] | None = None  # of what was left when new data moved far, or weights changed
         self._turn = 0
         self._looked_s = -np.inf
         self._passed_s = 0.0  # between the last two turns
 
     # -- smoothed orientation ------------------------------------------------------------------------------------------
 
-    def replace_filtered(self, all_at_once: bool = False) -> Replaced:
+    def replace_filtered(self, all_at_once: bool = False) -> list[Batch]:
         """Put smoothed orientation under batches that had to do with the filtered one, the oldest first.
 
-        Small ones are joined then, so that a window into which rays come a few at a time costs no more than others.
+        Small ones are joined then, so that a window into which rays come a few at a time costs no more than others;
+        returns the batches that came about that way.
 
         Parameters
         ----------
@@ -92,11 +78,9 @@ class Relinearisation:
                 chunks.append([])
             chunks[-1].append(batch)
         joined: list[Batch] = []
-        apart: list[Batch] = []
         for chunk in chain.from_iterable(groups.values()):
             if len(chunk) > 1:
                 joined.append(self._join(chunk))
-                apart += chunk
             else:
                 alone += chunk
         if alone:
@@ -105,14 +89,14 @@ class Relinearisation:
                 self._network.batches.linearise(batch, self._network.state.values(batch.columns), reweigh=True)
         for batch in (*alone, *joined):
             batch.provisional = False  # in a gap of the smoothed poses it stays with the filtered ones
-        return Replaced(joined, apart)
+        return joined
 
     def _join(self, parts: Sequence[Batch]) -> Batch:
         """One batch in place of several."""
         known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
         names = list(known)
-        joined, lost = self._maker.make(names, [self._network.intake.points[name] for name in names], known)
-        assert joined is not None and not lost
+        joined = self._maker.make(Draft(names, [self._network.intake.points[name] for name in names]), known)
+        assert joined is not None and joined.names == names
         joined.tested = min(b.tested for b in parts)
         for batch in parts:
             self._network.batches.remove(batch)
@@ -127,24 +111,17 @@ class Relinearisation:
         """Linearise again what has moved, in turn; before the solution, for which it then counts."""
         self._passed_s, self._looked_s = now_s - self._looked_s, now_s
         if not self._suspects:
-            self._following = self._reweighing = False
+            self._pace = None
             self._turn += 1
             turn = list(self._network.batches)[self._turn % LOOKED_AFTER :: LOOKED_AFTER]
             self._suspects = {id(b): b for b in turn}
-        if self._following:
-            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
-        else:
-            self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ) if self._reweighing else 0.0)
+        self._again(self._pace)
 
     def reweigh(self) -> None:
         """Other noise of poses has become known: all batches are linearised again, the oldest first."""
         self._suspects = {id(b): b for b in self._network.batches}
-        self._reweighing = True
-        self._again(self._bearable(LEAST_REWEIGHED, REWEIGHED_HZ))
-
-    def _bearable(self, least: int, rays_hz: float) -> float:
-        """Rays of a turn."""
-        return max(least, rays_hz * self._passed_s)
+        self._pace = self._pace or (LEAST_REWEIGHED, REWEIGHED_HZ)
+        self._again((LEAST_REWEIGHED, REWEIGHED_HZ))
 
     def follow(self, fresh: list[Batch]) -> bool:
         """After a solution, linearise again new batches that have moved far; whether there were any.
@@ -159,13 +136,14 @@ class Relinearisation:
         if far:
             new = {id(b) for b in fresh}
             self._suspects = {id(b): b for b in self._network.batches if id(b) not in new}
-            self._following = True
-            self._again(self._bearable(LEAST_AGAIN, AGAIN_HZ))
+            self._pace = LEAST_AGAIN, AGAIN_HZ
+            self._again(self._pace)
         return bool(due)
 
-    def _again(self, most_rays: float) -> None:
-        """Linearise suspects again that have moved, up to a number of rays, or of batches if that is 0."""
+    def _again(self, pace: tuple[int, float] | None) -> None:
+        """Linearise suspects again that have moved, up to so many rays, at least and a second; None: some batches."""
         rays = batches = 0
+        most_rays = max(pace[0], pace[1] * self._passed_s) if pace else 0.0
         for key, batch in list(self._suspects.items()):
             if rays > most_rays if most_rays else batches >= MOST_AGAIN:
                 break

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Array, IntArray
 from ...geometry.trajectory import Poses
 from ...models import MODELS
 from ...models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
@@ -16,9 +17,6 @@ from ...models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
 from ..results import WindowOptions
 from .platform import LivePlatform
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 #: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
 UNKNOWN_LENGTH_S = 600.0
@@ -150,10 +148,6 @@ class WindowStrip:
     def time_of(self, line: ArrayLike) -> Array:
         return self.first_line_time_s + np.asarray(line, dtype=float) / self.line_rate_hz
 
-    def time_of_line(self, line: float) -> float:
-        """`time_of` of one line."""
-        return self.first_line_time_s + line / self.line_rate_hz
-
     def contains(self, line: float) -> bool:
         return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
 
@@ -174,17 +168,13 @@ class WindowStrip:
         return self._numbered(self.model.design(time_s), time_s, poses)
 
     def design_and_left_out(self, time_s: ArrayLike, poses: Poses | None = None) -> tuple[Design, Array]:
-        """`design` and `left_out_variance` (n, 6) of times (n,), which have work in common."""
+        """`design` of times (n,) and what the model cannot follow (n, 6), which have work in common."""
         design, variance = self.model.design_and_left_out(time_s)
         return self._numbered(design, time_s, poses), variance
 
     def _numbered(self, d: Design, time_s: ArrayLike, poses: Poses | None) -> Design:
         d = Design(np.where(d.columns >= 0, self.numbers[d.columns], -1).astype(np.int32), d.coefficients)
         return d if self._platform is None else self._platform.joined(d, np.asarray(time_s, dtype=float), poses)
-
-    def left_out_variance(self, time_s: Array) -> Array:
-        """(n, 6) what the model cannot follow; 0 for models that do not say."""
-        return self.model.left_out_variance(time_s)
 
     @property
     def entered(self) -> IntArray:

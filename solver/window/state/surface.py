@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...adjustment.surface_control import SurfaceControl, SurfaceShift
+from ...arrays import Array
 from .unknowns import WindowState
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
 
 
 class LiveSurface:

@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from ...adjustment.reduced_system import DenseFactor
-
-Array = NDArray[np.floating]
-IntArray = NDArray[np.int64]
+from ...arrays import Array, Bools, IntArray
 
 #: Weight of what is held, which makes its cofactors nothing.
 HELD_WEIGHT = 1e30
@@ -149,7 +147,7 @@ class Border:
         self.H, self.r, self.numbers = self.H - q.T @ q, self.r - q.T @ m.d1, m.stayed.copy()
         return q
 
-    def freed(self, which: IntArray | NDArray[np.bool_], weight: Array | float = 0.0) -> Information:
+    def freed(self, which: IntArray | Bools, weight: Array | float = 0.0) -> Information:
         """Information that the unknowns lose when k of the quantities are estimated instead of held at zero.
 
         Parameters
@@ -161,7 +159,7 @@ class Border:
         K = np.linalg.inv(self.H[np.ix_(which, which)] + np.eye(len(r)) * weight)
         return Information(G @ K @ G.T, G @ (K @ r), float(r @ K @ r), 0 if np.any(weight) else len(r))
 
-    def keep(self, which: IntArray | NDArray[np.bool_]) -> None:
+    def keep(self, which: IntArray | Bools) -> None:
         """Forget all other quantities: they stay at zero."""
         self.G, self.H, self.r = self.G[:, which], self.H[which][:, which], self.r[which]
 
@@ -375,9 +373,12 @@ class WindowState:
     def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
         """Factor and values (n,) with other unknowns held at zero."""
         matrix, rhs = self.normal()
-        _hold(matrix, self.places(held))
+        places = self.places(held)
+        matrix[places, :] = 0.0
+        matrix[:, places] = 0.0
+        matrix[places, places] = HELD_WEIGHT  # cut off from the others: zero and certain
+        rhs[places] = 0.0
         factor = DenseFactor(matrix)
-        rhs[self.places(held)] = 0.0
         return factor, factor.solve(rhs)
 
     @property
@@ -468,10 +469,3 @@ def _add(matrix: Array, places: IntArray, more: Array, sign: int = 1) -> None:
     """Add to rows and columns of a large matrix whose rows stand one after the other; by one index that takes half the
     time of two."""
     matrix.reshape(-1)[places[:, None] * len(matrix) + places] += sign * more
-
-
-def _hold(matrix: Array, places: IntArray) -> None:
-    """Cut unknowns off from the others, so that they are zero and certain."""
-    matrix[places, :] = 0.0
-    matrix[:, places] = 0.0
-    matrix[places, places] = HELD_WEIGHT

@@ -70,7 +70,7 @@ def test_derivatives_of_a_batch_hold_where_the_heading_is_corrected_by_degrees(f
     theta = batch.theta.copy()
     assert np.abs(batch.layout.corrections(theta)[5]).max() > 0.04
     batch.linearise(theta, reweigh=False)
-    rows = batch.full_rows(np.arange(len(batch.rays)))
+    rows = batch.full_rows
 
     def residual(values):
         batch.linearise(values, reweigh=False)

@@ -9,7 +9,7 @@ from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
-from triline.solver.window.state.maker import BatchMaker
+from triline.solver.window.state.maker import BatchMaker, Draft
 from triline.solver.window.window import Window
 
 
@@ -70,8 +70,8 @@ def test_a_joined_batch_says_what_its_parts_said() -> None:
         points, state = window.network.intake.points, window.state
         known = {name: xyz for b in parts for name, xyz in zip(b.names, b.points_l, strict=True)}
         maker = BatchMaker(window.network)
-        made = [maker.make(b.names, [points[n] for n in b.names], known)[0] for b in parts]
-        joined = maker.make(list(known), [points[n] for n in known], known)[0]
+        made = [maker.make(Draft(b.names, [points[n] for n in b.names]), known) for b in parts]
+        joined = maker.make(Draft(list(known), [points[n] for n in known]), known)
         total, rhs = np.zeros((len(state), len(state))), np.zeros(len(state))
         for batch in made:
             assert batch is not None
