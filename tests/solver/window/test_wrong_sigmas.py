@@ -9,6 +9,7 @@ import pytest
 
 from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
+from triline.solver.models.wander import GLOBALS
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
 from triline.solver.simulation.scenario import simulate
@@ -160,6 +161,19 @@ def test_a_wander_that_is_present_keeps_its_factor_when_that_falls():
     assert state.theta == pytest.approx(expected_state.theta, rel=1e-7, abs=1e-12)
     got, want = (np.diagonal(of.covariance(of.numbers)) for of in (state, expected_state))
     assert got == pytest.approx(want, rel=1e-7)
+
+
+@pytest.mark.parametrize(("image", "left"), [(1.0, 5.0), (2.0, 1.0)])
+def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, monkeypatch, image, left):
+    state, check = camera_network.state, SigmaCheck(camera_network)
+    strip = strip_in(state)
+    stated = strip.apriori()[3]
+    camera_network.strips["S1"], camera_network.sigmas.image = strip, image
+    monkeypatch.setattr(camera_network, "batches", [None])
+    for factor in (5.0, 1.0):
+        monkeypatch.setattr(check, "_slow_errors", lambda *_, f=factor: (np.full(4, f), False))
+        check.look(9.0, due=True)
+    assert strip.apriori()[3] == pytest.approx(np.where(np.arange(len(stated)) < GLOBALS, 1.0, left) * stated)
 
 
 def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
