@@ -14,11 +14,13 @@ equations are compared with their redundancy over about the last `MEMORY_S`. Whe
 factors on the sigmas of positions and attitudes are weighed by their restricted likelihood (`_likely`); the sigmas of
 the unknowns present are stated anew, and those of all that come later. A factor falls again where the data no longer
 ask for it, and never below 1: a trajectory that is stated too good costs much, one that is stated too bad next to
-nothing. The image has a factor, too: from the median of squared normalised residuals, which gross errors do not move
-much. Few looks with much noise look as if the trajectory wandered, and a wander that is stated so large would follow
-their noise from then on. So before one is stated larger, noise of looks is a third factor of the bank. Where looks at
-different points, taken at nearly the same time, have much of it in common it is no noise of the image: the attitude
-vibrates. It is stated as noise of the attitude then, so that the orientation says it, too.
+nothing. Where that of a wander falls, the wander that is present keeps what it had: it may be all in one step of the
+GNSS, which a mean over the window no longer shows. Not where noise of the looks has been found larger since, which had
+been taken for a wander. The image has a factor, too: from the median of squared normalised residuals, which gross
+errors do not move much. Few looks with much noise look as if the trajectory wandered, and a wander that is stated so
+large would follow their noise from then on. So before one is stated larger, noise of looks is a third factor of the
+bank. Where looks at different points, taken at nearly the same time, have much of it in common it is no noise of the
+image: the attitude vibrates. It is stated as noise of the attitude then, so that the orientation says it, too.
 
 Source: W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, AVN 86, 1979; restricted
 likelihood: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin geodesique 60, 1986.
@@ -36,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.network import Rays
-from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT
+from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT, WANDERS
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
@@ -76,8 +78,7 @@ TOLD_AGAIN = 1.5
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
 #: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
 NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
-#: The pair that is weighed against it, and the steps from a choice of factors to its neighbours.
-WANDERS = POSITION_WANDER, ATTITUDE_WANDER
+#: The steps from a choice of factors to its neighbours.
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
@@ -150,10 +151,12 @@ class SigmaCheck:
                 of_slow, self._steady = True, 0
             elif judged is not None:
                 of_image = self._restate_looks(judged)
-        if of_slow:
+        if of_slow or of_image:
             sigmas.apriori = np.clip(factor, 1.0, LARGEST)
+            # what noise of looks was taken for has not wandered
+            kept = sigmas.image == 1.0 and network.pose_noise.vibration == 0.0
             for flown in network.flown:
-                flown.restate_sigmas(sigmas.apriori, network.state)
+                flown.restate_sigmas(sigmas.apriori, network.state, kept)
             network.state.solve()
         self._tell()
         self._tell_platform()
@@ -333,9 +336,9 @@ def _likely(
     present : factors in force
     noise : of looks; None where it stays as it is
     """
-    (A, a, now_a), (B, b, now_b) = (strip.apriori_information(g, state) for g in pair)
+    (A, A_now, a), (B, B_now, b) = (strip.apriori_information(g, state) for g in pair)
     N, rhs = state.normal()
-    rest = N - A / now_a**2 - B / now_b**2
+    rest = N - A_now - B_now
 
     def cost_of(f: float, g: float, h: float) -> float:
         matrix, right, of_looks = rest + A / f**2 + B / g**2, rhs, 0.0

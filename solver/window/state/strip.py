@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...arrays import Array, IntArray
 from ...geometry.trajectory import Poses
 from ...models import MODELS
-from ...models.base import CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
+from ...models.base import WANDERS, CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
 from ...models.dgr import DgrOptions
 from ...models.lim import LimOptions
 from ...models.ppm import PpmOptions
@@ -214,16 +214,17 @@ class WindowStrip:
         known = np.einsum("mt,mtu,mu->m", b, Q[place[:, :, None], place[:, None, :]], b)
         return self._group[rows], residual**2, np.clip(1.0 - known, 0.0, 1.0)
 
-    def apriori_information(self, group: int, state: WindowState) -> tuple[Array, int, float]:
-        """Information (n, n) about all unknowns of the state from the a-priori equations of a group that are present,
-        as if their sigmas were as stated; the number of these equations, and the factor that they have now."""
+    def apriori_information(self, group: int, state: WindowState) -> tuple[Array, Array, int]:
+        """Information (n, n) about all unknowns of the state from the a-priori equations of a group that are present:
+        as if their sigmas were as stated, and with those that are in force; the number of these equations."""
         rows = self._rows_present(state)
         rows = rows[self._group[rows] == group]
         columns, coefficients, _, sigma = self._rows(rows)
         place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), len(state))
         b = np.zeros((len(rows), len(state) + 1))
-        np.add.at(b, (np.arange(len(rows))[:, None], place), coefficients * (self._scale[rows] / sigma)[:, None])
-        return b[:, :-1].T @ b[:, :-1], len(rows), float(self.factor[group])
+        np.add.at(b, (np.arange(len(rows))[:, None], place), coefficients / sigma[:, None])
+        in_force, as_stated = b[:, :-1], b[:, :-1] * self._scale[rows, None]
+        return as_stated.T @ as_stated, in_force.T @ in_force, len(rows)
 
     def _rows_present(self, state: WindowState) -> IntArray:
         """A-priori equations whose unknowns are all in the state."""
@@ -232,14 +233,26 @@ class WindowStrip:
         present = (columns < 0) | (state.places(self.numbers[np.maximum(columns, 0)]) >= 0)
         return rows[present.all(axis=1)]
 
-    def restate_sigmas(self, factor: Array, state: WindowState) -> None:
-        """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come."""
+    def restate_sigmas(self, factor: Array, state: WindowState, kept: bool = False) -> None:
+        """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come.
+
+        Parameters
+        ----------
+        kept : a wander that is present keeps the largest factor that it has had: where the factor falls, what comes
+            wanders less, and what has happened has not become smaller. Offset, shift and drift are the same errors all
+            along, so that a smaller factor is what is known better of them
+        """
         self.factor = factor.copy()
         rows = self._rows_present(state)
-        rows = rows[self._scale[rows] != factor[self._group[rows]]]
+        group = self._group[rows]
+        scale = factor[group]
+        if kept:
+            scale = np.where(np.isin(group, WANDERS), np.maximum(scale, self._scale[rows]), scale)
+        other = scale != self._scale[rows]
+        rows, scale = rows[other], scale[other]
         if len(rows):
             columns, coefficients, value, before = self._rows(rows)
-            self._scale[rows] = factor[self._group[rows]]
+            self._scale[rows] = scale
             state.reweigh(columns, coefficients, value, before, self._prior.sigma[rows] * self._scale[rows])
 
     def activate(self, to_s: float, state: WindowState) -> bool:

@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, error_groups
+from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
+from triline.solver.models.wander import GLOBALS
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
 from triline.solver.simulation.scenario import simulate
@@ -20,7 +21,7 @@ from triline.solver.simulation.window_study import (
     point_errors,
 )
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
-from triline.solver.window.screening.sigma_check import ENOUGH, RIGHT, SigmaCheck
+from triline.solver.window.screening.sigma_check import ENOUGH, RIGHT, SigmaCheck, _likely
 from triline.solver.window.state.network import LiveNetwork
 from triline.solver.window.state.strip import WindowStrip
 from triline.solver.window.state.unknowns import WindowState
@@ -142,6 +143,53 @@ def test_sigmas_stated_anew_are_those_stated_from_the_start(when):
     got, want = (np.diagonal(s.covariance(s.numbers)) for s in (anew, from_start))
     assert got == pytest.approx(want, rel=1e-7)
     assert anew.cost() == pytest.approx(from_start.cost(), rel=1e-9)
+
+
+def test_a_wander_that_is_present_keeps_its_factor_when_that_falls():
+    """What comes later wanders as stated; offset, shift and drift are the same errors and are stated anew."""
+    one, factor = np.ones(4), np.array([2.0, 3.0, 1.5, 5.0])
+    expected_state, state = WindowState(), WindowState()
+    expected, strip = strip_in(expected_state, np.where(np.arange(4) < POSITION_WANDER, one, factor)), strip_in(state)
+    expected.factor = one
+    strip.restate_sigmas(factor, state)
+    for s, of in ((expected, expected_state), (strip, state)):
+        seen(s, of)
+    strip.restate_sigmas(one, state, kept=True)
+    for s, of in ((expected, expected_state), (strip, state)):
+        s.activate(15.0, of)
+        of.solve()
+    assert state.theta == pytest.approx(expected_state.theta, rel=1e-7, abs=1e-12)
+    got, want = (np.diagonal(of.covariance(of.numbers)) for of in (state, expected_state))
+    assert got == pytest.approx(want, rel=1e-7)
+
+
+@pytest.mark.parametrize(("image", "left"), [(1.0, 5.0), (2.0, 1.0)])
+def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, monkeypatch, image, left):
+    state, check = camera_network.state, SigmaCheck(camera_network)
+    strip = strip_in(state)
+    stated = strip.apriori()[3]
+    camera_network.strips["S1"], camera_network.sigmas.image = strip, image
+    monkeypatch.setattr(camera_network, "batches", [None])
+    for factor in (5.0, 1.0):
+        monkeypatch.setattr(check, "_slow_errors", lambda *_, f=factor: (np.full(4, f), False))
+        check.look(9.0, due=True)
+    assert strip.apriori()[3] == pytest.approx(np.where(np.arange(len(stated)) < GLOBALS, 1.0, left) * stated)
+
+
+def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
+    """What is in force now, and for which part of the wander, is no matter."""
+    as_stated, mixed = WindowState(), WindowState()
+    strips = strip_in(as_stated), strip_in(mixed)
+    for strip, state in zip(strips, (as_stated, mixed), strict=True):
+        seen(strip, state)
+    strips[1].restate_sigmas(np.array([2.0, 3.0, 4.0, 5.0]), mixed)
+    strips[1].restate_sigmas(np.ones(4), mixed, kept=True)
+    for strip, state in zip(strips, (as_stated, mixed), strict=True):
+        strip.activate(15.0, state)
+        state.solve()
+    assert np.linalg.norm(mixed.theta - as_stated.theta) > 1e-6
+    expected, found = (_likely(s, of, WANDERS, (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True))
+    assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_residuals_and_redundancies_of_what_was_known_beforehand():
