@@ -189,8 +189,7 @@ class _Search:
     def solve(self, options: AdjustmentOptions) -> None:
         control = self.solution.problem.control
         if (self.control_weight != control.weight).any():
-            count = int((self.control_weight > 0).sum())
-            control = replace(control, weight=self.control_weight.copy(), n_observations=count)
+            control = replace(control, weight=self.control_weight.copy())
             problem = replace(self.solution.problem, control=control)
             self.solution = replace(self.solution, problem=problem)
         self._take(solve(self.solution.problem, self.solution, self.weight, options))

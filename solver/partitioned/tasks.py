@@ -404,8 +404,7 @@ def _changed(store: Store, key: int, read: int, changes: Changes) -> tuple[Part,
         equations.given = changes.given
     if changes.control is not None:
         control = equations.problem.control
-        count = int((changes.control > 0).sum())
-        control = replace(control, weight=changes.control, n_observations=count)
+        control = replace(control, weight=changes.control)
         equations.problem = replace(equations.problem, control=control)
     if changes.renew:
         equations.renew()
