@@ -327,15 +327,9 @@ def long_flight(folder: Path, seconds: float, rate: float, attitude_rate: float,
 
 
 def strips_of(path: Path) -> list[tuple[int, int]]:
-    """Begin and end of the strips of a recording, ns."""
-    begun: dict[str, int] = {}
-    found = []
-    for m in RecordingReader(path).sorted_messages(["configuration/strip"]):
-        if m.body.ended:
-            found.append((begun[m.body.id], m.stamp_ns))
-        else:
-            begun[m.body.id] = m.stamp_ns
-    return found
+    """Times of the first and of the last line of the strips of a recording, ns; that a strip is over is said later."""
+    over = [m.body for m in RecordingReader(path).sorted_messages(["configuration/strip"]) if m.body.ended]
+    return [(b.first_line_time_ns, b.first_line_time_ns + round((b.lines - 1) / b.line_rate_hz * 1e9)) for b in over]
 
 
 KINDS = ("data", "images", "processes", "link", "packets")
