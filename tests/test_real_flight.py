@@ -42,8 +42,9 @@ def processed(flight: Path) -> Path:
 def test_on_line_orientation_removes_the_injected_errors(processed: Path):
     result = evaluate(processed)
     measured, final = result["orientation"]["smoothed"], result["orientation"]["final"]
-    # metre-level errors of the trajectory go down to the size of what 12 control points leave
-    assert final["rmse_m"][2] < measured["rmse_m"][2] / 5
+    # metre-level errors of the trajectory go down to the size of what 12 control points leave; in Z the focal length,
+    # as well as it is known, is worth metres from 20 km
+    assert final["rmse_m"][2] < measured["rmse_m"][2] / 3
     assert np.linalg.norm(final["rmse_m"]) < np.linalg.norm(measured["rmse_m"]) / 2.5
     assert np.linalg.norm(final["rmse_deg"]) < np.linalg.norm(measured["rmse_deg"])
     assert 0.93 < result["sigma0"] < 1.07

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...solver.adjustment.surface_control import SurfaceControl
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS
-from ...solver.models.platform import MOST_CLOCK_S, USUAL_PLATFORM, PlatformErrors
+from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.window.output import WindowUpdate
 from ...solver.window.results import Look, Refusal, WindowOptions
 from ...solver.window.window import Window
@@ -58,11 +58,13 @@ class Adjuster(Node):
         the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
         of long flights: an update every 5 s with what came till then, from smoothed poses alone where there are any,
         and the live orientation with the update
-    self_calibration : set of additional parameters, or "none"
+    self_calibration : set of additional parameters, or "none"; "focal" is the focal length alone, as it is known from a
+        calibration
     camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of
         the image): 0.03 for a camera that a calibration left half a pixel off
     clock_sigma_s : what is known beforehand of the difference between the clocks of poses and image lines, which is an
         unknown all along; 0 = they agree
+    lever_arm_sigma_m : what is known beforehand of each component of the lever arm, an unknown all along; 0 = right
     apriori : what is known beforehand of the slow errors of a strip: "project", what the project says; "trajectory",
         that, and more where the covariance of the pose at the start of the strip is clearly larger. A strip then waits
         for a pose with a known attitude.
@@ -111,9 +113,10 @@ class Adjuster(Node):
         update_s: float = 0.2,
         update_rays: int = 12,
         pace: str = "load",
-        self_calibration: str = "none",
+        self_calibration: str = "focal",
         camera_sigma: float = 1.0,
         clock_sigma_s: float = USUAL_PLATFORM.clock_sigma_s,
+        lever_arm_sigma_m: float = USUAL_PLATFORM.lever_arm_sigma_m,
         apriori: str = "trajectory",
         alert_limit_m: float = 0.0,
         datum: str = "control",
@@ -136,6 +139,10 @@ class Adjuster(Node):
             raise ValueError(f"camera_sigma: wanted more than 0, got {camera_sigma}")
         if not 0 <= clock_sigma_s < MOST_CLOCK_S:
             raise ValueError(f"clock_sigma_s: wanted 0 or more, and less than {MOST_CLOCK_S:g} s, got {clock_sigma_s}")
+        if not 0 <= lever_arm_sigma_m < MOST_LEVER_ARM_M:
+            raise ValueError(
+                f"lever_arm_sigma_m: wanted 0 or more, and less than {MOST_LEVER_ARM_M:g} m, got {lever_arm_sigma_m}"
+            )
         if pace not in PACES:
             raise ValueError(f"pace: {pace!r} is not known, wanted one of {', '.join(PACES)}")
         if apriori not in APRIORI:
@@ -152,7 +159,7 @@ class Adjuster(Node):
         self._pacing, self._governor = Pacing(), Governor(PARTS, LOSSLESS)
         self._self_calibration, self._camera_sigma = self_calibration, camera_sigma
         self._elevation = Elevation.stated(dem, dem_crs, dem_sigma_m, dem_shift_sigma_m)
-        self._platform = PlatformErrors(clock_sigma_s)
+        self._platform = PlatformErrors(clock_sigma_s, lever_arm_sigma_m)
         self._window: Window | None = None
         self._project: Any = None
         self._camera: Any = None

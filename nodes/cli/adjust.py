@@ -31,7 +31,7 @@ from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
-from ...solver.models.platform import MOST_CLOCK_S, PlatformErrors
+from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
 from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
@@ -95,6 +95,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--clock-sigma", type=float, default=0.0, metavar="S",
         help="clocks of poses and image lines differ by an unknown constant, beforehand known to S seconds (0)",
+    )  # fmt: skip
+    group.add_argument(
+        "--lever-arm-sigma", type=float, default=0.0, metavar="M",
+        help="each component of the lever arm is off by an unknown constant, beforehand known to M metres (0)",
     )  # fmt: skip
     selfcal = ["none", *SELF_CALIBRATIONS]
     group.add_argument("--selfcal", choices=selfcal, default="none", help="additional parameters of the camera (none)")
@@ -160,6 +164,8 @@ def run(args: argparse.Namespace) -> int:
     if scenes is not None:
         if args.clock_sigma:
             raise UserError("--clock-sigma does not go with satellite scenes")
+        if args.lever_arm_sigma:
+            raise UserError("--lever-arm-sigma does not go with satellite scenes")
         if args.camera is not None:
             raise UserError("--camera does not go with satellite scenes")
         if len(paths) > 1:
@@ -355,7 +361,10 @@ def models_of(
 def _platform(args: argparse.Namespace) -> PlatformErrors:
     if not 0 <= args.clock_sigma < MOST_CLOCK_S:
         raise UserError(f"--clock-sigma {args.clock_sigma:g}, wanted 0 or more, and less than {MOST_CLOCK_S:g} s")
-    return PlatformErrors(args.clock_sigma)
+    arm = args.lever_arm_sigma
+    if not 0 <= arm < MOST_LEVER_ARM_M:
+        raise UserError(f"--lever-arm-sigma {arm:g}, wanted 0 or more, and less than {MOST_LEVER_ARM_M:g} m")
+    return PlatformErrors(args.clock_sigma, arm)
 
 
 def wanders(settings: Mapping[str, object]) -> bool:

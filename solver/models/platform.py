@@ -5,6 +5,10 @@ Image lines and poses are stamped by clocks that differ by a constant ``clock``:
 measured orientation is its rate times ``clock``: velocity for the position, attitude rate for the attitude. Along a
 straight strip at a constant speed it is an offset along the flight; it shows by what the attitude does in turbulence,
 and between strips of opposite headings.
+
+The ``lever`` arm from the perspective centre to what the GNSS measures is known as well as it was surveyed. Its error
+is constant along the camera's axes x, y, z, so the correction of the position is ``R_lc lever``: an offset in one
+strip, which turns with the heading between strips.
 """
 
 from __future__ import annotations
@@ -22,9 +26,15 @@ Array = NDArray[np.floating]
 
 #: A clock that is off by more is no error of a clock, s: the first order of its effect does not go so far.
 MOST_CLOCK_S = 0.5
+#: A lever arm that is less well known is not known at all, m.
+MOST_LEVER_ARM_M = 100.0
 #: The attitude rate is a mean over so long before and after, s: with samples of 100 Hz and 2 mdeg the noise of the mean
 #: is a tenth of the rates of calm air, and what it smooths away is slower than 2 Hz by a hundredth. Tuned.
 RATE_OVER_S = 0.05
+
+
+#: Unknowns of the lever arm, along the axes of the camera.
+LEVER = ("lever x", "lever y", "lever z")
 
 
 class Measured(Protocol):
@@ -46,6 +56,7 @@ class PlatformErrors:
     Attributes
     ----------
     clock_sigma_s : of the clock; 0 = it is right
+    lever_arm_sigma_m : of each component of the lever arm; 0 = it is right
 
     Raises
     ------
@@ -53,8 +64,9 @@ class PlatformErrors:
     """
 
     clock_sigma_s: float = 0.0
+    lever_arm_sigma_m: float = 0.0
 
-    UNITS: ClassVar[dict[str, str]] = {"clock": "s"}
+    UNITS: ClassVar[dict[str, str]] = {"clock": "s"} | dict.fromkeys(LEVER, "m")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -64,18 +76,29 @@ class PlatformErrors:
     @property
     def unknown_names(self) -> tuple[str, ...]:
         """(m,) of the unknowns."""
-        return ("clock",) if self.clock_sigma_s else ()
+        return ("clock",) * bool(self.clock_sigma_s) + LEVER * bool(self.lever_arm_sigma_m)
 
     @staticmethod
     def words(name: str, value: float, sigma: float) -> str:
         """What an error comes to, for the operator."""
+        if name in LEVER:
+            axis = name.removeprefix("lever ")
+            return (
+                f"lever arm: the camera is {value:+.3f} +- {sigma:.3f} m along its {axis} axis from where it is stated"
+            )
         late = "later" if value > 0 else "earlier"
         return f"{name}: poses are stamped {1e3 * abs(value):.2f} +- {1e3 * sigma:.2f} ms {late} than image lines"
 
     @property
     def sigma(self) -> Array:
         """(m,) a priori."""
-        return np.array([self.clock_sigma_s] if self.clock_sigma_s else [])
+        clock, lever = [self.clock_sigma_s], [self.lever_arm_sigma_m] * 3
+        return np.array(clock * bool(self.clock_sigma_s) + lever * bool(self.lever_arm_sigma_m))
+
+    @property
+    def questioned(self) -> NDArray[np.bool_]:
+        """(m,) whose sigma may be stated larger: not the lever arm's, since what is more in one strip is an offset."""
+        return np.array([name not in LEVER for name in self.unknown_names], dtype=bool)
 
     @property
     def n_unknowns(self) -> int:
@@ -97,23 +120,41 @@ class PlatformErrors:
         measured : the trajectory they are of
         heading : kappa's correction is one of heading, see `adjustment.layout.Layout`
         """
-        n, t = len(poses.time_s), poses.time_s
-        ends = np.concatenate([t - RATE_OVER_S, t + RATE_OVER_S])
-        ends = np.where(measured.covers(ends), ends, np.tile(t, 2))
-        (before, after), ends = measured.angles_at(ends).reshape(2, n, 3), ends.reshape(2, n)
-        turned_by = (after - before + np.pi) % (2 * np.pi) - np.pi
-        rate = turned_by / np.maximum(ends[1] - ends[0], RATE_OVER_S)[:, None]
-        columns = np.full((n, 6 * self.n_unknowns, 6), -1, dtype=np.int32)
-        columns[:, np.arange(6), np.arange(6)] = 0
-        if heading:  # kappa's correction turns the tilt; omega and phi take that back
-            omega, phi, _ = poses.angles.T
-            turned = np.column_stack([phi, -omega, np.zeros(n)])
-            rate = rate + turned * rate[:, 2:]
-        return Design(columns, np.hstack([poses.velocity_l, rate]))
+        n, place = len(poses.time_s), 0
+        columns, coefficients = [np.empty((n, 0, 6), dtype=np.int32)], [np.empty((n, 0))]
+        if self.clock_sigma_s:
+            moved = np.full((n, 6, 6), -1, dtype=np.int32)
+            moved[:, np.arange(6), np.arange(6)] = 0
+            columns.append(moved)
+            coefficients.append(np.hstack([poses.velocity_l, _rate(poses, measured, heading)]))
+            place = 1
+        if self.lever_arm_sigma_m:
+            # the terms of one unknown follow one another: term 3 a + c is that of axis a and component c
+            along = np.full((n, 9, 6), -1, dtype=np.int32)
+            along[:, np.arange(9), np.tile(np.arange(3), 3)] = place + np.repeat(np.arange(3), 3)
+            columns.append(along)
+            coefficients.append(np.swapaxes(poses.R_lc, 1, 2).reshape(n, 9))
+        return Design(np.concatenate(columns, axis=1), np.concatenate(coefficients, axis=1))
+
+
+def _rate(poses: Poses, measured: Measured, heading: bool) -> Array:
+    """Attitude rate (n, 3) as corrections of the angles count it."""
+    n, t = len(poses.time_s), poses.time_s
+    ends = np.concatenate([t - RATE_OVER_S, t + RATE_OVER_S])
+    ends = np.where(measured.covers(ends), ends, np.tile(t, 2))
+    (before, after), ends = measured.angles_at(ends).reshape(2, n, 3), ends.reshape(2, n)
+    turned_by = (after - before + np.pi) % (2 * np.pi) - np.pi
+    rate = turned_by / np.maximum(ends[1] - ends[0], RATE_OVER_S)[:, None]
+    if heading:  # kappa's correction turns the tilt; omega and phi take that back
+        omega, phi, _ = poses.angles.T
+        turned = np.column_stack([phi, -omega, np.zeros(n)])
+        rate = rate + turned * rate[:, 2:]
+    return rate
 
 
 #: A platform that is as stated.
 NO_PLATFORM_ERRORS = PlatformErrors()
 #: What is usually known of a platform: clocks agree to some tenths of a millisecond if nothing is wrong with them.
-#: Where they do not, the sigma is stated anew by the window (`window.screening.sigma_check`). Tuned.
+#: Where they do not, the sigma is stated anew by the window (`window.screening.sigma_check`). Tuned. A lever arm is
+#: taken as it was surveyed: its unknowns would make the position of every flight that much less certain.
 USUAL_PLATFORM = PlatformErrors(clock_sigma_s=1e-3)

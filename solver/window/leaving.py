@@ -127,7 +127,7 @@ class Leaving:
         left = None
         if final is not None:
             update.final.append(final)
-            noise = self._orientation.noise(strip, final.time_s) + self._network.sigmas.doubt
+            noise = self._orientation.noise(strip, final.time_s)
             left = LeftOrientation(final, strip.design(final.time_s), noise)
             self._block.orientation(strip, left)
         strip.final_to_s = to_s

@@ -96,7 +96,7 @@ class OrientationOutput:
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = covariance + self._network.pose_noise.at(measured, strip.followed) + self._network.sigmas.doubt
+        covariance = covariance + self._network.pose_noise.at(measured, strip.followed)
         covariance += measured.open_end[:, :, None] * np.eye(6)
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction

@@ -91,7 +91,6 @@ class ControlTests:
         self._left.drop_drifts()
         self._weighed = None
         self._differ.clear()
-        self._network.sigmas.height_doubt_m = 0.0
 
     # -- judgement -----------------------------------------------------------------------------------------------------
 
@@ -293,8 +292,6 @@ class ControlTests:
             system = "height system (geoid)?" if a == 2 else "datum?"
             text = f"control and GNSS differ by {abs(by):.2f} +- {sigma:.2f} m in {AXES[a]} ({points}): {system}"
             self._differ[a] = text, abs(by), abs(by) > FAR * self.critical * sigma
-            if a == 2 and not self._of_gnss:
-                self._network.sigmas.height_doubt_m = abs(by)
             place = a, max(c.strip for c in d.coordinates)
             if place not in self._told and n > 1:
                 self._told.add(place)

@@ -39,6 +39,7 @@ from scipy.linalg import solve_triangular
 
 from ...adjustment.network import Rays
 from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT, WANDERS
+from ...models.slow_errors import LEARNING_TIME_S
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
@@ -48,8 +49,12 @@ Array = NDArray[np.floating]
 
 #: Residuals of a-priori equations are compared with their redundancy over so long, s.
 MEMORY_S = 30.0
-#: Probability that a right sigma is questioned, by one look at one group.
-QUESTIONED = 1e-4
+#: Probability that a right sigma is questioned, by one look at one group: offset, shift and drift are few, and the
+#: same in all looks; wanders are other ones again and again. Tuned.
+QUESTIONED = (3e-3, 3e-3, 1e-4, 1e-4)
+#: Where the wander of position is not as stated, but guessed from the covariance of a pose, the likelihood of a bank
+#: says what it is as soon as there is so much redundancy; no test has to ask for it first. Tuned.
+PLENTY = 10.0
 #: Redundancy of a group below which nothing is said about it.
 LEAST_REDUNDANCY = 0.2
 #: A factor is applied if it differs by so much from the one in force, and changes by so much at most in one look.
@@ -170,25 +175,42 @@ class SigmaCheck:
         n = len(ERROR_GROUPS)
         squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
         factor, of_looks = before.copy(), False
-        asked = (redundancies >= LEAST_REDUNDANCY) & ((factor > 1.0) | (squares > chi2.isf(QUESTIONED, redundancies)))
+        known = redundancies >= LEAST_REDUNDANCY
+        contradicted = known & (squares > chi2.isf(QUESTIONED, redundancies))
         if not self._suspect:  # a gross error that has not been found yet bends the attitude, control the position
-            asked[ATTITUDE_WANDER] &= factor[ATTITUDE_WANDER] > 1.0
+            contradicted[ATTITUDE_WANDER] = False
+        contradicted[OFFSET] |= self._offset_or_mounting(strip, now_s)
+        weighed = known & (factor > 1.0)
+        guessed = strip.slow.wander_time_s < 2.0 * LEARNING_TIME_S  # nearer to what is learnt than to what is stated
+        weighed[POSITION_WANDER] |= guessed and squares[POSITION_WANDER] > redundancies[POSITION_WANDER] > PLENTY
         for pair in self._pairs:
-            if not asked[list(pair)].any():
+            asked = weighed[list(pair)] | contradicted[list(pair)].any()
+            if not asked.any():
                 continue
             present = float(before[pair[0]]), float(before[pair[1]])
             *wanted, ratio = _likely(strip, state, pair, present)
             noise = self._noise() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
             if noise is not None:
                 *wanted, ratio = _likely(strip, state, pair, present, noise)
-            for g, w in zip(pair, wanted, strict=True):
-                factor[g] = _changed(float(factor[g]), w / float(factor[g]))
+            for g, w, it in zip(pair, wanted, asked, strict=True):
+                if it:
+                    factor[g] = _changed(float(factor[g]), w / float(factor[g]))
             if noise is not None and ratio > CHANGED:
                 self._state_noise(noise.variance * min(ratio, MOST_UP) ** 2, noise.pixel, noise.sigma_px)
                 of_looks = True
             if (factor != before).any() or of_looks:
                 break  # what wanders is looked at first; the rest when that is settled
         return factor, of_looks
+
+    def _offset_or_mounting(self, strip: WindowStrip, now_s: float) -> bool:
+        """Whether an offset would be contradicted if focal length and lever arm were as stated. These explain a height
+        or a place as well as an offset does, so that both may be wrong where one of them is."""
+        network = self._network
+        if not len(network.like_an_offset):
+            return False
+        group, square, redundancy = strip.apriori_fit(network.state, now_s - MEMORY_S, network.like_an_offset)
+        mine = (group == OFFSET) & (redundancy >= LEAST_REDUNDANCY)
+        return bool((square[mine] > redundancy[mine] * chi2.isf(QUESTIONED[OFFSET], 1)).any())
 
     def _noise(self) -> _Noise | None:
         """What the looks say with the noise that is stated now; None while some have the weights of another one."""

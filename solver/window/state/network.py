@@ -134,6 +134,13 @@ class LiveNetwork:
         return np.concatenate([self.platform.errors.sigma, self._camera_sigma, self.surface.sigma])
 
     @property
+    def like_an_offset(self) -> IntArray:
+        """Numbers of the unknowns that explain what an offset of the trajectory would explain as well: the focal length
+        where it is the only additional parameter, and the lever arm."""
+        one = self.camera_columns if len(self.camera_columns) == 1 else self.camera_columns[:0]
+        return np.concatenate([self.platform.numbers[~self.platform.errors.questioned], one])
+
+    @property
     def noise_version(self) -> int:
         """How often what is known of the noise of poses and images has changed."""
         return self.pose_noise.version + self.sigmas.version

@@ -46,6 +46,7 @@ class LivePlatform:
         value, variance = self._state.values(self.numbers), np.diagonal(self._state.covariance(self.numbers))
         left = np.sqrt(np.maximum(self.sigma**2 - variance, 0.0))
         wrong = np.abs(value) > critical * np.maximum(left, LEAST_LEFT * self.sigma)
+        wrong &= self.errors.questioned
         if not wrong.any():
             return False
         before, self.sigma = self.sigma, np.where(wrong, np.maximum(np.abs(value), 2.0 * self.sigma), self.sigma)

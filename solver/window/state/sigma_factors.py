@@ -21,8 +21,6 @@ class SigmaFactors:
     apriori : (4,) of the slow errors, by `ERROR_GROUPS`
     image : of lines and samples
     version : how often `image` has changed
-    height_doubt_m : by how much control and GNSS differ in height, which may be the focal length: then the height of
-        the camera is off by that, and what is on the ground is right
     disagreement : by how much the looks that came last disagree more than all sigmas allow, 1 where they do not: a
         test of single looks is that much wider as long as it is not known which sigma is wrong
     """
@@ -30,10 +28,4 @@ class SigmaFactors:
     apriori: Array = field(default_factory=lambda: np.ones(len(ERROR_GROUPS)))
     image: float = 1.0
     version: int = 0
-    height_doubt_m: float = 0.0
     disagreement: float = 1.0
-
-    @property
-    def doubt(self) -> Array:
-        """Covariance (6, 6) of what may be wrong with the orientation and not with what is on the ground."""
-        return np.diag([0.0, 0.0, self.height_doubt_m**2, 0.0, 0.0, 0.0])

@@ -191,13 +191,16 @@ class WindowStrip:
         columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
         return columns, p.coefficients[rows], p.value[rows], p.sigma[rows] * self._scale[rows]
 
-    def apriori_fit(self, state: WindowState, since_s: float) -> tuple[IntArray, Array, Array]:
+    def apriori_fit(
+        self, state: WindowState, since_s: float, held: IntArray | None = None
+    ) -> tuple[IntArray, Array, Array]:
         """How well the solution agrees with what was known beforehand of the unknowns that are present.
 
         Parameters
         ----------
         state : solved
         since_s : only what speaks of unknowns that are in use after this time, and of those of the whole strip
+        held : unknowns that are held at zero for this
 
         Returns
         -------
@@ -209,7 +212,12 @@ class WindowStrip:
         columns, coefficients, value, sigma = self._rows(rows)
         place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), -1)
         b = np.where(place >= 0, coefficients, 0.0) / sigma[:, None]
-        theta, Q = np.append(state.theta, 0.0), state.covariance(state.numbers)
+        if held is None:
+            values, Q = state.theta, state.covariance(state.numbers)
+        else:
+            factor, values = state.conditioned(held)
+            Q = factor.inverse()
+        theta = np.append(values, 0.0)
         residual = np.einsum("mt,mt->m", b, theta[place]) - value / sigma
         known = np.einsum("mt,mtu,mu->m", b, Q[place[:, :, None], place[:, None, :]], b)
         return self._group[rows], residual**2, np.clip(1.0 - known, 0.0, 1.0)

@@ -111,7 +111,7 @@ def test_reports_add_up(done):
     assert busy.observations - busy.unknowns > 0 and busy.control >= 3 and busy.strip == "S1"
     names = [p.name for p in busy.parameters]
     of_strip = ["dX", "dY", "dZ", "domega", "dphi", "dkappa", "omega drift", "phi drift", "kappa drift"]
-    assert names == [*of_strip, "clock"]
+    assert names == [*of_strip, "clock", "dc"]
     assert all(p.sigma > 0 and p.t == pytest.approx(p.value / p.sigma) for p in busy.parameters)
     assert 0.0 < busy.data_latency_s < 1.0
 
@@ -249,6 +249,8 @@ def test_settings_are_checked():
         Adjuster(camera_sigma=-1)
     with pytest.raises(ValueError, match="clock_sigma_s: wanted 0 or more, and less than 0"):
         Adjuster(clock_sigma_s=-1)
+    with pytest.raises(ValueError, match="lever_arm_sigma_m: wanted 0 or more, and less than 100 m, got nan"):
+        Adjuster(lever_arm_sigma_m=float("nan"))
     with pytest.raises(ValueError, match="window_s"):
         Adjuster(window_s=-1.0)
     with pytest.raises(ValueError, match="spline"):
@@ -275,7 +277,9 @@ def test_refused_control_is_in_the_report_and_in_the_log(flight):
         message.body.z += 47.0
         return [message]
 
-    outputs = run(Adjuster(grid_hz=2.0, datum="gnss"), with_control(flight[1], raised))
+    # a focal length that is unknown takes a little of 47 m, and Y of a point at the edge of the image is refused, too
+    adjuster = Adjuster(grid_hz=2.0, datum="gnss", self_calibration="none")
+    outputs = run(adjuster, with_control(flight[1], raised))
     refused = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.coordinate]
     assert refused and {(r.coordinate, r.reason) for r in refused} == {("Z", "contradicts")}
     assert all(r.w > 5.0 and r.off == pytest.approx(47.0, abs=8.0) and not r.ccd for r in refused)

@@ -397,6 +397,8 @@ def test_refusals_are_one_line(folder, tmp_path, capsys):
     assert "not an MCAP recording" in refusal(capsys, foreign)
     assert "needs a folder" in refusal(capsys, folder, "--plots")
     assert "--clock-sigma -1, wanted 0 or more, and less than 0.5 s" in refusal(capsys, folder, "--clock-sigma", "-1")
+    wanted = "--lever-arm-sigma nan, wanted 0 or more, and less than 100 m"
+    assert wanted in refusal(capsys, folder, "--lever-arm-sigma", "nan")
     assert "--fixes is for the model lim" in refusal(capsys, folder, "--fixes", "8")
     assert "fixes" in refusal(capsys, folder, "--model", "lim", "--fixes", "2")
     assert "segments" in refusal(capsys, folder, "--model", "ppm", "--segments", "0")
@@ -486,6 +488,15 @@ def test_unknown_option_is_a_usage_error(folder):
     with pytest.raises(SystemExit) as stop:
         adjust(folder, "--model", "spline")
     assert stop.value.code == 2
+
+
+def test_the_lever_arm_is_an_unknown_where_it_is_asked_for(folder, tmp_path):
+    code = main(["adjust", str(folder), "--lever-arm-sigma", "0.05", "-o", str(tmp_path), "-q"])
+    platform = json.loads((tmp_path / "result.json").read_text())["platform"]
+    assert code == 0 and list(platform) == ["lever x", "lever y", "lever z"]
+    for found in platform.values():  # that of the block is right
+        assert found["unit"] == "m" and 0.0 < found["sigma"] < 0.0501
+        assert abs(found["value"]) < 4.0 * found["sigma"]
 
 
 def test_the_clock_is_an_unknown_where_it_is_asked_for(folder, tmp_path):

@@ -25,7 +25,7 @@ from triline.solver.simulation.orbital_imagery import render, texture_of
 
 def on_line(messages, **options):
     """Points of the adjuster: name -> (xyz, covariance), and the node."""
-    node = Adjuster(**options)
+    node = Adjuster(**({"self_calibration": "none"} | options))  # as the batch beside it
     points = {}
     found = [out for message in messages if message.topic in node.inputs for out in node.step(message)]
     for out in [*found, *node.finish()]:

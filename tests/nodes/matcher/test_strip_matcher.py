@@ -79,7 +79,7 @@ def on_line(messages, ties):
     """Points of the adjuster, name -> (xyz, covariance), and all that it was given."""
     given = list(merge(messages, sorted(ties, key=order), key=order))
     points = {}
-    for out in through(Adjuster(model="dgr"), given):
+    for out in through(Adjuster(model="dgr", self_calibration="none"), given):
         if out.topic == "point/object":
             body = out.body
             points[body.point] = np.array([body.x, body.y, body.z]), np.reshape(body.covariance, (3, 3))

@@ -11,7 +11,16 @@ from places import BLOCKS, needs_blocks
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.covariance import point_cofactors
 from triline.solver.camera.line_camera import Lens, LineCamera, straight_line
-from triline.solver.camera.self_calibration import SELF_CALIBRATIONS, boresight, lens, prism, tls, unit_of
+from triline.solver.camera.self_calibration import (
+    FOCAL_SIGMA,
+    SELF_CALIBRATIONS,
+    boresight,
+    focal_length,
+    lens,
+    prism,
+    tls,
+    unit_of,
+)
 from triline.solver.geometry.rotation import matrix_from_angles
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.simulation.network import disturb_camera
@@ -40,7 +49,8 @@ def test_names_and_counts():
     three = LineCamera("prism", tuple(Lens(i, 2000.0) for i in "FNB"), tuple(triplet))
     assert prism(three).n_unknowns == 30 and prism(three).name == "prism30"
     assert lens(two_lenses()).n_unknowns == 18
-    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens", "boresight"}
+    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens", "boresight", "focal"}
+    assert focal_length(CAMERA).names == ("dc",) and focal_length(CAMERA).apriori_sigma == [FOCAL_SIGMA]
 
 
 def test_tls_formulas():

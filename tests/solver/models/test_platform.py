@@ -1,5 +1,7 @@
 """A clock that differs: its derivative, in the window and in the batch, and that it is found with its sigma."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,43 @@ def test_at_the_ends_of_a_trajectory_there_is_a_rate():
     np.testing.assert_allclose(change[:, 3:], CLOCK_S * path.at(ends).angle_rate, atol=1e-4)
 
 
+def test_the_lever_arm_moves_the_camera_along_its_own_axes_and_comes_after_the_clock():
+    path = swinging(np.arange(0.0, 20.0, 0.01))
+    measured, arm = path.at(np.linspace(3.0, 17.0, 50)), np.array([0.3, -0.2, 0.1])
+    alone = PlatformErrors(lever_arm_sigma_m=0.05)
+    both = PlatformErrors(clock_sigma_s=1e-3, lever_arm_sigma_m=0.05)
+    assert both.unknown_names == ("clock", "lever x", "lever y", "lever z")
+    np.testing.assert_array_equal(both.sigma, [1e-3, 0.05, 0.05, 0.05])
+    moved = alone.design(measured, path, True).evaluate(arm)
+    np.testing.assert_allclose(moved[:, :3], measured.R_lc @ arm, atol=1e-12)
+    assert not moved[:, 3:].any()
+    late = USUAL.design(measured, path, True).evaluate([CLOCK_S])
+    np.testing.assert_allclose(both.design(measured, path, True).evaluate([CLOCK_S, *arm]), moved + late, atol=1e-12)
+
+
+def test_strips_of_opposite_headings_find_the_lever_arm_in_window_and_batch():
+    arm = np.array([0.3, -0.2, 0.0])  # height is like an offset all along
+    plan = FlightPlan(strips=2, strip_s=25.0, turns=False, gap_s=4.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, 2, SETTINGS["rtk"], OBSERVED, world=World(lever_arm_m=tuple(arm)))
+    poses, unknown = navigate(simulation), PlatformErrors(lever_arm_sigma_m=0.3)
+    found = []
+
+    def watch(_, window):
+        numbers = window.network.platform.numbers
+        found.append((window.state.values(numbers), np.sqrt(np.diagonal(window.state.covariance(numbers)))))
+
+    adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), live=False, watch=watch, platform=unknown)
+    network = network_of(simulation, poses)
+    batch = run_batch(network, Job(WanderOptions(slow_errors_of(simulation.errors)), platform=unknown)).solution
+    columns = batch.layout.platform_columns
+    of_batch = batch.state.theta[columns], np.sqrt(batch.factor.variances()[columns])
+    body_to_camera = simulation.mounting.R_bc.T  # the world states it in the body's axes
+    for value, sigma in (found[-1], of_batch):
+        assert (sigma[:2] < 0.12).all()  # of 0.3 m beforehand
+        assert (np.abs(value + body_to_camera @ arm) < 3.5 * sigma)[:2].all()
+    np.testing.assert_allclose(found[-1][0][:2], of_batch[0][:2], atol=2.0 * of_batch[1][:2].max())
+
+
 def test_a_sigma_must_not_be_negative():
     with pytest.raises(ValueError, match="clock_sigma_s: wanted a sigma not below 0, got -1"):
         PlatformErrors(-1.0)
@@ -97,6 +136,17 @@ def test_the_batch_finds_the_clock_and_publishes_it(late):
     assert np.abs(along).mean() < 0.3 * 70.0 * CLOCK_S
     spread = np.sqrt(correction_cofactors(found.solution, 0, t)[:, 0, 0])
     assert (spread > 0.5 * 70.0 * sigma).all()
+
+
+def test_an_unknown_of_several_terms_is_one_wherever_its_terms_stand(late):
+    simulation, poses = late
+    network, model = network_of(simulation, poses), WanderOptions(slow_errors_of(simulation.errors))
+    platform = PlatformErrors(clock_sigma_s=1e-3, lever_arm_sigma_m=0.05)
+    alone = run_batch(network, Job(model, platform=PlatformErrors(lever_arm_sigma_m=0.05))).solution
+    with_clock = run_batch(network, Job(model, platform=replace(platform, clock_sigma_s=1e-9))).solution
+    # a clock that is known to a nanosecond changes nothing, though the terms of the lever arm stand elsewhere
+    same = with_clock.state.theta[with_clock.layout.platform_columns[1:]]
+    np.testing.assert_allclose(same, alone.state.theta[alone.layout.platform_columns], atol=1e-6)
 
 
 def test_normal_equations_hold_the_terms_of_one_unknown_together(late):
