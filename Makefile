@@ -10,9 +10,9 @@ help:
 	@echo "make demo    live on-line triangulation of a simulated flight (headless where there is no display)"
 	@echo "make test    all tests"
 	@echo "make lint    ruff, type checker, import contract"
-	@echo "make bench   benchmarks; writes their tables into docs/benchmarks.md"
+	@echo "make bench   benchmarks of speed; writes their tables into docs/benchmarks.md"
 	@echo "make docs    the documentation as a site, in build/docs"
-	@echo "make study   slow statistical studies and the fuzz campaign"
+	@echo "make study   slow statistical studies and the fuzz campaign; hours"
 	@echo "make lowest  all tests with the lowest versions that pyproject.toml allows"
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
@@ -59,7 +59,7 @@ bench: $(VENV)/.bench
 
 study: $(VENV)/.bench
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m study
-	$(BIN)/python bench/fuzz.py --cases 1000000 --seconds 5400
+	$(BIN)/python bench/run.py --studies --long
 	$(BIN)/triline study all
 
 # the oldest dependencies that pyproject.toml names, in an environment of their own

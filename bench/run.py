@@ -1,8 +1,9 @@
-"""Run benchmarks and studies, and write what they print into ``docs/``: ``make bench``.
+"""Run benchmarks and studies, and write what they print into ``docs/``: ``make bench``, ``make study``.
 
-    python bench/run.py                 # all but those that take longer than half an hour
+    python bench/run.py                 # benchmarks: how fast, beside what, with how much memory
+    python bench/run.py --studies       # studies: how good, over how many flights; those that take up to half an hour
+    python bench/run.py --studies --long  # all studies
     python bench/run.py strips latency  # these
-    python bench/run.py --long          # all
     python bench/run.py --list          # names, questions and commands
 
 A benchmark owns one block of a page in ``docs/``, between ``<!-- bench NAME -->`` and ``<!-- end -->``. As soon as it
@@ -28,8 +29,13 @@ import frame
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-#: What takes longer runs only when it is asked for.
+#: A study that takes longer runs only when it is asked for.
 LONG_MIN = 30.0
+#: `make bench` measures speed, all of it in less than 25 minutes on two idle cores; the others are `make study`.
+SPEED = (
+    "latency", "tie-latency", "window-peers", "hour", "bus-load", "recordings", "rotations", "replay", "batch",
+    "large-blocks", "navigation", "matcher", "orthoimage", "rectification", "satellites", "scale",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,13 @@ class Benchmark:
     @property
     def long(self) -> bool:
         return self.minutes > LONG_MIN
+
+    @property
+    def run_by(self) -> str:
+        """What runs it, for a reader."""
+        if self.name in SPEED:
+            return "make bench"
+        return "run.py --studies --long" if self.long else "make study"
 
 
 BENCHMARKS = (
@@ -435,7 +448,8 @@ BENCHMARKS = (
 def main() -> int:
     parser = frame.parser(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run")
-    parser.add_argument("--long", action="store_true", help=f"also those that take more than {LONG_MIN:g} minutes")
+    parser.add_argument("--studies", action="store_true", help="studies instead of benchmarks of speed")
+    parser.add_argument("--long", action="store_true", help=f"also studies of more than {LONG_MIN:g} minutes")
     parser.add_argument("--list", action="store_true", help="say what there is, and run nothing")
     args = parser.parse_args()
     if args.list:
@@ -452,7 +466,9 @@ def main() -> int:
 def chosen(parser: argparse.ArgumentParser, args: argparse.Namespace) -> list[Benchmark]:
     """Those that the command line asks for."""
     if not args.names:
-        return [b for b in BENCHMARKS if args.long or not b.long]
+        if args.studies:
+            return [b for b in BENCHMARKS if b.name not in SPEED and (args.long or not b.long)]
+        return [b for b in BENCHMARKS if b.name in SPEED]
     known = {b.name: b for b in BENCHMARKS}
     unknown = [name for name in args.names if name not in known]
     if unknown:
@@ -502,10 +518,10 @@ def machine(minutes: float) -> str:
 
 def overview() -> list[str]:
     """The table of all benchmarks."""
-    rows = ["| benchmark | question | programs | minutes |", "|---|---|---|---|"]
+    rows = ["| name | question | programs | minutes | run by |", "|---|---|---|---|---|"]
     for b in BENCHMARKS:
         programs = ", ".join(dict.fromkeys(f"`{program_of(c)}`" for c in b.commands))
-        rows.append(f"| {b.name} | {b.question} | {programs} | {b.minutes:g}{' (`--long`)' if b.long else ''} |")
+        rows.append(f"| {b.name} | {b.question} | {programs} | {b.minutes:g} | `{b.run_by}` |")
     return rows
 
 
