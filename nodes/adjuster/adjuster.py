@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...solver.adjustment.surface_control import SurfaceControl
+from ...solver.camera.line_camera import finest_pixel
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.window.output import WindowUpdate
@@ -277,6 +278,8 @@ class Adjuster(Node):
             parameters = SELF_CALIBRATIONS[self._self_calibration](camera).scaled(self._camera_sigma)
         surface, told = self._surface()
         slow = convert.slow_errors_of(self._project)
+        if not (self._project.wander_sigma_m or self._project.wander_sigma_deg):
+            slow = slow.with_some_wander(finest_pixel(camera))
         self._window = Window(camera, slow, self.options, parameters, self._platform, surface=surface)
         self._strips.begin_window(self._window)
         self._outputs.reference_ns = self._reference_ns

@@ -39,6 +39,8 @@ _TOLD_PX = 0.01
 _MOST_OFF_LINES = 0.1
 #: The sigmas of a project that a recording carries.
 _CARRIED = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg")
+#: Orbit and attitude of a scene do not wander in its seconds, where a project says nothing else.
+_NO_WANDER = {"wander_sigma_m": (0.0, 0.0, 0.0), "wander_sigma_deg": (0.0, 0.0, 0.0)}
 
 
 @dataclass(frozen=True)
@@ -199,4 +201,4 @@ def _sigmas(data: SceneBlockData, images: list[_Image], frame: LocalFrame) -> di
         pairs = ((track, offset), (turns, shift), (turns, drift))
         found.append(np.stack([np.linalg.norm(A * s, axis=1) for A, s in pairs]))
     largest = np.max(found, axis=0)
-    return stated | {key: tuple(map(float, row)) for key, row in zip(_CARRIED, largest, strict=True)}
+    return _NO_WANDER | stated | {key: tuple(map(float, row)) for key, row in zip(_CARRIED, largest, strict=True)}

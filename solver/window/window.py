@@ -60,6 +60,9 @@ HURRIED_S = 0.1
 LOOK_AFTER, QUESTION, RETEST, WATCH = "look after", "question", "retest", "watch"
 #: Time between two turns of each part, s; it is done in the first update after that.
 TURN_S = {LOOK_AFTER: 0.1, QUESTION: 1.0, RETEST: 0.1, WATCH: 0.3}
+#: Where an update comes late and what was found has changed sigmas, they are questioned again, as often as updates in
+#: quick succession would have done it, but no more than this.
+MOST_QUESTIONS = 5
 #: An update that has other work to do leaves a part to the next one unless it is overdue by more than this share of the
 #: time between its turns.
 PUT_OFF = 1.0
@@ -68,11 +71,17 @@ _SMALL_S = 1e-6
 
 class Duties:
     """Shares out work that can wait among the updates, by platform time, so that results do not depend on how many
-    updates a second there are."""
+    updates a second there are.
+
+    Attributes
+    ----------
+    turns : of each part, how many turns have passed since it was done, when it was taken last; 1 at first
+    """
 
     def __init__(self) -> None:
         self._now_s = float("-inf")
         self._done_s = dict.fromkeys(TURN_S, float("-inf"))
+        self.turns: dict[str, int] = dict.fromkeys(TURN_S, 1)
 
     def take(self, now_s: float, busy: bool = False) -> set[str]:
         """The parts that an update does.
@@ -90,6 +99,7 @@ class Duties:
             most = max(TURN_S, key=lambda part: late[part])
             due = set() if busy and late[most] < PUT_OFF else {most}
         for part in due:
+            self.turns[part] = 1 + max(int(late[part] + _SMALL_S), 0) if np.isfinite(late[part]) else 1
             self._done_s[part] = now_s
         return due
 
@@ -299,15 +309,20 @@ class Window:
 
     def _question_sigmas(self, due: bool, result: WindowUpdate) -> int:
         """Variance components, before any look is thrown out; number of solutions computed."""
-        of_slow, of_image = self._sigma_check.look(self._now_s, due)
+        solutions = 0
+        for _ in range(min(self._duties.turns[QUESTION], MOST_QUESTIONS) if due else 1):
+            of_slow, of_image = self._sigma_check.look(self._now_s, due)
+            if of_image:
+                self._relinearisation.reweigh()
+                self.state.solve()
+            solutions += int(of_slow) + int(of_image)
+            if of_image or not of_slow:
+                break
         result.events += self._sigma_check.take_events()
-        if of_image:
-            self._relinearisation.reweigh()
-            self.state.solve()
-        if of_slow or of_image:
+        if solutions:
             self._orientation.forget()
             self._history.restart()
-        return int(of_slow) + int(of_image)
+        return solutions
 
     def _screen(self, fresh: list[Batch], due: list[Batch], result: WindowUpdate) -> int:
         """Data snooping, and the robust start of a young strip; number of solutions computed."""
