@@ -128,8 +128,7 @@ class BusRunner:
         heard = self._patience.now_s()
         while not self._stop.is_set():
             raws = self._inbox.take(0.0 if self._sequencer.ready else 0.02)
-            if self._ordered:
-                raws = self._recall.complete(raws)
+            raws = self._recall.complete(raws) if self._ordered else self._recall.once(raws)
             now = self._patience.now_s()
             if raws:
                 heard = now

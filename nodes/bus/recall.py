@@ -56,13 +56,19 @@ class Recall:
         """The work of one turn is done."""
         self._round_s = time.monotonic()
 
+    def once(self, raws: list[RawMessage]) -> list[RawMessage]:
+        """What has come, without what was on its way when it was recalled."""
+        if not self._given:
+            return raws
+        raws = [raw for raw in raws if (raw.topic, raw.envelope) not in self._given]
+        if time.monotonic() - self._recalled_s > ON_ITS_WAY_S:
+            self._given.clear()
+        return raws
+
     def complete(self, raws: list[RawMessage]) -> list[RawMessage]:
         """What has come, and before it what was missed; call once a turn."""
         now_s, opened = time.monotonic(), len(self._bus.opened_anew)
-        if self._given:
-            raws = [raw for raw in raws if (raw.topic, raw.envelope) not in self._given]
-            if now_s - self._recalled_s > ON_ITS_WAY_S:
-                self._given.clear()
+        raws = self.once(raws)
         stood_still = now_s - self._round_s > STOOD_STILL_S
         missing = now_s - self._asked_s > AGAIN_S and self._skip(raws)
         lacking = self._lacking(now_s)

@@ -48,6 +48,18 @@ def test_missing_numbers_are_asked_for_and_come_once_in_order():
         assert taken(150) == [150] and check.counts[TOPIC].gaps == 50
 
 
+def test_what_was_recalled_and_comes_all_the_same_is_taken_once_by_who_only_looks_on():
+    port = free_port()
+    with Bus(port=port, source="simulator") as speaker, Bus(port=port, source="recorder") as listener:
+        wait_for(listener.peers, 20, "the link")
+        for number in range(10):
+            speaker.publish_raw(attitude(number))
+        recall = Recall(listener, [TOPIC], StreamCheck())
+        wait_for(lambda: len(listener.recall([TOPIC])) == 10, 20, "what the publisher keeps")
+        assert len(recall.joined([attitude(0)])) == 10
+        assert [raw.envelope.sequence for raw in recall.once([attitude(n) for n in range(1, 12)])] == [10, 11]
+
+
 def test_a_publisher_that_does_not_answer_in_time_is_asked_again():
     port, held = free_port(), []
 
