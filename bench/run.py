@@ -105,8 +105,20 @@ BENCHMARKS = (
     Benchmark(
         "misspecified",
         "What happens in a world that is not as it is stated?",
-        ("triline study misspecified --seeds 2 --settings rtk --jobs 2",),
-        12,
+        ("triline study misspecified --seeds 20 --jobs 2",),
+        55,
+    ),
+    Benchmark(
+        "misspecified-block",
+        "And over three strips?",
+        ("triline study misspecified --seeds 3 --strips 3 --jobs 2",),
+        40,
+    ),
+    Benchmark(
+        "disturbed-folders",
+        "And in block folders of another program, disturbed by hand?",
+        ("python bench/disturbed_folders.py",),
+        7,
     ),
     Benchmark(
         "hours",
