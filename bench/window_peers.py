@@ -140,7 +140,7 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
             started = True
             if cameras:
                 enter(gtsam.symbol("c", 0), now_s)
-                sigma = window._self_calibration.apriori_sigma
+                sigma = window.network.self_calibration.apriori_sigma
                 graph.add(factor({gtsam.symbol("c", 0): np.diag(1.0 / sigma)}, np.zeros(cameras)))
         until = int(np.searchsorted(borders, now_s + 3.0, side="right"))
         while border < min(until, len(borders) - 1):
