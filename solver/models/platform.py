@@ -121,7 +121,8 @@ class PlatformErrors:
         heading : kappa's correction is one of heading, see `adjustment.layout.Layout`
         """
         n, place = len(poses.time_s), 0
-        columns, coefficients = [np.empty((n, 0, 6), dtype=np.int32)], [np.empty((n, 0))]
+        columns: list[NDArray[np.int32]] = [np.empty((n, 0, 6), dtype=np.int32)]
+        coefficients: list[Array] = [np.empty((n, 0))]
         if self.clock_sigma_s:
             moved = np.full((n, 6, 6), -1, dtype=np.int32)
             moved[:, np.arange(6), np.arange(6)] = 0
