@@ -15,7 +15,6 @@ from .. import convert
 from ..node import Message
 from .canvas import Canvas, Color, FleetLayout, Series
 from .orthoimages import LARGEST_TILE
-from .scene import all_finite
 from .scene_part import CONTROL, Pieces, faded
 
 Array = NDArray[np.floating]
@@ -105,8 +104,6 @@ class FleetScene:
         """
         aircraft = self._of(platform)
         if aircraft is None or not any(topics.find(name).matches(message.topic) for name in TOPICS):
-            return
-        if not all_finite(message.body):
             return
         if message.topic == "configuration/project":
             aircraft.frame = convert.local_frame(message.body)

@@ -95,8 +95,6 @@ class Scene:
         topic, body = message.topic, message.body
         if not is_shown(topic):
             return
-        if not topic.startswith(LINES) and not all_finite(body):
-            raise ValueError("value is not finite")
         self.state.note(message)
         if topic.startswith("configuration/"):
             return
@@ -251,16 +249,3 @@ class Scene:
         rows = [(self.state.measured, FILTERED), *(row for row in LEGEND if truth or row[0] != "truth")]
         places = np.array([[100.0 * i, 0.0] for i in range(len(rows))])
         self.canvas.points("legend", places, [color for _, color in rows], 5.0, [text for text, _ in rows])
-
-
-def all_finite(body: Any) -> bool:
-    """Whether all numbers of a message and of the messages in it are finite."""
-    for field, value in body.ListFields():
-        if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
-            if not np.isfinite(value).all():
-                return False
-        elif field.cpp_type == field.CPPTYPE_MESSAGE:
-            for part in (value,) if hasattr(value, "ListFields") else value:
-                if not all_finite(part):
-                    return False
-    return True
