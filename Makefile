@@ -3,6 +3,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # tests and studies use processes, not BLAS threads
 export OPENBLAS_NUM_THREADS ?= 1
+# workers of the tests: one more than the two cores, since tests of the bus wait a good part of their time
+WORKERS ?= 3
 
 .PHONY: help demo test docs lint bench study lowest schemas golden clean
 
@@ -40,7 +42,7 @@ demo: $(VENV)/.run
 	$(BIN)/triline demo
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -b html docs build/docs
@@ -58,7 +60,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python bench/run.py
 
 study: $(VENV)/.bench
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m study
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m study
 	$(BIN)/python bench/run.py --studies --long
 	$(BIN)/triline study all
 
@@ -67,7 +69,7 @@ lowest:
 	$(PYTHON) -m venv .venv-lowest
 	.venv-lowest/bin/python -m pip install --quiet uv
 	VIRTUAL_ENV=.venv-lowest .venv-lowest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[dev]'
-	PATH="$(CURDIR)/.venv-lowest/bin:$$PATH" .venv-lowest/bin/python -m pytest -n 2 --dist worksteal
+	PATH="$(CURDIR)/.venv-lowest/bin:$$PATH" .venv-lowest/bin/python -m pytest -n $(WORKERS) --dist worksteal
 
 golden: $(VENV)/.dev
 	$(BIN)/python recordings/golden.py

@@ -61,10 +61,12 @@ def test_each_node_killed_in_turn(tmp_path):
         nodes["recorder"].kill()
         killed_ns, moment = time.time_ns(), time.monotonic()
         nodes["recorder"].wait()
+        told = len(listener.statuses)
         nodes["recorder"] = rig.start("node", "recorder", "-o", tmp_path / "0.mcap")
 
-        # the navigator: the adjuster waits for it and goes on with the restarted one
-        time.sleep(0.5)
+        # the navigator: the adjuster waits for it and goes on with the restarted one. Before that the recorder has to
+        # be back: what it missed while it began it asks the navigator for, which has to be there to answer
+        wait_for(lambda: sum(s.node == "recorder" for s in listener.statuses[told:]) > 2, 30, "the recorder's return")
         assert listener.since("adjustment/report", moment) > 0
         runs = listener.runs("trajectory/filtered")
         moment = time.monotonic()

@@ -89,6 +89,14 @@ class Keeps(Node):
         return sample.message("orientation/final")
 
 
+def identity(bus: Bus) -> str:
+    return str(bus._session.info.zid())
+
+
+def linked_with(bus: Bus) -> list[str]:
+    return [str(peer) for peer in bus._session.info.peers_zid()]
+
+
 def test_a_session_that_was_opened_anew_misses_nothing_that_was_declared():
     port, node = free_port(), Keeps()
     with (
@@ -101,6 +109,9 @@ def test_a_session_that_was_opened_anew_misses_nothing_that_was_declared():
         wait_for(lambda: len(node.given) == 1, 10, "the camera")
         bus._open_anew("a test")
         sender._open_anew("a test")
+        # the sessions of before answer, too, as long as they are linked
+        wait_for(lambda: linked_with(sender) == [identity(bus)], 10, "the link of the new sessions")
+        wait_for(lambda: linked_with(bus) == [identity(sender)], 10, "the link of the new sessions")
         wait_for(lambda: sender.alive() == {"keeps"}, 10, "the node, again")
         assert len(sender.query("orientation", "orientation/final", t=1)) == 1
         for i in range(20):

@@ -147,6 +147,21 @@ def test_a_flight_is_not_written_over(folder, capsys):
     assert "no flight.toml" in capsys.readouterr().err
 
 
+def connected(port: int) -> socket.socket:
+    """A link to a program that is on the bus already and may not listen yet."""
+    found: list[socket.socket] = []
+
+    def tried() -> bool:
+        try:
+            found.append(socket.create_connection(("127.0.0.1", port)))
+        except ConnectionRefusedError:
+            return False
+        return True
+
+    wait_for(tried, 60, "the program to listen")
+    return found[0]
+
+
 def test_a_program_publishes_under_its_id_and_tells_what_it_refuses(tmp_path):
     port, device = free_port(), free_port()
     said, received, statuses = [], [], []
@@ -160,7 +175,7 @@ def test_a_program_publishes_under_its_id_and_tells_what_it_refuses(tmp_path):
         try:
             wait_for(lambda: "imu1" in bus.alive(), 60, "the program")
             wait_for(lambda: bus.peers(), 60, "the link")
-            with socket.create_connection(("127.0.0.1", device)) as driver:
+            with connected(device) as driver:
                 text = "".join(f"IMU {T + i} 10000000 0 0 -9.8 0 0 0\n" for i in range(5))
                 driver.sendall(text.encode() + b"rubbish\nrubbish\n")
             wait_for(lambda: len(received) >= 5, 60, "the samples")
