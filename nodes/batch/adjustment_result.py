@@ -13,7 +13,7 @@ from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control
-from ...solver.adjustment.reliability import Reliability, reliability
+from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability, reliability
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
 from ...solver.adjustment.surface_control import SurfaceFit
@@ -365,6 +365,12 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
         failing = int((result.rays.largest_w[result.solution.ray_weight > 0] > critical).sum())
         if failing > 0.01 * len(network.rays):
             notes.append(f"{failing} image points have |w| > {critical:g}; --snoop leaves out outliers")
+    narrowly = sum(r.reason == "snooping" and r.ray >= 0 and abs(r.w) < NARROWLY * critical for r in result.rejected)
+    if narrowly > HEAVY_TAILS * len(network.rays):
+        notes.append(
+            f"{100.0 * narrowly / len(network.rays):.0f} % of the image points fail narrowly: their errors have "
+            "heavier tails than stated, sigmas of points are too small"
+        )
     w = control_tests(result.solution, result.cofactors)
     worst = [(p, a) for p, a in np.argwhere(np.abs(w) > critical)]
     worst.sort(key=lambda key: -abs(w[key]))

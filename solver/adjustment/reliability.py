@@ -12,6 +12,12 @@ from ..quantiles import norm
 
 #: Critical value of the normalised residual for alpha = 0.001 [K A.17].
 CRITICAL_W = 3.29
+#: A look fails narrowly up to so many critical values. Of a normal distribution 0.1 % fail so, of a Student
+#: distribution with three degrees of freedom 4 to 7 %. Beyond are mismatches. Tuned.
+NARROWLY = 2.0
+#: Share of looks that fail narrowly which says that their errors have heavy tails, so that sigmas of points are too
+#: small. Tuned.
+HEAVY_TAILS = 0.02
 
 #: Power of the test that marginal detectable errors are stated for.
 POWER = 0.80

@@ -117,6 +117,7 @@ class Leaving:
             self._block.leave(batch, left, cells.get(id(batch)), update)
         self._quality.integrity.leave(leaving, forget_s)
         self._control.leaving(leaving, sources.leave(leaving))
+        network.tails.leaving(leaving)
         for batch in leaving:
             network.batches.leave(batch)
             network.intake.finish(batch)

@@ -40,6 +40,9 @@ FAR = 2.0
 #: clocks, slower flight than this, m/s, shows none; two strips say the same if their clocks agree within that share,
 #: and their directions differ by more than the angle of this cosine. Flight is averaged over so long, s. Tuned.
 ALONG, SLOWEST_M_S, OTHER_WAY, AVERAGED_S = 0.3, 5.0, 0.5, 4.0
+#: Where more looks than this share fail narrowly (`state.tails`), there are errors of that size at control, too: a
+#: coordinate has to contradict the rest by more, in proportion, twice as much where `TAILED` more do. Tuned.
+USUAL_SHARE, TAILED = 0.01, 0.03
 #: Hypotheses named in a line for the operator at most.
 NAMED = 3
 
@@ -112,7 +115,7 @@ class ControlTests:
         d = verdict = None
         if of_batches or len(self._left):
             d = discrepancies([*(part for _, part in of_batches), self._left], network.state)
-            verdict = d.judge(self.critical**2, self._shifted) if self._is_suspect(d) else None
+            verdict = d.judge(self._price, self._shifted) if self._is_suspect(d) else None
         if d is None or verdict is None:
             self._weighed = None
             self._tell_differences([])
@@ -161,6 +164,12 @@ class ControlTests:
         """Axes in which GNSS is known to be off the datum of control; None where GNSS is the datum."""
         return None if self._of_gnss else self._differ
 
+    @property
+    def _price(self) -> float:
+        """Of a bias of control: square of the critical value, which heavy tails of the looks make larger."""
+        beyond = self._network.tails.share(self._network.batches) - USUAL_SHARE
+        return (self.critical * (1.0 + min(max(beyond / TAILED, 0.0), 1.0))) ** 2
+
     def _is_suspect(self, d: Discrepancies) -> bool:
         """Whether a coordinate is refused, or one alone, all of an axis or all together fail their test."""
         if d.out.any():
@@ -195,7 +204,7 @@ class ControlTests:
         cells = self.sources.cells(batches)
         parts = [part for batch in batches for part in self._of_batch(batch, cells.get(id(batch)))]
         d = discrepancies([*parts, self._left], self._network.state, drifts[0])
-        return weigh(d, drifts[1], self.critical**2, verdict, blamed, self._shifted)
+        return weigh(d, drifts[1], self._price, verdict, blamed, self._shifted)
 
     def _of_batch(self, batch: Batch, cell: Cell | None = None) -> list[Biases]:
         """Biases of the coordinates of a batch that can be judged, by point."""

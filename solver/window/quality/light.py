@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...adjustment.drift_hypotheses import BiasedSource, Group
-from ...adjustment.reliability import CRITICAL_W
+from ...adjustment.reliability import CRITICAL_W, HEAVY_TAILS
 from ...arrays import Array
 from ...models.base import ERROR_GROUPS
 from ...quantiles import chi2
@@ -77,6 +77,7 @@ class QualityFindings:
     ground_sigma_m, ground_protection_m : (4,) of the same on the ground, see `ground`; none where it is not known
     alert_limit_m : what protection levels on the ground stay below if the light is good; inf before the ground is seen
     standing : of the additional parameters
+    narrowly : share of looks that fail narrowly, see `Tails`
     disagreement, trajectory : see `SigmaFactors`; the latter of offset, of shift and drift, and of the wander of
         position: that of the attitude shows in the images, and its sigma is what these say
     light, reason : that are shown, see `LightDisplay`
@@ -105,6 +106,7 @@ class QualityFindings:
     ground_protection_m: Array
     alert_limit_m: float
     standing: tuple[Standing, ...] = ()
+    narrowly: float = 0.0
     disagreement: float = 1.0
     trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
     light: str = GOOD
@@ -141,6 +143,9 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
         return WEAK, f"observations disagree more than sigmas say: sigma0 {s.fit.sigma0:.2f}, by chance {chance:.2f}"
     if s.disagreement > DISAGREE:
         return WEAK, f"new looks disagree {s.disagreement:.1f} times as much as sigmas say, which are being questioned"
+    if s.narrowly > HEAVY_TAILS:
+        share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
+        return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
     names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if names:
         return WEAK, f"the trajectory is worse than stated: {', '.join(names)}"

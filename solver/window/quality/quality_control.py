@@ -120,6 +120,7 @@ class QualityControl:
             ground_protection_m=protection[6:],
             alert_limit_m=self._alert_limit_m,
             standing=() if self._parameters is None else self._parameters.standing,
+            narrowly=network.tails.share(batches),
             disagreement=float(network.sigmas.disagreement),
             trajectory=(a, b, c),
         )

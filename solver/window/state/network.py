@@ -19,6 +19,7 @@ from .points import Intake
 from .sigma_factors import SigmaFactors
 from .strip import WindowStrip
 from .surface import LiveSurface
+from .tails import Tails
 from .unknowns import WindowState
 
 
@@ -93,6 +94,7 @@ class LiveNetwork:
     batches : points with their equations
     pose_noise : what the corrections leave of the noise of poses
     sigmas : what a-priori sigmas are multiplied by
+    tails : how many looks fail narrowly
     platform : constant errors of the platform
     camera_columns : (m,) numbers of the additional parameters
     surface : on which tie points lie
@@ -113,6 +115,7 @@ class LiveNetwork:
         self.batches = Batches(self.state)
         self.pose_noise = PoseNoise(self.trajectory)
         self.sigmas = SigmaFactors()
+        self.tails = Tails()
         self.platform = LivePlatform(platform, self.trajectory, self.state)
         self._camera_sigma = np.empty(0) if self_calibration is None else self_calibration.apriori_sigma
         m = len(self._camera_sigma)

@@ -241,7 +241,7 @@ class WindowStrip:
         present = (columns < 0) | (state.places(self.numbers[np.maximum(columns, 0)]) >= 0)
         return rows[present.all(axis=1)]
 
-    def restate_sigmas(self, factor: Array, state: WindowState, kept: bool = False) -> None:
+    def restate_sigmas(self, factor: Array, state: WindowState, kept: tuple[bool, bool] = (False, False)) -> None:
         """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come.
 
         Parameters
@@ -254,8 +254,8 @@ class WindowStrip:
         rows = self._rows_present(state)
         group = self._group[rows]
         scale = factor[group]
-        if kept:
-            scale = np.where(np.isin(group, WANDERS), np.maximum(scale, self._scale[rows]), scale)
+        keeps = np.isin(group, [wander for wander, keep in zip(WANDERS, kept, strict=True) if keep])
+        scale = np.where(keeps, np.maximum(scale, self._scale[rows]), scale)
         other = scale != self._scale[rows]
         rows, scale = rows[other], scale[other]
         if len(rows):

@@ -235,6 +235,16 @@ def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
     assert result_in(tmp_path / "dgr")["model"] == "dgr"
 
 
+@pytest.mark.parametrize("noise", ["t3", "normal"])
+def test_heavy_tails_are_told(tmp_path, noise):
+    flight = tmp_path / "flight.mcap"
+    words = ["--true", "tie-noise=t3"] if noise == "t3" else []
+    assert main(["simulate", "-o", str(flight), "--seconds", "40", "--ties", "10", *words, "-q"]) == 0
+    assert main(["process", str(flight), "-o", str(tmp_path / "s.mcap"), "--nodes", "navigator", "-q"]) == 0
+    assert adjust(tmp_path / "s.mcap", "--snoop", "-q", "-o", tmp_path / "out") == 0
+    assert any("fail narrowly" in note for note in result_in(tmp_path / "out")["notes"]) == (noise == "t3")
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
 def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
     """The block moved to 9 deg 30' east, 48 deg north: same adjustment, coordinates and angles in the other system."""

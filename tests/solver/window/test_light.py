@@ -152,6 +152,8 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"control_doubt": "GNSS differs in Z", "control_failed": True}, FAILED, "GNSS differs in Z"),
         ({"points": 0, "refused": 0}, WEAK, "no tie points within 40 s"),
         ({"points": 0, "refused": 0, "since_s": 5.0}, WEAK, "no tie points yet"),
+        ({"narrowly": 0.04}, WEAK, "4 % of the looks fail narrowly: their errors have heavier tails than stated"),
+        ({"narrowly": 0.015}, GOOD, ""),
         ({"sources": (DRIFT,)}, WEAK, "source matcher-2 on CCD B drift: line +0.00 px, sample +0.50 px"),
         ({"control": np.zeros(3)}, GOOD, "no control within 40 s; earlier control holds the datum"),
         (

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from triline.solver.adjustment.reliability import HEAVY_TAILS
 from triline.solver.camera.self_calibration import focal_length
 from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
@@ -21,8 +23,17 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
+from triline.solver.window.quality.light import GOOD
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
-from triline.solver.window.screening.sigma_check import ENOUGH, RIGHT, SigmaCheck, _likely
+from triline.solver.window.screening.sigma_check import (
+    ENOUGH,
+    RIGHT,
+    USUAL_LOG,
+    SigmaCheck,
+    _Cost,
+    _likely,
+    _Noise,
+)
 from triline.solver.window.state.network import LiveNetwork
 from triline.solver.window.state.strip import WindowStrip
 from triline.solver.window.state.unknowns import WindowState
@@ -120,6 +131,24 @@ def test_an_offset_is_questioned_that_a_focal_length_would_hide():
     assert len(right.window.network.like_an_offset) == 1
 
 
+def test_heavy_tails_are_told_and_cost_no_control():
+    """Before, coordinates of control were refused for outlying looks at them, and the light was green."""
+    simulation, online = flown("noise-t3", 60.0, 1)
+    share = online.window.network.tails.share(online.window.network.batches)
+    assert 0.03 < share < 0.1
+    assert not refused_control(online) and "fail narrowly" in online.reports[-1].quality.reason
+    assert np.sqrt((point_errors(simulation, online.whole_points).error ** 2).sum(axis=1).mean()) < 0.35
+
+
+def test_mismatches_are_no_heavy_tails():
+    plan = replace(OBSERVED, outlier_share=0.08)
+    simulation = simulate(FlightPlan(strip_s=40.0), 4, SETTINGS["rtk"], plan)
+    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+    assert rejected(online) > 0.05 * len(simulation.images)
+    assert online.window.network.tails.share(online.window.network.batches) < HEAVY_TAILS
+    assert online.reports[-1].quality.light == GOOD
+
+
 def test_vibration_is_not_taken_for_a_wander():
     """Before, the wander was stated up to 60 times as large, and a tenth of the looks rejected."""
     simulation, online = flown("sine-fast")
@@ -190,7 +219,7 @@ def test_a_wander_that_is_present_keeps_its_factor_when_that_falls():
     strip.restate_sigmas(factor, state)
     for s, of in ((expected, expected_state), (strip, state)):
         seen(s, of)
-    strip.restate_sigmas(one, state, kept=True)
+    strip.restate_sigmas(one, state, kept=(True, True))
     for s, of in ((expected, expected_state), (strip, state)):
         s.activate(15.0, of)
         of.solve()
@@ -212,6 +241,17 @@ def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, mo
     assert strip.apriori()[3] == pytest.approx(np.where(np.arange(len(stated)) < GLOBALS, 1.0, left) * stated)
 
 
+def test_a_wander_falls_where_the_other_one_was_meant(camera_network):
+    """A step of the GNSS stays large; what the position was blamed for and the attitude did does not."""
+    step = SigmaCheck(camera_network)
+    assert [step._kept(np.array(f)) for f in ([3.0, 1.0], [4.0, 1.5], [1.0, 1.2])] == [(True, True)] * 3
+    swing = SigmaCheck(camera_network)
+    assert swing._kept(np.array([4.0, 7.0])) == (True, True)
+    assert swing._kept(np.array([3.0, 12.0])) == (True, True)
+    assert swing._kept(np.array([2.0, 26.0])) == (False, True)
+    assert swing._kept(np.array([1.5, 26.0])) == (True, True)  # it has fallen, and keeps that
+
+
 def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
     """What is in force now, and for which part of the wander, is no matter."""
     as_stated, mixed = WindowState(), WindowState()
@@ -219,13 +259,38 @@ def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
     for strip, state in zip(strips, (as_stated, mixed), strict=True):
         seen(strip, state)
     strips[1].restate_sigmas(np.array([2.0, 3.0, 4.0, 5.0]), mixed)
-    strips[1].restate_sigmas(np.ones(4), mixed, kept=True)
+    strips[1].restate_sigmas(np.ones(4), mixed, kept=(True, True))
     for strip, state in zip(strips, (as_stated, mixed), strict=True):
         strip.activate(15.0, state)
         state.solve()
     assert np.linalg.norm(mixed.theta - as_stated.theta) > 1e-6
     expected, found = (_likely(s, of, WANDERS, (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True))
     assert found == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("pair", [(OFFSET, SHIFT), WANDERS])
+def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
+    """Elimination in parts beside the formula, with all unknowns at once."""
+    state = WindowState()
+    strip = strip_in(state)
+    seen(strip, state)
+    size = np.sqrt(np.diagonal(state.normal()[0]))
+    J = 0.1 * size * np.random.default_rng(3).standard_normal((30, len(size)))
+    state.observe(np.tile(state.numbers, (30, 1)), J, np.ones(30), np.ones(30))
+    state.solve()
+    N, rhs = state.normal()
+    noise = _Noise(0.1, 1e-4, 0.3, 30, 40.0, J.T @ J, J.T @ np.ones(30))
+    (A, A_now, a), (B, B_now, b) = (strip.apriori_information(g, state) for g in pair)
+    cost, expected = _Cost(strip, state, pair, noise).of, []
+    choices = [(1.0, 1.0, 1.0), (3.5, 1.0, 1.0), (1.0, 9.0, 1.45), (60.0, 2.3, 2.1)]
+    for f, g, h in choices:
+        less = 1.0 - 1.0 / h**2
+        matrix = N - A_now - B_now + A / f**2 + B / g**2 - less * noise.matrix
+        n = rhs - less * noise.rhs
+        value = np.linalg.slogdet(matrix)[1] + 2.0 * (a * np.log(f) + b * np.log(g)) - n @ np.linalg.solve(matrix, n)
+        value += 2.0 * noise.rows * np.log(h) - less * noise.square
+        expected.append(value + np.sum(np.square(np.log([f, g, h]))) / USUAL_LOG**2)
+    assert [cost(*choice) for choice in choices] == pytest.approx(expected, rel=1e-6)
 
 
 def test_residuals_and_redundancies_of_what_was_known_beforehand():
@@ -281,3 +346,20 @@ def camera_network() -> LiveNetwork:
     from triline.solver.camera.sensors import preset
 
     return LiveNetwork(preset("ads40"))
+
+
+def test_a_wander_of_the_attitude_that_is_faster_is_stated_apart():
+    """GNSS wanders over a minute, attitude over six seconds; one time for both has to be the shorter one."""
+    true = replace(SETTINGS["def"], wander_time_s=60.0, attitude_wander_time_s=6.0)
+    alike = replace(true, wander_time_s=6.0, attitude_wander_time_s=0.0)
+    found = []
+    for told in (true, alike):
+        squares = []
+        for seed in (1, 2):
+            simulation = replace(simulate(FlightPlan(strip_s=25.0), seed, true, OBSERVED), errors=told)
+            online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=1.0)
+            points = point_errors(simulation, online.whole_points)
+            squares.append((np.mean(np.sum(points.error**2, axis=1)), points.nees.mean()))
+        found.append(np.mean(squares, axis=0))
+    (apart, nees), (together, _) = found
+    assert apart < 0.7 * together and 0.6 < nees < 1.6
