@@ -261,6 +261,7 @@ def slow_errors_of(project: Any) -> SlowErrors:
         three(project.wander_sigma_m),
         three(project.wander_sigma_deg, to_rad),
         project.wander_time_s or SlowErrors.wander_time_s,
+        project.attitude_wander_time_s,
     )
 
 

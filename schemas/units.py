@@ -71,7 +71,7 @@ UNITS: dict[str, dict[str, str | tuple[str, ...]]] = {
         "lever_arm_m": _with("m", ("forward", "right", "down")), "boresight_deg": _with("deg", _RPY),
         "image_sigma_px": "px", "offset_sigma_m": _with("m", _XYZ), "wander_sigma_m": _with("m", _XYZ),
         **{f"{name}_sigma_deg": _with("deg", ("omega", "phi", "kappa")) for name in ("shift", "drift", "wander")},
-        "wander_time_s": "s",
+        "wander_time_s": "s", "attitude_wander_time_s": "s",
     },
     "triline.ImagePoint": {
         "line": "px", "sample": "px", "sigma_line": "px", "sigma_sample": "px", "time_ns": "ns",

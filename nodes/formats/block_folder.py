@@ -60,6 +60,8 @@ _IMAGE = (
 
 #: Settings of trajectory models that are whole numbers.
 _WHOLE = ("segments", "fixes", "order", "continuity")
+#: Correlation times of the wander that a project may state.
+WANDER_TIMES = ("wander_time_s", "attitude_wander_time_s")
 
 Key = tuple[str, str | None]  # strip and lens
 
@@ -176,6 +178,8 @@ def _settings(table: Keys) -> dict[str, object]:
             settings[key] = table.numbers(key, 3, positive=True) if many else (table.number(key, positive=True),) * 3
         elif key in _WHOLE:
             settings[key] = table.integer(key)
+        elif key in WANDER_TIMES:
+            settings[key] = table.number(key, positive=True)
         else:
             settings[key] = table.raw(key)
     return settings

@@ -17,6 +17,7 @@ from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaterni
 from ...solver.models.dgr import DgrOptions
 from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
 from ..node import Message
+from .block_folder import WANDER_TIMES
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0
@@ -49,7 +50,7 @@ def block_messages(block: BlockData, source: str = "import") -> Iterator[Message
 def not_carried(block: BlockData) -> list[str]:
     """The parts of a block that messages cannot hold, a line each."""
     notes = []
-    keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, "wander_time_s")]
+    keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, *WANDER_TIMES)]
     keys += [f"then.{key}" for key in block.apriori.then]
     if keys:
         notes.append(f"project.toml: trajectory.{', trajectory.'.join(keys)}: not carried by a recording")
@@ -142,8 +143,9 @@ def _project(block: BlockData) -> Any:
     )
     for key, values in known.items():
         getattr(project, key).extend(values)
-    if "wander_time_s" in settings:
-        project.wander_time_s = float(np.asarray(settings["wander_time_s"], dtype=float))
+    for key in WANDER_TIMES:
+        if key in settings:
+            setattr(project, key, float(np.asarray(settings[key], dtype=float)))
     return project
 
 

@@ -17,6 +17,7 @@ from ...solver.models.slow_errors import SlowErrors
 from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of
 from ..errors import UserError
 from ..node import Message
+from .block_folder import WANDER_TIMES
 from .block_messages import SIGMAS
 
 #: What `block_from_messages` reads.
@@ -99,8 +100,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     if not strips:
         raise UserError(f"{name}: no strip with a trajectory; {notes[0] if notes else ''}")
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
-    if project.wander_time_s:
-        settings["wander_time_s"] = project.wander_time_s
+    settings |= {key: getattr(project, key) for key in WANDER_TIMES if getattr(project, key)}
     apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings)
     ground = _ground_of(found, notes)
     point_ids, image = _image_of(found, camera, strips, ground, apriori)

@@ -22,7 +22,8 @@ from .. import config, registry
 from ..convert import camera_message, ground_point_message
 from ..errors import UserError
 from ..node import Message
-from .block_folder import read_ground_points
+from .block_folder import WANDER_TIMES, read_ground_points
+from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
 from .detect import KINDS, Imported, Options, check_within, kind_of_path, read_any, read_track
@@ -53,7 +54,6 @@ ATTITUDE_ERRORS = {
     "MEMS": ((0.05, 0.05, 0.15), (0.02, 0.02, 0.05), (0.02, 0.02, 0.05)),
 }
 _GRADES = {"tactical": TACTICAL, "MEMS": MEMS}
-_SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg")
 _IMU = ("gyro_noise_deg_sqrt_h", "gyro_bias_deg_h", "accel_noise_m_s_sqrt_h", "accel_bias_mgal", "bias_time_s")
 #: Table of a flight.toml -> its keys; "" has the tables themselves.
 _KEYS = {
@@ -74,7 +74,7 @@ _KEYS = {
     "camera": ("file", "preset"),
     "mounting": ("lever_arm_m", "camera_lever_arm_m", "boresight_deg"),
     "navigation": ("file", "kind", "date", "gnss", "imu", "images", "line_rate_hz"),
-    "trajectory": (*_SIGMAS, "wander_time_s"),
+    "trajectory": (*SIGMAS, *WANDER_TIMES),
     "imu": (*_IMU, "gyro_scale_ppm", "accel_scale_ppm"),
     "control": ("file",),
     "dem": ("file", "crs", "sigma_m", "shift_sigma_m"),
@@ -286,8 +286,8 @@ def _configuration(flight: Flight, project: Any, start: int, source: str) -> Ite
     frame = LocalFrame(project.origin_latitude, project.origin_longitude, project.origin_height, flight.crs)
     arm = np.asarray(flight.lever_arm_m) - np.asarray(flight.mounting.lever_arm_m)
     for key, values in (("lever_arm_m", arm), ("boresight_deg", flight.mounting.boresight_deg), *flight.sigmas.items()):
-        if key == "wander_time_s":
-            project.wander_time_s = values
+        if key in WANDER_TIMES:
+            setattr(project, key, values)
             continue
         del getattr(project, key)[:]
         getattr(project, key).extend(float(v) for v in values)
@@ -448,6 +448,8 @@ def _errors(flight: Flight, navigation: Keys, trajectory: Keys, imu: Keys) -> No
     }  # fmt: skip
     flight.sigmas = {key: trajectory.numbers(key, 3, value, positive=True) for key, value in defaults.items()}
     flight.sigmas["wander_time_s"] = trajectory.number("wander_time_s", time_s, positive=True)
+    if trajectory.has("attitude_wander_time_s"):
+        flight.sigmas["attitude_wander_time_s"] = trajectory.number("attitude_wander_time_s", 0.0, positive=True)
     flight.grade = read_grade(imu, flight.notes, FILE, _GRADES[unit])
 
 
@@ -594,6 +596,7 @@ imu = "MEMS"                      # tactical or MEMS: slow errors of the attitud
 #wander_sigma_m = [0.5, 0.5, 1.0]
 #wander_sigma_deg = [0.02, 0.02, 0.05]
 #wander_time_s = 60.0
+#attitude_wander_time_s = 60.0    # of the attitude's, where it is another one
 
 #[imu]                            # data sheet of the inertial sensor, in place of that of its grade
 #gyro_noise_deg_sqrt_h = 0.2

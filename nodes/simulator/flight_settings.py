@@ -18,11 +18,11 @@ from ...solver.simulation.flight import FlightPlan
 from ...solver.simulation.imagery import ImagingPlan, LineImager, imager_of
 from ...solver.simulation.inertial_sensors import InertialPlan
 from ...solver.simulation.misstated import World
-from ...solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for, real_motion
+from ...solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for
 from ...solver.simulation.scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
 from .. import convert
 from ..errors import UserError
-from .motion_track import motion_track
+from .motion_track import motion_of
 from .world_settings import world_from
 
 GRADES = {"tactical": TACTICAL, "mems": MEMS}
@@ -108,6 +108,13 @@ OPTIONS: tuple[Option, ...] = (
     Option("drift", float, "its change over a strip, deg", "errors", "drift_sigma_deg", 3),
     Option("wander_attitude", float, "slow attitude error, deg", "errors", "wander_sigma_deg", 3),
     Option("wander_time", float, "correlation time of the slow errors, s", "errors", "wander_time_s"),
+    Option(
+        "wander_attitude_time",
+        float,
+        "that of the slow attitude error; 0: the same",
+        "errors",
+        "attitude_wander_time_s",
+    ),
     Option("noise", float, "white noise of positions, X Y Z, m", "errors", "gnss_noise_m", 3),
     Option("noise_attitude", float, "white noise of roll, pitch, heading, deg", "errors", "attitude_noise_deg", 3),
     Option("gnss_rate", float, "positions a second", "errors", "gnss_rate_hz"),
@@ -236,12 +243,9 @@ def _real(values: Mapping[str, Any]) -> SimulatedFlight:
             raise UserError(f"simulation: {name.replace('_', '-')} belongs to a planned flight, not to a real motion")
     if "pixels" in values and "sensor" not in values:
         raise UserError("simulation: pixels of a real motion's camera wants a sensor as well")
-    track = motion_track(Path(values["motion"]))
-    seconds = (track.time_ns - track.time_ns[0]) * 1e-9
-    lat, lon, height = track.geodetic.T
     start, duration = values.get("from", 0.0), values.get("seconds")
     ground = values.get("ground", GROUND_M)
-    motion = real_motion(seconds, lat, lon, height, track.rpy, ground, from_s=start, duration_s=duration)
+    motion, epoch_ns = motion_of(Path(values["motion"]), ground, start, duration)
     above = float(np.median(motion.trajectory.position_l[:, 2]))
     if not above > 0:
         raise UserError(f"simulation: the motion lies {-above:.0f} m below the ground at {ground:g} m, wanted ground")
@@ -258,7 +262,7 @@ def _real(values: Mapping[str, Any]) -> SimulatedFlight:
         as_sensors=values.get("as_sensors", False),
         world=_world(values),
     )
-    return SimulatedFlight(simulation, int(track.time_ns[0]) + round(motion.first_time_s * 1e9), motion)
+    return SimulatedFlight(simulation, epoch_ns, motion)
 
 
 def shown_default(option: Option) -> str:

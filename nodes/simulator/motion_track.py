@@ -8,6 +8,7 @@ import numpy as np
 
 from ...solver.geometry.frames import navigation_from_R_lc
 from ...solver.geometry.rotation import matrix_from_quaternion
+from ...solver.simulation.real_motion import RealMotion, real_motion
 from .. import convert
 from ..errors import UserError
 from ..formats.detect import KINDS, Options, kind_of_path, read_track
@@ -21,6 +22,23 @@ POSE_TOPICS = (
 )
 #: Kinds of files with poses.
 TRACKS = ("avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
+
+
+def motion_of(
+    path: Path, ground_m: float, from_s: float = 0.0, duration_s: float | None = None
+) -> tuple[RealMotion, int]:
+    """The motion in a file, see `real_motion`, and when it begins, ns.
+
+    Raises
+    ------
+    UserError : as of `motion_track`
+    ValueError : as of `real_motion`
+    """
+    track = motion_track(path)
+    seconds = (track.time_ns - track.time_ns[0]) * 1e-9
+    lat, lon, height = track.geodetic.T
+    motion = real_motion(seconds, lat, lon, height, track.rpy, ground_m, from_s, duration_s)
+    return motion, int(track.time_ns[0]) + round(motion.first_time_s * 1e9)
 
 
 def motion_track(path: Path) -> NavigationTrack:

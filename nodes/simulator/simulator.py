@@ -159,6 +159,7 @@ class Simulator(Node):
             wander_sigma_m=errors.wander_sigma_m,
             wander_sigma_deg=errors.wander_sigma_deg,
             wander_time_s=errors.wander_time_s,
+            attitude_wander_time_s=errors.attitude_wander_time_s,
         )
 
     def _trajectory_sensors(self) -> list[_Stream]:

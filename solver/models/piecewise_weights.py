@@ -25,8 +25,8 @@ BEFORE = 4
 
 
 def slow_errors_stated(settings: Mapping[str, object]) -> SlowErrors | None:
-    """The slow errors of a ``[trajectory]`` table, if it says that they wander."""
-    stated = WanderOptions.from_settings(settings).slow
+    """The slow errors of a ``[trajectory]`` table, if it says that they wander; with one correlation time."""
+    stated = WanderOptions.from_settings(settings).slow.alike
     wanders = any(np.any(np.asarray(settings.get(key, 0.0), float)) for key in ("wander_sigma_m", "wander_sigma_deg"))
     return stated if wanders else None
 

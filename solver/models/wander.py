@@ -85,6 +85,7 @@ class WanderOptions(ModelOptions):
             three(settings, "wander_sigma_m", (0.1, 0.1, 0.1)),
             angles("wander_sigma_deg", 0.005),
             float(str(settings.get("wander_time_s", 30.0))),
+            float(str(settings.get("attitude_wander_time_s", 0.0))),
         )
         return cls(slow, float(str(settings.get("segment_s", 0.0))))
 

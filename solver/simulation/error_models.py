@@ -44,7 +44,8 @@ class ErrorModel:
     shift_sigma_deg : omega, phi, kappa, constant over a strip
     drift_sigma_deg : omega, phi, kappa, change over a strip
     wander_sigma_deg : omega, phi, kappa
-    wander_time_s : correlation time of both wanders (see `models.gauss_markov`)
+    wander_time_s : correlation time of the wander (see `models.gauss_markov`)
+    attitude_wander_time_s : of the attitude's, where it is another one; 0 = the same
     gnss_noise_m : X, Y, Z, white
     gnss_rate_hz :
     attitude_noise_deg : roll, pitch, heading, white
@@ -65,13 +66,14 @@ class ErrorModel:
     gnss_rate_hz: float = 5.0
     attitude_noise_deg: Three = (0.0005, 0.0005, 0.001)
     attitude_rate_hz: float = 200.0
+    attitude_wander_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, tuple):
                 if len(value) != 3 or not all(np.isfinite(v) and v >= 0 for v in value):
                     raise ValueError(f"error model: {name} wants three numbers not below 0, got {value}")
-            elif not (np.isfinite(value) and value > 0):
+            elif not (np.isfinite(value) and (value > 0 or (value == 0 and name == "attitude_wander_time_s"))):
                 raise ValueError(f"error model: {name} must be positive, got {value}")
 
 
@@ -141,8 +143,11 @@ def draw_slow_errors(
         raise ValueError("strips must follow each other in time")
     n = int(np.ceil((end_s - start_s) / WANDER_STEP_S)) + 1
     parts = [
-        draw_wander(rng, n, WANDER_STEP_S, np.asarray(sigma), model.wander_time_s)
-        for rng, sigma in ((position, model.wander_sigma_m), (attitude, np.radians(model.wander_sigma_deg)))
+        draw_wander(rng, n, WANDER_STEP_S, np.asarray(sigma), time_s)
+        for rng, sigma, time_s in (
+            (position, model.wander_sigma_m, model.wander_time_s),
+            (attitude, np.radians(model.wander_sigma_deg), model.attitude_wander_time_s or model.wander_time_s),
+        )
     ]
     value, rate = (np.hstack([p[i] for p in parts]) for i in range(2))
     count = len(strip_s)

@@ -127,6 +127,7 @@ class World:
             wander_sigma_m=(f * m[0], f * m[1], f * m[2]),
             wander_sigma_deg=(f * deg[0], f * deg[1], f * deg[2]),
             wander_time_s=stated.wander_time_s * self.wander_time_factor,
+            attitude_wander_time_s=stated.attitude_wander_time_s * self.wander_time_factor,
         )
 
     def camera(self, stated: LineCamera) -> LineCamera:

@@ -48,6 +48,7 @@ def slow_errors_of(errors: ErrorModel) -> SlowErrors:
         errors.wander_sigma_m,
         rad(errors.wander_sigma_deg),
         errors.wander_time_s,
+        errors.attitude_wander_time_s,
     )
 
 

@@ -136,6 +136,14 @@ BAD = {
         {"project": "[trajectory]\nshift_sigma_deg = [1, 2]\n"},
         "project.toml: trajectory.shift_sigma_deg: [1, 2], wanted 3 positive numbers",
     ),
+    "correlation time of no length": (
+        {"project": "[trajectory]\nwander_time_s = -1\n"},
+        "project.toml: trajectory.wander_time_s: -1, wanted a number above 0",
+    ),
+    "correlation time in words": (
+        {"project": "[trajectory]\nattitude_wander_time_s = 'x'\n"},
+        "project.toml: trajectory.attitude_wander_time_s: 'x', wanted a number above 0",
+    ),
     "file missing": ({"strips": None}, "no strips.csv; a block folder has"),
 }
 

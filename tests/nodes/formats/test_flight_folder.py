@@ -39,6 +39,7 @@ gnss = "RTK"
 imu = "tactical"
 [trajectory]
 shift_sigma_deg = [0.004, 0.004, 0.008]
+attitude_wander_time_s = 20
 [control]
 file = "control.csv"
 [[strips]]
@@ -93,7 +94,7 @@ def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
     np.testing.assert_allclose(project.offset_sigma_m, [0.03, 0.03, 0.05])  # RTK
     np.testing.assert_allclose(project.shift_sigma_deg, [0.004, 0.004, 0.008])  # stated
     np.testing.assert_allclose(project.drift_sigma_deg, [0.002, 0.002, 0.005])  # tactical
-    assert project.wander_time_s == 60.0
+    assert project.wander_time_s == 60.0 and project.attitude_wander_time_s == 20.0  # of the GNSS; stated
     camera = next(iter(reader.messages(["configuration/camera"]))).body
     assert [line.id for line in camera.lines] == ["F", "N", "B"]
     control = [message.body for message in reader.messages(["observation/control"])]

@@ -206,6 +206,9 @@ def test_block_survives_the_recording(tmp_path):
     block = simulated_block("EPSG:32632")
     sigma = 0.2 + 0.01 * np.arange(len(block.image))
     block = replace(block, image=replace(block.image, sigma_px=sigma))
+    wander = {"wander_sigma_deg": (0.002, 0.002, 0.003), "wander_time_s": 60.0, "attitude_wander_time_s": 12.0}
+    apriori = replace(block.apriori, trajectory={**block.apriori.trajectory, **wander})
+    block = replace(block, apriori=apriori)
     write_block(tmp_path / "block", block)
     out = tmp_path / "flight.mcap"
     assert main(["import", str(tmp_path / "block"), "-o", str(out), "-q"]) == 0

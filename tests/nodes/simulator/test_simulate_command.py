@@ -138,11 +138,15 @@ def test_rays_reproject_through_the_messages_alone(simulation, messages):
 
 
 def test_project_tells_what_was_simulated():
-    errors = ErrorModel(offset_sigma_m=(1.0, 2.0, 3.0), wander_time_s=44.0, drift_sigma_deg=(0.0, 0.1, 0.2))
+    errors = ErrorModel(
+        offset_sigma_m=(1.0, 2.0, 3.0), wander_time_s=44.0, attitude_wander_time_s=8.0, drift_sigma_deg=(0.0, 0.1, 0.2)
+    )
     s = simulate(SMALL, 1, errors, ObservationPlan(tie_points_per_s=1.0, image_sigma_px=0.4))
     project_body = next(iter(Simulator(s).messages(EPOCH_NS))).body
     assert list(project_body.offset_sigma_m) == [1.0, 2.0, 3.0]
-    assert project_body.wander_time_s == 44.0 and project_body.image_sigma_px == 0.4
+    assert (project_body.wander_time_s, project_body.attitude_wander_time_s) == (44.0, 8.0)
+    assert convert.slow_errors_of(project_body).wander_times_s.tolist() == [44.0] * 3 + [8.0] * 3
+    assert project_body.image_sigma_px == 0.4
     assert list(project_body.wander_sigma_m) == [1.0, 1.0, 1.5]
     assert list(project_body.drift_sigma_deg)[1:] == [0.1, 0.2] and 0 < project_body.drift_sigma_deg[0] < 1e-5
     assert convert.lever_arm_of(project_body) == pytest.approx(s.mounting.lever_arm_m)
