@@ -106,13 +106,22 @@ BENCHMARKS = (
         "misspecified",
         "What happens in a world that is not as it is stated?",
         ("triline study misspecified --seeds 20 --jobs 2",),
-        55,
+        65,
     ),
     Benchmark(
         "misspecified-block",
         "And over three strips?",
-        ("triline study misspecified --seeds 3 --strips 3 --jobs 2",),
-        40,
+        ("triline study misspecified --seeds 2 --strips 3 --jobs 2",),
+        25,
+    ),
+    Benchmark(
+        "misspecified-motion",
+        "And with the motion of a real flight?",
+        (
+            "triline study misspecified --seeds 3 --motion "
+            "../shared/data/avirisng/ang20170323t202244_eph_att --from 800",
+        ),
+        8,
     ),
     Benchmark(
         "disturbed-folders",

@@ -20,9 +20,12 @@ from ...solver.simulation.misspecified_study import (
     fly,
     through_window,
 )
+from ...solver.simulation.real_motion import RealMotion
 from ..batch.json_values import plain
 from ..errors import UserError
 from ..formats.new_file import new_file
+from ..simulator.flight_settings import GROUND_M
+from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
 from .misspecified_nodes import through_nodes
 from .progress import progress
@@ -44,6 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="nodes: a recording through navigator and adjuster, as `process` does (default); window: the window alone "
         "with updates at fixed times, in two thirds of the time",
     )  # fmt: skip
+    parser.add_argument(
+        "--told", action="store_true",
+        help="state the true sigmas and correlation times of the wander: what the data allow at best",
+    )  # fmt: skip
+    parser.add_argument("--motion", metavar="FILE", help="fly the motion recorded there, with the camera for 20 km")
+    parser.add_argument("--from", type=float, default=0.0, dest="from_s", metavar="X", help="first second of it (0)")
+    parser.add_argument(
+        "--ground", type=float, default=GROUND_M, metavar="X",
+        help=f"height of the ground under it above the ellipsoid, m ({GROUND_M:g})",
+    )  # fmt: skip
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--csv", metavar="FILE", help="also write a row of figures for each row and setting")
 
@@ -51,10 +64,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if min(args.seeds, args.jobs, args.strips) < 1 or args.first < 0 or not args.seconds > 0:
         raise UserError("wanted --seeds, --jobs, --strips 1 at least, --first 0 at least, --seconds more than 0")
+    if args.motion and args.strips > 1:
+        raise UserError("a motion is one strip: wanted --motion or --strips")
+    if not args.motion and (args.from_s or args.ground != GROUND_M):
+        raise UserError("--from and --ground belong to a motion: wanted --motion")
+    motion = _motion(args) if args.motion else None
     rows = [row for row in ROWS if row in args.rows]
     keys = [(setting, row) for setting in args.settings for row in rows]
     seeds = range(args.first, args.first + args.seeds)
-    cases = [(setting, row, seed, args.strips, args.seconds, args.online) for setting, row in keys for seed in seeds]
+    cases = [
+        (setting, row, seed, args.strips, args.seconds, args.online, motion, args.told)
+        for setting, row in keys
+        for seed in seeds
+    ]
     flights: dict[tuple[str, str], list[FlightFigures]] = {key: [] for key in keys}
     with progress("flights", args.quiet or args.json) as tell, ProcessPoolExecutor(args.jobs) as pool:
         for i, found in enumerate((pool.map if args.jobs > 1 else map)(_fly, cases)):
@@ -67,13 +89,20 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(document(args, cells, flights), indent=2))
     else:
-        print("\n".join(lines(cells, args.seeds, args.strips, args.seconds)))
+        print("\n".join(lines(cells, args.seeds, _flown(args))))
     return 0
 
 
-def _fly(case: tuple[str, str, int, int, float, str]) -> FlightFigures:
-    setting, row, seed, strips, seconds, online = case
-    return fly(setting, row, seed, strips, seconds, ONLINE[online])
+def _motion(args: argparse.Namespace) -> RealMotion:
+    try:
+        return motion_of(Path(args.motion), args.ground, args.from_s, args.seconds)[0]
+    except ValueError as error:
+        raise UserError(str(error)) from None
+
+
+def _fly(case: tuple[str, str, int, int, float, str, RealMotion | None, bool]) -> FlightFigures:
+    setting, row, seed, strips, seconds, online, motion, told = case
+    return fly(setting, row, seed, strips, seconds, ONLINE[online], motion, told)
 
 
 def document(
@@ -82,6 +111,7 @@ def document(
     """The machine-readable result: figures of each row and setting, and of each flight."""
     return {
         "seeds": args.seeds, "first": args.first, "strips": args.strips, "seconds": args.seconds, "online": args.online,
+        "motion": args.motion or "", "told": args.told,
         "cells": [
             {**plain(asdict(cell)), "true": world_text(ROWS[cell.row].world),
              "each": [plain(asdict(f)) for f in flights[cell.setting, cell.row]]}
@@ -106,10 +136,19 @@ def write_csv(cells: Sequence[Cell], path: Path) -> None:
         writer.writerows(table)
 
 
-def lines(cells: Sequence[Cell], seeds: int, strips: int, seconds: float) -> list[str]:
+def _flown(args: argparse.Namespace) -> str:
+    return _what(args) + (", true wander stated" if args.told else "")
+
+
+def _what(args: argparse.Namespace) -> str:
+    if args.motion:
+        return f"{args.seconds:g} s of {Path(args.motion).name}"
+    return f"{args.strips} strip{'s' if args.strips > 1 else ''} of {args.seconds:g} s"
+
+
+def lines(cells: Sequence[Cell], seeds: int, flown: str) -> list[str]:
     """The figures as a table a setting, what the light said in the worst flight, and which limits do not hold."""
-    flown = f"{seeds} flights a row, {strips} strip{'s' if strips > 1 else ''} of {seconds:g} s"
-    out = [f"worlds that are not as stated: {flown}; 3D RMSE of points, m"]
+    out = [f"worlds that are not as stated: {seeds} flights a row, {flown}; 3D RMSE of points, m"]
     for setting in dict.fromkeys(cell.setting for cell in cells):
         out += ["", _HEAD.format(setting)]
         mine = [cell for cell in cells if cell.setting == setting]

@@ -8,7 +8,7 @@ told what `ErrorModel` and `ObservationPlan` state and nothing of the `World`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import process_time
 
 import numpy as np
@@ -25,7 +25,8 @@ from .error_models import ErrorModel
 from .flight import FlightPlan
 from .flight_network import batch_errors, network_of
 from .misstated import AS_STATED, Sine, Step, World
-from .scenario import ObservationPlan, Simulation, simulate
+from .real_motion import RealMotion
+from .scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
 from .window_study import (
     Errors,
     TimedPose,
@@ -219,7 +220,14 @@ def through_window(simulation: Simulation, poses: list[TimedPose]) -> OnlineAnsw
 
 
 def fly(
-    setting: str, row: str, seed: int, strips: int = 1, strip_s: float = 60.0, online: Online = through_window
+    setting: str,
+    row: str,
+    seed: int,
+    strips: int = 1,
+    strip_s: float = 60.0,
+    online: Online = through_window,
+    motion: RealMotion | None = None,
+    told: bool = False,
 ) -> FlightFigures:
     """One flight of a row, navigated, adjusted on line and in batch.
 
@@ -228,10 +236,19 @@ def fly(
     setting, row : keys of `SETTINGS` and `ROWS`
     strips, strip_s : parallel strips, each so long
     online : the on-line system
+    motion : what is flown instead of these strips
+    told : whether the true sigmas and correlation times of the wander are stated, to see what the data allow at best
     """
     begun = process_time()
-    plan = FlightPlan(strips=strips, strip_s=strip_s, turns=False, gap_s=8.0, lead_in_s=5.0, lead_out_s=3.0)
-    simulation = simulate(plan, seed, SETTINGS[setting], OBSERVED, world=ROWS[row].world)
+    if motion is None:
+        plan = FlightPlan(strips=strips, strip_s=strip_s, turns=False, gap_s=8.0, lead_in_s=5.0, lead_out_s=3.0)
+        simulation = simulate(plan, seed, SETTINGS[setting], OBSERVED, world=ROWS[row].world)
+    else:
+        simulation = simulate_real_motion(
+            motion, seed, SETTINGS[setting], OBSERVED, as_sensors=True, world=ROWS[row].world
+        )
+    if told:
+        simulation = replace(simulation, errors=simulation.world.errors(simulation.errors))
     poses = navigate(simulation)
     answer = online(simulation, poses)
     batch, _ = adjust_in_batch(simulation, poses, answer, components=False)
@@ -318,6 +335,7 @@ def adjust_in_batch(
 
 _STATED = (
     "offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg", "wander_time_s",
+    "attitude_wander_time_s",
 )  # fmt: skip
 
 

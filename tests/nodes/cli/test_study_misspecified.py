@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from places import MOTION, needs_motion
 
 from triline.nodes.cli import main
 from triline.nodes.cli.misspecified_nodes import answer_of, processed
@@ -21,6 +22,7 @@ from triline.solver.simulation.misspecified_study import (
     Quality,
     cell_of,
     cells_of,
+    fly,
     online_quality,
     still_refused,
     through_window,
@@ -56,6 +58,37 @@ def test_the_command(tmp_path, capsys):
         read = list(csv.DictReader(rows))
     assert [row["row"] for row in read] == ["stated", "gnss-datum"]
     assert float(read[1]["direct_m"]) == datum["direct_m"] and read[0]["limit light"] in ("0", "1")
+
+
+@needs_motion
+def test_a_recorded_motion_with_errors_on_top(capsys):
+    """A boresight of 0.05 deg is 17 m on the ground, 20 km below; the images see it."""
+    words = ["study", "misspecified", "--motion", str(MOTION), "--from", "900", "--seconds", "40", "--seeds", "1"]
+    assert (
+        main([*words, "--rows", "boresight", "--settings", "rtk", "--online", "window", "--jobs", "1", "--json"]) == 0
+    )
+    cell = json.loads(capsys.readouterr().out)["cells"][0]
+    assert cell["direct_m"] > 17.0 and cell["online_m"] < 5.0
+
+
+def test_a_motion_is_one_strip(capsys):
+    assert main(["study", "misspecified", "--motion", str(MOTION), "--strips", "3"]) == 1
+    assert "--motion or --strips" in capsys.readouterr().err
+    assert main(["study", "misspecified", "--from", "800"]) == 1
+    assert "wanted --motion" in capsys.readouterr().err
+
+
+def test_what_is_told_is_the_true_wander():
+    """In a world as stated there is nothing to tell; in another one the model has its correlation time."""
+    heard = []
+
+    def online(simulation, poses):
+        heard.append(simulation.errors)
+        return through_window(simulation, poses)
+
+    for row in ("wander-time", "stated"):
+        fly("rtk", row, 1, strip_s=12.0, online=online, told=True)
+    assert heard == [replace(SETTINGS["rtk"], wander_time_s=10.0), SETTINGS["rtk"]]
 
 
 def test_the_nodes_give_what_process_gives(tmp_path):
