@@ -104,9 +104,11 @@ TOPICS: tuple[Topic, ...] = (
         "observation/progress", m.Progress, _O, 20, allowed_lateness_ms=0, recorded=False, grace_s=3.0, order_only=True
     ),
     Topic("orientation/live", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0),
-    Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000),
+    # what becomes final comes beside orientation/live, and at the end of a strip after it: what its publisher says next
+    # tells whether something is missing
+    Topic("orientation/final", m.PoseInFrame, _R, 20, allowed_lateness_ms=1000, grace_s=2.0, in_bursts=True),
     Topic("orientation/whole", m.PoseInFrame, _R, 0, allowed_lateness_ms=1000),
-    Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=1000),
+    Topic("point/object", m.ObjectPoint, _R, 50, allowed_lateness_ms=1000, grace_s=2.0, in_bursts=True),
     # comes beside orientation/live: what its publisher says there tells whether one is missing, however rare they are;
     # the first one may wait for the matcher being heard first, and no longer than for that
     Topic("adjustment/report", m.AdjustmentReport, _R, 5, allowed_lateness_ms=2000, grace_s=2.0, in_bursts=True),
@@ -125,6 +127,8 @@ TOPICS: tuple[Topic, ...] = (
 #: What a flight consists of, and where the platform was: nodes that look at image lines take all of these.
 CONFIGURATION = tuple(row.name for row in TOPICS if row.family is Family.CONFIGURATION)
 POSES = ("trajectory/filtered", "trajectory/smoothed")
+#: What comes at the end of a flight only once the adjuster has seen that nothing more comes.
+FINAL = ("orientation/final", "orientation/whole", "point/object")
 
 
 @lru_cache(maxsize=1024)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -23,9 +23,9 @@ from .session import KEPT_S, Bus
 from .status import StatusPublisher
 
 #: After so long without any message everything that waits is worked off. A node that lives on the results of others
-#: waits longer, so that theirs still come before.
-IDLE_S = 1.0
-IDLE_RESULTS_S = 2.0
+#: waits longer, so that theirs still come before, and one that lives on what becomes final longer still: the adjuster,
+#: which says it, lives on results itself.
+IDLE_S, IDLE_RESULTS_S, IDLE_FINAL_S = 1.0, 2.0, 4.0
 #: Time in which latched topics arrive before the first message is worked off.
 JOIN_S = 0.5
 #: Messages worked off before it is looked what has arrived meanwhile.
@@ -59,6 +59,12 @@ class _Patience:
         self._waited_s += min(seen_s - self._seen_s, self.LONGEST_WAIT_S)
         self._seen_s = seen_s
         return self._waited_s
+
+
+def _idle_s(inputs: Iterable[str]) -> float:
+    if any(name in topics.FINAL for name in inputs):
+        return IDLE_FINAL_S
+    return IDLE_RESULTS_S if any(topics.find(name).family is Family.RESULT for name in inputs) else IDLE_S
 
 
 class BusRunner:
@@ -104,13 +110,12 @@ class BusRunner:
         self._open_strip = ""
         self._collections = collections
         self._status = StatusPublisher(bus, node.name)
-        results = any(topics.find(name).family is Family.RESULT for name in node.inputs)
         # Who publishes nothing needs no order, and must not slow down those who do.
         self._ordered = bool(node.outputs)
         listened = self._driver.inputs
         asked = listened if self._ordered else [name for name in listened if topics.find(name).latched]
         self._recall = Recall(bus, asked, self._check)
-        self._idle_s = IDLE_RESULTS_S if results else IDLE_S
+        self._idle_s = _idle_s(node.inputs)
 
     def stop(self) -> None:
         """Ask the runner to finish; safe in a signal handler and in any thread."""

@@ -154,13 +154,16 @@ def test_reports_of_a_busy_adjuster_come_in_order_and_rare_ones_hold_nothing_up(
 
 
 @pytest.mark.parametrize("topic", ["orientation/final", "point/object"])
-def test_the_orthoimage_may_get_the_end_of_a_strip_a_second_late(topic):
+def test_the_orthoimage_may_get_the_end_of_a_strip_two_seconds_late(topic):
     """The adjuster has flown a strip and is silent on what is live; what became final at its end comes later."""
     begin = 10**18
-    lines = [(t, "sensor/lines/N", Envelope(begin + t * MS, "s", t // 50)) for t in range(0, 6000, 50)]
+    lines = [(t, "sensor/lines/N", Envelope(begin + t * MS, "s", t // 50)) for t in range(0, 8000, 50)]
     live = [(t + 20, "orientation/live", Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 3000, 50)]
-    for behind, lost in ((900, False), (1500, True)):
-        told = [(t + behind, topic, Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 4000, 50)]
+    for behind, lost in ((1900, False), (3500, True)):
+        told = [
+            (t + (20 if t < 3000 else behind), topic, Envelope(begin + t * MS, "a", t // 50))
+            for t in range(0, 4000, 50)
+        ]
         sequencer: Sequencer = Sequencer(Rectifier.inputs)
         late = []
         for at, name, envelope in sorted([*lines, *live, *told], key=lambda m: (m[0], m[1])):
