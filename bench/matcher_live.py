@@ -1,6 +1,6 @@
 """The matcher on the bus at full rate, on two cores: player, navigator, matcher and adjuster as processes of their own.
 
-    python bench/matcher_live.py [--points 30] [--cores 2] [--json]
+    python bench/matcher_live.py [--points 45] [--cores 2] [--json]
 
 A flight of 20 s with 12 000 px x 3 CCD lines x 800 lines/s is rendered once (out/bench/full_rate.mcap, 1.2 GB) and
 replayed at its pace. All processes share the cores, the player and this listener
@@ -195,12 +195,12 @@ def lines(result: dict) -> list[str]:
 
 def met(result: dict) -> bool:
     """Whether the rate, the latency and the completeness are as wanted."""
-    return result["rays_per_s"] >= 100 and result["latency_p95_s"] < 0.5 and not result["bad"]
+    return result["rays_per_s"] >= 150 and result["latency_p95_s"] < 0.5 and not result["bad"]
 
 
 def main() -> int:
     parser = frame.parser(__doc__, as_json=True)
-    parser.add_argument("--points", type=float, default=30.0, help="tie points a second that are wanted (30)")
+    parser.add_argument("--points", type=float, default=45.0, help="tie points a second that are wanted (45)")
     parser.add_argument("--budget-mb", type=float, default=1024.0, help="for image lines (1024)")
     parser.add_argument("--cores", type=int, default=2, help="for all processes together (2)")
     parser.add_argument("--port", type=int, default=17651)

@@ -2,8 +2,9 @@
 
 What a node can do is measured: the time that it works for a second of the flight. It is the sum of what every second
 costs and of what each level saves, so that the time at a level that was never tried is known, too. A heap of messages
-alone is no reason to shed work, since it goes away if there is time enough; only one that hurts is, and then as much is
-shed as lets it go away within some seconds.
+alone is no reason to shed work, since it goes away if there is time enough. Where there is not, as much is shed as lets
+the node keep up once the heap is half as large as one that hurts, and only of one that hurts as much as lets it go away
+within some seconds.
 """
 
 from __future__ import annotations
@@ -20,52 +21,65 @@ P = TypeVar("P")
 
 #: Behind by this share of the window, and by so much at least, hurts: answers come late. Tuned.
 HURTS, HURTS_S = 0.15, 2.0
+#: From this share of it on the node has to keep up. Tuned.
+PRESSES = 0.5
 #: Behind by more, levels are used that lose nothing, s. Tuned.
 NOTICED_S = 0.5
 #: Behind by this share of the window, a level at which nothing is seen may be used. Tuned.
 ALARM = 0.4
 #: A heap is to go away within so long, s, in this share of the time there is. Tuned.
 DRAIN_S, USED = 5.0, 0.95
-#: The cost is measured over so much of the flight or of work, s; so much of what was known counts on. Tuned.
+#: The cost is measured over so much of the flight or of work, s; of the rate so much counts on. Tuned.
 MEASURED_S, KEPT = 0.5, 0.8
+#: One measurement of the rate at which the flight comes is not taken for more than this times the one before. Tuned.
+MOST_FASTER = 2.0
 #: Time between two changes, s. Tuned.
 CHANGED_S = 1.0
 #: A level at which nothing is seen is left after so long, s, to see whether there is time again. Tuned.
 BLIND_S = 10.0
-#: Before anything is known, this share of the work is there at any level. Tuned.
-FIXED = 0.3
+#: Before anything is known, this share of the work is there at any level, more or less. Tuned.
+FIXED, FIXED_SIGMA, FIXED_RANGE = 0.3, 0.15, (0.02, 0.98)
+#: From one measurement to the next the logarithm of all work changes by so much, the fixed share by so much; a measured
+#: cost scatters by so much of itself. Tuned.
+TOTAL_CHANGES, FIXED_CHANGES, COST_SIGMA = 0.1, 0.01, 0.2
+#: A cost is no less, s a second.
+LEAST_COST = 1e-3
 
 
 class Cost:
-    """Work a second of the flight, ``fixed u + saved v``, at levels that do the parts u and v of all there is to do."""
+    """Work a second of the flight, ``total (fixed u + (1 - fixed) v)``, at levels of the parts u and v of all there is.
+
+    How much there is to do changes within seconds, which part of it no level saves hardly does: an extended Kalman
+    filter of the logarithm of the total and of that part, of which one level alone tells the former only.
+    """
 
     def __init__(self) -> None:
-        self._parts: Array | None = None  # fixed and saved, s a second
-        # what is known beforehand is the ratio of the two, and little of that
-        row = np.array([1.0 - FIXED, -FIXED])
-        self._information = 0.1 * np.outer(row, row) + 1e-3 * np.eye(2)
+        self._state: Array | None = None  # logarithm of the total, s a second; the fixed part
+        self._covariance = np.diag([1.0, FIXED_SIGMA**2])
 
     def measure(self, parts: tuple[float, float], cost: float) -> None:
-        """At a level of these parts a second of the flight took ``cost`` seconds.
-
-        Only what the level tells is forgotten (directional forgetting): how the two parts are to each other, which one
-        level alone cannot tell, stays known.
-        """
-        row = np.array(parts)
-        if self._parts is None:
-            share = np.array([FIXED, 1.0 - FIXED])
-            self._parts = share * cost / max(float(row @ share), 1e-3)
-        told = self._information @ row
-        forgotten = np.outer(told, told) / float(row @ told)
-        self._information = self._information - (1.0 - KEPT) * forgotten + np.outer(row, row)
-        found = self._parts + np.linalg.solve(self._information, row) * (cost - float(row @ self._parts))
-        for k in np.flatnonzero(found < 0):  # then the other one is all there is
-            found[k], found[1 - k] = 0.0, cost / max(row[1 - k], 1e-3)
-        self._parts = found
+        """At a level of these parts a second of the flight took ``cost`` seconds."""
+        measured = np.log(max(cost, LEAST_COST))
+        if self._state is None:
+            self._state = np.array([measured - np.log(self._share(parts, FIXED)), FIXED])
+        self._covariance = self._covariance + np.diag([TOTAL_CHANGES**2, FIXED_CHANGES**2])
+        share = self._share(parts, self._state[1])
+        row = np.array([1.0, (parts[0] - parts[1]) / share])
+        told = self._covariance @ row
+        gain = told / (row @ told + COST_SIGMA**2)
+        self._covariance = self._covariance - np.outer(gain, told)
+        self._state = self._state + gain * (measured - self._state[0] - np.log(share))
+        self._state[1] = np.clip(self._state[1], *FIXED_RANGE)
 
     def at(self, parts: tuple[float, float]) -> float:
         """Seconds of work a second of the flight at a level of these parts."""
-        return 0.0 if self._parts is None else float(self._parts @ parts)
+        if self._state is None:
+            return 0.0
+        return float(np.exp(self._state[0])) * (self._share(parts, self._state[1]) if any(parts) else 0.0)
+
+    @staticmethod
+    def _share(parts: tuple[float, float], fixed: float) -> float:
+        return fixed * parts[0] + (1.0 - fixed) * parts[1]
 
 
 class Governor:
@@ -99,13 +113,14 @@ class Governor:
         window_s : of the node
         """
         self._measure(lag_s, now_s, busy_s, flown_s)
-        hurts = lag_s > max(HURTS * window_s, HURTS_S)
+        much_s = max(HURTS * window_s, HURTS_S)
+        presses, hurts = lag_s > PRESSES * much_s, lag_s > much_s
         in_need = lag_s > ALARM * window_s
         if not self._known or (now_s - self._changed_s < CHANGED_S and not in_need):
             return False
         if not self.level and lag_s <= NOTICED_S:
             return False
-        wanted = self._wanted(lag_s, hurts, in_need)
+        wanted = self._wanted(lag_s, presses, hurts, in_need)
         if not any(self._parts[self.level]) and not hurts and now_s - self._changed_s > BLIND_S:
             wanted = min(wanted, self.level - 1)
         if wanted == self.level:
@@ -125,16 +140,17 @@ class Governor:
             self._cost.measure(parts, worked / flown)
             # a heap that grows says that more comes than is worked off
             came = flown / passed / max(1.0 - (lag_s - self._begun[3]) / passed, 0.1)
-            self._rate = came if not self._known else self._rate + (1.0 - KEPT) * (came - self._rate)
+            # so does what was held back for its order and leaves together: no single measurement counts for much
+            came = np.clip(came, self._rate / MOST_FASTER, self._rate * MOST_FASTER)
+            self._rate += (1.0 - KEPT) * float(came - self._rate)
             self._known = True
         self._begun = busy_s, flown_s, now_s, lag_s
 
-    def _wanted(self, lag_s: float, hurts: bool, in_need: bool) -> int:
-        """The best level that leaves time to work a heap off, or, without one that hurts, that keeps up."""
-        drain = 1.0 + lag_s / DRAIN_S if hurts else 1.0
-        most = USED / (self._rate * drain)
+    def _wanted(self, lag_s: float, presses: bool, hurts: bool, in_need: bool) -> int:
+        """The best level that keeps up, and leaves time to work a heap off that hurts."""
+        most = USED / (self._rate * (1.0 + lag_s / DRAIN_S if hurts else 1.0))
         last = max(k for k, parts in enumerate(self._parts) if parts[0] > 0 or in_need)
-        if not hurts:  # work is shed where it hurts only; what was shed comes back when there is time
+        if not presses:  # work is shed where it has to be only; what was shed comes back when there is time
             last = max(self.level, self._lossless)
         wanted = next((k for k in range(last) if self._cost.at(self._parts[k]) <= most), last)
         return max(wanted, self.level) if hurts else wanted

@@ -22,8 +22,9 @@ PROMPT = 0.8
 BANDS, MEMORY_S = 8, 10.0
 #: At most so many places are tried for one tie point that is wanted; the share that succeeds before anything is known.
 MOST_TRIED, FIRST_YIELD = 2.5, 0.5
-#: The wanted density is changed within these factors by what the window holds.
-LEAST_FACTOR, MOST_FACTOR = 0.2, 2.0
+#: The wanted density is changed within these factors by what the window holds; what comes within so many seconds
+#: anyway is as good as there: without that, a strip with many points would begin with twice as many as it needs.
+LEAST_FACTOR, MOST_FACTOR, SOON_S = 0.2, 2.0, 2.0
 #: Two places are so much of the matching window apart at least, along or across: what lies on the border of two cells
 #: would be the best of both. Errors at one place are the same (correlation 0.98; 0.5 at 5 px, 0.2 at 10, 0.05 at 16).
 APART = 0.75
@@ -62,7 +63,7 @@ class Density:
     def window_holds(self, points: int, rays: int) -> None:
         """What the adjustment's window holds: few points are given company, too many rays get fewer."""
         o = self.options
-        few = min(o.window_points / max(points, 1), MOST_FACTOR)
+        few = min(o.window_points / (points + SOON_S * o.points_per_s), MOST_FACTOR)
         many = o.window_rays / max(rays, 1)
         self._factor = float(np.clip(min(max(few, 1.0), many), LEAST_FACTOR, MOST_FACTOR))
 

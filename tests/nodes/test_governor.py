@@ -77,6 +77,25 @@ def test_full_work_comes_back_as_fast_as_it_went():
     assert node.share(0, 30) == 1.0 and node.share(70, 120) == 1.0
 
 
+def test_a_burst_of_work_is_no_reason_to_shed_most_of_it():
+    """Six seconds of twice the work that can be done: some of it is shed, and all comes back."""
+    node = Node(lambda flown, parts: 0.15 * parts[0] + (1.4 if 30 < flown < 36 else 0.45) * parts[1])
+    assert node.share(30, 45) > 0.75 and min(SHARES[k] for k in node.level) >= 0.5
+    assert node.lag_s.max() < 1.5 and not node.level[500:].any()
+
+
+def test_a_heap_that_leaves_together_is_not_taken_for_a_flight_that_comes_faster():
+    """What was held back for its order for two seconds comes at once, and waits for the work on it only."""
+    governor, flown, now, busy = Governor(PARTS), 100.0, 0.0, 0.0
+    for _ in range(60):
+        flown, now, busy = flown + 0.1, now + 0.1, busy + 0.05
+        assert not governor.look(0.0, now, busy, flown, WINDOW_S)
+    now += 2.0
+    for k in range(20):  # all of it within a second, and the last one waited for it
+        flown, now, busy = flown + 0.1, now + 0.05, busy + 0.05
+        assert not governor.look(0.05 * (k + 1) + 0.2, now, busy, flown, WINDOW_S)
+
+
 def test_a_load_just_below_what_can_be_done_is_left_alone():
     assert not Node(_of(0.2, 0.77)).level.any()
 

@@ -183,12 +183,20 @@ def test_points_keep_their_names_from_strip_to_strip(tmp_path):
     assert rejected < 0.03 * sum(len(tie.images) for tie in ties)
 
 
+def test_where_many_points_are_wanted_an_empty_window_asks_for_no_more():
+    density = Density(MatchingOptions(points_per_s=45.0, window_points=60))
+    density.window_holds(points=0, rays=0)
+    assert density.cells(10.0)[0] == pytest.approx(900, abs=2)
+
+
 def test_density_follows_the_window_and_the_success_of_its_places():
     density = Density(MatchingOptions(points_per_s=8.0, window_points=60, window_rays=600))
     first, borders = density.cells(10.0)
     assert first == pytest.approx(160, abs=2) and np.ptp(np.diff(borders)) < 1e-9
-    density.window_holds(points=20, rays=60)
+    density.window_holds(points=10, rays=30)
     assert density.cells(10.0)[0] == pytest.approx(320, abs=4)
+    density.window_holds(points=20, rays=60)  # 16 more come within two seconds
+    assert density.cells(10.0)[0] == pytest.approx(160 * 60 / 36, abs=4)
     density.window_holds(points=400, rays=1200)
     assert density.cells(10.0)[0] == pytest.approx(80, abs=2)
     density.window_holds(points=100, rays=300)
