@@ -60,16 +60,17 @@ class Cost:
     def measure(self, parts: tuple[float, float], cost: float) -> None:
         """At a level of these parts a second of the flight took ``cost`` seconds."""
         measured = np.log(max(cost, LEAST_COST))
-        if self._state is None:
-            self._state = np.array([measured - np.log(self._share(parts, FIXED)), FIXED])
+        state = self._state
+        if state is None:
+            state = np.array([measured - np.log(self._share(parts, FIXED)), FIXED])
         self._covariance = self._covariance + np.diag([TOTAL_CHANGES**2, FIXED_CHANGES**2])
-        share = self._share(parts, self._state[1])
+        share = self._share(parts, state[1])
         row = np.array([1.0, (parts[0] - parts[1]) / share])
         told = self._covariance @ row
         gain = told / (row @ told + COST_SIGMA**2)
         self._covariance = self._covariance - np.outer(gain, told)
-        self._state = self._state + gain * (measured - self._state[0] - np.log(share))
-        self._state[1] = np.clip(self._state[1], *FIXED_RANGE)
+        total, fixed = state + gain * (measured - state[0] - np.log(share))
+        self._state = np.array([total, np.clip(fixed, *FIXED_RANGE)])
 
     def at(self, parts: tuple[float, float]) -> float:
         """Seconds of work a second of the flight at a level of these parts."""
