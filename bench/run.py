@@ -33,8 +33,8 @@ DOCS = ROOT / "docs"
 LONG_MIN = 30.0
 #: `make bench` measures speed, all of it in less than 25 minutes on two idle cores; the others are `make study`.
 SPEED = (
-    "latency", "tie-latency", "window-peers", "hour", "bus-load", "recordings", "rotations", "replay", "batch",
-    "navigation", "matcher", "orthoimage", "rectification", "satellites",
+    "latency", "tie-latency", "demo-cores", "window-peers", "hour", "bus-load", "recordings", "rotations", "replay",
+    "batch", "navigation", "matcher", "orthoimage", "rectification", "satellites",
 )  # fmt: skip
 
 
@@ -216,6 +216,12 @@ BENCHMARKS = (
             "python bench/tie_latency.py",
             "python bench/tie_latency.py --selfcal tls18 --computed",
         ),
+        4,
+    ),
+    Benchmark(
+        "demo-cores",
+        "Does a live flight keep up on two cores, and what does each of its processes take?",
+        ("python bench/demo_cores.py",),
         4,
     ),
     Benchmark(

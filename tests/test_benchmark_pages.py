@@ -80,7 +80,12 @@ def test_a_failed_program_leaves_its_block(run, tmp_path, monkeypatch, code, wri
 
 @pytest.mark.parametrize("program", sorted({path.stem for path in BENCH.glob("*.py")} - {"run"}))
 def test_what_a_program_imports_exists(program, monkeypatch):
-    for extra in {"bus_load": ["psutil"], "matcher_live": ["psutil"], "matcher": ["psutil", "cv2"]}.get(program, []):
+    for extra in {
+        "bus_load": ["psutil"],
+        "demo_cores": ["psutil"],
+        "matcher_live": ["psutil"],
+        "matcher": ["psutil", "cv2"],
+    }.get(program, []):
         pytest.importorskip(extra, reason="of the extra `bench`")
     monkeypatch.syspath_prepend(str(BENCH))
     assert importlib.import_module(program).__doc__

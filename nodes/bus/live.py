@@ -30,6 +30,8 @@ IDLE_S, IDLE_RESULTS_S, IDLE_FINAL_S = 1.0, 2.0, 4.0
 JOIN_S = 0.5
 #: Messages worked off before it is looked what has arrived meanwhile.
 MOST_AT_ONCE = 64
+#: A node that only looks on takes what came in so long together, s, and is not woken for every message.
+LOOK_ON_S = 0.03
 #: How often a node is told how far it is behind.
 LAG_PERIOD_S = 0.1
 #: A steady input that says nothing for so long while the flight goes on is an alarm, s; ties may be rare for a while.
@@ -132,6 +134,8 @@ class BusRunner:
         self._join()
         heard = self._patience.now_s()
         while not self._stop.is_set():
+            if not self._ordered:
+                self._stop.wait(LOOK_ON_S)
             raws = self._inbox.take(0.0 if self._sequencer.ready else 0.02)
             raws = self._recall.complete(raws) if self._ordered else self._recall.once(raws)
             now = self._patience.now_s()
