@@ -155,7 +155,7 @@ class Leaving:
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
             return limit_s
         old = [b for b in self._network.batches if b.oldest_s <= limit_s]
-        return _until(old, max(LEAST_LEAVING, sum(len(b.rays) for b in old) * passed_s / LEAVING_S), limit_s)
+        return _until(old, max(LEAST_LEAVING, sum([len(b.rays) for b in old]) * passed_s / LEAVING_S), limit_s)
 
     def _marginalise(self, numbers: IntArray, final: LeftOrientation | None = None) -> None:
         """Marginalise unknowns, with all that stands beside them, and keep what leads back to them."""
@@ -182,7 +182,7 @@ class Leaving:
         if not np.isfinite(limit_s) and limit_s < 0:
             return
         self._network.intake.forget(limit_s - length_s)
-        used = min((b.oldest_s for b in self._network.batches), default=np.inf)
+        used = min([b.oldest_s for b in self._network.batches], default=np.inf)
         waiting = self._network.intake.oldest_waiting_s
         finals = min(
             (s.final_to_s for s in self._network.strips.values() if not s.is_gone(self._network.state)), default=np.inf

@@ -12,6 +12,8 @@ know of it (`block.ties`), and after each strip by a solution of the block as a 
 
 from __future__ import annotations
 
+from heapq import nsmallest
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -392,8 +394,8 @@ class Window:
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""
         first = self._quality.integrity.most_exposed
-        waiting = sorted((b for b in self.network.batches if b.tested >= 0), key=lambda b: (b is not first, b.tested))
-        waiting = waiting[: self.options.retest]
+        tested = [b for b in self.network.batches if b.tested >= 0]
+        waiting = nsmallest(self.options.retest, tested, key=lambda b: (b is not first, b.tested))
         due, rays = [], 0
         for batch in waiting:
             if due and rays + len(batch.rays) > MOST_RETESTED:
@@ -462,17 +464,18 @@ class Window:
             if state.solution != solution:
                 self._orientation.forget()
         result.events += findings.events
-        unknowns = len(state) + sum(b.determined for b in batches)
+        counts = batches.counts()
+        unknowns = len(state) + counts.determined
         return WindowReport(
             **vars(fit),
-            observations=unknowns + sum(b.information.rows for b in batches),
+            observations=unknowns + counts.redundancy,
             unknowns=unknowns,
             iterations=iterations,
             start_s=min((s.final_to_s for s in flown), default=self._now_s),
             end_s=self._newest_ray_s,
-            rays=sum(b.active_rays for b in batches),
-            points=sum(b.n_points for b in batches),
-            control=sum(b.active_control for b in batches),
+            rays=counts.rays,
+            points=counts.points,
+            control=counts.control,
             strip=newest.id if newest else "",
             parameters=parameters(self.network, newest, findings.standing) if newest else (),
             quality=findings,

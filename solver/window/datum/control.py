@@ -209,6 +209,8 @@ class ControlTests:
     def _of_batch(self, batch: Batch, cell: Cell | None = None) -> list[Biases]:
         """Biases of the coordinates of a batch that can be judged, by point."""
         found, intake = [], self._network.intake
+        if intake.control.keys().isdisjoint(batch.names):
+            return []
         checkable = (batch.normals.rank == 3) & (batch.points_left > 0)
         for p, name in enumerate(batch.names):
             if name not in intake.control or not checkable[p]:

@@ -15,7 +15,7 @@ of another group. Which group it is, or which ones cannot be told apart, see `ad
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -32,13 +32,13 @@ from ...adjustment.drift_hypotheses import (
     covers,
     hypotheses,
 )
-from ...adjustment.ray_statistics import whitened_pixels
 from ...adjustment.reduced_system import DenseFactor
 from ...arrays import Array, IntArray
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from ..state.batch import Batch, Information
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border, Marginal
+from .cells import Drifting, cells_of
 from .drifts import MOST_GROUPS, Cell, Compensation, Named, estimated
 
 #: Age at which a batch is taken in, s: by then data snooping has removed its gross errors. Tuned.
@@ -119,14 +119,15 @@ class DriftMonitor:
         settled = [b for b in mine if b.newest_s <= now_s - (0.0 if self.biased else JUDGED_S)]
         new = [b for b in settled if id(b) not in self._cells]
         changed = [b for b in settled if (k := self._cells.get(id(b))) and k[1].information is not b.information]
-        for batch in new if self.biased else ():
-            self._take(batch)
-        rays = 0
+        if self.biased:
+            self._take(new)
+        rays, turn = 0, list[Batch]()
         for batch in changed if self.biased else new + changed:
             if rays > AT_ONCE:
                 break
-            self._take(batch)
+            turn.append(batch)
             rays += len(batch.rays)
+        self._take(turn)
         if now_s >= self._next_s:
             self._next_s = now_s + TEST_EVERY_S
             self._test(now_s, mine)
@@ -134,15 +135,16 @@ class DriftMonitor:
     def _mine(self, batches: Iterable[Batch]) -> list[Batch]:
         return [b for b in batches if b.strips[-1] == self._strip]
 
-    # -- cells: the drifts of one batch --------------------------------------------------------------------------------
+    # -- cells: the drifts of single batches ---------------------------------------------------------------------------
 
     def cells(self, batches: Iterable[Batch]) -> dict[int, Cell]:
         """Drifts of the rays of batches as these are now, by identity of the batch."""
-        return {id(b): cell for b in self._mine(batches) if (cell := self._take(b)) is not None}
+        mine = self._mine(batches)
+        return {id(b): cell for b, cell in zip(mine, self._take(mine), strict=True) if cell is not None}
 
     def cell_of_single(self, batch: Batch) -> Cell | None:
         """Drifts of the rays of a batch of points with one look each, which is no part of the window."""
-        return self._cell(batch, 2) if self._mine([batch]) else None
+        return self._made(self._mine([batch]), 2)[0] if batch.strips[-1] == self._strip else None
 
     def leave(self, batches: list[Batch]) -> dict[int, Cell]:
         """Batches leave the window; call before they are fixed. Returns their cells, by identity of the batch."""
@@ -153,50 +155,37 @@ class DriftMonitor:
             self._left_shared += cell.shared
         return cells
 
-    def _take(self, batch: Batch) -> Cell | None:
-        """The cell of a batch as it is now; it is kept."""
-        known = self._cells.get(id(batch))
-        if known is not None and known[1].information is batch.information:
-            return known[1]
-        cell = self._cell(batch)
-        if cell is not None:
-            self._cells[id(batch)] = batch, cell
-        else:
-            self._cells.pop(id(batch), None)
-        return cell
+    def _take(self, batches: Sequence[Batch]) -> list[Cell | None]:
+        """The cells of batches as these are now; they are kept."""
+        known = [self._cells.get(id(b)) for b in batches]
+        changed = [b for b, k in zip(batches, known, strict=True) if k is None or k[1].information is not b.information]
+        for batch, cell in zip(changed, self._made(changed), strict=True):
+            if cell is not None:
+                self._cells[id(batch)] = batch, cell
+            else:
+                self._cells.pop(id(batch), None)
+        return [kept[1] if (kept := self._cells.get(id(b))) is not None else None for b in batches]
 
-    def _cell(self, batch: Batch, rank: int = 3) -> Cell | None:
-        """Of rays with weight at points of that rank at least; None if no group that is watched has any."""
-        state, groups = self._network.state, self._network.intake.sources_of(batch)
-        for group in groups:
-            if group not in self._groups and len(self._groups) < MOST_GROUPS:
-                self._groups[group] = len(self._groups)
-        numbers = np.array([self._groups.get(g, -1) for g in groups])
-        use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] >= rank) & (numbers >= 0))
-        if not len(use):
-            return None
-        present, of_ray = np.unique(numbers[use], return_inverse=True)
-        rays, n, k = batch.rays, len(batch.rays), EACH * len(present)
-        pixels = whitened_pixels(rays, batch.lin, batch.whitening)
-        since = (rays.time_s - self._start_s) / DRIFT_S
-        effect = np.zeros((n, 2, len(present), 2, 2))  # of a line and a sample, constant and drifting
-        effect[use, :, of_ray] = np.stack([pixels, pixels * since[:, None, None]], axis=2)[use]
-        effect = effect.reshape(n, 2, k)
-        v = np.einsum("nij,nj->ni", pixels, batch.residuals_px(state))
-        W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(batch.inverse_factors, 1, 2)[rays.point]
-        coupling = np.add.reduceat(np.swapaxes(W, 1, 2) @ effect, batch.first_ray[:-1], axis=0)
-        rows = (batch.full_rows - W @ batch.coupling[rays.point]).reshape(2 * n, -1)
-        flat, of_points = effect.reshape(2 * n, k), coupling.reshape(-1, k)
-        G = rows.T @ flat
-        score = flat.T @ v.ravel() + state.values(batch.columns) @ G
-        places = (EACH * present[:, None] + np.arange(EACH)).ravel()
-        of_position = batch.lin.orientation[:, :3].transpose(2, 0, 1)[use]
-        shared = 0.5 * float(np.einsum("nij,njk,nik->", of_position, batch.pose_covariance[use, :3, :3], of_position))
-        return Cell(
-            batch.information, batch.weight.copy(), self._strip, places,
-            Border(batch.columns, G, flat.T @ flat - of_points.T @ of_points, score),
-            np.bincount(numbers[use], minlength=MOST_GROUPS), shared, effect, coupling,
-        )  # fmt: skip
+    def _made(self, batches: Sequence[Batch], rank: int = 3) -> list[Cell | None]:
+        """Cells of rays with weight at points of that rank at least; None where no group that is watched has any."""
+        cells: list[Cell | None] = [None] * len(batches)
+        alike: dict[bytes, list[tuple[int, Drifting]]] = {}
+        for i, batch in enumerate(batches):
+            groups = self._network.intake.sources_of(batch)
+            for group in dict.fromkeys(groups):
+                if group not in self._groups and len(self._groups) < MOST_GROUPS:
+                    self._groups[group] = len(self._groups)
+            numbers = np.array([self._groups.get(g, -1) for g in groups])
+            use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] >= rank) & (numbers >= 0))
+            if len(use):
+                present, of_ray = np.unique(numbers[use], return_inverse=True)
+                alike.setdefault(present.tobytes(), []).append((i, Drifting(batch, use, present, of_ray)))
+        for some in alike.values():
+            of_some = [drifting for _, drifting in some]
+            made = cells_of(of_some, self._network.state, self._strip, self._start_s, DRIFT_S)
+            for (i, _), cell in zip(some, made, strict=True):
+                cells[i] = cell
+        return cells
 
     # -- the border: the drifts of all batches of the strip ------------------------------------------------------------
 
@@ -218,7 +207,7 @@ class DriftMonitor:
         """Cells of those of the batches that have been taken in and have lost no ray since."""
         present = {id(b): b for b in batches}
         self._cells = {key: kept for key, kept in self._cells.items() if key in present}
-        return {k: c for k, (b, c) in self._cells.items() if np.array_equal(c.weight, b.weight)}
+        return {k: c for k, (b, c) in self._cells.items() if c.weight is b.weight or np.array_equal(c.weight, b.weight)}
 
     def _assembled(self, now_s: float, cells: dict[int, Cell]) -> tuple[Border, list[Hypothesis], float]:
         """The border of these batches and those that have left, beside all unknowns of the state, at theta = 0; what
@@ -314,7 +303,7 @@ class DriftMonitor:
         if drift is None:
             return None
         A = batch.coupling @ drift.through[self._network.state.places(batch.columns)]
-        cell = self._take(batch) if self._drift is not None and batch.strips[-1] == self._strip else None
+        cell = self._take([batch])[0] if self._drift is not None and batch.strips[-1] == self._strip else None
         if cell is not None and self._drift is not None:
             mine = np.isin(cell.places, self._drift[0])
             A[:, :, np.searchsorted(self._drift[0], cell.places[mine])] -= cell.coupling[:, :, mine]

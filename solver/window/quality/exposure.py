@@ -235,8 +235,8 @@ class Integrity:
 
     def note(self, batches: Iterable[Batch]) -> None:
         """Find the most exposed observations of batches that have been judged since; forget those taken apart."""
-        present = self._network.batches
-        self._of_batch = {key: known for key, known in self._of_batch.items() if known.batch in present}
+        for key in self._network.batches.missing(self._of_batch.keys()):
+            del self._of_batch[key]
         for batch in batches:
             if batch.judged is None:
                 continue
@@ -263,7 +263,7 @@ class Integrity:
         assert batch.judged is not None
         cofactors, rays, weight = batch.judged[1], batch.rays, batch.control.weight
         L, n = batch.inverse_factors, len(rays)
-        W = batch.lin.point.transpose(2, 0, 1) @ np.swapaxes(L, 1, 2)[rays.point]
+        W, rows_of_rays = batch.without_points
         point, axis = np.nonzero(weight > 0)
         through_point = (weight * np.einsum("pia,pia->pa", L, L))[point, axis]
         adjusted = (weight * np.einsum("pii->pi", cofactors.points))[point, axis]
@@ -273,11 +273,11 @@ class Integrity:
         leverages[:n][(batch.weight == 0) | (batch.normals.rank[rays.point] < 3)] = 0.0
         order = np.argsort(-leverages)
         chosen = order[: max(1, int((leverages[order[:OF_BATCH]] > SMALL).sum()))]
-        full, found = batch.full_rows, []
+        found = []
         for i, inverse in zip(chosen.tolist(), inverses_of(C[chosen]), strict=True):
             if i < n:
                 place, p, a, sigma_m = i, int(rays.point[i]), -1, 0.0
-                rows = full[i] - W[i] @ batch.coupling[p]
+                rows = rows_of_rays[i]
             else:
                 place = p = int(point[i - n])
                 a = int(axis[i - n])

@@ -60,12 +60,9 @@ class ConsensusSchedule:
         if not fresh:
             return []
         strip = max(batch.strips[-1] for batch in fresh)
-        mine, count, refused = [], 0, 0
-        for batch in batches:
-            if strip in batch.strips:
-                mine.append(batch)
-                count += batch.n_points
-                refused += batch.control_refused if batch.active_control else 0
+        mine = [batch for batch in batches if strip in batch.strips]
+        count = sum([batch.n_points for batch in mine])
+        refused = sum([batch.control_refused for batch in mine if batch.counts.control])
         asked, before = self.asked.get(strip, 0), self.refused.get(strip, 0)
         step = next((n for n in YOUNG if n > asked), np.inf)
         if step == np.inf and count < asked:  # points that were counted have left
@@ -80,7 +77,7 @@ class ConsensusSchedule:
         chosen: list[Batch] = []
         points = 0
         for batch in mine if due else ():
-            if not chosen or points + batch.n_points <= MOST_POINTS or batch.active_control:
+            if not chosen or points + batch.n_points <= MOST_POINTS or batch.counts.control:
                 chosen.append(batch)
                 points += batch.n_points
         return chosen if any((b.weight == 0).any() for b in chosen) else []

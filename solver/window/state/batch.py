@@ -6,13 +6,16 @@ Residuals, weights, models and statistics are those of the batch adjustment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ...adjustment.covariance import Cofactors
+from ...adjustment.drift_hypotheses import Group
 from ...adjustment.layout import Layout
-from ...adjustment.linearisation import Linearisation, linearise, linearise_and_weigh
+from ...adjustment.linearisation import Linearisation, joined_equations, linearise, linearise_and_weigh
 from ...adjustment.network import Rays
 from ...adjustment.normal_equations import ControlWeights, inverse_factors, point_normals
 from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
@@ -92,6 +95,24 @@ class PointTies:
         return TieRows(design, root, np.einsum("pij,pj->pi", root, self.xyz_l - origin_l), self.active)
 
 
+class Counts(NamedTuple):
+    """What a batch, or several, count for.
+
+    Attributes
+    ----------
+    redundancy : observations less object coordinates
+    determined : object coordinates
+    rays, control : with weight; of control whole points
+    points : with or without any
+    """
+
+    redundancy: int
+    determined: int
+    rays: int
+    control: int
+    points: int
+
+
 @dataclass
 class Batch:
     """A mini network of p points with n rays (sorted by point).
@@ -117,6 +138,7 @@ class Batch:
     counted : whether its rays are counted there
     tested : number of the update that tested it last
     judged : cofactors and statistics of the last test, and the solution of the window they are for
+    groups : source and CCD line of each ray, where they were asked for, see `Intake.sources_of`
     n_points : p
     first_ray : (p + 1,) where the rays of each point begin
     newest_s, oldest_s, strips, height_m : times of its rays, places of their strips, and how high these were flown
@@ -126,7 +148,7 @@ class Batch:
     inverse_factors : (p, 3, 3) ``L^-1`` of the points' normal matrices ``L L^T``
     coupling : (p, 3, u) how the points hang on the unknowns, times their inverse factors
     information : about the unknowns
-    active_rays, active_control, determined : rays and control points with weight, determined object coordinates
+    counts : of `information`
     """
 
     names: list[str]
@@ -145,8 +167,11 @@ class Batch:
     image_factor: float = 1.0
     counted: bool = False
     tested: int = -1
+    groups: list[Group] | None = None
     judged: tuple[int, Cofactors, RayStatistics] | None = field(init=False, repr=False, default=None)
-    _left: tuple[Array, IntArray] | None = field(init=False, repr=False, default=None)
+    _of_rays: tuple[Linearisation, Array] | None = field(init=False, repr=False, default=None)
+    _without_points: tuple[Array, Array] | None = field(init=False, repr=False, default=None)
+    _left: tuple[Array, IntArray, bool] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         self.n_points = len(self.names)
@@ -193,7 +218,7 @@ class Batch:
         """Information about the orientation, with the points eliminated, at the present linearisation and weights."""
         n, u, p = len(self.rays), len(self.columns), self.n_points
         lin = self.lin if (self.weight == 1.0).all() else self.lin.reweighted(self.weight)
-        A = self._design_rows(lin)
+        A = self.full_rows if lin is self.lin else self.full_rows * np.sqrt(self.weight)[:, None, None]
         flat = A.reshape(2 * n, u)
         # the right-hand side for theta counted from zero, the points from where they are
         lin = replace(lin, residual=lin.residual + (flat @ self.theta).reshape(n, 2).T)
@@ -219,10 +244,8 @@ class Batch:
         rhs = lin.residual.T.ravel() @ flat - y @ of_points
         off = self.control.residual(self.origin_l)
         square = float(np.vdot(lin.residual, lin.residual) + np.vdot(off, off) - y @ y)
-        self.active_rays = int((self.weight > 0).sum())
-        self.active_control = int(self.control.weight.any(axis=1).sum())
-        self.determined = int(normals.rank.sum())
-        rows = 2 * self.active_rays + self.control.n_observations - self.determined
+        active_rays, determined = int(np.count_nonzero(self.weight)), int(normals.rank.sum())
+        rows = 2 * active_rays + self.control.n_observations - determined
         if surface is not None:
             above = surface.residual(self.origin_l, 0.0)
             matrix[place, place] += surface.weight.sum()
@@ -235,7 +258,9 @@ class Batch:
             square += float(np.vdot(tied.residual, tied.residual))
             rows += int(self.ties.observations[tied.active].sum())
         self.normals, self.information = normals, Information(matrix, rhs, square, rows)
-        self.judged = None
+        control = int(np.count_nonzero(self.control.weight.any(axis=1)))
+        self.counts = Counts(rows, determined, active_rays, control, p)
+        self.judged = self._without_points = None
         self._rows, self.coupling = A, D
 
     @property
@@ -270,15 +295,24 @@ class Batch:
     @property
     def points_left(self) -> IntArray:
         """(p,) rays with weight of each point."""
+        return self._weighed()[1]
+
+    @property
+    def some_rejected(self) -> bool:
+        """Whether a ray has no weight."""
+        return self._weighed()[2]
+
+    def _weighed(self) -> tuple[Array, IntArray, bool]:
+        """Weights of the rays, rays with weight of each point, and whether another one has none."""
         if self._left is None or self._left[0] is not self.weight:  # weights are replaced, never written into
             left = np.bincount(self.rays.point, self.weight > 0, self.n_points).astype(np.int64)
-            self._left = self.weight, left
-        return self._left[1]
+            self._left = self.weight, left, int(left.sum()) < len(self.rays)
+        return self._left
 
     @property
     def control_refused(self) -> int:
         """Control points of which no ray is left."""
-        return int((self.control.weight.any(axis=1) & (self.points_left == 0)).sum()) if self.active_control else 0
+        return int((self.control.weight.any(axis=1) & (self.points_left == 0)).sum()) if self.counts.control else 0
 
     def weigh_control(self, point: int, axis: int, weight: float) -> None:
         """Give a control coordinate another weight; `eliminate` makes it count."""
@@ -295,9 +329,7 @@ class Batch:
         D, u = self.coupling, len(self.columns)
         inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
         points = np.swapaxes(L, 1, 2) @ inner @ L
-        j = self.lin.point.transpose(2, 0, 1)  # (n, 2, 3), of full weight
-        W = j @ np.swapaxes(L, 1, 2)[self.rays.point]
-        rows = self.full_rows - W @ D[self.rays.point]
+        W, rows = self.without_points
         through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
         observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
         return Cofactors(np.diagonal(Q).copy(), points, observed)
@@ -305,11 +337,22 @@ class Batch:
     @property
     def full_rows(self) -> Array:
         """Rows (n, 2, u) of the rays at full weight."""
-        return self._rows if (self.weight == 1.0).all() else self._design_rows(self.lin)
+        if self._of_rays is None or self._of_rays[0] is not self.lin:
+            self._of_rays = self.lin, self._design_rows()
+        return self._of_rays[1]
 
-    def _design_rows(self, lin: Linearisation) -> Array:
-        """Derivatives (n, 2, u) of all rays to the unknowns, with the weights of a linearisation."""
-        n, u = len(self.rays), len(self.columns)
+    @property
+    def without_points(self) -> tuple[Array, Array]:
+        """How the rays at full weight hang on the points, times their inverse factors, (n, 2, 3), and rows (n, 2, u) of
+        the rays from which the points are eliminated."""
+        if self._without_points is None:
+            W = self.lin.point.transpose(2, 0, 1) @ np.swapaxes(self.inverse_factors, 1, 2)[self.rays.point]
+            self._without_points = W, self.full_rows - W @ self.coupling[self.rays.point]
+        return self._without_points
+
+    def _design_rows(self) -> Array:
+        """Derivatives (n, 2, u) of all rays to the unknowns."""
+        n, u, lin = len(self.rays), len(self.columns), self.lin
         place, of_camera = self._places
         rows = np.zeros(2 * n * u + u + 1)  # the last ones take what a ray does not have
         for axis in range(2):
@@ -341,20 +384,16 @@ class Batch:
     def judge(self, state: WindowState) -> tuple[Cofactors, RayStatistics]:
         """Points, cofactors and statistics at the present solution; computed once for each solution."""
         if self.judged is None or self.judged[0] != state.solution:
-            theta = state.values(self.columns)
-            self.back_substitute(theta)
-            cofactors = self.cofactors(state.covariance(self.columns))
-            statistics = statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
+            lin, cofactors = self.solved(state), self.cofactors(state.covariance(self.columns))
+            statistics = statistics_of_rays(self.rays, lin, self.whitening, self.weight, cofactors)
             self.judged = state.solution, cofactors, statistics
         return self.judged[1], self.judged[2]
 
-    def residuals_px(self, state: WindowState) -> Array:
-        """Residuals (n, 2) of the rays in lines and samples at the present solution, as `judge` gives them."""
-        if self.judged is not None and self.judged[0] == state.solution:
-            return self.judged[2].v_px
+    def solved(self, state: WindowState) -> Linearisation:
+        """The linear equations at the present solution, with the points where they belong there."""
         theta = state.values(self.columns)
         self.back_substitute(theta)
-        return residuals_px(self.rays, self._at(theta), self.whitening)
+        return self._at(theta)
 
     def _at(self, theta: Array) -> Linearisation:
         """The linear equations with their residuals at values (u,) of the unknowns and the present points.
@@ -366,3 +405,16 @@ class Batch:
         shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
         moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
         return replace(self.lin, residual=self.lin.residual - moved)
+
+
+def residuals_px_of(batches: Sequence[Batch], state: WindowState) -> list[Array]:
+    """Residuals (n, 2) of the rays of batches in lines and samples at the present solution, as `Batch.judge` gives
+    them."""
+    found = [b.judged[2].v_px if b.judged is not None and b.judged[0] == state.solution else None for b in batches]
+    others = [b for b, v_px in zip(batches, found, strict=True) if v_px is None]
+    if not others:
+        return [v_px for v_px in found if v_px is not None]
+    lin, whitening = joined_equations([(b.solved(state), b.whitening) for b in others])
+    all_px = residuals_px(Rays.joined([b.rays for b in others]), lin, whitening)
+    of_others = iter(np.split(all_px, np.cumsum([len(b.rays) for b in others])[:-1]))
+    return [v_px if v_px is not None else next(of_others) for v_px in found]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, KeysView
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredTrajectory
 from ...models.platform import NO_PLATFORM_ERRORS, PlatformErrors
-from .batch import Batch
+from .batch import Batch, Counts
 from .platform import LivePlatform
 from .points import Intake
 from .sigma_factors import SigmaFactors
@@ -41,6 +41,15 @@ class Batches:
 
     def __contains__(self, batch: Batch) -> bool:
         return id(batch) in self._by_id
+
+    def missing(self, ids: KeysView[int]) -> set[int]:
+        """Which of the identities of batches that somebody still holds are not those of any of these."""
+        return ids - self._by_id.keys()
+
+    def counts(self) -> Counts:
+        """What all of them count for."""
+        every = [batch.counts for batch in self._by_id.values()]
+        return Counts(*map(sum, zip(*every, strict=True))) if every else Counts(0, 0, 0, 0, 0)
 
     def enter(self, batch: Batch) -> None:
         """A batch comes."""

@@ -129,9 +129,11 @@ class Intake:
 
     def sources_of(self, batch: Batch) -> list[Group]:
         """Source and CCD line of each ray."""
-        looks = [self.points[name].looks for name in batch.names]
-        of_rays = (looks[p][k] for p, k in zip(batch.rays.point.tolist(), batch.rays.source.tolist(), strict=True))
-        return [(look.source, look.ccd) for look in of_rays]
+        if batch.groups is None:
+            looks = [self.points[name].looks for name in batch.names]
+            of_rays = (looks[p][k] for p, k in zip(batch.rays.point.tolist(), batch.rays.source.tolist(), strict=True))
+            batch.groups = [(look.source, look.ccd) for look in of_rays]
+        return batch.groups
 
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""

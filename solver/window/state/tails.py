@@ -40,7 +40,7 @@ def _counts(batches: Iterable[Batch]) -> np.ndarray:
     looks = narrowly = 0
     for batch in batches:
         looks += len(batch.weight)
-        failed = batch.weight == 0.0
-        if batch.judged is not None and failed.any():
+        if batch.judged is not None and batch.some_rejected:
+            failed = batch.weight == 0.0
             narrowly += int((failed & (batch.judged[2].largest_w < NARROWLY * CRITICAL_W)).sum())
     return np.array([looks, narrowly], dtype=float)

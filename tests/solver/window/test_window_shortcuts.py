@@ -9,6 +9,7 @@ from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
+from triline.solver.window.state.batch import residuals_px_of
 from triline.solver.window.state.maker import BatchMaker, Draft
 from triline.solver.window.window import Window
 
@@ -44,10 +45,10 @@ def test_residuals_without_cofactors() -> None:
         nonlocal compared
         for batch in window.network.batches:
             batch.judged = None
-            alone = batch.residuals_px(window.state)
+            alone = residuals_px_of([batch], window.state)[0]
             assert batch.judged is None
             np.testing.assert_allclose(alone, batch.judge(window.state)[1].v_px, rtol=1e-12, atol=1e-12)
-            np.testing.assert_array_equal(batch.residuals_px(window.state), batch.judge(window.state)[1].v_px)
+            np.testing.assert_array_equal(residuals_px_of([batch], window.state)[0], batch.judge(window.state)[1].v_px)
             compared += 1
 
     adjust_online(simulation, navigate(simulation), live=False, watch=watch)
