@@ -96,23 +96,32 @@ def judge(
 def _search(M: Array, m: Array, usable: IntArray, price: float) -> dict[frozenset[int], float]:
     """Scores of the hypotheses worth a look, the lower the better; that of none is 0."""
     scores: dict[frozenset[int], float] = {frozenset(): 0.0}
-    beam = [frozenset[int]()]
+    beam = np.empty((1, 0), dtype=np.int64)  # sets, the places of each in order
     best, idle = 0.0, 0
     for size in range(1, min(MOST, len(usable)) + 1):
-        sets = sorted({s | {int(i)} for s in beam for i in usable if i not in s}, key=sorted)
-        places = np.array([sorted(s) for s in sets])
+        places = _with_one_more(beam, usable)
         blocks = M[places[:, :, None], places[:, None]] + UNTOLD * np.eye(size)
         right = m[places]
         drop = np.einsum("ki,ki->k", right, np.linalg.solve(blocks, right[:, :, None])[:, :, 0])
         score = price * size - drop
         order = np.argsort(score, kind="stable")[:BEAM]
-        beam = [sets[i] for i in order]
-        scores.update((sets[i], float(score[i])) for i in order)
+        beam = places[order]
+        scores.update(zip(map(frozenset, beam.tolist()), score[order].tolist(), strict=True))
         lowest = float(score[order[0]])
         best, idle = (lowest, 0) if lowest < best - 1e-9 else (best, idle + 1)
         if idle == 2:
             break
     return scores
+
+
+def _with_one_more(sets: IntArray, usable: IntArray) -> IntArray:
+    """All different sets (k, s + 1) of one place more than sets (b, s) have, each in order, and they among each other
+    as well."""
+    (b, s), n = sets.shape, len(usable)
+    more = np.column_stack([np.repeat(sets, n, axis=0), np.tile(usable, b)])
+    more = np.sort(more[(more[:, :s] != more[:, s:]).all(axis=1)], axis=1)
+    more = more[np.lexsort(more.T[::-1])]
+    return more[np.append(True, (more[1:] != more[:-1]).any(axis=1))]
 
 
 def biases(C: Array, v: Array, out: Bools) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -61,14 +61,6 @@ class Linearisation:
         """With every ray's weight multiplied by (n,) factors."""
         root = np.sqrt(factor)
         return Linearisation(self.residual * root, self.orientation * root, self.camera * root, self.point * root)
-
-
-def joined_equations(parts: Sequence[tuple[Linearisation, Whitening]]) -> tuple[Linearisation, Whitening]:
-    """Equations of rays one after the other, and their weights."""
-    lin, whitening = zip(*parts, strict=True)
-    names = ("residual", "orientation", "camera", "point")
-    both = Linearisation(*(np.concatenate([getattr(own, name) for own in lin], axis=-1) for name in names))
-    return both, Whitening(np.concatenate([own.g for own in whitening], axis=1))
 
 
 def residual_covariance(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:

@@ -116,12 +116,6 @@ class Rays:
     def __len__(self) -> int:
         return len(self.point)
 
-    @classmethod
-    def joined(cls, parts: Sequence[Rays]) -> Rays:
-        """Rays of several networks one after the other, with the points, strips and cameras that each names."""
-        names = [name for name, value in vars(parts[0]).items() if value is not None]
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
     def part(self, which: slice | IntArray) -> Rays:
         """Some of the rays; a range of them as views."""
         given = {name: value for name, value in vars(self).items() if value is not None}

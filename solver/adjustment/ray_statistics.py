@@ -78,19 +78,19 @@ def statistics_of_rays(
     return RayStatistics(v * sigma, sigma * np.sqrt(unit), np.clip(redundancy, 0.0, 1.0), w, _joint(v, C, unit))
 
 
-def residuals_px(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
-    """Residuals (n, 2) in lines and samples, as those of `ray_statistics`."""
-    v = np.einsum("nij,jn->ni", _in_sigmas(rays, lin, whitening), lin.residual)
-    return v * np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
-
-
 def whitened_pixels(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
     """What moves the whitened residuals (n, 2, 2): one pixel in the line, the first column, or in the sample."""
-    g, pitch = whitening.g, rays.pitch_mm.T
-    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T])
-    M = np.empty((len(rays), 2, 2))
+    rates = np.concatenate([rays.velocity_l, rays.angle_rate], axis=1)
+    return pixels_of_motion(rates, rays.line_period_s, rays.pitch_mm, lin.orientation, whitening.g)
+
+
+def pixels_of_motion(rates: Array, line_period_s: Array, pitch_mm: Array, orientation: Array, g: Array) -> Array:
+    """`whitened_pixels` of rays with the rates (n, 6) of the measured orientation; ``orientation``, ``g``: see
+    `Linearisation` and `Whitening`."""
+    pitch = pitch_mm.T
+    M = np.empty((len(rates), 2, 2))
     # a later line lets the computed point move on: the residual goes against the image motion
-    M[:, :, 0] = -(np.einsum("ckn,kn->cn", lin.orientation, rates) * rays.line_period_s).T
+    M[:, :, 0] = -(np.einsum("ckn,kn->cn", orientation, rates.T) * line_period_s).T
     M[:, 0, 1] = g[0] * pitch[0]
     M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
     return M

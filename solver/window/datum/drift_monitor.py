@@ -175,14 +175,15 @@ class DriftMonitor:
             for group in dict.fromkeys(groups):
                 if group not in self._groups and len(self._groups) < MOST_GROUPS:
                     self._groups[group] = len(self._groups)
-            numbers = np.array([self._groups.get(g, -1) for g in groups])
+            numbers = np.array([self._groups.get(group, -1) for group in groups])
             use = np.flatnonzero((batch.weight > 0) & (batch.normals.rank[batch.rays.point] >= rank) & (numbers >= 0))
             if len(use):
-                present, of_ray = np.unique(numbers[use], return_inverse=True)
+                present = np.array(sorted(set(numbers[use].tolist())))
+                of_ray = np.searchsorted(present, numbers[use])
                 alike.setdefault(present.tobytes(), []).append((i, Drifting(batch, use, present, of_ray)))
         for some in alike.values():
             of_some = [drifting for _, drifting in some]
-            made = cells_of(of_some, self._network.state, self._strip, self._start_s, DRIFT_S)
+            made = cells_of(of_some, self._strip, self._start_s, DRIFT_S)
             for (i, _), cell in zip(some, made, strict=True):
                 cells[i] = cell
         return cells

@@ -6,7 +6,6 @@ Residuals, weights, models and statistics are those of the batch adjustment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -15,10 +14,10 @@ import numpy as np
 from ...adjustment.covariance import Cofactors
 from ...adjustment.drift_hypotheses import Group
 from ...adjustment.layout import Layout
-from ...adjustment.linearisation import Linearisation, joined_equations, linearise, linearise_and_weigh
+from ...adjustment.linearisation import Linearisation, linearise, linearise_and_weigh
 from ...adjustment.network import Rays
 from ...adjustment.normal_equations import ControlWeights, inverse_factors, point_normals
-from ...adjustment.ray_statistics import RayStatistics, residuals_px, statistics_of_rays
+from ...adjustment.ray_statistics import RayStatistics, statistics_of_rays
 from ...adjustment.surface_control import SurfaceControl
 from ...arrays import Array, Bools, IntArray
 from .unknowns import Information, WindowState
@@ -342,11 +341,15 @@ class Batch:
         return self._of_rays[1]
 
     @property
+    def through_points(self) -> Array:
+        """How the rays at full weight hang on the points, times their inverse factors (n, 2, 3)."""
+        return self.lin.point.transpose(2, 0, 1) @ np.swapaxes(self.inverse_factors, 1, 2)[self.rays.point]
+
+    @property
     def without_points(self) -> tuple[Array, Array]:
-        """How the rays at full weight hang on the points, times their inverse factors, (n, 2, 3), and rows (n, 2, u) of
-        the rays from which the points are eliminated."""
+        """`through_points`, and rows (n, 2, u) of the rays from which the points are eliminated."""
         if self._without_points is None:
-            W = self.lin.point.transpose(2, 0, 1) @ np.swapaxes(self.inverse_factors, 1, 2)[self.rays.point]
+            W = self.through_points
             self._without_points = W, self.full_rows - W @ self.coupling[self.rays.point]
         return self._without_points
 
@@ -384,16 +387,12 @@ class Batch:
     def judge(self, state: WindowState) -> tuple[Cofactors, RayStatistics]:
         """Points, cofactors and statistics at the present solution; computed once for each solution."""
         if self.judged is None or self.judged[0] != state.solution:
-            lin, cofactors = self.solved(state), self.cofactors(state.covariance(self.columns))
-            statistics = statistics_of_rays(self.rays, lin, self.whitening, self.weight, cofactors)
+            theta = state.values(self.columns)
+            self.back_substitute(theta)
+            cofactors = self.cofactors(state.covariance(self.columns))
+            statistics = statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
             self.judged = state.solution, cofactors, statistics
         return self.judged[1], self.judged[2]
-
-    def solved(self, state: WindowState) -> Linearisation:
-        """The linear equations at the present solution, with the points where they belong there."""
-        theta = state.values(self.columns)
-        self.back_substitute(theta)
-        return self._at(theta)
 
     def _at(self, theta: Array) -> Linearisation:
         """The linear equations with their residuals at values (u,) of the unknowns and the present points.
@@ -405,16 +404,3 @@ class Batch:
         shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
         moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
         return replace(self.lin, residual=self.lin.residual - moved)
-
-
-def residuals_px_of(batches: Sequence[Batch], state: WindowState) -> list[Array]:
-    """Residuals (n, 2) of the rays of batches in lines and samples at the present solution, as `Batch.judge` gives
-    them."""
-    found = [b.judged[2].v_px if b.judged is not None and b.judged[0] == state.solution else None for b in batches]
-    others = [b for b, v_px in zip(batches, found, strict=True) if v_px is None]
-    if not others:
-        return [v_px for v_px in found if v_px is not None]
-    lin, whitening = joined_equations([(b.solved(state), b.whitening) for b in others])
-    all_px = residuals_px(Rays.joined([b.rays for b in others]), lin, whitening)
-    of_others = iter(np.split(all_px, np.cumsum([len(b.rays) for b in others])[:-1]))
-    return [v_px if v_px is not None else next(of_others) for v_px in found]

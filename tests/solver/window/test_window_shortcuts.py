@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from triline.solver.adjustment.ray_statistics import whitened_pixels
 from triline.solver.adjustment.reduced_system import DenseFactor
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
-from triline.solver.window.state.batch import residuals_px_of
+from triline.solver.window.datum.drift_monitor import DriftMonitor
 from triline.solver.window.state.maker import BatchMaker, Draft
 from triline.solver.window.window import Window
 
@@ -36,19 +37,25 @@ def test_cofactors_of_few_unknowns_of_a_singular_matrix() -> None:
     assert len(factor.undetermined.eigenvalues) == 3
 
 
-def test_residuals_without_cofactors() -> None:
-    """Of every batch of a window, at a solution for which it has not been judged."""
+def test_scores_of_drifts_are_those_of_the_residuals() -> None:
+    """Of every batch of a window, whatever solution its residuals are for."""
     simulation = simulate(FlightPlan(strip_s=12.0), 1, observation_plan=ObservationPlan(tie_points_per_s=6.0))
     compared = 0
 
     def watch(_: float, window: Window) -> None:
         nonlocal compared
-        for batch in window.network.batches:
-            batch.judged = None
-            alone = residuals_px_of([batch], window.state)[0]
-            assert batch.judged is None
-            np.testing.assert_allclose(alone, batch.judge(window.state)[1].v_px, rtol=1e-12, atol=1e-12)
-            np.testing.assert_array_equal(residuals_px_of([batch], window.state)[0], batch.judge(window.state)[1].v_px)
+        state, batches = window.state, list(window.network.batches)
+        monitor = DriftMonitor(window.network)
+        monitor.begin()
+        cells = monitor.cells(batches)
+        for batch in batches:
+            v_px = batch.judge(state)[1].v_px
+            v = np.einsum("nij,nj->ni", whitened_pixels(batch.rays, batch.lin, batch.whitening), v_px)
+            cell = cells[id(batch)]
+            B, G = cell.effect.reshape(2 * len(v), -1), batch.without_points[1].reshape(2 * len(v), -1).T
+            np.testing.assert_allclose(cell.border.G, G @ B, atol=1e-9 * np.abs(cell.border.G).max())
+            score = B.T @ v.ravel() + state.values(batch.columns) @ cell.border.G
+            np.testing.assert_allclose(cell.border.r, score, atol=1e-8 * np.abs(score).max())
             compared += 1
 
     adjust_online(simulation, navigate(simulation), live=False, watch=watch)
