@@ -234,7 +234,7 @@ def _by_chunks(
     """Range, rays, residual in mm, derivatives and depth of one chunk after the other."""
     for low in range(0, len(rays), CHUNK):
         part = slice(low, min(low + CHUNK, len(rays)))
-        own = rays.part(part)
+        own = rays if len(rays) <= CHUNK else rays.part(part)
         xy_mm = own.xy_mm.T
         if layout.shift is not None:
             position_l = own.position_l + layout.shift.orientation[part, :3]

@@ -203,21 +203,19 @@ def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Stan
         return ()
     covariance = state.covariance(numbers)
     sigma = np.sqrt(np.diagonal(covariance))
-    correlation = np.clip(covariance / np.outer(sigma, sigma), -1.0, 1.0)
+    correlation = (covariance / np.outer(sigma, sigma)).clip(-1.0, 1.0)
     np.fill_diagonal(correlation, 0.0)
     strongest = np.argmax(np.abs(correlation), axis=1).tolist()
     values = state.values(numbers)
     of_strip = len(names) - len(camera_columns)
     result = []
-    for i, ((name, unit, _), v, s) in enumerate(zip(names, values, sigma, strict=True)):
+    strongest_r = correlation[np.arange(len(names)), strongest].tolist()
+    for i, ((name, unit, _), v, s) in enumerate(zip(names, values.tolist(), sigma.tolist(), strict=True)):
         known = Standing(ESTIMATED, "")
         if i >= of_strip and standing:
             known = standing[i - of_strip]
         elif i < of_strip and s > BETTER * apriori[i]:
             known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
-        k = strongest[i]
-        partner = names[k][0] if correlation[i, k] else ""
-        result.append(
-            Parameter(name, unit, float(v), float(s), known.status, known.reason, float(correlation[i, k]), partner)
-        )
+        partner = names[strongest[i]][0] if strongest_r[i] else ""
+        result.append(Parameter(name, unit, v, s, known.status, known.reason, strongest_r[i], partner))
     return tuple(result)

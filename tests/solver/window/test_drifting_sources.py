@@ -84,7 +84,7 @@ def test_the_test_value_is_what_the_adjustment_gains_by_the_drift(flight):
     monitor, batches = DriftMonitor(window.network), list(window.network.batches)
     monitor._strip = 0
     for batch in batches:
-        monitor._take(batch)
+        monitor._take([batch])
     cells = monitor._in_border(batches)
     border, found, _ = monitor._assembled(45.0, cells)
     scores = monitor._scores(45.0, batches, cells, border)

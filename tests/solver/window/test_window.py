@@ -91,7 +91,7 @@ def test_a_window_that_lets_nothing_go_is_the_batch_adjustment(flight, model):
             strip = window.strips["S1"]
             seen["values"], seen["cov"] = window.state.values(strip.numbers), window.state.covariance(strip.numbers)
             seen["model"] = strip.model
-            seen["rays"] = sum(b.active_rays for b in window.network.batches)
+            seen["rays"] = sum(b.counts.rays for b in window.network.batches)
             seen["points"] = {n: x for b in window.network.batches for n, x in zip(b.names, b.points_l, strict=True)}
 
     adjust_online(simulation, smoothed, options, live=False, watch=watch)
