@@ -8,8 +8,9 @@ that was kept gives another place.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,24 +27,32 @@ ORIENTATION_SHARE = 1.3
 #: Rays of a point whose pairs are all tried; of more, pairs of this many.
 MOST_RAYS = 24
 
+#: Variance of a whitened residual from which on it is controlled by other rays.
+CONTROLLED = 1e-6
+
 #: Linearisations: the first point may lie far off.
 PASSES = 3
+
+#: Values of rays and pairs worked on at a time, a few hundred bytes each.
+BATCH = 100_000
 
 
 @dataclass(frozen=True)
 class Consensus:
-    """Rays of an object point that agree.
+    """Rays of m object points that agree; all of these points have k rays.
 
     Attributes
     ----------
-    rays : places among the k rays of the point
-    shift_m : (3,) from the point of linearisation to the intersection
-    rival : whether another set of as many rays gives another place
+    found : (m,) whether any two rays agree; where they do not, nothing is chosen and the shift is zero
+    chosen : (m, k) which rays agree
+    shift_m : (m, 3) from the point of linearisation to the intersection
+    rival : (m,) whether another set of as many rays gives another place
     """
 
-    rays: Places
+    found: Bools
+    chosen: Bools
     shift_m: Array
-    rival: bool
+    rival: Bools
 
 
 @dataclass(frozen=True)
@@ -63,87 +72,115 @@ class Doubt:
     reason: str
 
 
-def consensus(residual: Array, design: Array, limit: float) -> Consensus | None:
-    """Largest set of rays that agree on one place; None where no two do.
+def consensus(residual: Array, design: Array, limit: float) -> Consensus:
+    """Largest set of rays that agree on one place, for each of m points with k rays.
 
     Parameters
     ----------
-    residual : (2, k) whitened
-    design : (2, 3, k) whitened derivatives to the point
+    residual : (m, k, 2) whitened
+    design : (m, k, 2, 3) whitened derivatives to the point
     limit : of the squared residual of one ray in its sigmas (see `snooping.joint_limit`)
     """
-    k = residual.shape[1]
-    found: dict[tuple[int, ...], tuple[float, Array, Array]] = {}
-    for pair in combinations(np.unique(np.linspace(0, k - 1, min(k, MOST_RAYS)).astype(int)).tolist(), 2):
-        grown = _grown(np.array(pair), residual, design, limit)
-        if grown is not None:
-            chosen, squares, shift, Q = grown
-            found[tuple(chosen.tolist())] = (squares, shift, Q)
-    if not found:
-        return None
-    best = min(found, key=lambda rays: (-len(rays), found[rays][0]))
-    _, shift, Q = found[best]
-    apart = float(chi2.isf(chi2.sf(limit, 2), 3))
-    rival = any(
-        len(rays) == len(best) and _distance(other[1] - shift, Q + other[2]) > apart
-        for rays, other in found.items()
-        if rays != best
-    )
-    return Consensus(np.array(best, dtype=np.int64), shift, rival)
+    m, k = residual.shape[:2]
+    chosen, shift, rival = np.zeros((m, k), dtype=bool), np.zeros((m, 3)), np.zeros(m, dtype=bool)
+    sets = _grown(residual, design, limit)
+    # the largest set of each point, of these the one with the smallest residuals
+    order = np.lexsort((sets.squares, -sets.size, sets.point))
+    best = order[np.diff(sets.point[order], prepend=-1) != 0]
+    found = np.zeros(m, dtype=bool)
+    found[sets.point[best]] = True
+    chosen[sets.point[best]], shift[sets.point[best]] = sets.inside[best], sets.shift_m[best]
+    best_of = np.empty(m, dtype=np.int64)
+    best_of[sets.point[best]] = best
+    of = best_of[sets.point]
+    others = np.flatnonzero((sets.size == sets.size[of]) & (sets.inside != sets.inside[of]).any(axis=1))
+    of = of[others]
+    d, C = sets.shift_m[others] - sets.shift_m[of], sets.cofactors[others] + sets.cofactors[of]
+    apart = (d * np.linalg.solve(C, d[:, :, None])[:, :, 0]).sum(axis=1) / ORIENTATION_SHARE**2
+    rival[sets.point[others[apart > float(chi2.isf(chi2.sf(limit, 2), 3))]]] = True
+    return Consensus(found, chosen, shift, rival)
 
 
-def _grown(start: Places, residual: Array, design: Array, limit: float) -> tuple[Places, float, Array, Array] | None:
-    """A set that agrees, from a pair: takes in who agrees best and drops who disagrees, until nothing changes.
+class _Sets(NamedTuple):
+    """Sets of rays that agree: point (s,), rays (s, k), ``v^T v`` (s,), shift (s, 3), cofactors (s, 3, 3)."""
 
-    Returns its rays, ``v^T v``, shift and cofactors (3, 3); None where the pair contradicts itself or does not fix a
-    point.
+    point: IntArray
+    inside: Bools
+    squares: Array
+    shift_m: Array
+    cofactors: Array
+
+    @property
+    def size(self) -> IntArray:
+        return self.inside.sum(axis=1)
+
+
+def _grown(residual: Array, design: Array, limit: float) -> _Sets:
+    """Sets that agree, from every pair of rays of m points; see `consensus` for the arguments.
+
+    A set takes in who agrees best and drops who disagrees most, until nothing changes. Pairs that contradict themselves
+    or do not fix a point are absent.
     """
-    k = residual.shape[1]
-    inside = np.zeros(k, dtype=bool)
-    inside[start] = True
-    dropped = np.zeros(k, dtype=bool)
-    while True:
-        fit = _fit(inside, residual, design)
-        if fit is None:
-            return None
-        shift, Q = fit
-        v = residual - np.einsum("cpk,p->ck", design, shift)
-        joint = _joint(v, np.einsum("apk,pq,bqk->kab", design, Q, design), inside)
-        worst = int(np.argmax(np.where(inside, joint, -1.0)))
-        if joint[worst] > limit:
-            if inside.sum() <= 2:
-                return None
-            inside[worst], dropped[worst] = False, True
-            continue
-        outside = np.where(inside | dropped, np.inf, joint)
-        nearest = int(np.argmin(outside))
-        if outside[nearest] > limit:
-            return np.flatnonzero(inside), float((v[:, inside] ** 2).sum()), shift, Q
-        inside[nearest] = True
-
-
-def _fit(inside: Bools, residual: Array, design: Array) -> tuple[Array, Array] | None:
-    A = design[:, :, inside].transpose(0, 2, 1).reshape(-1, 3)
-    N = A.T @ A
-    values = np.linalg.eigvalsh(N)
-    if values[0] < 1e-8 * values[2]:
-        return None
-    Q = np.linalg.inv(N)
-    return Q @ (A.T @ residual[:, inside].reshape(-1)), Q
+    m, k = residual.shape[:2]
+    tried = np.unique(np.linspace(0, k - 1, min(k, MOST_RAYS)).astype(int))
+    pairs = np.stack(np.triu_indices(len(tried), 1), axis=1)
+    point = np.repeat(np.arange(m), len(pairs))
+    inside = np.zeros((len(point), k), dtype=bool)
+    np.put_along_axis(inside, np.tile(tried[pairs], (m, 1)), True, axis=1)
+    dropped = np.zeros_like(inside)
+    normal = np.swapaxes(design, 2, 3) @ design  # of each ray
+    moment = (np.swapaxes(design, 2, 3) @ residual[..., None])[..., 0]
+    ended: list[tuple[IntArray, _Sets]] = []
+    number = np.arange(len(point))
+    while len(number):
+        weight = inside[:, None].astype(float)
+        N = (weight @ normal[point].reshape(-1, k, 9)).reshape(-1, 3, 3)
+        values = np.linalg.eigvalsh(N)
+        fixed = values[:, 0] >= 1e-8 * values[:, 2]
+        if not fixed.all():
+            number, point, inside, dropped = number[fixed], point[fixed], inside[fixed], dropped[fixed]
+            N, weight = N[fixed], weight[fixed]
+        Q = np.linalg.inv(N)
+        shift = (Q @ (weight @ moment[point])[:, 0, :, None])[:, :, 0]
+        A = design[point]
+        v = residual[point] - (A @ shift[:, None, :, None])[..., 0]
+        joint = _joint(v, A @ Q[:, None] @ np.swapaxes(A, 2, 3), inside)
+        every = np.arange(len(number))
+        worst = np.argmax(np.where(inside, joint, -1.0), axis=1)
+        disagrees = joint[every, worst] > limit
+        nearest = np.argmin(np.where(inside | dropped, np.inf, joint), axis=1)
+        free = ~(inside | dropped)[every, nearest]
+        grows = ~disagrees & free & (joint[every, nearest] <= limit)
+        done = ~(disagrees | grows)
+        squares = ((v**2).sum(axis=2) * inside).sum(axis=1)
+        ended.append((number[done], _Sets(point[done], inside[done], squares[done], shift[done], Q[done])))
+        more = grows | (disagrees & (inside.sum(axis=1) > 2))
+        out, taken = every[disagrees], every[grows]
+        inside[out, worst[out]], dropped[out, worst[out]] = False, True
+        inside[taken, nearest[taken]] = True
+        number, point, inside, dropped = number[more], point[more], inside[more], dropped[more]
+    # in the order of the pairs they began with
+    order = np.argsort(np.concatenate([n for n, _ in ended]))
+    return _Sets(*(np.concatenate(part)[order] for part in zip(*(sets for _, sets in ended), strict=True)))
 
 
 def _joint(v: Array, AQA: Array, inside: Bools) -> Array:
-    """Squared residuals (k,) in their own sigmas, those of rays outside as predictions."""
-    C = np.eye(2) + np.where(inside, -1.0, 1.0)[:, None, None] * AQA
-    values, vectors = np.linalg.eigh(C)
-    along = np.einsum("kab,ak->kb", vectors, v)
-    controlled = values > 1e-6
-    squares = np.where(controlled, along**2 / np.where(controlled, values, 1.0), 0.0).sum(axis=1)
+    """Squared residuals (s, k) in their own sigmas, those of rays outside as predictions.
+
+    Directions of a residual whose variance is as good as zero do not count.
+    """
+    C = np.where(inside, -1.0, 1.0)[..., None, None] * AQA
+    a, b, d = 1.0 + C[..., 0, 0], C[..., 0, 1], 1.0 + C[..., 1, 1]
+    x, y = v[..., 0], v[..., 1]
+    middle, half = 0.5 * (a + d), np.hypot(0.5 * (a - d), b)
+    larger, det = middle + half, a * d - b * b
+    one = larger > CONTROLLED
+    both = one & (det > CONTROLLED * larger)
+    squares = (d * x * x - 2.0 * b * x * y + a * y * y) / np.where(both, det, 1.0)
+    smaller = middle - half  # where only the larger counts, the part of v along it
+    along2 = ((a - smaller) * x * x + 2.0 * b * x * y + (d - smaller) * y * y) / np.where(half > 0, 2.0 * half, 1.0)
+    squares = np.where(both, squares, np.where(one, along2 / np.where(one, larger, 1.0), 0.0))
     return squares / ORIENTATION_SHARE**2
-
-
-def _distance(d: Array, C: Array) -> float:
-    return float(d @ np.linalg.solve(C, d)) / ORIENTATION_SHARE**2
 
 
 def consensus_of_points(solution: Solution, points: Places, limit: float) -> dict[int, tuple[Places, bool]]:
@@ -153,21 +190,35 @@ def consensus_of_points(solution: Solution, points: Places, limit: float) -> dic
     """
     if solution.problem.parts is not None:
         return solution.problem.parts.consensus(solution, points, limit)
+    if not len(points):
+        return {}
     network, state = solution.network, solution.state
-    own = {int(p): np.flatnonzero(network.rays.point == p) for p in points}
     place, lin = state.points_l.copy(), solution.linearisation
     found: dict[int, tuple[Places, bool]] = {}
     for number in range(PASSES):
         if number:
             lin = linearise(network.rays, solution.layout, solution.whitening, state.theta, place)
-        for p, rays in own.items():
-            best = consensus(lin.residual[:, rays], lin.point[:, :, rays], limit)
-            if best is None:
-                found.pop(p, None)
-            else:
-                found[p] = rays[best.rays], best.rival
-                place[p] += best.shift_m
-    return found
+        found = {}
+        for own in _alike(points, network.rays_per_point):
+            rays = network.first_ray[own][:, None] + np.arange(int(network.rays_per_point[own[0]]))
+            best = consensus(
+                np.moveaxis(lin.residual[:, rays], 0, 2), np.moveaxis(lin.point[:, :, rays], (0, 1), (2, 3)), limit
+            )
+            place[own] += best.shift_m
+            for i in np.flatnonzero(best.found).tolist():
+                found[int(own[i])] = rays[i, best.chosen[i]], bool(best.rival[i])
+    return {p: found[p] for p in points.tolist() if p in found}
+
+
+def _alike(points: Places, rays_per_point: IntArray) -> Iterator[Places]:
+    """Points with the same number of rays, not too many at a time; those with less than two rays are left out."""
+    k = rays_per_point[points]
+    for rays in np.unique(k[k >= 2]).tolist():
+        own = points[k == rays]
+        tried = min(rays, MOST_RAYS)
+        step = max(1, BATCH // (rays * tried * (tried - 1) // 2))
+        for low in range(0, len(own), step):
+            yield own[low : low + step]
 
 
 def doubts(solution: Solution, lost: Places, limit: float) -> tuple[Doubt, ...]:

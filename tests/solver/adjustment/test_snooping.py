@@ -153,14 +153,13 @@ def test_points_of_a_clean_block_are_not_doubtful():
 
 def test_three_rays_of_one_strip_of_which_one_slid_along_it_do_not_tell_which():
     """Each two of three rays in a plane meet: leaving out any of them cures the misfit."""
-    design = np.zeros((2, 3, 3))
+    design = np.zeros((3, 2, 3))
     tilt = np.array([-0.5, 0.0, 0.5])
-    design[0, 0], design[0, 2], design[1, 1] = 1.0, tilt, 1.0
-    slid = np.array([[20.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    found = consensus(slid, design, joint_limit(CRITICAL_W))
-    assert found is not None and len(found.rays) == 2 and found.rival
-    across = consensus(slid[::-1], design, joint_limit(CRITICAL_W))
-    assert across is not None and across.rays.tolist() == [1, 2] and not across.rival
+    design[:, 0, 0], design[:, 0, 2], design[:, 1, 1] = 1.0, tilt, 1.0
+    slid = np.array([[20.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    both = consensus(np.array([slid, slid[:, ::-1]]), np.array([design, design]), joint_limit(CRITICAL_W))
+    assert both.found.all() and both.chosen[0].sum() == 2
+    assert both.chosen[1].tolist() == [False, True, True] and both.rival.tolist() == [True, False]
 
 
 def test_clean_block_loses_no_more_than_the_error_probability():
