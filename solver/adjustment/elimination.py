@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..arrays import IntArray
+from ..arrays import Bools, IntArray
 from .layout import Layout
 from .nested_dissection import Dissection
 from .normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
@@ -96,7 +96,7 @@ def plan_elimination(
     clusters = []
     for low, high in _cluster_bounds(layout.n_unknowns, cell, cells, first_ray):
         rays = slice(int(first_ray[low]), int(first_ray[high]))
-        used = np.unique(cell[rays])
+        used = np.flatnonzero(np.bincount(cell[rays], minlength=len(cells)))
         columns = np.unique(np.concatenate([cells[k].columns for k in used])) if len(used) else np.empty(0, dtype=int)
         columns = columns[columns >= 0]
         if layout.n_surface:
@@ -126,17 +126,19 @@ def _cells(layout: Layout) -> tuple[IntArray, IntArray, list[Cell]]:
         if layout.camera is not None:
             key = (key ^ layout.camera.pattern.astype(np.uint64)) * np.uint64(0xD6E8FEB86659FD93)
             key ^= key >> np.uint64(32)
-    _, first, cell = np.unique(key, return_index=True, return_inverse=True)
-    by_cell = np.argsort(cell, kind="stable")
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=len(first)))])
+    by_cell = np.argsort(key, kind="stable")
+    begins = np.flatnonzero(np.diff(key[by_cell], prepend=key[by_cell[:1]] + np.uint64(1)))
+    bounds = np.append(begins, n)
+    cell = np.empty(n, dtype=np.int64)
+    cell[by_cell] = np.repeat(np.arange(len(begins)), np.diff(bounds))
     cells = []
-    for k, example in enumerate(first):
+    for k, example in enumerate(by_cell[begins]):
         columns = layout.columns[:, example].astype(np.int64)
         if layout.camera is not None:
             own = layout.camera.columns[layout.camera.pattern[example]].astype(np.int64)
             columns = np.concatenate([columns, np.where(own >= 0, own + layout.n_model, -1)])
         cells.append(Cell(int(bounds[k]), int(bounds[k + 1]), columns))
-    return cell.astype(np.int64), by_cell, cells
+    return cell, by_cell, cells
 
 
 def _cluster_bounds(n_unknowns: int, cell: IntArray, cells: list[Cell], first_ray: IntArray) -> list[tuple[int, int]]:
@@ -145,23 +147,23 @@ def _cluster_bounds(n_unknowns: int, cell: IntArray, cells: list[Cell], first_ra
     for k, c in enumerate(cells):
         touched[k, c.columns] = True
     touched[:, -1] = False
+    return _divided(0, len(first_ray) - 1, cell, touched, first_ray)[1]
 
-    def cost(low: int, high: int) -> float:
-        present = np.zeros(len(cells), dtype=bool)
-        present[cell[first_ray[low] : first_ray[high]]] = True
-        u = int(np.count_nonzero(touched[present].any(axis=0)))
-        return 3 * (high - low) * u * u * FLOP + u * u * ADD + CLUSTER
 
-    def divide(low: int, high: int) -> tuple[float, list[tuple[int, int]]]:
-        own = cost(low, high)
-        rays = first_ray[high] - first_ray[low]
-        if high - low < 2 * FEWEST_POINTS or (own < 3 * CLUSTER and rays <= MOST_RAYS):
-            return own, [(low, high)]
-        middle = (low + high) // 2
-        left, left_bounds = divide(low, middle)
-        right, right_bounds = divide(middle, high)
-        if left + right < own or rays > MOST_RAYS:
-            return left + right, left_bounds + right_bounds
+def _divided(
+    low: int, high: int, cell: IntArray, touched: Bools, first_ray: IntArray
+) -> tuple[float, list[tuple[int, int]]]:
+    """Cost of points ``low:high``, and the ranges they are best divided into; ``touched`` (cells, u) are unknowns."""
+    rays = first_ray[high] - first_ray[low]
+    present = np.zeros(len(touched), dtype=bool)
+    present[cell[first_ray[low] : first_ray[high]]] = True
+    u = int(np.count_nonzero(touched[present].any(axis=0)))
+    own = 3 * (high - low) * u * u * FLOP + u * u * ADD + CLUSTER
+    if high - low < 2 * FEWEST_POINTS or (own < 3 * CLUSTER and rays <= MOST_RAYS):
         return own, [(low, high)]
-
-    return divide(0, len(first_ray) - 1)[1]
+    middle = (low + high) // 2
+    left, left_bounds = _divided(low, middle, cell, touched, first_ray)
+    right, right_bounds = _divided(middle, high, cell, touched, first_ray)
+    if left + right < own or rays > MOST_RAYS:
+        return left + right, left_bounds + right_bounds
+    return own, [(low, high)]

@@ -126,6 +126,8 @@ class Layout:
     def corrections(self, theta: Array, rays: slice = slice(None)) -> Array:
         """Orientation corrections (6, n) of the rays, or of a range of them."""
         padded = np.append(theta[: self.n_model], 0.0)
+        if not padded.any():
+            return np.zeros((6, self.columns[:, rays].shape[1]))
         coefficients = self.coefficients[:, rays]
         if coefficients.shape[1] <= FEW_RAYS:  # one product costs less than many calls
             sums = (self.component == np.arange(6)[:, None]).astype(float)
@@ -315,16 +317,16 @@ def _terms(
     nodes = max(d.coefficients.shape[1] for _, _, d in designs)
     present = np.zeros((nodes, 6), dtype=bool)
     for _, _, d in designs:
-        present[: d.columns.shape[1]] |= (d.columns >= 0).any(axis=0)
+        present[: d.columns.shape[1]] |= d.columns.max(axis=0) >= 0
     node, component = np.nonzero(present)
     columns = np.full((len(node), n), -1, dtype=np.int32)
     coefficients = np.zeros((nodes, n))
     for mine, first, d in designs:
         width = d.columns.shape[1]
         coefficients[:width, mine] = d.coefficients.T
-        for t in np.flatnonzero(node < width):
-            local = d.columns[:, node[t], component[t]]
-            columns[t, mine] = np.where(local >= 0, local + first, -1)
+        own = np.flatnonzero(node < width)
+        local = d.columns[:, node[own], component[own]].T
+        columns[own[:, None], mine] = np.where(local >= 0, local + first, -1)
     return node, component, columns, coefficients
 
 

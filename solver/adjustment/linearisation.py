@@ -15,7 +15,7 @@ from .layout import Layout, RayShift
 from .network import Rays
 
 #: Rays worked on at a time: so many that a call's overhead is small, so few that the arrays stay in the cache.
-CHUNK = 4096
+CHUNK = 8192
 #: Lines and samples by which a ray may be fitted elsewhere than measured: blunders and bad starts go no further.
 MOST_PIXELS = 200.0
 

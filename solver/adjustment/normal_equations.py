@@ -277,12 +277,16 @@ def _add_batch(
         J = np.concatenate([J[:, :first], sums, J[:, T:]], axis=1)
     for cell in batch:
         x, y = J[:, :, cell.low - low : cell.high - low]
-        block = x @ x.T + y @ y.T
-        of_terms = np.concatenate([cell.columns[:first], layout.platform_columns, cell.columns[T:]])
-        used = np.flatnonzero(of_terms >= 0)
-        columns = of_terms[used]
-        rhs[columns] += block[used, -1]
-        matrix.add(columns, block[np.ix_(used, used)] if len(used) < len(of_terms) else block[:-1, :-1])
+        block = x @ x.T
+        block += y @ y.T
+        columns = cell.columns
+        if m:
+            columns = np.concatenate([columns[:first], layout.platform_columns, columns[T:]])
+        if columns.min() < 0:
+            used = np.flatnonzero(columns >= 0)
+            columns, block = columns[used], block[np.ix_(np.append(used, -1), np.append(used, -1))]
+        rhs[columns] += block[:-1, -1]
+        matrix.add(columns, block[:-1, :-1])
 
 
 def couplings(

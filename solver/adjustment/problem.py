@@ -215,12 +215,17 @@ def pose_problem(
 def with_left_out(network: Network, layout: Layout, sign: float = 1.0) -> Network:
     """The network with what the model cannot follow in (or, sign -1, no more in) the noise of the rays' orientation."""
     rays = network.rays
-    variance = np.zeros((len(rays), 6))
+    left: list[tuple[IntArray, Array]] = []
     for i, item in enumerate(layout.sets):
         mine = np.flatnonzero(layout.set_of_ray == i)
-        variance[mine] = item.model.left_out_variance(rays.time_s[mine])
-    if not variance.any():
+        of_set = item.model.left_out_variance(rays.time_s[mine])
+        if of_set.any():
+            left.append((mine, of_set))
+    if not left:
         return network
+    variance = np.zeros((len(rays), 6))
+    for mine, of_set in left:
+        variance[mine] = of_set
     before = 0.0 if rays.orientation_noise is None else rays.orientation_noise
     noise = before + sign * variance[:, :, None] * np.eye(6)
     return replace(network, rays=replace(rays, orientation_noise=noise))

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.rotation import sine_and_cosine
+
 Array = NDArray[np.floating]
 
 
@@ -64,7 +66,7 @@ def collinearity(
     depth : (n,) third image coordinate of the object point, metres; negative in front of the camera
     """
     d1, d2, d3 = point_l - position_l
-    (so, sp, sk), (co, cp, ck) = np.sin(angles), np.cos(angles)
+    (so, sp, sk), (co, cp, ck) = sine_and_cosine(angles)
     # f = Rz(-kappa) Ry(-phi) Rx(-omega) d, turned axis by axis
     u2, u3 = co * d2 + so * d3, co * d3 - so * d2
     v1, v3 = cp * d1 - sp * u3, sp * d1 + cp * u3
