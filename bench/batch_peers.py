@@ -64,7 +64,7 @@ def write_problem(path: Path, problem, whitening) -> None:
     camera = np.zeros((n, 20))
     place = {}
     if layout.camera is not None:
-        camera = layout.camera.coefficients.transpose(2, 0, 1).reshape(n, 20)
+        camera = layout.camera.coefficients().transpose(2, 0, 1).reshape(n, 20)
         table = problem.self_calibration.columns
         place = {int(c): ("common", k) for k, c in enumerate(table[0, :6])}
         place |= {int(table[i, 6 + k]): (i, k) for i in range(n_lines) for k in range(4)}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..arrays import Array, Bools, IntArray
+from ..arrays import Array, Bools
 from ..models.base import ModelOptions
 from .adjustment import State, pose_problem
 from .layout import Layout
@@ -57,9 +57,12 @@ def georeference_posed(network: Network, layout: Layout, prior: Prior, ray_weigh
     for _ in range(4):
         _, lin, _ = linearise_and_weigh(network.rays, layout, state.theta, state.points_l)
         lin = lin.reweighted(weight)
-        J = np.moveaxis(lin.point, 2, 0)  # (n, 2, 3)
-        normal = _per_point(np.einsum("nij,nik->njk", J, J), p, count)
-        right = _per_point(np.einsum("nij,in->nj", J, lin.residual), p, count)
+        (x, y), v = lin.point, lin.residual
+        normal = np.empty((count, 3, 3))
+        for i in range(3):
+            for k in range(i + 1):
+                normal[:, i, k] = normal[:, k, i] = np.bincount(p, x[i] * x[k] + y[i] * y[k], count)
+        right = np.stack([np.bincount(p, x[i] * v[0] + y[i] * v[1], count) for i in range(3)], axis=1)
         inverse, known = _inverse(normal)
         state = State(state.theta, state.points_l + np.einsum("pij,pj->pi", inverse, right))
     assert lin is not None
@@ -71,12 +74,6 @@ def georeference_posed(network: Network, layout: Layout, prior: Prior, ray_weigh
 
 def _root(variance: Array, known: Bools) -> Array:
     return np.where(known[:, None], np.sqrt(np.maximum(variance, 0.0)), np.nan)
-
-
-def _per_point(values: Array, point: IntArray, count: int) -> Array:
-    total = np.zeros((count, *values.shape[1:]))
-    np.add.at(total, point, values)
-    return total
 
 
 def _inverse(normal: Array) -> tuple[Array, Bools]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..arrays import Bools, IntArray
@@ -17,7 +18,7 @@ from .normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
 
 #: Costs that decide how points are clustered: seconds per multiply-add in a dense product, per element added to the
 #: normal matrix, per value scattered, and per cluster. Only their ratios matter.
-FLOP, ADD, CLUSTER = 3e-11, 4e-9, 1e-4
+FLOP, ADD, CLUSTER = 3e-11, 1.5e-9, 5e-5
 #: Fewest points that make a cluster, and most rays (so that its arrays stay in the cache).
 FEWEST_POINTS, MOST_RAYS = 8, 8192
 
@@ -39,13 +40,13 @@ class Cluster:
     ----------
     points, rays : ranges; rays of the points are contiguous
     columns : (U,) sorted columns of the reduced system that these rays touch
-    place : (q, rays) flat index of each term in a (points, U + 1) array; column U takes what a ray does not have
+    place : (q, rays) int32 flat index of each term in a (points, U + 1) array; column U takes what a ray does not have
     """
 
     points: slice
     rays: slice
     columns: IntArray
-    place: IntArray
+    place: NDArray[np.int32]
 
     @property
     def n_points(self) -> int:
@@ -104,10 +105,11 @@ def plan_elimination(
         width = len(columns) + 1
         local = np.full(layout.n_unknowns + 1, width - 1)
         local[columns] = np.arange(width - 1)
-        table = np.zeros((len(cells), len(cells[0].columns)), dtype=np.int64)
+        table = np.zeros((len(cells), len(cells[0].columns)), dtype=np.int32)
         table[used] = local[np.stack([cells[k].columns for k in used])] if len(used) else 0
-        place = table[cell[rays]].T + (point[rays] - low) * width
-        clusters.append(Cluster(slice(low, high), rays, columns, np.ascontiguousarray(place)))
+        place = np.empty((table.shape[1], len(point[rays])), dtype=np.int32)
+        np.add(table[cell[rays]].T, ((point[rays] - low) * width).astype(np.int32), out=place)
+        clusters.append(Cluster(slice(low, high), rays, columns, place))
     cliques = [c.columns for c in clusters if len(c.columns)]
     structure = None if dense else find_structure(layout.n_of_sets, layout.n_unknowns, cliques, prior)
     return Elimination(

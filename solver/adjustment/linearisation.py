@@ -131,19 +131,22 @@ def linearise(
     points_l : (p, 3)
     camera : (2, slots, n) of another linearisation with the same weights and layout; it does not depend on the values
     """
-    n = len(rays)
-    result = Linearisation(
-        np.empty((2, n)),
-        np.empty((2, 6, n)),
-        whitening.apply(_camera(layout, n)) if camera is None else camera,
-        np.empty((2, 3, n)),
-    )
+    result = _not_filled(layout, len(rays), camera)
     for part, _, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
         g = whitening.g[:, part]
         _whiten_into(result.residual, residual, g, part)
         _whiten_into(result.orientation, d_orientation, g, part)
         _whiten_into(result.point, d_point, g, part)
+        if camera is None and layout.camera is not None:
+            _whiten_into(result.camera, layout.camera.coefficients(part), g, part)
     return result
+
+
+def _not_filled(layout: Layout, n: int, camera: Array | None = None) -> Linearisation:
+    """Place for the equations of n rays; the effect of the additional parameters where it is known."""
+    if camera is None:
+        camera = np.empty((2, 0 if layout.camera is None else len(layout.camera.kinds), n))
+    return Linearisation(np.empty((2, n)), np.empty((2, 6, n)), camera, np.empty((2, 3, n)))
 
 
 class Weighed(NamedTuple):
@@ -167,9 +170,8 @@ def linearise_and_weigh(
     """
     n, kept = len(rays), whitening is not None
     layout = fit_rays(rays, layout, theta, points_l)
-    camera = _camera(layout, n)
     whitening = whitening or Whitening(np.empty((3, n)))
-    result = Linearisation(np.empty((2, n)), np.empty((2, 6, n)), np.empty(camera.shape), np.empty((2, 3, n)))
+    result = _not_filled(layout, n)
     for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
         if not kept:
             whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
@@ -177,7 +179,8 @@ def linearise_and_weigh(
         _whiten_into(result.residual, residual, g, part)
         _whiten_into(result.orientation, d_orientation, g, part)
         _whiten_into(result.point, d_point, g, part)
-        _whiten_into(result.camera, camera[:, :, part], g, part)
+        if layout.camera is not None:
+            _whiten_into(result.camera, layout.camera.coefficients(part), g, part)
     return Weighed(whitening, result, layout)
 
 
@@ -214,18 +217,13 @@ def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layou
         moved[part] = share[:, None] * change
         image[:, part] = np.einsum("ckn,nk->cn", d_orientation, moved[part])
         fitted[:, part] = own.xy_mm.T - share * samples * pitch
-    return layout.fitted(layout.camera.coefficients_at(fitted), RayShift(moved, image))
+    return layout.fitted(fitted, RayShift(moved, image))
 
 
 def _image_motion(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:
     """Image motion (2, n) in mm/s by velocity and attitude rate of the platform; whitened if `d_orientation` is."""
     rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T if attitude_rate else np.zeros((3, len(rays)))])
     return np.einsum("ckn,kn->cn", d_orientation, rates)
-
-
-def _camera(layout: Layout, n: int) -> Array:
-    """Effect of the additional parameters (2, slots, n), unwhitened."""
-    return layout.camera.coefficients if layout.camera is not None else np.empty((2, 0, n))
 
 
 def _by_chunks(

@@ -332,7 +332,7 @@ def _coupling_terms(lin: Linearisation, layout: Layout, points: PointNormals, po
 
 def _coupling(terms: Array, cluster: Cluster) -> Array:
     width = len(cluster.columns) + 1
-    place = cluster.place.ravel()
+    place = cluster.place.ravel().astype(np.intp)
     D = np.empty((3, cluster.n_points * width))
     for k in range(3):
         D[k] = np.bincount(place, terms[k].ravel(), cluster.n_points * width)

@@ -22,7 +22,8 @@ DENSE_UP_TO = 600
 FRONTS_FROM = 1200
 #: Fronts are taken if a band, or a dense matrix, takes so many times their work. Tuned: they do it in smaller pieces.
 WORTH = 4.0
-#: Elements of a block for each pair of ranges from which on it is added range by range. Tuned.
+#: Elements of a block for each pair of ranges from which on it is added range by range: what a slice costs in elements,
+#: by order of magnitude.
 LONG_RANGES = 200
 #: Levels of the band are joined to blocks of at least this size.
 BLOCK = 48

@@ -67,25 +67,29 @@ class CameraDesign:
     ----------
     pattern : (n,) which row of `columns` a ray uses
     columns : (patterns, slots) int32 index of the parameter; -1 where it is not estimated
-    coefficients : (2, slots, n) mm per unit of the parameter
     kinds : (slots) of parameter
+    xy_mm : (2, n) image coordinates at which the parameters act
     focal_length_mm : (n,)
+
+    Coefficients are ten times as many as the coordinates that they follow from, and made where they are wanted.
     """
 
     pattern: NDArray[np.int64]
     columns: NDArray[np.int32]
-    coefficients: Array
     kinds: tuple[str, ...] = field(repr=False)
+    xy_mm: Array = field(repr=False)
     focal_length_mm: Array = field(repr=False)
 
     def evaluate(self, values: Array, rays: slice = slice(None)) -> Array:
         """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
+        if not np.any(values):
+            return np.zeros(self.xy_mm[:, rays].shape)
         of_slot = np.append(values, 0.0)[self.columns].T  # (slots, patterns)
-        return np.einsum("csn,sn->cn", self.coefficients[:, :, rays], of_slot[:, self.pattern[rays]])
+        return np.einsum("csn,sn->cn", self.coefficients(rays), of_slot[:, self.pattern[rays]])
 
-    def coefficients_at(self, xy_mm: Array) -> Array:
-        """Coefficients (2, slots, n) where the rays have image coordinates (2, n), mm."""
-        return _coefficients(self.kinds, xy_mm, self.focal_length_mm)
+    def coefficients(self, rays: slice = slice(None)) -> Array:
+        """Coefficients (2, slots, n) of all rays or a range of them, mm per unit of the parameter."""
+        return _coefficients(self.kinds, self.xy_mm[:, rays], self.focal_length_mm[rays])
 
 
 @dataclass(frozen=True)
@@ -170,10 +174,9 @@ class SelfCalibration:
             if len(chips) > 1:
                 mine = ccd == k
                 pattern[mine] += np.searchsorted(chips, sample[mine] + 0.5, side="right") - 1
-        coefficients = _coefficients(self.slots, xy_mm.T, focal_length_mm)
         unknown = np.where(self.estimated, np.cumsum(self.estimated) - 1, -1)
         columns = np.append(unknown, -1)[self.columns].astype(np.int32)
-        return CameraDesign(pattern, columns, coefficients, self.slots, focal_length_mm)
+        return CameraDesign(pattern, columns, self.slots, xy_mm.T, focal_length_mm)
 
     def expand(self, values: Array, fill: float = 0.0) -> Array:
         """Values of the estimated parameters (n_unknowns,) put in their places among all (m,)."""
@@ -193,7 +196,7 @@ _EFFECT: dict[str, _Effect] = {
     "dc": lambda x, y, r2, c: (-x / c, -y / c),
     "k1": lambda x, y, r2, c: (x * r2, y * r2),
     "k2": lambda x, y, r2, c: (x * r2**2, y * r2**2),
-    "k3": lambda x, y, r2, c: (x * r2**3, y * r2**3),
+    "k3": lambda x, y, r2, c: (x * (r2 * r2 * r2), y * (r2 * r2 * r2)),
     "p1": lambda x, y, r2, c: (r2 + 2 * x * x, 2 * x * y),
     "p2": lambda x, y, r2, c: (2 * x * y, r2 + 2 * y * y),
     "xp": lambda x, y, r2, c: (1.0, 0.0),

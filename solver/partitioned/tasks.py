@@ -420,9 +420,7 @@ def _save(store: Store, key: int, version: int, equations: BlockEquations) -> No
     if equations.trial is not None:
         reached = equations.trial[0]
         same = reached.whitening is at.whitening
-        fitted = (
-            reached.layout.camera.coefficients if reached.layout.camera and reached.layout is not at.layout else None
-        )
+        fitted = reached.layout.camera.xy_mm if reached.layout.camera and reached.layout is not at.layout else None
         trial = (
             reached.state,
             None if same else reached.whitening.g,
@@ -434,7 +432,7 @@ def _save(store: Store, key: int, version: int, equations: BlockEquations) -> No
         at.state,
         at.whitening.g,
         at.linearisation,
-        at.layout.camera.coefficients if at.layout.camera is not None else None,
+        at.layout.camera.xy_mm if at.layout.camera is not None else None,
         at.layout.shift,
         equations.given,
         equations.weight,
@@ -464,8 +462,8 @@ def _load(store: Store, key: int, version: int) -> tuple[Part, BlockEquations]:
     equations.points, equations.trial = saved.points, None
     equations.refresh()
     if saved.trial is not None:
-        state, g, lin, coefficients, shift = saved.trial
+        state, g, lin, xy_mm, shift = saved.trial
         weights = whitening if g is None else Whitening(g)
-        place = layout if coefficients is None else layout.fitted(coefficients, shift)  # pyright: ignore[reportArgumentType]
+        place = layout if xy_mm is None else layout.fitted(xy_mm, shift)  # pyright: ignore[reportArgumentType]
         equations.retry(Reached(state, weights, lin, place))
     return part, equations

@@ -332,8 +332,8 @@ def camera_effect(calibration: Calibration, look_b: Array, sample: Array) -> Arr
     design = calibration.parameters.design(np.zeros(n, dtype=np.int64), np.asarray(sample, dtype=float), xy, focal)
     D = np.zeros((n, 2, calibration.parameters.n_unknowns + 1))
     columns = design.columns[design.pattern]  # (n, slots)
-    for axis in range(2):
-        np.add.at(D[:, axis], (np.arange(n)[:, None], columns), design.coefficients[axis].T)
+    for axis, coefficients in enumerate(design.coefficients()):
+        np.add.at(D[:, axis], (np.arange(n)[:, None], columns), coefficients.T)
     return np.einsum("ij,njk->nik", view.R_bc[:, :2], D[:, :, :-1])
 
 
