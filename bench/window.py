@@ -18,6 +18,7 @@ import numpy as np
 
 from triline.nodes.garbage_collection import RareCollections
 from triline.solver.camera.self_calibration import tls
+from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
@@ -26,6 +27,8 @@ from triline.solver.window.results import WindowOptions
 from triline.solver.window.state.relinearisation import Relinearisation
 from triline.solver.window.window import Window
 
+#: White noise of GNSS positions, X, Y, Z, m.
+GNSS_NOISE_M = (0.002, 0.002, 0.002)
 #: Phases of an update, see docs/architecture.md, and what does them.
 PHASES = (
     ("extend the strips", Window, "_extend_strips"),
@@ -76,9 +79,11 @@ class Stopwatch:
 def latency(args: argparse.Namespace) -> dict[str, object]:
     """20 000 rays in a window of 40 s, while it is full; the end of the strip apart.
 
-    Every 0.024 s is the adjuster's pace at 500 rays a second: 12 new rays an update.
+    Every 0.024 s is the adjuster's pace at 500 rays a second: 12 new rays an update. GNSS has the noise of
+    `GNSS_NOISE_M`: with more, so many rays see what smoothing leaves of it, and healthy control is doubted.
     """
-    simulation = simulate(FlightPlan(strip_s=110.0), 1, observation_plan=ObservationPlan(tie_points_per_s=300.0))
+    plan, errors = ObservationPlan(tie_points_per_s=300.0), ErrorModel(gnss_noise_m=GNSS_NOISE_M)
+    simulation = simulate(FlightPlan(strip_s=110.0), 1, errors, plan)
     RareCollections()
     parameters = tls(simulation.flight.camera) if args.selfcal else None
     options, interval_s, watch = WindowOptions(window_s=40.0), args.interval, Stopwatch()
