@@ -329,7 +329,7 @@ class Window:
     def _screen(self, fresh: list[Batch], due: list[Batch], result: WindowUpdate) -> int:
         """Data snooping, and the robust start of a young strip; number of solutions computed."""
         solutions = self._snoop(due, result)
-        young = self._consensus.due(list(self.network.batches), fresh)
+        young = self._consensus.due(self.network.batches, fresh)
         weights = consensus_weights(young, self.state) if young else None
         if weights is not None:
             result.refused += reweigh(young, weights, self.network)
@@ -464,7 +464,7 @@ class Window:
             if state.solution != solution:
                 self._orientation.forget()
         result.events += findings.events
-        counts = batches.counts()
+        counts = batches.counts
         unknowns = len(state) + counts.determined
         return WindowReport(
             **vars(fit),

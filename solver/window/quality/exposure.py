@@ -230,13 +230,16 @@ class Integrity:
         self._network = network
         self._critical, self._delta = critical, noncentrality(critical)
         self._of_batch: dict[int, _OfBatch] = {}
+        self._gone = 0  # batches when those taken apart were forgotten
         self._left = LeftObservations()
         self.most_exposed: Batch | None = None
 
     def note(self, batches: Iterable[Batch]) -> None:
         """Find the most exposed observations of batches that have been judged since; forget those taken apart."""
-        for key in self._network.batches.missing(self._of_batch.keys()):
-            del self._of_batch[key]
+        if self._network.batches.gone > self._gone:
+            self._gone = self._network.batches.gone
+            for key in self._network.batches.missing(self._of_batch.keys()):
+                del self._of_batch[key]
         for batch in batches:
             if batch.judged is None:
                 continue

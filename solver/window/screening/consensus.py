@@ -23,6 +23,7 @@ from ...adjustment.snooping import largest_of_group
 from ...arrays import Array, Bools, IntArray
 from ...quantiles import chi2
 from ..state.batch import Batch
+from ..state.network import Batches
 from ..state.unknowns import WindowState
 
 #: Numbers of points of a strip at which they are judged together, each 1.6 times the one before; later points are
@@ -55,14 +56,13 @@ class ConsensusSchedule:
     asked: dict[int, int] = field(default_factory=dict)
     refused: dict[int, int] = field(default_factory=dict)
 
-    def due(self, batches: Sequence[Batch], fresh: Sequence[Batch]) -> list[Batch]:
+    def due(self, batches: Batches, fresh: Sequence[Batch]) -> list[Batch]:
         """The batches to judge together, the newest first; none if it is not time, or no look is refused."""
         if not fresh:
             return []
         strip = max(batch.strips[-1] for batch in fresh)
-        mine = [batch for batch in batches if strip in batch.strips]
-        count = sum([batch.n_points for batch in mine])
-        refused = sum([batch.control_refused for batch in mine if batch.counts.control])
+        count = batches.points_in(strip)
+        refused = sum(batch.control_refused for batch in batches.with_control() if strip in batch.strips)
         asked, before = self.asked.get(strip, 0), self.refused.get(strip, 0)
         step = next((n for n in YOUNG if n > asked), np.inf)
         if step == np.inf and count < asked:  # points that were counted have left
@@ -71,6 +71,7 @@ class ConsensusSchedule:
         if not due and count < asked + RECENT:
             self.asked[strip], self.refused[strip] = asked, refused
             return []
+        mine = [batch for batch in batches if strip in batch.strips]
         mine.sort(key=attrgetter("newest_s"), reverse=True)
         due = due or _mostly_refused(mine)
         self.asked[strip], self.refused[strip] = max(count, asked) if due else asked, refused

@@ -202,7 +202,7 @@ def _try_again(batch: Batch, network: LiveNetwork, update: Update) -> bool:
     if not lost.any():
         return False
     again, w = entry_weight(batch, EntryEquations.of(batch, state), RETURNING, network.sigmas.disagreement)
-    before, information = batch.weight, batch.information
+    before, information, counted = batch.weight, batch.information, batch.counts
     batch.weight = np.where(lost[point], again, before)
     if not (batch.weight > before).any():
         batch.weight = before
@@ -215,9 +215,9 @@ def _try_again(batch: Batch, network: LiveNetwork, update: Update) -> bool:
     update.refused += _note(batch, network, before, w)
     batch.eliminate()
     if not (batch.weight > before).any():  # nothing of these points is in the state
-        batch.information = information
+        batch.information, batch.counts = information, counted
         return False
-    state.exchange(batch.columns, information, batch.information)
+    network.batches.exchange(batch, information, counted)
     return True
 
 

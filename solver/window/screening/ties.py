@@ -82,11 +82,11 @@ def snoop_ties(batches: Sequence[Batch], network: LiveNetwork, update: Update) -
     worst = max((float(value.max(initial=0.0)) for *_, value in tests), default=0.0)
     failed = False
     for batch, ties, value in tests:
-        before = batch.information
+        before, counted = batch.information, batch.counts
         limit = chi2.isf(INSIDE, ties.observations)
         set_apart(batch, value > np.maximum(limit, TOGETHER * worst), network, update)
         if batch.information is not before:
-            network.state.exchange(batch.columns, before, batch.information)
+            network.batches.exchange(batch, before, counted)
             failed = True
     return failed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, KeysView
 
 import numpy as np
@@ -20,18 +21,27 @@ from .sigma_factors import SigmaFactors
 from .strip import WindowStrip
 from .surface import LiveSurface
 from .tails import Tails
-from .unknowns import WindowState
+from .unknowns import Information, WindowState
 
 
 class Batches:
     """The batches whose information is in the live part of the state, in the order in which they came.
 
-    All that changes what the state holds of a batch goes through here.
+    All that changes what the state holds of a batch goes through here, and what is asked in every update is kept: there
+    are up to thousands of batches.
+
+    Attributes
+    ----------
+    gone : how many have been taken apart or become final
     """
 
     def __init__(self, state: WindowState) -> None:
         self._state = state
         self._by_id: dict[int, Batch] = {}
+        self._counts, self._points = Counts(0, 0, 0, 0, 0), Counter[int]()
+        self._with_control: dict[int, Batch] = {}
+        self._provisional: dict[int, Batch] = {}
+        self.gone = 0
 
     def __iter__(self) -> Iterator[Batch]:
         return iter(self._by_id.values())
@@ -46,31 +56,63 @@ class Batches:
         """Which of the identities of batches that somebody still holds are not those of any of these."""
         return ids - self._by_id.keys()
 
+    @property
     def counts(self) -> Counts:
         """What all of them count for."""
-        every = [batch.counts for batch in self._by_id.values()]
-        return Counts(*map(sum, zip(*every, strict=True))) if every else Counts(0, 0, 0, 0, 0)
+        return self._counts
+
+    def points_in(self, strip: int) -> int:
+        """Points of batches with rays of a strip."""
+        return self._points[strip]
+
+    def with_control(self) -> list[Batch]:
+        """Those with control that counts."""
+        return list(self._with_control.values())
+
+    def provisional(self) -> list[Batch]:
+        """Those that lean on filtered poses, in the order in which they came."""
+        self._provisional = {key: batch for key, batch in self._provisional.items() if batch.provisional}
+        return list(self._provisional.values())
 
     def enter(self, batch: Batch) -> None:
         """A batch comes."""
         self._by_id[id(batch)] = batch
+        self._points.update(dict.fromkeys(batch.strips, batch.n_points))
+        self._count(batch, batch.counts, 1)
+        if batch.provisional:
+            self._provisional[id(batch)] = batch
         self._state.add(batch.columns, batch.information)
 
     def remove(self, batch: Batch) -> None:
         """A batch is taken apart."""
-        del self._by_id[id(batch)]
+        self._forget(batch)
         self._state.add(batch.columns, batch.information, -1)
 
     def leave(self, batch: Batch) -> None:
         """A batch becomes final: what it knows stays."""
-        del self._by_id[id(batch)]
+        self._forget(batch)
         self._state.fix(batch.columns, batch.information)
+
+    def _forget(self, batch: Batch) -> None:
+        del self._by_id[id(batch)]
+        self.gone += 1
+        self._points.subtract(dict.fromkeys(batch.strips, batch.n_points))
+        self._count(batch, batch.counts, -1)
+        self._with_control.pop(id(batch), None)
+        self._provisional.pop(id(batch), None)
+
+    def _count(self, batch: Batch, counts: Counts, sign: int) -> None:
+        self._counts = Counts(*(a + sign * b for a, b in zip(self._counts, counts, strict=True)))
+        if batch.counts.control:
+            self._with_control[id(batch)] = batch
+        else:
+            self._with_control.pop(id(batch), None)
 
     def linearise(self, batch: Batch, theta: Array, reweigh: bool) -> None:
         """Linearise a batch again, see `Batch.linearise`."""
-        before = batch.information
+        before, counted = batch.information, batch.counts
         batch.linearise(theta, reweigh)
-        self._state.exchange(batch.columns, before, batch.information)
+        self.exchange(batch, before, counted)
 
     def reweigh(self, batch: Batch, weight: Array) -> None:
         """Give the rays of a batch other weights (n,)."""
@@ -79,8 +121,14 @@ class Batches:
 
     def eliminate(self, batch: Batch) -> None:
         """Let count what was changed in a batch: weights of its rays and of its control, its ties."""
-        before = batch.information
+        before, counted = batch.information, batch.counts
         batch.eliminate()
+        self.exchange(batch, before, counted)
+
+    def exchange(self, batch: Batch, before: Information, counted: Counts) -> None:
+        """Let count what a batch knows by now, in place of the information and the counts that it had."""
+        self._count(batch, counted, -1)
+        self._count(batch, batch.counts, 1)
         self._state.exchange(batch.columns, before, batch.information)
 
 

@@ -61,7 +61,7 @@ class Relinearisation:
         all_at_once : however many they are
         """
         smoothed_s = self._network.trajectory.smoothed_to_s
-        due = [b for b in self._network.batches if b.provisional and b.newest_s <= smoothed_s]
+        due = [b for b in self._network.batches.provisional() if b.newest_s <= smoothed_s]
         number = sum(len(b.rays) for b in due)
         alone: list[Batch] = []
         groups: dict[int, list[list[Batch]]] = {}

@@ -11,6 +11,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.datum.drift_monitor import DriftMonitor
+from triline.solver.window.results import WindowOptions
 from triline.solver.window.state.maker import BatchMaker, Draft
 from triline.solver.window.window import Window
 
@@ -98,3 +99,25 @@ def test_a_joined_batch_says_what_its_parts_said() -> None:
     adjust_online(simulation, navigate(simulation), live=False, watch=watch, update_s=0.05)
     assert compared == 20
     assert 12 < max(sizes) <= 160  # 3 rays an update; smoothed poses come five times a second
+
+
+def test_what_batches_keep_of_all_is_what_a_walk_over_them_gives() -> None:
+    """While points come, looks are rejected, batches are joined and leave, over two strips."""
+    plan = ObservationPlan(tie_points_per_s=6.0, outlier_share=0.05)
+    simulation = simulate(FlightPlan(strips=2, strip_s=20.0), 3, observation_plan=plan)
+    compared = 0
+
+    def watch(_: float, window: Window) -> None:
+        nonlocal compared
+        batches = window.network.batches
+        every = list(batches)
+        for name in ("redundancy", "determined", "rays", "control", "points"):
+            assert getattr(batches.counts, name) == sum(getattr(batch.counts, name) for batch in every), name
+        for strip in range(2):
+            assert batches.points_in(strip) == sum(b.n_points for b in every if strip in b.strips)
+        assert {id(b) for b in batches.with_control()} == {id(b) for b in every if b.counts.control}
+        assert batches.provisional() == [b for b in every if b.provisional]
+        compared += bool(every)
+
+    adjust_online(simulation, navigate(simulation), WindowOptions(window_s=8.0), live=False, watch=watch)
+    assert compared > 100
