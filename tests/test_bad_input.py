@@ -38,7 +38,7 @@ import numpy as np
 import pytest
 import sample_messages as sample
 import zenoh
-from bus_rig import Rig, simulated_flight, triline, wait_for
+from bus_rig import Rig, simulated_flight, triline, wait_for, wait_for_nodes
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
@@ -87,8 +87,10 @@ def test_every_node_survives_rubbish_on_every_topic_and_counts_it(tmp_path):
         status: dict = {}
         bus.subscribe("status/*", lambda raw: status.update({raw.topic.split("/")[1]: raw.data}))
         session = zenoh.open(configuration(rig.port))
+        wait_for_nodes(bus, *(name for name in nodes if name != "monitor"))
         wait_for(lambda: bus.alive() >= set(nodes), 40, "the nodes")
-        time.sleep(1.0)  # until all have joined
+        alive = bus.key("alive/*")  # who is seen to live has told what it listens to before
+        wait_for(lambda: len(list(session.liveliness().get(alive))) >= len(nodes), 40, "the nodes, there too")
         stamp, sent = sample.EPOCH_NS, 0
         for row in TOPICS:
             topic = row.name.replace("*", "x")
@@ -112,13 +114,12 @@ def test_every_node_survives_rubbish_on_every_topic_and_counts_it(tmp_path):
 
         for node in ("navigator", "adjuster"):
             wait_for(lambda node=node: malformed(node) >= 3 * 6, 10, f"the counts of the {node}")
-        time.sleep(0.7)
-        for name, process_ in nodes.items():
-            assert process_.poll() is None, rig.log(name)
         for name in nodes:
             if name != "monitor":
-                told = codec.decode(f"status/{name}", status[name])
-                assert told.last_problem, name
+                problem = lambda name=name: codec.decode(f"status/{name}", status[name]).last_problem  # noqa: E731
+                wait_for(problem, 10, f"what the {name} says of it")
+        for name, process_ in nodes.items():
+            assert process_.poll() is None, rig.log(name)
         session.close()
         for name, process_ in nodes.items():
             assert rig.stop(process_) == 0, rig.log(name)
@@ -420,7 +421,8 @@ def test_a_recorder_without_room_says_so_and_goes_on_when_there_is_room(tmp_path
         assert np.diff([full, *(t for t in heard if t > full)]).max() < 1.0  # the sensors notice nothing
         resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (hard, hard))
         wait_for(lambda: states[-1] == "recording", 10, "recording again")
-        time.sleep(0.5)
+        again = len(heard)
+        wait_for(lambda: len(heard) > again + 100, 10, "what is recorded now")
         rig.stop(replay)
         assert rig.stop(recorder) == 1  # it did not keep everything, and says so
         assert "lost" in rig.log("recorder") and "Traceback" not in rig.log("recorder")
