@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from triline.nodes.cli import main
+from triline.nodes.cli import batch, main
 
 TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 #: Quick, and has no input but the recording.
@@ -218,6 +218,18 @@ def test_an_interrupted_batch_leaves_what_is_finished_and_nothing_else(season, h
     assert {path: after[path] for path in before} == before, "finished jobs are not done again"
     assert summary()["jobs"]["earlier"] >= len(before)
     assert not list(Path("out").rglob(".job-*"))
+
+
+def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_finished(season, monkeypatch, capsys):
+    def interrupted(plans, pool, *_):
+        pool.submit(plans[0].jobs["adjust"], 1, 0)
+        until(lambda: not pool._ended.empty(), "nothing was finished")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "drive", interrupted)
+    assert main(["batch", "season/day1", "-o", "out", *ADJUST]) == 1
+    assert "interrupted; 1 " in capsys.readouterr().err
+    assert [row["state"] for row in summary()["flights"]] == ["finished", "unfinished"]
 
 
 def test_two_batches_do_not_write_to_one_folder(season, capsys):
