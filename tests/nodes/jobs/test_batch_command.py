@@ -53,7 +53,9 @@ def summary(out: str | Path = "out") -> dict:
 
 
 def records(out: str | Path = "out") -> dict[str, int]:
-    return {str(path): path.stat().st_mtime_ns for path in sorted(Path(out).rglob("*.done.json"))}
+    # folders of jobs that end go while they are looked at: os.walk takes that, Path.rglob does not
+    found = [os.path.join(folder, name) for folder, _, names in os.walk(out) for name in names]
+    return {path: os.stat(path).st_mtime_ns for path in sorted(found) if path.endswith(".done.json")}
 
 
 def started(*words: str) -> subprocess.Popen:
