@@ -99,7 +99,8 @@ def cluster(tmp_path):
 
 
 def records() -> dict[str, int]:
-    return {str(path): path.stat().st_mtime_ns for path in sorted(Path("out").rglob("*.done.json"))}
+    found = [os.path.join(folder, name) for folder, _, names in os.walk("out") for name in names]
+    return {path: os.stat(path).st_mtime_ns for path in sorted(found) if path.endswith(".done.json")}
 
 
 def batch(cluster: Cluster) -> subprocess.Popen:
