@@ -71,37 +71,46 @@ def parse(topic: str, data: bytes | memoryview) -> Any:
 
 
 class _Numbers(NamedTuple):
-    """Where a message type has numbers: fields of one (what gets them), of many with how many there may be, and of
-    messages."""
+    """Where a message type has numbers, itself or in the messages that it always has: what gets fields of one, and of
+    many with how many there may be (0: any); and what gets lists of messages."""
 
     single: Callable[[Any], Iterable[float]]
-    many: tuple[tuple[str, int], ...]
-    message: tuple[str, ...]
-    messages: tuple[str, ...]
+    many: tuple[tuple[Callable[[Any], Any], int], ...]
+    messages: tuple[Callable[[Any], Any], ...]
 
 
 @cache
 def _numbers_of(cls: Any) -> _Numbers:
-    single, many, message, messages = [], [], [], []
-    sizes = _SIZES.get(cls.DESCRIPTOR.full_name, {})
-    empty = cls()
-    for field in cls.DESCRIPTOR.fields:
-        repeated = hasattr(getattr(empty, field.name), "extend")
-        if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
-            if repeated:
-                many.append((field.name, sizes.get(field.name, 0)))
-            else:
-                single.append(field.name)
-        elif field.cpp_type == field.CPPTYPE_MESSAGE:
-            (messages if repeated else message).append(field.name)
-    return _Numbers(_getter(single), tuple(many), tuple(message), tuple(messages))
+    single: list[str] = []
+    many: list[tuple[Callable[[Any], Any], int]] = []
+    messages: list[Callable[[Any], Any]] = []
+
+    def collect(empty: Any, path: str) -> None:
+        sizes = _SIZES.get(empty.DESCRIPTOR.full_name, {})
+        for field in empty.DESCRIPTOR.fields:
+            name, value = f"{path}{field.name}", getattr(empty, field.name)
+            repeated = hasattr(value, "extend")
+            if field.cpp_type in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
+                if repeated:
+                    many.append((attrgetter(name), sizes.get(field.name, 0)))
+                else:
+                    single.append(name)
+            elif field.cpp_type == field.CPPTYPE_MESSAGE:
+                if repeated:
+                    messages.append(attrgetter(name))
+                else:
+                    collect(value, f"{name}.")
+
+    collect(cls(), "")
+    return _Numbers(_getter(single), tuple(many), tuple(messages))
 
 
 def _getter(names: list[str]) -> Callable[[Any], Iterable[float]]:
     """What gets the values of fields."""
     if len(names) > 1:
         return attrgetter(*names)
-    return lambda body: [getattr(body, name) for name in names]
+    getters = [attrgetter(name) for name in names]
+    return lambda body: [get(body) for get in getters]
 
 
 def validate(body: Any) -> None:
@@ -120,20 +129,20 @@ def validate(body: Any) -> None:
 
 
 def _is_fine(body: Any) -> bool:
-    """Whether all numbers together are finite (those of a sane message do not overflow) and vectors have their size."""
+    """Whether all numbers together are finite (those of a sane message do not overflow) and vectors have their size.
+
+    What a message does not have reads as zero, or as no value.
+    """
     numbers = _numbers_of(type(body))
     total = sum(numbers.single(body))
-    for name, size in numbers.many:
-        values = getattr(body, name)
+    for get, size in numbers.many:
+        values = get(body)
         if values:
             if size and len(values) != size:
                 return False
             total += sum(values)
-    for name in numbers.message:
-        if body.HasField(name) and not _is_fine(getattr(body, name)):
-            return False
-    for name in numbers.messages:
-        for part in getattr(body, name):
+    for get in numbers.messages:
+        for part in get(body):
             if not _is_fine(part):
                 return False
     return math.isfinite(total)

@@ -14,6 +14,19 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Modules and tests are some 360 000 objects that stay: the garbage collector need not look for them again and again.
 gc.disable()
 
+#: Tests that start programs and wait for them. They come first, so that one worker waits while the others compute, and
+#: not all at the end for one flight.
+WAITING = ("tests/test_demo.py", "tests/nodes/sensors/test_fly.py", "tests/test_users_day.py", "tests/nodes/bus/",
+           "tests/test_bad_input.py", "tests/nodes/router/", "tests/nodes/recording/test_slow_disk.py",
+           "tests/nodes/jobs/")  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    def place(item):
+        return next((i for i, path in enumerate(WAITING) if item.nodeid.startswith(path)), len(WAITING))
+
+    items.sort(key=place)
+
 
 def pytest_collection_finish():
     gc.collect()

@@ -38,12 +38,13 @@ import numpy as np
 import pytest
 import sample_messages as sample
 import zenoh
-from bus_rig import Rig, simulated_flight, triline, wait_for
+from bus_rig import Rig, simulated_flight, triline, wait_for, wait_for_nodes
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.bus.session import Bus, configuration
 from triline.nodes.navigator.navigator import Navigator
+from triline.nodes.recorder.recorder import RETRY_S
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.runner import ProcessSummary, process
 from triline.nodes.recording.writer import RecordingWriter
@@ -87,8 +88,10 @@ def test_every_node_survives_rubbish_on_every_topic_and_counts_it(tmp_path):
         status: dict = {}
         bus.subscribe("status/*", lambda raw: status.update({raw.topic.split("/")[1]: raw.data}))
         session = zenoh.open(configuration(rig.port))
+        wait_for_nodes(bus, *(name for name in nodes if name != "monitor"))
         wait_for(lambda: bus.alive() >= set(nodes), 40, "the nodes")
-        time.sleep(1.0)  # until all have joined
+        alive = bus.key("alive/*")  # who is seen to live has told what it listens to before
+        wait_for(lambda: len(list(session.liveliness().get(alive))) >= len(nodes), 40, "the nodes, there too")
         stamp, sent = sample.EPOCH_NS, 0
         for row in TOPICS:
             topic = row.name.replace("*", "x")
@@ -112,13 +115,12 @@ def test_every_node_survives_rubbish_on_every_topic_and_counts_it(tmp_path):
 
         for node in ("navigator", "adjuster"):
             wait_for(lambda node=node: malformed(node) >= 3 * 6, 10, f"the counts of the {node}")
-        time.sleep(0.7)
-        for name, process_ in nodes.items():
-            assert process_.poll() is None, rig.log(name)
         for name in nodes:
             if name != "monitor":
-                told = codec.decode(f"status/{name}", status[name])
-                assert told.last_problem, name
+                problem = lambda name=name: codec.decode(f"status/{name}", status[name]).last_problem  # noqa: E731
+                wait_for(problem, 10, f"what the {name} says of it")
+        for name, process_ in nodes.items():
+            assert process_.poll() is None, rig.log(name)
         session.close()
         for name, process_ in nodes.items():
             assert rig.stop(process_) == 0, rig.log(name)
@@ -415,12 +417,14 @@ def test_a_recorder_without_room_says_so_and_goes_on_when_there_is_room(tmp_path
         full = time.monotonic()
         wait_for(lambda: any(state.startswith("not recording: ") for state in states), 10, "the message")
         assert "a.mcap: file too large" in next(state for state in states if state.startswith("not recording"))
-        time.sleep(2.5)  # it tries again, and fails again
+        time.sleep(RETRY_S + 0.5)  # it tries again, and fails again
         assert states[-1].startswith("not recording: ") and recorder.poll() is None
-        assert np.diff([full, *(t for t in heard if t > full)]).max() < 1.0  # the sensors notice nothing
+        before, since = np.diff([t for t in heard if t <= full]), np.diff([full, *(t for t in heard if t > full)])
+        assert since.max() < max(1.0, 2.0 * before.max())  # the sensors notice nothing
         resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (hard, hard))
         wait_for(lambda: states[-1] == "recording", 10, "recording again")
-        time.sleep(0.5)
+        again = len(heard)
+        wait_for(lambda: len(heard) > again + 100, 10, "what is recorded now")
         rig.stop(replay)
         assert rig.stop(recorder) == 1  # it did not keep everything, and says so
         assert "lost" in rig.log("recorder") and "Traceback" not in rig.log("recorder")

@@ -9,9 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
+from bus_rig import free_port, wait_for
 
+from triline.nodes.bus.session import Bus
+from triline.nodes.cli.demo import PLATFORM
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.simulator.flight_settings import DEFAULT_EPOCH_NS
+from triline.schemas import codec
 
 DEMO = [sys.executable, "-m", "triline.nodes.cli", "demo", "--headless", "--json"]
 RESULTS = (
@@ -36,14 +40,15 @@ def process(recording: Path, output: Path) -> Path:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     """A flight with image lines, and a control point that a surveyor rejects on the way."""
-    from bus_rig import free_port
-
     folder, port = tmp_path_factory.mktemp("demo"), str(free_port())
-    command = [*DEMO, "--seconds", "25", "--seed", "3", "-o", str(folder), "--port", port]
+    command = [*DEMO, "--seconds", "14", "--seed", "3", "-o", str(folder), "--port", port]
     flight = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_for_simulator(folder)
-        time.sleep(22)
+        with Bus(PLATFORM, source="listener", port=int(port)) as bus:
+            seen: set[str] = set()
+            bus.subscribe("observation/target", lambda raw: seen.add(codec.decode(raw.topic, raw.data).point))
+            wait_for(lambda: "GCP2" in seen or flight.poll() is not None, 120, "the first look at GCP2")
         words = ["confirm", "GCP2", "--reject", "--by", "me", "--port", port]
         said = subprocess.run([*DEMO[:3], *words], capture_output=True, timeout=900)
         out, error = flight.communicate(timeout=900)
@@ -55,9 +60,7 @@ def demo(tmp_path_factory):
 
 
 def wait_for_simulator(folder: Path) -> None:
-    until = time.monotonic() + 30
-    while not (folder / "log" / "simulator.log").exists() and time.monotonic() < until:
-        time.sleep(0.2)
+    wait_for((folder / "log" / "simulator.log").exists, 30, "the simulator")
 
 
 def test_demo_leaves_recording_scene_and_report_with_better_orientation(demo):
@@ -164,8 +167,6 @@ def test_the_flight_before_is_kept(tmp_path):
 @pytest.mark.study
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds processes in /proc")
 def test_nodes_killed_in_turn_are_started_again_and_the_flight_is_kept(tmp_path):
-    from bus_rig import free_port
-
     port = free_port()
     command = [*DEMO, "--seconds", "25", "--seed", "5", "-o", str(tmp_path), "--port", str(port)]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -25,20 +24,35 @@ COMMANDS = re.findall(r"^    (triline .+)$", PAGE.read_text(encoding="utf-8"), f
 def fly(folder: Path, seconds: float) -> users_day.Truth:
     """Run all commands of the page in a folder."""
     truth = users_day.write_files(folder / "files", seconds)
+    assert COMMANDS[0] == "triline new flight valley"
+    run(folder, COMMANDS[:1])
+    toml = re.search(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert toml is not None
+    (folder / "valley" / "flight.toml").write_text(toml.group(1))
+    for file in (folder / "files").iterdir():
+        if file.is_file():
+            file.rename(folder / "valley" / file.name)
+    run(folder, COMMANDS[1:])
+    return truth
+
+
+#: Runs commands one after the other until one fails: an interpreter for each would load the same modules ten times.
+ALL = """
+import shlex, sys
+from triline.nodes.cli import main
+for command in sys.argv[1:]:
+    print(command, flush=True)
+    if main(shlex.split(command)[1:]):
+        sys.exit(1)
+"""
+
+
+def run(folder: Path, commands: list[str]) -> None:
     # PROJ looks for the geoid here too
     environment = os.environ | {"PROJ_USER_WRITABLE_DIRECTORY": str(folder / "files" / "proj"), "COLUMNS": "120"}
-    for command in COMMANDS:
-        words = [sys.executable, "-m", "triline.nodes.cli", *shlex.split(command)[1:]]
-        done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
-        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-        if command == "triline new flight valley":
-            toml = re.search(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-            assert toml is not None
-            (folder / "valley" / "flight.toml").write_text(toml.group(1))
-            for file in (folder / "files").iterdir():
-                if file.is_file():
-                    file.rename(folder / "valley" / file.name)
-    return truth
+    words = [sys.executable, "-c", ALL, *commands]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
 
 
 def orientation_error(recording, truth: users_day.Truth, topic: str):

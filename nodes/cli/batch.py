@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +95,10 @@ def _work(planned: Sequence[Plan], progress: Progress, workers: int, args: argpa
         with _interruptible(), _told(progress, pool, args) as told:
             drive(planned, pool, args.retries, progress, told)
     except KeyboardInterrupt:
+        with suppress(UserError):  # of a scheduler that is lost
+            for outcome in pool.ended(0.0):
+                if outcome.good:  # it was finished, and had not been looked at
+                    progress.outcomes.setdefault((outcome.flight, outcome.step), outcome)
         return f"interrupted; {_finished(progress)}, the same command goes on from there"
     except UserError as error:
         return str(error)

@@ -24,7 +24,7 @@ from .carried import gravitation
 from .error_state import NavigationSettings, bias_variances
 from .filter_pass import rates_at
 from .inertial_data import GnssData, InertialData, cut
-from .strapdown import OMEGA_IE, IncrementBlock, earth_rotation, integrate_one, rotation_matrix
+from .strapdown import OMEGA_IE, IncrementBlock, earth_rotation, integrate_to, rotation_matrix
 
 Array = NDArray[np.floating]
 
@@ -70,14 +70,10 @@ def curve(inertial: InertialData, gnss: GnssData, t0: float) -> Curve:
     tau = gnss.time_s - t0
     pieces = cut(inertial, np.concatenate([[t0], gnss.time_s]))[0]
     middle = pieces.time_s - 0.5 * pieces.dt_s
-    zero = np.zeros(3)
-    blocks, total, last = [], IncrementBlock.empty(), int(np.searchsorted(middle, t0))
-    for t in gnss.time_s:
-        end = int(np.searchsorted(middle, t))
-        if end > last:
-            total = total.then(integrate_one(pieces[last:end], zero, zero))
-        blocks.append(total)
-        last = end
+    zero, first = np.zeros(3), int(np.searchsorted(middle, t0))
+    ends = np.searchsorted(middle, gnss.time_s) - first
+    blocks = [IncrementBlock.empty()] * int(np.sum(ends == 0))  # of fixes before the first piece
+    blocks += integrate_to(pieces[first : first + ends[-1]], ends[ends > 0].tolist(), zero, zero)
     C = np.array([earth_rotation(t).T for t in tau])  # Earth-fixed to non-rotating
     r_e = gnss.position_e
     g = _apply(C, gravitation(r_e))

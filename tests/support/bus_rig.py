@@ -13,6 +13,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import zenoh
+
+from triline.nodes.bus.session import Bus
+from triline.schemas import codec
+from triline.schemas.envelope import RawMessage
+
 TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
@@ -47,6 +53,26 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 10.0, what: str
     while not condition():
         assert time.monotonic() < until, f"{what} did not come within {PATIENCE * timeout_s:g} s"
         time.sleep(0.02)
+
+
+def wait_for_nodes(bus: Bus, *names: str) -> None:
+    """Until nodes are on the bus and have worked off what was said before they came."""
+    states: dict[str, str] = {}
+
+    def hear(raw: RawMessage) -> None:
+        states[raw.topic.removeprefix("status/")] = codec.decode(raw.topic, raw.data).state
+
+    stop = bus.subscribe("status/*", hear)
+    wait_for(lambda: all(states.get(name, "starting") != "starting" for name in names), 40, f"{', '.join(names)}")
+    wait_for(lambda: bus.alive() >= set(names), 40, f"{', '.join(names)}")
+    stop()
+
+
+def wait_for_listener(session: zenoh.Session, key: str) -> None:
+    """Until a session knows of somebody who listens to a key: what it says there from now on is heard."""
+    publisher = session.declare_publisher(key)
+    wait_for(lambda: publisher.matching_status.matching, 20, f"one who listens to {key}")
+    publisher.undeclare()
 
 
 class Rig:

@@ -21,6 +21,32 @@ def line_block(i: int = 0, *, width: int = 64, height: int = 4, ccd: str = "F") 
     return LineBlock(pixels, ccd, "S1", i * height, EPOCH_NS + i * 40_000_000, 1_250_000)
 
 
+def _report(i: int, time_ns: int) -> Any:
+    report = m.AdjustmentReport(update=i, sigma0=1.01, redundancy=30, strip="S1", window_end_ns=time_ns)
+    report.rejected.add(point="T1", strip="S1", ccd="F", line=10.5, sample=3.25, w=7.5, reason="snooping")
+    report.parameters.add(name="dX", unit="m", value=1.5, sigma=0.1, t=15.0, status="estimated")
+    return report
+
+
+def _point() -> Any:
+    point = m.ObjectPoint(point="T1", x=1.0, y=2.0, z=3.0, covariance=IDENTITY3, rays=3, role="tie")
+    point.residuals.add(strip="S1", ccd="F", line=10.5, sample=3.25, v_line=0.25, v_sample=-0.5)
+    return point
+
+
+def _camera() -> Any:
+    camera = m.Camera(name="test")
+    camera.lenses.add(id="L", focal_length_mm=62.7)
+    camera.lines.add(id="F", lens="L", x_mm=[14.0, 14.0], y_mm=[-30.0, 30.0])
+    return camera
+
+
+def _log(time_ns: int) -> Any:
+    log = m.Log(level=m.Log.Level.Value("INFO"), message="strip S1 begins", name="adjuster")
+    convert.set_time(log.timestamp, time_ns)
+    return log
+
+
 def body(topic: str, i: int = 0) -> Any:
     """A body of a topic of the table (wildcards filled in), number ``i``."""
     time_ns = EPOCH_NS + i * 5_000_000
@@ -30,19 +56,7 @@ def body(topic: str, i: int = 0) -> Any:
         status = m.NodeStatus(node="navigator", state="running", uptime_s=1.5 + i, lag_s=0.1, queued=3)
         status.topics.add(topic="sensor/gnss", received=10, gaps=1, rate_hz=5.0)
         return status
-    pose = dict(covariance=IDENTITY6, correction=np.full(6, 0.25), velocity_l=(60.0, 1.0, 0.0), strip="S1")
-    report = m.AdjustmentReport(update=i, sigma0=1.01, redundancy=30, strip="S1", window_end_ns=time_ns)
-    report.rejected.add(point="T1", strip="S1", ccd="F", line=10.5, sample=3.25, w=7.5, reason="snooping")
-    report.parameters.add(name="dX", unit="m", value=1.5, sigma=0.1, t=15.0, status="estimated")
-    point = m.ObjectPoint(point="T1", x=1.0, y=2.0, z=3.0, covariance=IDENTITY3, rays=3, role="tie")
-    point.residuals.add(strip="S1", ccd="F", line=10.5, sample=3.25, v_line=0.25, v_sample=-0.5)
-    camera = m.Camera(name="test")
-    camera.lenses.add(id="L", focal_length_mm=62.7)
-    camera.lines.add(id="F", lens="L", x_mm=[14.0, 14.0], y_mm=[-30.0, 30.0])
-    log = m.Log(level=m.Log.Level.Value("INFO"), message="strip S1 begins", name="adjuster")
-    convert.set_time(log.timestamp, time_ns)
     tie = {"strip": "S1", "ccd": "F", "line": 10.5 + i, "sample": 3.25, "time_ns": time_ns}
-    ground = convert.ground_point_message(f"G{i}", (1.0, 2.0, 3.0), IDENTITY3, "control")
     tile: dict[str, Any] = {
         "size": 2,
         "gsd_m": 0.5,
@@ -50,18 +64,29 @@ def body(topic: str, i: int = 0) -> Any:
         "data": b"\0\1\2\3",
         "newest_time_ns": time_ns,
     }
+
+    def pose() -> Any:
+        more = dict(covariance=IDENTITY6, correction=np.full(6, 0.25), velocity_l=(60.0, 1.0, 0.0), strip="S1")
+        return convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **more)
+
+    def ground() -> Any:
+        return convert.ground_point_message(f"G{i}", (1.0, 2.0, 3.0), IDENTITY3, "control")
+
+    # only the one that is asked for is made
     return {
-        "configuration/project": m.Project(name="test", crs="local", origin_latitude=48.9, lever_arm_m=[0.1, 0.2, 0.3]),
-        "configuration/camera": camera,
-        "configuration/strip": m.Strip(id="S1", first_line_time_ns=time_ns, line_rate_hz=800.0, lines=1000),
-        "sensor/imu": m.Imu(time_ns=time_ns, interval_ns=5_000_000, force_z=-9.81, rate_x=0.01),
-        "sensor/attitude": convert.attitude_message(time_ns, (0.1, 0.2, 0.3), (1e-4, 1e-4, 2e-4)),
-        "sensor/gnss": convert.gnss_message(time_ns, (48.9, 8.9, 2000.0), (0.1, 0.1, 0.2), (60.0, 0.0, 0.0)),
-        "trajectory/filtered": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
-        "trajectory/smoothed": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
+        "configuration/project": lambda: m.Project(
+            name="test", crs="local", origin_latitude=48.9, lever_arm_m=[0.1, 0.2, 0.3]
+        ),
+        "configuration/camera": _camera,
+        "configuration/strip": lambda: m.Strip(id="S1", first_line_time_ns=time_ns, line_rate_hz=800.0, lines=1000),
+        "sensor/imu": lambda: m.Imu(time_ns=time_ns, interval_ns=5_000_000, force_z=-9.81, rate_x=0.01),
+        "sensor/attitude": lambda: convert.attitude_message(time_ns, (0.1, 0.2, 0.3), (1e-4, 1e-4, 2e-4)),
+        "sensor/gnss": lambda: convert.gnss_message(time_ns, (48.9, 8.9, 2000.0), (0.1, 0.1, 0.2), (60.0, 0.0, 0.0)),
+        "trajectory/filtered": pose,
+        "trajectory/smoothed": pose,
         "observation/control": ground,
-        "observation/verdict": m.Verdict(point=f"G{i}", accepted=True, by="test"),
-        "observation/target": m.TargetLook(
+        "observation/verdict": lambda: m.Verdict(point=f"G{i}", accepted=True, by="test"),
+        "observation/target": lambda: m.TargetLook(
             point=f"G{i}",
             image=m.ImagePoint(**tie),
             state=m.TargetLook.State.Value("HELD"),
@@ -73,22 +98,22 @@ def body(topic: str, i: int = 0) -> Any:
             off=[0.1, -0.2],
             chi2=3.0,
         ),
-        "observation/progress": m.Progress(time_ns=time_ns),
-        "observation/tie": convert.tie_message(f"T{i}", [tie]),
-        "orientation/live": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
-        "orientation/whole": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
-        "orientation/final": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), **pose),
-        "point/object": point,
-        "adjustment/report": report,
-        "orthoimage/live": m.GroundTile(**tile),
-        "orthoimage/final": m.GroundTile(row=-3, **tile),
-        "adjustment/pace": m.Pace(start_ns=time_ns, level=3, interval_factor=5, kept_share=0.5, lag_s=2.5),
-        "matching/pace": m.Pace(start_ns=time_ns, level=2, interval_factor=1, kept_share=0.5, lag_s=0.5),
-        "truth/trajectory": convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
+        "observation/progress": lambda: m.Progress(time_ns=time_ns),
+        "observation/tie": lambda: convert.tie_message(f"T{i}", [tie]),
+        "orientation/live": pose,
+        "orientation/whole": pose,
+        "orientation/final": pose,
+        "point/object": _point,
+        "adjustment/report": lambda: _report(i, time_ns),
+        "orthoimage/live": lambda: m.GroundTile(**tile),
+        "orthoimage/final": lambda: m.GroundTile(row=-3, **tile),
+        "adjustment/pace": lambda: m.Pace(start_ns=time_ns, level=3, interval_factor=5, kept_share=0.5, lag_s=2.5),
+        "matching/pace": lambda: m.Pace(start_ns=time_ns, level=2, interval_factor=1, kept_share=0.5, lag_s=0.5),
+        "truth/trajectory": lambda: convert.pose_message(time_ns, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3)),
         "truth/point": ground,
-        "truth/world": log,
-        "event/log": log,
-    }[topic]
+        "truth/world": lambda: _log(time_ns),
+        "event/log": lambda: _log(time_ns),
+    }[topic]()
 
 
 def names() -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sample_messages as sample
 import zenoh
-from bus_rig import Rig, free_port, simulated_flight, triline, wait_for
+from bus_rig import PATIENCE, Rig, free_port, simulated_flight, triline, wait_for, wait_for_listener, wait_for_nodes
 from recording_file import payloads, write_recording
 
 from triline.nodes import convert
@@ -151,7 +151,9 @@ def test_jitter_of_arrival_does_not_change_a_result(tmp_path, seed):
         runner = BusRunner(Chain(), bus, stop=stop)
         thread = threading.Thread(target=runner.run)
         thread.start()
-        time.sleep(0.8)
+        wait_for_nodes(sender, "chain")
+        for topic in Chain.inputs:
+            wait_for_listener(sender._session, sender.key(topic))
         arrival = jittered(messages, seed)
         assert [a.topic for a in arrival] != [a.topic for a in messages]
         for message in arrival:
@@ -174,8 +176,9 @@ def test_bad_messages_are_counted_reported_and_dropped(rig):
     session = zenoh.open(configuration(rig.port))
     with Bus(port=rig.port, source="test") as bus:
         bus.subscribe("status/*", lambda raw: statuses.append(codec.decode(raw.topic, raw.data)))
-        wait_for(lambda: "navigator" in bus.alive(), 20, "the navigator")
-        time.sleep(0.6)
+        wait_for_nodes(bus, "navigator")
+        for opened in (session, bus._session):
+            wait_for_listener(opened, bus.key("sensor/gnss"))
         good = codec.encode(sample.body("sensor/gnss"))
         key = bus.key("sensor/gnss")
         session.put(key, good)  # no envelope
@@ -272,14 +275,14 @@ def test_the_port_is_taken_over_when_its_owner_is_killed(rig):
             wait_for(lambda: b.peers() == 2, what="links")
             got = []
             b.subscribe("sensor/gnss", lambda raw: got.append((raw.envelope.source, raw.envelope.sequence)))
-            time.sleep(0.2)
+            wait_for_listener(a._session, a.key("sensor/gnss"))
             first.kill()
             wait_for(lambda: a.peers() == 1, what="the end of the owner")
             a.publish(sample.message("sensor/gnss", source="a"))
             wait_for(lambda: got == [("a", 0)], what="a message without the owner")
             with Bus(port=rig.port, source="c") as c:  # comes later: takes the port, and all find it
                 wait_for(lambda: c.peers() == 2, what="links of the newcomer")
-                time.sleep(0.3)
+                wait_for_listener(c._session, c.key("sensor/gnss"))
                 c.publish(sample.message("sensor/gnss", source="c"))
                 wait_for(lambda: ("c", 0) in got, what="a message of the newcomer")
 
@@ -323,8 +326,10 @@ def test_a_stop_under_load_is_clean(rig, number, tmp_path):
     navigator = rig.start("node", "navigator")
     replay = rig.start("replay", simulated_flight(), "--rate", 3, "--wait-for", "navigator")
     with Bus(port=rig.port) as bus:
+        poses: list[RawMessage] = []
+        bus.subscribe("trajectory/filtered", poses.append)
         wait_for(lambda: bus.alive() >= {"recorder", "navigator", "player"}, 20, "the nodes")
-        time.sleep(1.5)
+        wait_for(lambda: len(poses) > 300, 20, "the middle of the flight")
     assert [rig.stop(p, number) for p in (navigator, replay, recorder)] == [0, 0, 0]
     for name in ("navigator", "replay", "recorder"):
         assert "FATAL" not in rig.log(name) and "Traceback" not in rig.log(name), rig.log(name)
@@ -334,15 +339,15 @@ def test_a_stop_under_load_is_clean(rig, number, tmp_path):
 def test_a_recorder_that_is_stopped_takes_what_is_on_its_way(rig, tmp_path):
     recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
     with Bus(port=rig.port, source="last") as bus:
-        wait_for(lambda: "recorder" in bus.alive(), 20, "the recorder")
+        wait_for_nodes(bus, "recorder")
         bus.prepare(["sensor/gnss"])
-        time.sleep(0.5)
+        wait_for_listener(bus._session, bus.key("sensor/gnss"))
         for number in range(40):
             bus.publish(sample.message("sensor/gnss", number, source="last"))
             if number == 20:
                 recorder.send_signal(signal.SIGTERM)
             time.sleep(0.02)
-        assert recorder.wait(10) == 0
+        assert recorder.wait(20 * PATIENCE) == 0
     assert len(payloads(tmp_path / "a.mcap", "sensor/gnss")) == 40
 
 
@@ -370,7 +375,7 @@ def test_a_platform_hears_only_itself():
         for bus in (b, c):
             bus.subscribe("sensor/gnss", lambda raw, bus=bus: got.append(bus.platform))
         wait_for(lambda: a.peers() == 2, what="links")
-        time.sleep(0.3)
+        wait_for_listener(a._session, a.key("sensor/gnss"))
         a.publish(sample.message("sensor/gnss"))
         wait_for(lambda: got, what="the message")
         time.sleep(0.1)

@@ -6,7 +6,7 @@ import threading
 import time
 
 import sample_messages as sample
-from bus_rig import free_port, wait_for
+from bus_rig import free_port, wait_for, wait_for_listener, wait_for_nodes
 
 from triline.nodes.bus.inbox import Inbox
 from triline.nodes.bus.live import BusRunner
@@ -35,6 +35,7 @@ def test_a_full_lossless_queue_holds_its_publisher():
     inbox = Inbox(lossless_depth=5)
     thread = threading.Thread(target=lambda: [inbox.put(raw(i), Queue.LOSSLESS) for i in range(20)])
     thread.start()
+    wait_for(lambda: len(inbox) == 5, what="a full queue")
     time.sleep(0.1)
     assert len(inbox) == 5
     taken = []
@@ -66,8 +67,8 @@ def test_a_node_that_only_looks_on_slows_nobody():
         runner._inbox = Inbox(newest_depth=20)
         thread = threading.Thread(target=runner.run)
         thread.start()
-        wait_for(lambda: "slow" in sender.alive(), what="the node")
-        time.sleep(0.7)
+        wait_for_nodes(sender, "slow")
+        wait_for_listener(sender._session, sender.key("sensor/attitude"))
         begun = time.monotonic()
         for i in range(1000):
             sender.publish(sample.message("sensor/attitude", i))

@@ -163,7 +163,7 @@ def test_a_session_that_takes_long_to_close_does_not_stop_the_watch(monkeypatch)
 
 def test_a_node_that_was_stopped_for_longer_than_the_lease_hears_its_sensors_again(tmp_path):
     with Rig(tmp_path) as rig, Bus(port=rig.port, source="sender") as bus:
-        received = [0]
+        received, sent = [0], [0]
 
         def take(raw) -> None:
             for row in codec.decode(raw.topic, raw.data).topics:
@@ -175,10 +175,9 @@ def test_a_node_that_was_stopped_for_longer_than_the_lease_hears_its_sensors_aga
         stop = threading.Event()
 
         def publish() -> None:
-            i = 0
             while not stop.wait(0.02):
-                i += 4
-                bus.publish(sample.message("sensor/attitude", i))
+                sent[0] += 1
+                bus.publish(sample.message("sensor/attitude", 4 * sent[0]))
 
         publishing = threading.Thread(target=publish, daemon=True)
         publishing.start()
@@ -186,8 +185,7 @@ def test_a_node_that_was_stopped_for_longer_than_the_lease_hears_its_sensors_aga
         navigator.send_signal(signal.SIGSTOP)
         time.sleep(4.7)
         navigator.send_signal(signal.SIGCONT)
-        time.sleep(1.0)
-        before = received[0]
+        before = sent[0]  # more than this cannot have been on its way
         wait_for(lambda: received[0] > before + 20, 20, "attitudes after the standstill")
         stop.set()
         publishing.join()

@@ -5,7 +5,7 @@ import sys
 import time
 
 import pytest
-from bus_rig import free_port
+from bus_rig import free_port, wait_for
 
 from triline.nodes.bus.processes import NodeProcess
 from triline.nodes.recording.reader import RecordingReader
@@ -28,17 +28,12 @@ def test_nodes_end_cleanly_when_their_parent_is_killed(tmp_path):
     try:
         assert parent.stdout is not None and parent.stdout.readline().strip().isdigit()
         log = tmp_path / "log" / "recorder.log"
-        until = time.monotonic() + 20
-        while "recording to" not in log.read_text() and time.monotonic() < until:
-            time.sleep(0.1)
+        wait_for(lambda: "recording to" in log.read_text(), 20, "the recorder")
         time.sleep(1)
     finally:
         parent.kill()
         parent.wait()
-    until = time.monotonic() + 15
-    while "messages in" not in log.read_text() and time.monotonic() < until:
-        time.sleep(0.2)
-    assert "messages in" in log.read_text(), "the recorder did not end by itself"
+    wait_for(lambda: "messages in" in log.read_text(), 15, "the end of the recorder by itself")
     assert RecordingReader(recording).complete
 
 

@@ -227,7 +227,7 @@ def _server(host: str, bundle: Path, wants: Path | None = None):
         yield f"tls/{host}:{listener.getsockname()[1]}"
     finally:
         listener.close()
-        thread.join(5)
+        thread.join(60)
 
 
 def test_names_revoked_expired_and_refused_certificates_at_the_other_end_are_told_apart(

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from triline.nodes.cli import main
+from triline.nodes.cli import batch, main
 
 TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 #: Quick, and has no input but the recording.
@@ -53,7 +53,9 @@ def summary(out: str | Path = "out") -> dict:
 
 
 def records(out: str | Path = "out") -> dict[str, int]:
-    return {str(path): path.stat().st_mtime_ns for path in sorted(Path(out).rglob("*.done.json"))}
+    # folders of jobs that end go while they are looked at: os.walk takes that, Path.rglob does not
+    found = [os.path.join(folder, name) for folder, _, names in os.walk(out) for name in names]
+    return {path: os.stat(path).st_mtime_ns for path in sorted(found) if path.endswith(".done.json")}
 
 
 def started(*words: str) -> subprocess.Popen:
@@ -218,6 +220,18 @@ def test_an_interrupted_batch_leaves_what_is_finished_and_nothing_else(season, h
     assert {path: after[path] for path in before} == before, "finished jobs are not done again"
     assert summary()["jobs"]["earlier"] >= len(before)
     assert not list(Path("out").rglob(".job-*"))
+
+
+def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_finished(season, monkeypatch, capsys):
+    def interrupted(plans, pool, *_):
+        pool.submit(plans[0].jobs["adjust"], 1, 0)
+        until(lambda: not pool._ended.empty(), "nothing was finished")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "drive", interrupted)
+    assert main(["batch", "season/day1", "-o", "out", *ADJUST]) == 1
+    assert "interrupted; 1 " in capsys.readouterr().err
+    assert [row["state"] for row in summary()["flights"]] == ["finished", "unfinished"]
 
 
 def test_two_batches_do_not_write_to_one_folder(season, capsys):

@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import distributed
 import pytest
 
 from triline.nodes.cli import main
@@ -35,6 +36,8 @@ class Cluster:
         until(self._answers, "the scheduler does not answer")
         words = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "w"), "--death-timeout", "60")
         self.nanny = self._start("distributed.cli.dask_worker", self.address, *words)
+        # a nanny gives up where its worker is killed while it still begins itself
+        until(self._begun, "the worker does not begin")
 
     def _start(self, module: str, *words: str) -> subprocess.Popen:
         with open(self.folder / "cluster.log", "ab") as log:
@@ -42,6 +45,11 @@ class Cluster:
             process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=CPU)
         self.processes.append(process)
         return process
+
+    def _begun(self) -> bool:
+        with distributed.Client(self.address) as client:
+            states = client.run(lambda dask_worker: dask_worker.status.name, nanny=True)
+            return set(states.values()) == {"running"}
 
     def _answers(self) -> bool:
         with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 1):
@@ -99,7 +107,8 @@ def cluster(tmp_path):
 
 
 def records() -> dict[str, int]:
-    return {str(path): path.stat().st_mtime_ns for path in sorted(Path("out").rglob("*.done.json"))}
+    found = [os.path.join(folder, name) for folder, _, names in os.walk("out") for name in names]
+    return {path: os.stat(path).st_mtime_ns for path in sorted(found) if path.endswith(".done.json")}
 
 
 def batch(cluster: Cluster) -> subprocess.Popen:

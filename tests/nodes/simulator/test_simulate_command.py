@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 
 import numpy as np
 import pytest
+from bus_rig import wait_for
 from places import MOTION
 
 from triline.nodes import convert
@@ -308,11 +309,12 @@ def test_flight_on_the_bus(free_port):
             bus.subscribe(topic, received.append)
         before = time.time_ns()
         assert run(options) == 0
-        time.sleep(0.5)
-    expected = simulate(FlightPlan(strip_s=1, lead_in_s=1), 1, observation_plan=ObservationPlan(tie_points_per_s=1))
+        expected = simulate(FlightPlan(strip_s=1, lead_in_s=1), 1, observation_plan=ObservationPlan(tie_points_per_s=1))
+        wanted = Counter(message.topic for message in Simulator(expected).messages(0))
+        wait_for(lambda: Counter(raw.topic for raw in tuple(received)) >= wanted, 10, "all messages")
     counts = Counter(raw.topic for raw in received)
     assert counts.pop("status/simulator") >= 1
-    assert counts == Counter(message.topic for message in Simulator(expected).messages(0))
+    assert counts == wanted
     stamps = [raw.envelope.stamp_ns for raw in received if raw.topic == "sensor/attitude"]
     assert 0 < min(stamps) - before < 5e9 and stamps == sorted(stamps)
 
