@@ -17,16 +17,6 @@ R_BC_NOMINAL: Array = np.diag([1.0, -1.0, -1.0])
 R_ENU_NED: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def sine_and_cosine(angle: ArrayLike) -> tuple[Array, Array]:
-    """Sine and cosine of angles (...) in radians, to a few units of the last place of 1.
-
-    By the tangent of half the angle, which NumPy computes up to 15 times as fast as a sine.
-    """
-    t = np.tan(np.multiply(angle, 0.5))
-    share = 1.0 / (1.0 + t * t)
-    return 2.0 * t * share, (1.0 - t) * (1.0 + t) * share
-
-
 def matrix_from_angles(omega: ArrayLike, phi: ArrayLike, kappa: ArrayLike) -> Array:
     """Image-to-object rotation ``R_lc = Rx(omega) Ry(phi) Rz(kappa)`` [K A.20].
 

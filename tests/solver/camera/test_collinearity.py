@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from triline.solver.camera.collinearity import image_motion, project
+from triline.solver.camera.collinearity import image_motion, project, sine_and_cosine
 from triline.solver.camera.line_camera import CcdLine, Lens, LineCamera, straight_line, three_line_camera
 from triline.solver.geometry.rotation import matrix_from_angles
 
@@ -13,6 +13,16 @@ POSITION = RNG.normal([0, 0, 1500], 100, (N, 3))
 ANGLES = RNG.normal(0, 0.05, (N, 3)) + np.column_stack([np.zeros(N), np.zeros(N), RNG.uniform(-3, 3, N)])
 POINT = RNG.normal(0, 400, (N, 3)) * [1, 1, 0.1]
 C = np.full(N, 62.7)
+
+
+def test_sine_and_cosine_on_the_whole_circle_and_beyond():
+    quarters = np.pi / 2 * np.arange(-8, 9)
+    angles = np.concatenate([np.linspace(-9, 9, 2000), quarters, quarters + 1e-9, [0.0]])
+    sine, cosine = sine_and_cosine(angles)
+    np.testing.assert_allclose(sine, np.sin(angles), rtol=0, atol=5e-16)
+    np.testing.assert_allclose(cosine, np.cos(angles), rtol=0, atol=5e-16)
+    small = 1e-3 * np.linspace(-1, 1, 100)
+    np.testing.assert_allclose(sine_and_cosine(small)[0], np.sin(small), rtol=1e-15)
 
 
 def test_projection_meets_the_ray():

@@ -10,16 +10,6 @@ RNG = np.random.default_rng(7)
 ANGLES = np.column_stack([RNG.uniform(-3, 3, 50), RNG.uniform(-1.5, 1.5, 50), RNG.uniform(-3.1, 3.1, 50)])
 
 
-def test_sine_and_cosine_on_the_whole_circle_and_beyond():
-    quarters = np.pi / 2 * np.arange(-8, 9)
-    angles = np.concatenate([RNG.uniform(-9, 9, 2000), quarters, quarters + 1e-9, [0.0]])
-    sine, cosine = rot.sine_and_cosine(angles)
-    np.testing.assert_allclose(sine, np.sin(angles), rtol=0, atol=5e-16)
-    np.testing.assert_allclose(cosine, np.cos(angles), rtol=0, atol=5e-16)
-    small = 1e-3 * RNG.standard_normal(100)
-    np.testing.assert_allclose(rot.sine_and_cosine(small)[0], np.sin(small), rtol=1e-15)
-
-
 def test_photogrammetric_matrix_is_the_product_of_three_rotations():
     expected = Rotation.from_euler("XYZ", ANGLES).as_matrix()
     np.testing.assert_allclose(rot.matrix_from_angles(*ANGLES.T), expected, atol=1e-14)
