@@ -57,6 +57,10 @@ class Node:
         """What follows from one message."""
         raise TypeError(f"{type(self).__name__} does not define step")
 
+    def looks_at(self, topic: str, stamp_ns: int) -> bool:
+        """Whether a node without outputs wants a message at all; live, what it does not want is not even decoded."""
+        return True
+
     def finish(self) -> Iterable[Message]:
         """What was still held back when the last message has come."""
         return ()

@@ -31,7 +31,7 @@ JOIN_S = 0.5
 #: Messages worked off before it is looked what has arrived meanwhile.
 MOST_AT_ONCE = 64
 #: A node that only looks on takes what came in so long together, s, and is not woken for every message.
-LOOK_ON_S = 0.03
+LOOK_ON_S = 0.05
 #: How often a node is told how far it is behind.
 LAG_PERIOD_S = 0.1
 #: A steady input that says nothing for so long while the flight goes on is an alarm, s; ties may be rare for a while.
@@ -254,6 +254,8 @@ class BusRunner:
 
     def _arrive(self, raw: RawMessage, now: float) -> None:
         for accepted in self._check.accept(raw.topic, raw.envelope, raw):
+            if not (self._ordered or self.node.looks_at(accepted.topic, accepted.envelope.stamp_ns)):
+                continue
             message = self._decode(accepted)
             if message is None:
                 continue

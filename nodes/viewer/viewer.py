@@ -12,7 +12,7 @@ from . import scene
 from .canvas import Canvas
 from .rerun_process import ViewerProcess
 
-_PERIOD_S = 0.4  # between two drawings
+_PERIOD_S = 0.5  # between two drawings
 _POSE_STEP_NS = 45_000_000  # poses that come faster are not looked at
 _MOST_LINES = 100  # blocks of image lines that wait
 _FINISH_S = 20.0
@@ -57,6 +57,7 @@ class Viewer(Node):
         self._queue_size = queue_size
         self._lines_taken_in = self._lines_worked_off = 0  # each is counted by one thread
         self._last_pose_ns: dict[str, int] = {}
+        self._last_stamp_ns = 0  # of a filtered pose
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._failed = ""
@@ -67,6 +68,14 @@ class Viewer(Node):
     def url(self) -> str | None:
         """Where a browser finds the web viewer; None in other modes."""
         return self._process.web_url if self._process is not None and self._process.web_port else None
+
+    def looks_at(self, topic: str, stamp_ns: int) -> bool:
+        if topic != "trajectory/filtered":  # smoothed poses come in batches of one stamp
+            return True
+        if 0 < stamp_ns - self._last_stamp_ns < _POSE_STEP_NS:
+            return False
+        self._last_stamp_ns = stamp_ns
+        return True
 
     def step(self, message: Message) -> Iterable[Message]:
         if message.topic in self._hidden:
