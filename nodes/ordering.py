@@ -265,6 +265,7 @@ class Sequencer(Generic[T]):
         self._newest_ns: int | None = None
         self._time_ns: int | None = None  # the same without observations
         self._released: Key | None = None
+        self._flushed = False  # since it was released
         self._ahead: dict[tuple[str, str], int] = {}  # messages in a row that were far ahead, by topic and source
         self._leapt_ns: int | None = None  # a stamp far ahead of all others that the next message has to confirm
         self._streams: dict[tuple[str, str], _Watermark] = {}
@@ -301,7 +302,7 @@ class Sequencer(Generic[T]):
         if row.order_only:
             return None
         key = order_key(topic, envelope)
-        if self._released is not None and key < self._released:
+        if self._released is not None and key < self._released and not (self._flushed and stamp == self._released[0]):
             return item
         self._arrivals += 1
         heapq.heappush(self._heap, (key, self._arrivals, item))
@@ -360,11 +361,16 @@ class Sequencer(Generic[T]):
                 self.ready = True
                 break
             out.append(self._take())
+            self._flushed = False
         return out
 
     def flush(self, ahead: bool = True) -> list[T]:
-        """Everything that waits, in order; on request without observations that are stamped ahead of time."""
+        """Everything that waits, in order; on request without observations that are stamped ahead of time.
+
+        What comes later with the stamp of the last of it, as from a node that ends, is not late.
+        """
         out: list[T] = []
+        self._flushed = True
         newest_ns = self.newest_ns
         while self._heap and (ahead or newest_ns is None or self._heap[0][0][0] <= newest_ns):
             out.append(self._take())

@@ -172,6 +172,17 @@ def test_the_orthoimage_may_get_the_end_of_a_strip_two_seconds_late(topic):
         assert bool(late) == lost
 
 
+def test_the_last_words_of_a_node_that_ends_are_not_late():
+    """Everything was worked off for lack of news; the navigator ends and says its last smoothed poses."""
+    sequencer: Sequencer = Sequencer(("trajectory/smoothed", "orientation/live"))
+    for t in (100, 200):
+        sequencer.push("orientation/live", Envelope(t * MS, "a", t), f"live {t}", 0.0)
+    assert sequencer.flush() == ["live 100", "live 200"]
+    assert sequencer.push("trajectory/smoothed", Envelope(200 * MS, "n", 1), "last", 3.0) is None
+    assert sequencer.flush() == ["last"]
+    assert sequencer.push("trajectory/smoothed", Envelope(150 * MS, "m", 1), "too late", 3.0) == "too late"
+
+
 ADJUSTER = (
     "configuration/strip", "trajectory/filtered", "trajectory/smoothed", "observation/control", "observation/verdict",
     "observation/tie", "observation/progress",
