@@ -54,7 +54,7 @@ def test_poses_that_come_faster_than_they_are_drawn_are_not_decoded():
     viewer = Viewer(canvas=NullCanvas())
     step_ns = 5_000_000
     assert sum(viewer.looks_at("trajectory/filtered", START_NS + i * step_ns) for i in range(200)) == 23
-    assert all(viewer.looks_at("trajectory/filtered", START_NS + 250 * step_ns) for _ in range(3)), "a batch of one stamp"
+    assert all(viewer.looks_at("trajectory/filtered", START_NS + 250 * step_ns) for _ in range(3)), "of one stamp"
     assert all(viewer.looks_at("orientation/live", START_NS + i * step_ns) for i in range(20))
     _finish(viewer)
 
