@@ -72,8 +72,10 @@ def curve(inertial: InertialData, gnss: GnssData, t0: float) -> Curve:
     middle = pieces.time_s - 0.5 * pieces.dt_s
     zero, first = np.zeros(3), int(np.searchsorted(middle, t0))
     ends = np.searchsorted(middle, gnss.time_s) - first
-    blocks = [IncrementBlock.empty()] * int(np.sum(ends == 0))  # of fixes before the first piece
-    blocks += integrate_to(pieces[first : first + ends[-1]], ends[ends > 0].tolist(), zero, zero)
+    later = ends[ends > 0].tolist()
+    blocks = [IncrementBlock.empty()] * (len(ends) - len(later))  # of fixes before the first piece
+    if later:
+        blocks += integrate_to(pieces[first : first + later[-1]], later, zero, zero)
     C = np.array([earth_rotation(t).T for t in tau])  # Earth-fixed to non-rotating
     r_e = gnss.position_e
     g = _apply(C, gravitation(r_e))

@@ -242,6 +242,18 @@ def test_filter_and_smoother_agree_with_a_batch_adjustment():
     assert ((ratio > 0.85) & (ratio < 1.15)).all(), ratio
 
 
+@pytest.mark.parametrize("until_s", [15.0, 25.0])
+def test_fixes_before_the_inertial_data_have_no_integrals(until_s):
+    from triline.solver.navigation.alignment_window import curve
+
+    f = sim.flight(duration_s=30.0, seed=2, line_s=10.0)
+    begin_s, t0 = f.gnss.time_s[0] + 16.0, f.gnss.time_s[0]
+    c = curve(f.inertial[f.inertial.time_s > begin_s].corrected(), f.gnss[f.gnss.time_s < t0 + until_s], t0)
+    before = c.tau < 15.9
+    assert before.any() and not c.v[before].any() and (c.R[before] == np.eye(3)).all()
+    assert c.v[c.tau > 16.1].any(axis=1).all()
+
+
 def test_trajectory_between_nodes_follows_the_inertial_data(tactical):
     f, r = tactical[0]
     t = np.arange(200.0, 203.0, 0.0013)
