@@ -116,7 +116,7 @@ class PseudoObservations:
 #: Groups of slow errors whose a-priori sigmas are right or wrong together: what is constant over a strip, or drifts
 #: over it, and what wanders.
 OFFSET, SHIFT, POSITION_WANDER, ATTITUDE_WANDER = range(4)
-WANDERS = POSITION_WANDER, ATTITUDE_WANDER
+CONSTANT, WANDERS = (OFFSET, SHIFT), (POSITION_WANDER, ATTITUDE_WANDER)
 ERROR_GROUPS = ("offset", "shift and drift", "wander of position", "wander of attitude")
 _ANGLES = ("omega", "phi", "kappa")
 

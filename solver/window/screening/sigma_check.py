@@ -9,18 +9,20 @@ over many points if all sigmas are right, also where every fifth look is a gross
 is clearly larger, tests of single looks are made wider by that much. A strip begins with points of two looks, of which
 none can be spared; they count until there are others.
 
-*Variance components.* For each group of slow errors (`models.base.ERROR_GROUPS`) the squared residuals of its a-priori
-equations are compared with their redundancy over about the last `MEMORY_S`. Where they are significantly more, pairs of
-factors on the sigmas of positions and attitudes are weighed by their restricted likelihood (`_likely`); the sigmas of
-the unknowns present are stated anew, and those of all that come later. A factor falls again where the data no longer
-ask for it, and never below 1: a trajectory that is stated too good costs much, one that is stated too bad next to
-nothing. Where that of a wander falls, the wander that is present keeps what it had: it may be all in one step of the
-GNSS, which a mean over the window no longer shows. Not where noise of the looks, or the other wander, has been found
-larger since, which had been taken for it. The image has a factor, too: from the median of squared normalised residuals,
-which gross errors do not move much. Few looks with much noise look as if the trajectory wandered, and a wander that is
-stated so large would follow their noise from then on. So before one is stated larger, noise of looks is a third factor
-of the bank. Where looks at different points, taken at nearly the same time, have much of it in common it is no noise of
-the image: the attitude vibrates. It is stated as noise of the attitude then, so that the orientation says it, too.
+*Variance components.* Pairs of factors on the sigmas of positions and attitudes are weighed by their restricted
+likelihood (`_likely`); the sigmas of the unknowns present are stated anew, and those of all that come later. Those of
+the wanders are weighed where larger ones are clearly more likely than those in force: a wander that is stated too small
+bends smoothly, and its residuals in single a-priori equations say little of it where few looks contradict each other.
+Those of offset and of shift and drift are weighed where the squared residuals of their few a-priori equations are
+significantly more than their redundancy. A factor falls again where the data no longer ask for it, and never below 1: a
+trajectory that is stated too good costs much, one that is stated too bad next to nothing. Where that of a wander falls,
+the wander that is present keeps what it had: it may be all in one step of the GNSS, which a mean over the window no
+longer shows. Not where noise of the looks, or the other wander, has been found larger since, which had been taken for
+it. The image has a factor, too: from the median of squared normalised residuals, which gross errors do not move much.
+Few looks with much noise look as if the trajectory wandered, and a wander that is stated so large would follow their
+noise from then on. So before one is stated larger, noise of looks is a third factor of the bank. Where looks at
+different points, taken at nearly the same time, have much of it in common it is no noise of the image: the attitude
+vibrates. It is stated as noise of the attitude then, so that the orientation says it, too.
 
 Source: W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, AVN 86, 1979; restricted
 likelihood: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin geodesique 60, 1986.
@@ -38,7 +40,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ...adjustment.network import Rays
-from ...models.base import ATTITUDE_WANDER, ERROR_GROUPS, OFFSET, POSITION_WANDER, SHIFT, WANDERS
+from ...models.base import ATTITUDE_WANDER, CONSTANT, ERROR_GROUPS, OFFSET, POSITION_WANDER, WANDERS
 from ...models.slow_errors import LEARNING_TIME_S
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
@@ -49,11 +51,16 @@ Array = NDArray[np.floating]
 
 #: Residuals of a-priori equations are compared with their redundancy over so long, s.
 MEMORY_S = 30.0
-#: Probability that a right sigma is questioned, by one look at one group: offset, shift and drift are few, and the
-#: same in all looks; wanders are other ones again and again. Tuned: of 20 flights each with a lever arm 0.2 m off and
-#: with a random walk one is shown as good though its orientation is worse than its sigmas say; at 3e-3 for the offset
-#: four. Flights as stated are the same at both.
-QUESTIONED = (1.5e-2, 3e-3, 1e-4, 1e-4)
+#: Probability that a right sigma of the offset, and of shift and drift, is questioned by one look. Tuned: of 20 flights
+#: each with a lever arm 0.2 m off and with a random walk one is shown as good though its orientation is worse than its
+#: sigmas say; at 3e-3 for the offset four. Flights as stated are the same at both.
+QUESTIONED = (1.5e-2, 3e-3)
+#: Wanders are weighed where twice as large a one is more likely by so much, as minus twice the logarithm of a
+#: likelihood ratio: chi-square of two degrees of freedom, 0.5 %. Tuned: between 6 and 18 flights as stated are the
+#: same, and points of flights whose wander is twice as large and seen by few looks are within 3 %.
+CLEARLY_LIKELIER = 10.6
+#: Factors on position and attitude that are tried for that.
+TWICE = ((1.0, 2.0), (2.0, 1.0), (2.0, 2.0))
 #: Where the wander of position is not as stated, but guessed from the covariance of a pose, the likelihood of a bank
 #: says what it is as soon as there is so much redundancy; no test has to ask for it first. Tuned.
 PLENTY = 10.0
@@ -97,9 +104,9 @@ PLATFORM_QUESTIONED, CERTAIN, SURPRISING = 2.6, 5.0, 2.0
 #: No factor becomes larger.
 LARGEST = 1000.0
 #: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
-#: median of chi-square values of one degree of freedom that are the least of three), that from which it counts, and
-#: from which a wander of attitude is questioned; that of position may show at control alone. Tuned.
-REMEMBERED, ENOUGH, RIGHT, CLEARLY, SUSPECT = 60, 15, 0.3, 1.5, 0.8
+#: median of chi-square values of one degree of freedom that are the least of three), and that from which it counts.
+#: Tuned.
+REMEMBERED, ENOUGH, RIGHT, CLEARLY = 60, 15, 0.3, 1.5
 
 
 class SigmaCheck:
@@ -112,13 +119,13 @@ class SigmaCheck:
 
     def __init__(self, network: LiveNetwork, constants: bool = True) -> None:
         self._network = network
-        self._pairs = (WANDERS, (OFFSET, SHIFT))[: 1 + constants]
+        self._pairs = (WANDERS, CONSTANT)[: 1 + constants]
         self._ratios: deque[float] = deque(maxlen=REMEMBERED)
         self._of_two: deque[float] = deque(maxlen=REMEMBERED)
         self._told = np.ones(len(ERROR_GROUPS) + 1)
         self._vibration = self._shared = 0.0
         self._steady = 0
-        self._suspect = False
+        self._enough = False
         self._told_platform: set[str] = set()
         # largest factor of the wanders of position and attitude, and that of the other one then
         self._largest, self._beside = np.ones(2), np.ones(2)
@@ -132,8 +139,8 @@ class SigmaCheck:
             else:
                 self._of_two.append(RIGHT * square / _median_square(redundancy))
         known = self._ratios if len(self._ratios) >= ENOUGH else self._of_two
-        ratio = float(np.median(known)) if len(known) >= ENOUGH else 1.0
-        self._suspect = ratio > SUSPECT
+        self._enough = len(known) >= ENOUGH
+        ratio = float(np.median(known)) if self._enough else 1.0
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
 
     def look(self, now_s: float, due: bool) -> tuple[bool, bool]:
@@ -151,7 +158,7 @@ class SigmaCheck:
         network.state.solve()
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
-        factor, of_image = self._slow_errors(strip, now_s)
+        factor, of_image = self._slow_errors(strip, now_s, due)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
         self._steady = 0 if of_slow or of_image else self._steady + 1
@@ -187,7 +194,7 @@ class SigmaCheck:
         position, attitude = (~moved).tolist()
         return position, attitude
 
-    def _slow_errors(self, strip: WindowStrip, now_s: float) -> tuple[Array, bool]:
+    def _slow_errors(self, strip: WindowStrip, now_s: float, due: bool) -> tuple[Array, bool]:
         """Factors (4,) that the residuals of a-priori equations ask for; whether the noise of looks was stated anew,
         which may be what bends the trajectory."""
         before, state = self._network.sigmas.apriori, self._network.state
@@ -196,22 +203,28 @@ class SigmaCheck:
         squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
         factor, of_looks = before.copy(), False
         known = redundancies >= LEAST_REDUNDANCY
-        contradicted = known & (squares > chi2.isf(QUESTIONED, redundancies))
-        if not self._suspect:  # a gross error that has not been found yet bends the attitude, control the position
-            contradicted[ATTITUDE_WANDER] = False
-        contradicted[OFFSET] |= self._offset_or_mounting(strip, now_s)
+        too_large = [
+            known[g] and squares[g] > chi2.isf(p, redundancies[g]) for g, p in zip(CONSTANT, QUESTIONED, strict=True)
+        ]
+        contradicted = any(too_large) or self._offset_or_mounting(strip, now_s)
         weighed = known & (factor > 1.0)
         guessed = strip.slow.wander_time_s < 2.0 * LEARNING_TIME_S  # nearer to what is learnt than to what is stated
         weighed[POSITION_WANDER] |= guessed and squares[POSITION_WANDER] > redundancies[POSITION_WANDER] > PLENTY
         for pair in self._pairs:
-            asked = weighed[list(pair)] | contradicted[list(pair)].any()
+            asked = weighed[list(pair)] | (pair == CONSTANT and contradicted)
+            # a gross error among the first few points bends the trajectory as a wander does
+            by_likelihood = pair == WANDERS and due and self._enough
+            if not asked.any() and not by_likelihood:
+                continue
+            cost, present = _Cost(strip, state, pair), (float(before[pair[0]]), float(before[pair[1]]))
+            if by_likelihood:
+                asked |= cost.prefers_larger(*present)
             if not asked.any():
                 continue
-            present = float(before[pair[0]]), float(before[pair[1]])
-            *wanted, ratio = _likely(strip, state, pair, present)
+            *wanted, ratio = _likely(cost, present)
             noise = self._noise() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
             if noise is not None:
-                *wanted, ratio = _likely(strip, state, pair, present, noise)
+                *wanted, ratio = _likely(_Cost(strip, state, pair, noise), present)
             for g, w, it in zip(pair, wanted, asked, strict=True):
                 if it:
                     factor[g] = _changed(float(factor[g]), w / float(factor[g]))
@@ -364,13 +377,16 @@ class _Cost:
 
     Parameters
     ----------
-    as of `_likely`
+    pair : groups of position and attitude
+    noise : of looks; None where it stays as it is
     """
 
-    def __init__(self, strip: WindowStrip, state: WindowState, pair: tuple[int, int], noise: _Noise | None) -> None:
+    def __init__(
+        self, strip: WindowStrip, state: WindowState, pair: tuple[int, int], noise: _Noise | None = None
+    ) -> None:
         (A, A_now, self._a), (B, B_now, self._b) = (strip.apriori_information(g, state) for g in pair)
         N, self._rhs = state.normal()
-        self._rest, self._noise = N - A_now - B_now, noise
+        self._rest, self.noise = N - A_now - B_now, noise
         position, attitude = A.any(axis=0), B.any(axis=0)
         assert not (position & attitude).any()
         self._others = np.flatnonzero(~(position | attitude))
@@ -378,6 +394,11 @@ class _Cost:
         self._A, self._B = (M[np.ix_(own, own)] for M, own in zip((A, B), self._places, strict=True))
         self._of_noise: dict[float, _Eliminated | None] = {}
         self._of_position: dict[tuple[float, float], _Eliminated | None] = {}
+
+    def prefers_larger(self, f: float, g: float) -> bool:
+        """Whether larger factors than these, of position or attitude or both, are clearly more likely."""
+        larger = min(self.of(i * f, j * g, 1.0) for i, j in TWICE)
+        return self.of(f, g, 1.0) - larger > CLEARLY_LIKELIER
 
     def of(self, f: float, g: float, h: float) -> float:
         """Of factors of position, attitude and noise; infinite where the equations have no solution."""
@@ -397,8 +418,8 @@ class _Cost:
             return np.inf
         gained = sum(part.log_det - part.square for part in (both, one, last))
         of_looks = 0.0
-        if self._noise is not None and h > 1.0:
-            of_looks = 2.0 * self._noise.rows * np.log(h) - (1.0 - h**-2) * self._noise.square
+        if self.noise is not None and h > 1.0:
+            of_looks = 2.0 * self.noise.rows * np.log(h) - (1.0 - h**-2) * self.noise.square
         far = (np.log(f) ** 2 + np.log(g) ** 2 + np.log(h) ** 2) / USUAL_LOG**2
         return float(gained + 2.0 * (self._a * np.log(f) + self._b * np.log(g)) + of_looks + far)
 
@@ -406,9 +427,9 @@ class _Cost:
         """The equations of the pair, without what is stated of it."""
         order = np.concatenate([self._others, *self._places])
         matrix, rhs = self._rest, self._rhs
-        if self._noise is not None and h > 1.0:
+        if self.noise is not None and h > 1.0:
             less = 1.0 - h**-2
-            matrix, rhs = matrix - less * self._noise.matrix, rhs - less * self._noise.rhs
+            matrix, rhs = matrix - less * self.noise.matrix, rhs - less * self.noise.rhs
         return _eliminated(matrix[np.ix_(order, order)], rhs[order], len(self._others))
 
 
@@ -434,13 +455,7 @@ def _eliminated(matrix: Array, rhs: Array, first: int) -> _Eliminated | None:
     return _Eliminated(matrix[first:, first:] - X.T @ X, rhs[first:] - X.T @ y, log_det, float(y @ y))
 
 
-def _likely(
-    strip: WindowStrip,
-    state: WindowState,
-    pair: tuple[int, int],
-    present: tuple[float, float],
-    noise: _Noise | None = None,
-) -> tuple[float, float, float]:
+def _likely(cost: _Cost, present: tuple[float, float]) -> tuple[float, float, float]:
     """Factors of errors of position and attitude of one kind, and what the noise of looks is to be multiplied by, from
     the likelihood of the data under a bank of them.
 
@@ -451,27 +466,25 @@ def _likely(
 
     Parameters
     ----------
-    pair : groups of position and attitude
+    cost : of a choice of factors
     present : factors in force
-    noise : of looks; None where it stays as it is
     """
-    cost_of = _Cost(strip, state, pair, noise).of
-    banks = BANK, BANK, NOISES if noise is not None else (1.0,)
+    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,)
     most = tuple(len(bank) for bank in banks)
-    cost = np.full(most, np.inf)
+    costs = np.full(most, np.inf)
     first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
     seen, waiting, least = {(*first, 0)}, [(*first, 0)], np.inf
     while waiting:
         place = waiting.pop()
-        cost[place] = cost_of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
-        least = min(least, cost[place])
-        if cost[place] > least + COUNTS and np.isfinite(least):
+        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
+        least = min(least, costs[place])
+        if costs[place] > least + COUNTS and np.isfinite(least):
             continue
         beside = {(place[0] + i, place[1] + j, place[2] + k) for i, j, k in STEPS} - seen
         near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
         seen.update(near)
         waiting.extend(near)
-    weight = np.exp(-0.5 * (cost - least))
+    weight = np.exp(-0.5 * (costs - least))
     weight /= weight.sum()
     square = [
         float(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)) for i, bank in enumerate(banks)

@@ -264,7 +264,9 @@ def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
         strip.activate(15.0, state)
         state.solve()
     assert np.linalg.norm(mixed.theta - as_stated.theta) > 1e-6
-    expected, found = (_likely(s, of, WANDERS, (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True))
+    expected, found = (
+        _likely(_Cost(s, of, WANDERS), (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True)
+    )
     assert found == pytest.approx(expected, rel=1e-6)
 
 
