@@ -88,6 +88,11 @@ STEADY = 3
 APART_S, LASTING, RAISED = (0.4, 0.8), 0.15, 1.5
 #: The other wander was meant where its factor has become so many times as large since. Tuned.
 MOVED = 2.0
+#: Disagreements of two looks beyond so many standard deviations may be gross errors, and this share of them is taken
+#: for good: usual, and tuned, for points of which a third are spoilt. Rounds that find out.
+WITHIN, SURELY_GOOD, MOST_ROUNDS = 2.5, 0.3, 30
+#: What is left of the variance of a normal distribution within these. Derived.
+KEPT_INSIDE = float((1.0 - chi2.sf(WITHIN**2, 3)) / (1.0 - chi2.sf(WITHIN**2, 1)))
 #: A factor is told again when it differs by so much from what was told last.
 TOLD_AGAIN = 1.5
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
@@ -137,10 +142,14 @@ class SigmaCheck:
             if spared:
                 self._ratios.append(square / _median_square(redundancy))
             else:
-                self._of_two.append(RIGHT * square / _median_square(redundancy))
-        known = self._ratios if len(self._ratios) >= ENOUGH else self._of_two
-        self._enough = len(known) >= ENOUGH
-        ratio = float(np.median(known)) if self._enough else 1.0
+                self._of_two.append(square)
+        self._enough, ratio = True, RIGHT
+        if len(self._ratios) >= ENOUGH:
+            ratio = float(np.median(self._ratios))
+        elif len(self._of_two) >= ENOUGH:
+            ratio = RIGHT * _variance_of_most(np.array(self._of_two))
+        else:
+            self._enough = False
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
 
     def look(self, now_s: float, due: bool) -> tuple[bool, bool]:
@@ -228,8 +237,10 @@ class SigmaCheck:
             for g, w, it in zip(pair, wanted, asked, strict=True):
                 if it:
                     factor[g] = _changed(float(factor[g]), w / float(factor[g]))
+            # gross errors count in the likelihood, and not in a median
+            ratio = min(ratio, MOST_UP, np.sqrt(self._median_ratio()))
             if noise is not None and ratio > CHANGED:
-                self._state_noise(noise.variance * min(ratio, MOST_UP) ** 2, noise.pixel, noise.sigma_px)
+                self._state_noise(noise.variance * ratio**2, noise.pixel, noise.sigma_px)
                 of_looks = True
             if (factor != before).any() or of_looks:
                 break  # what wanders is looked at first; the rest when that is settled
@@ -258,13 +269,20 @@ class SigmaCheck:
             sum(i.rows for i in information), sum(i.square for i in information), *network.state.live(),
         )  # fmt: skip
 
+    def _controlled(self) -> Array:
+        """Normalised residuals of the looks in the window that the others control, as they were judged last."""
+        known = [b.judged[2] for b in self._network.batches if b.judged is not None]
+        return np.concatenate([s.w[s.redundancy > LEAST_CONTROLLED] for s in known]) if known else np.empty(0)
+
+    def _median_ratio(self) -> float:
+        """Median of the squares of these over that of right sigmas; 1 where there are too few."""
+        w = self._controlled()
+        return float(np.median(w**2) / _median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
+
     def _judged(self) -> _Residuals | None:
         """Residuals of the looks in the window, where they ask for another noise than is stated; None where not."""
         sigmas, noise, state = self._network.sigmas, self._network.pose_noise, self._network.state
-        known = [b.judged[2] for b in self._network.batches if b.judged is not None]
-        if not known:
-            return None
-        w = np.concatenate([s.w[s.redundancy > LEAST_CONTROLLED] for s in known])
+        w = self._controlled()
         if len(w) < LEAST_LOOKS:
             return None
         stated = sigmas.image == 1.0 and noise.vibration == 0.0
@@ -496,6 +514,23 @@ def _pixel_and_sigma(rays: Sequence[Rays]) -> tuple[float, float]:
     """Angle that a pixel subtends, rad, and the sigma of a sample as it is stated now, pixels: medians of rays."""
     pixel = np.concatenate([np.linalg.norm(r.pitch_mm, axis=1) / r.focal_length_mm for r in rays])
     return float(np.median(pixel)), float(np.median(np.concatenate([r.sigma_sample_px for r in rays])))
+
+
+def _variance_of_most(squares: Array) -> float:
+    """Variance of which squares (n,) with one degree of freedom each are, but for gross errors among them.
+
+    With one gross error among three values their median is three times that of good ones. So the search begins with a
+    smaller quantile, and goes on with the mean of those within `WITHIN` standard deviations, until nothing changes.
+
+    Source: P. J. Rousseeuw, A. M. Leroy, Robust regression and outlier detection, 1987, section 5.1 (reweighted).
+    """
+    variance = float(np.quantile(squares, SURELY_GOOD)) / float(chi2.ppf(SURELY_GOOD, 1))
+    for _ in range(MOST_ROUNDS):
+        inside = squares < WITHIN**2 * variance
+        before, variance = variance, float(squares[inside].mean()) / KEPT_INSIDE if inside.any() else variance
+        if np.isclose(variance, before):
+            break
+    return variance
 
 
 @lru_cache

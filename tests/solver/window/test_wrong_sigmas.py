@@ -13,9 +13,10 @@ from triline.solver.camera.self_calibration import focal_length
 from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.models.wander import GLOBALS
+from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
-from triline.solver.simulation.scenario import simulate
+from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import (
     adjust_online,
     direct_points,
@@ -33,6 +34,7 @@ from triline.solver.window.screening.sigma_check import (
     _Cost,
     _likely,
     _Noise,
+    _variance_of_most,
 )
 from triline.solver.window.state.network import LiveNetwork
 from triline.solver.window.state.strip import WindowStrip
@@ -250,6 +252,36 @@ def test_a_wander_falls_where_the_other_one_was_meant(camera_network):
     assert swing._kept(np.array([3.0, 12.0])) == (True, True)
     assert swing._kept(np.array([2.0, 26.0])) == (False, True)
     assert swing._kept(np.array([1.5, 26.0])) == (True, True)  # it has fallen, and keeps that
+
+
+@pytest.mark.parametrize("spoilt", [0.0, 0.36])
+@pytest.mark.parametrize("sigma", [1.0, 4.0])
+def test_the_variance_of_two_looks_is_that_of_the_good_ones(sigma, spoilt):
+    """Every fifth look a gross error: every third point of two looks has one."""
+    rng, found = np.random.default_rng(3), []
+    for _ in range(300):
+        value = sigma * rng.standard_normal(30)
+        gross = rng.random(30) < spoilt
+        value[gross] += rng.choice([-1.0, 1.0], gross.sum()) * rng.uniform(8.0, 60.0, gross.sum()) * sigma
+        found.append(_variance_of_most(value**2) / sigma**2)
+    assert 0.9 < np.median(found) < 1.15
+    assert np.percentile(found, 2) > 0.3 and np.percentile(found, 98) < 2.4
+
+
+@pytest.mark.parametrize("seed", [2, 7])
+def test_gross_errors_of_a_strip_that_begins_are_not_taken_for_sigmas(seed):
+    """Its points have two looks at first, of which none can be spared. Sigmas of the image became twenty times as
+    large, tests of single looks as much wider, and the orientation was twice as bad to the end of the strip."""
+    plan = ObservationPlan(tie_points_per_s=8.0, check=10, outlier_share=0.2)
+    simulation = simulate(
+        FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0), seed, ErrorModel(attitude_rate_hz=100.0), plan
+    )
+    poses = navigate(simulation)
+    clean = replace(simulation, images=simulation.images.select(~simulation.images.outlier))
+    with_errors, without = (adjust_online(s, poses, OPTIONS, live=False, update_s=0.5) for s in (simulation, clean))
+    assert with_errors.window.network.sigmas.image == 1.0
+    worse, rms = (np.linalg.norm(orientation_errors(simulation, of.whole).rmse[:3]) for of in (with_errors, without))
+    assert worse < 1.15 * rms
 
 
 def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
