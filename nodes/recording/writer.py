@@ -1,4 +1,4 @@
-"""Writing recordings: MCAP files of messages with their envelopes. the MCAP library writes them.
+"""Writing recordings: MCAP files of messages with their envelopes.
 
 One channel stands for one run of one publisher on one topic. What all else depends on, the configuration, stands in a
 chunk of its own at the head, and once more at the end, on channels marked as copies; readers take a copy only where the
@@ -13,17 +13,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
 from ..node import Message
 from .index import CHANNEL_METADATA
+from .mcap_writer import McapWriter
 
 LIBRARY = "triline"
-COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+COMPRESSIONS = {"none": "", "lz4": "lz4", "zstd": "zstd"}
 _SEQUENCE_MASK = 0xFFFFFFFF
 
 
@@ -55,7 +55,7 @@ class RecordingWriter:
         self._stream: IO[bytes] = (
             open(target, "wb") if isinstance(target, (str, Path)) else target  # noqa: SIM115  # closed by close
         )
-        self._writer = Writer(self._stream, chunk_size, COMPRESSIONS[compression], enable_data_crcs=True)
+        self._writer = McapWriter(self._stream, chunk_size, COMPRESSIONS[compression], LIBRARY)
         self._platform = platform
         self._every = every
         self._schemas: dict[str, int] = {}
@@ -65,7 +65,6 @@ class RecordingWriter:
         self.counts: Counter[str] = Counter()
         self._head = True
         self._configuration: list[tuple[RawMessage, str | None]] = []
-        self._writer.start(library=LIBRARY)
         self._stream.flush()
 
     def write(self, message: Message, receive_ns: int | None = None) -> None:
@@ -114,13 +113,15 @@ class RecordingWriter:
         if channel is None:
             channel = self._channels[key] = self._register(*key)
         number = sequence & _SEQUENCE_MASK
-        self._writer.add_message(channel, receive_ns, data, stamp_ns, number)  # type: ignore[arg-type]  # a view serves
+        self._writer.add_message(channel, receive_ns, data, stamp_ns, number)
 
     def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)
         schema = self._schemas.get(row.type_name)
         if schema is None:
-            schema = self._schemas[row.type_name] = register_schema(self._writer, row.type)
+            content = build_file_descriptor_set(row.type).SerializeToString()
+            schema = self._writer.register_schema(row.type_name, SchemaEncoding.Protobuf, content)
+            self._schemas[row.type_name] = schema
         metadata = {"source": source, "platform": platform}
         if start:
             metadata["start"] = str(start)
