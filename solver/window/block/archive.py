@@ -86,8 +86,11 @@ class Archive:
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept; drifts (negative numbers) are."""
-        kept = np.concatenate([self._shared, *(strip.numbers for strip in self.strips.values())])
-        return bool((np.isin(columns, kept) | (columns < 0)).all())
+        kept = (columns < 0) | np.isin(columns, self._shared)
+        for strip in self.strips.values():
+            if len(strip.numbers):
+                kept |= (columns >= strip.numbers[0]) & (columns <= strip.numbers[-1])
+        return bool(kept.all())
 
     @property
     def over(self) -> list[str]:
