@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
-from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
+from ...solver.geometry.rotation import quaternion_from_angles
 from ...solver.window.output import WindowReport, WindowUpdate
 from ...solver.window.quality.light import kind
 from ...solver.window.results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal
@@ -130,7 +130,7 @@ def orientations(
     validity: Callable[[float], tuple[bool, str]],
 ) -> list[Message]:
     """Pose messages, one a time; ``validity`` says of a time whether its measured pose is to be relied on."""
-    quaternion = quaternion_from_matrix(matrix_from_angles(*orientation.angles.T))
+    quaternion = quaternion_from_angles(orientation.angles)
     result = []
     for i, time_s in enumerate(orientation.time_s):
         valid, reason = validity(float(time_s))
