@@ -218,8 +218,10 @@ class _Recorded:
 
     def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
         """Messages by their numbers."""
-        for topic, envelope, data, _ in self.reader.raws(numbers):
-            yield RawMessage(topic, envelope, self.instead.get(topic, data), envelope.stamp_ns)
+        raws = self.reader.raws(numbers, as_stamped=True)
+        if not self.instead:
+            return raws
+        return (raw._replace(data=self.instead.get(raw.topic, raw.data)) for raw in raws)
 
 
 class _Progress:
@@ -242,6 +244,18 @@ def _feeds(node: Node, others: Sequence[Node]) -> bool:
     return any(topics.find(i).matches(o) for other in others for i in other.inputs for o in node.outputs)
 
 
+class _Listening(dict[str, list[StepDriver]]):
+    """Which of some drivers listen to a topic."""
+
+    def __init__(self, drivers: Sequence[StepDriver]) -> None:
+        super().__init__()
+        self._drivers = drivers
+
+    def __missing__(self, topic: str) -> list[StepDriver]:
+        self[topic] = [driver for driver in self._drivers if _listens(driver, topic)]
+        return self[topic]
+
+
 class _Line:
     """Nodes one after the other: hands inputs and outputs on in order, and has them written.
 
@@ -256,29 +270,34 @@ class _Line:
         self, drivers: Sequence[StepDriver], write: Callable[[RawMessage], None], summary: ProcessSummary
     ) -> None:
         self._drivers, self._write, self._summary = drivers, write, summary
-        self._listeners: dict[str, list[StepDriver]] = {}
+        self._listening = _Listening(drivers)
         self._pending: list[tuple[Key, Message, RawMessage]] = []
 
     def take(self, raw: RawMessage) -> None:
         """The next message of the recording; what cannot be decoded, and a node would need, is left out and counted."""
+        topic = raw.topic
+        listening = self._listening[topic]
         message = None
-        if self._listening(raw.topic):
+        if listening:
             try:
-                message = _message(raw, codec.decode(raw.topic, raw.data))
+                message = _message(raw, codec.decode(topic, raw.data))
             except ValueError as error:
                 e = raw.envelope
-                self._summary.drop("malformed", f"{raw.topic} {e.sequence} of {e.source!r}: {error}")
+                self._summary.drop("malformed", f"{topic} {e.sequence} of {e.source!r}: {error}")
                 return
-        self._summary.inputs[raw.topic] += 1
+        self._summary.inputs[topic] += 1
         if self._pending:
-            self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        self._hand_on(message, raw)
+            self._hand_on_pending(order_key(topic, raw.envelope))
+        self._write(raw)
+        if message is not None:
+            for driver in listening:
+                self._queue(driver.step(message))
 
     def take_made(self, raw: RawMessage) -> None:
         """The next message, of a node before these."""
         if self._pending:
             self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        heard = bool(self._listening(raw.topic))
+        heard = bool(self._listening[raw.topic])
         self._hand_on(_message(raw, codec.parse(raw.topic, raw.data)) if heard else None, raw)
 
     def settle(self) -> None:
@@ -297,11 +316,6 @@ class _Line:
             if node.last_problem:
                 self._summary.problems[node.name] = node.last_problem
 
-    def _listening(self, topic: str) -> list[StepDriver]:
-        if topic not in self._listeners:
-            self._listeners[topic] = [d for d in self._drivers if _listens(d, topic)]
-        return self._listeners[topic]
-
     def _queue(self, outputs: list[Message]) -> None:
         for output in outputs:
             raw = RawMessage(
@@ -314,7 +328,7 @@ class _Line:
     def _hand_on(self, message: Message | None, raw: RawMessage) -> None:
         self._write(raw)
         if message is not None:
-            for driver in self._listening(raw.topic):
+            for driver in self._listening[raw.topic]:
                 self._queue(driver.step(message))
 
     def _hand_on_pending(self, until: Key | None) -> None:

@@ -139,6 +139,11 @@ class KinematicFilter:
             self._advance(self._attitude.last_s, None, None, judge=False)
         return self._smooth(np.inf)
 
+    @property
+    def has_events(self) -> bool:
+        """Whether `take_events` would return some."""
+        return bool(self._events)
+
     def take_events(self) -> list[NavigationEvent]:
         """What happened since the last call, for the log."""
         events, self._events = self._events, []
