@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import IO
+from typing import IO, Any
 
 import lz4.frame
 import zstandard
@@ -35,7 +35,7 @@ from mcap.records import (
 from .mcap_scan import MAGIC, MESSAGE_HEAD
 
 #: How chunks can be compressed, by the name that stands in them.
-COMPRESSORS: dict[str, Callable[[bytearray], bytes | bytearray]] = {
+COMPRESSORS: dict[str, Callable[[bytearray], Any]] = {
     "": lambda content: content, "lz4": lz4.frame.compress, "zstd": zstandard.compress,
 }  # fmt: skip
 #: A message up to its data: opcode, length of what follows; channel, sequence number, log time, publish time.
@@ -129,6 +129,11 @@ class McapWriter:
         self._stream.write(content)
         self._stream.write(_bytes_of(Footer(begin, offsets_begin, zlib.crc32(head, zlib.crc32(content)))))
         self._stream.write(MAGIC)
+
+    @property
+    def counts(self) -> Counter[int]:
+        """Messages by channel."""
+        return self._counts + Counter({channel: len(rows) // 2 for channel, rows in self._index.items()})
 
     def _begin_chunk(self) -> None:
         self._open = bytearray()

@@ -26,7 +26,7 @@ from ...schemas.envelope import Envelope, RawMessage
 from ..errors import UserError
 from ..node import Message
 from . import mcap_scan as scan
-from .index import CHANNEL_METADATA, Channel, Index
+from .index import CHANNEL_METADATA, Channel, Index, Recorded
 from .ranges import Ranged, open_ranged
 from .remote import RemoteFile, RemotePath, path_of
 
@@ -309,26 +309,25 @@ class RecordingReader:
         """A message of the index, not decoded; its data are a view of the file where chunks are not compressed."""
         return next(self.raws(np.array([number])))
 
-    def raws(self, numbers: NDArray[np.int64], *, as_stamped: bool = False) -> Iterator[RawMessage]:
-        """The same for many messages, one after the other; on request as if each had been received when stamped."""
-        index = self._index
-        heads = {number: (c.topic, c.source, c.start) for number, c in self.channels.items()}
+    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+        """The same for many messages, one after the other."""
+        for channel, stamp, sequence, data, receive in self.recorded(numbers):
+            yield RawMessage(channel.topic, Envelope(stamp, channel.source, sequence, channel.start), data, receive)
+
+    def recorded(self, numbers: NDArray[np.int64]) -> Iterator[Recorded]:
+        """The same without their envelopes, which take half of the time."""
+        index, channels = self._index, self.channels
         content, of_chunk = self._buffer, -1
         for begin in range(0, len(numbers), _TOGETHER):
             part = numbers[begin : begin + _TOGETHER]
             if self._ranged is not None:
                 self._know(part)
                 self._ranged.payloads(part)
-            received_ns = index.stamp_ns if as_stamped else index.receive_ns
-            columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, received_ns)
-            for chunk, place, channel, stamp, sequence, receive in zip(
-                *(c[part].tolist() for c in columns), strict=True
-            ):
+            columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
+            for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
                 if chunk != of_chunk:
                     content, of_chunk = self._buffer if chunk < 0 else self._content(chunk), chunk
-                topic, source, start = heads[channel]
-                envelope = Envelope(stamp, source, sequence, start)
-                yield RawMessage(topic, envelope, scan.payload_at(content, place), receive)
+                yield channels[of], stamp, sequence, scan.payload_at(content, place), receive
 
     def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
         """Numbers of the messages of some topics (all known topics where none are named), in file order.
