@@ -237,7 +237,7 @@ class Archive:
         rows = kept.functions.rows(kept.place, origin)
         point, matrix, rhs, _ = eliminated([rows], np.diag(change), xyz_l, origin)
         self.add(point.columns, matrix, rhs)
-        left = LeftPoints(point, (replace(kept.point, role=role),))
+        left = LeftPoints(point, (kept.point._replace(role=role),))
         self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, kept.control + change)
 
     # -- solution ------------------------------------------------------------------------------------------------------
