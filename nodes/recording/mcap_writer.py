@@ -2,7 +2,7 @@
 
 Records are those of the MCAP library, which writes them; only messages and their index, which come by the thousand, are
 packed here. The library's own writer makes an object of each message, and writes each field of it and of its index by
-itself, which takes three to four times as long (`bench/recordings.py`). The bytes are the same.
+itself, which takes five times as long (`bench/recordings.py`). The bytes are the same.
 """
 
 from __future__ import annotations
