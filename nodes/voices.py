@@ -47,7 +47,7 @@ class _Voice:
     rival_ns: int = 0
 
 
-@dataclass
+@dataclass(slots=True)
 class Heard:
     """What follows from a message.
 
@@ -104,6 +104,8 @@ class Voices:
 
     def alarm(self, now_ns: int) -> str:
         """The newest reason for alarm at a platform time; "" without one."""
+        if not self._held:
+            return ""
         told = [r for r in self._held.values() if r.stays or now_ns - r.latest_ns < ALARM_S * _SECOND_NS]
         return max(told, key=lambda r: r.told_ns).text if told else ""
 

@@ -117,11 +117,12 @@ def validate(body: Any) -> None:
     """Raise ValueError for a message with values that are not finite, or with the wrong number of values."""
     if not _is_fine(body):
         _find_fault(body)
-    if isinstance(body, m.LocationFix) and not abs(body.latitude) <= 90:
+    of_type = type(body)
+    if of_type is m.LocationFix and not abs(body.latitude) <= 90:
         raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
-    if isinstance(body, m.Camera) and not (body.lenses and body.lines):
+    if of_type is m.Camera and not (body.lenses and body.lines):
         raise ValueError(f"camera {body.name!r} with {len(body.lenses)} lenses and {len(body.lines)} CCD lines")
-    if isinstance(body, m.PoseInFrame):
+    if of_type is m.PoseInFrame:
         q = body.pose.orientation
         norm = math.hypot(q.x, q.y, q.z, q.w)
         if abs(norm - 1) > 1e-3:

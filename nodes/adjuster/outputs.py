@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
-from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
+from ...solver.geometry.rotation import quaternion_from_angles
 from ...solver.window.output import WindowReport, WindowUpdate
 from ...solver.window.quality.light import kind
 from ...solver.window.results import TAKEN_BACK, AdjustedPoint, RefinedOrientation, Refusal
@@ -20,6 +20,7 @@ from .poses import OrientationStore, PoseBuffer
 
 #: A reason that has become another one, under a light of the same colour, is told after so long, s.
 REASON_S = 10.0
+_STATUS = dict(m.ObjectPoint.Status.items())
 
 
 class AdjusterOutputs:
@@ -130,41 +131,40 @@ def orientations(
     validity: Callable[[float], tuple[bool, str]],
 ) -> list[Message]:
     """Pose messages, one a time; ``validity`` says of a time whether its measured pose is to be relied on."""
-    quaternion = quaternion_from_matrix(matrix_from_angles(*orientation.angles.T))
-    result = []
-    for i, time_s in enumerate(orientation.time_s):
-        valid, reason = validity(float(time_s))
+    quaternion = quaternion_from_angles(orientation.angles)
+    n, result = len(orientation.time_s), []
+    columns = (
+        orientation.time_s, orientation.position_l, orientation.angles, orientation.covariance.reshape(n, 36),
+        quaternion, orientation.correction,
+    )  # fmt: skip
+    protection = [None] * n if orientation.protection is None else orientation.protection.tolist()
+    for time_s, position, angles, covariance, q, correction, protected in zip(
+        *(column.tolist() for column in columns), protection, strict=True
+    ):
+        valid, reason = validity(time_s)
         body = convert.pose_message(
-            reference_ns + round(float(time_s) * convert.SECOND_NS),
-            orientation.position_l[i],
-            orientation.angles[i],
-            orientation.covariance[i],
-            quaternion=quaternion[i],
-            valid=valid,
-            reason=reason,
-            strip=orientation.strip,
-            correction=orientation.correction[i],
-            protection=None if orientation.protection is None else orientation.protection[i],
-        )
+            reference_ns + round(time_s * convert.SECOND_NS), position, angles, covariance, quaternion=q, valid=valid,
+            reason=reason, strip=orientation.strip, correction=correction, protection=protected,
+        )  # fmt: skip
         result.append(Message(topic, stamp_ns, body))
     return result
 
 
 def object_point(point: AdjustedPoint, stamp_ns: int) -> Message:
     """An adjusted object point, with the residuals of its looks unless it comes from the backward pass."""
-    x, y, z = (float(v) for v in point.xyz_l)
-    status = m.ObjectPoint.Status.Value("WHOLE" if point.whole else "FINAL" if point.final else "LIVE")
+    x, y, z = point.xyz_l.tolist()
+    status = _STATUS["WHOLE" if point.whole else "FINAL" if point.final else "LIVE"]
     body = m.ObjectPoint(
         point=point.name, x=x, y=y, z=z, covariance=point.covariance.ravel().tolist(), rays=point.rays, role=point.role,
         status=status, checked=point.checked,
-        residuals=[
-            m.RayResidual(
-                strip=r.look.strip, ccd=r.look.ccd, line=r.look.line, sample=r.look.sample, v_line=r.v_line,
-                v_sample=r.v_sample, w=r.w, rejected=r.rejected,
-            )
-            for r in (() if point.whole else point.residuals)
-        ],
     )  # fmt: skip
+    add = body.residuals.add
+    for r in () if point.whole else point.residuals:
+        look = r.look
+        add(
+            strip=look.strip, ccd=look.ccd, line=look.line, sample=look.sample, v_line=r.v_line, v_sample=r.v_sample,
+            w=r.w, rejected=r.rejected,
+        )  # fmt: skip
     return Message("point/object", stamp_ns, body)
 
 

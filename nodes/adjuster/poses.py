@@ -115,7 +115,7 @@ class PoseBuffer:
     def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
         self.filtered_seen |= not smoothed
         assert sample.covariance is not None
-        known = float(np.diagonal(sample.covariance)[3:].max()) < KNOWN_ATTITUDE_RAD**2
+        known = max(sample.covariance[i, i] for i in (3, 4, 5)) < KNOWN_ATTITUDE_RAD**2
         if not smoothed and self._latest:
             self._attitude_lost |= not known
         if known:

@@ -94,7 +94,10 @@ def run(args: argparse.Namespace) -> int:
                 if told is not None:
                     told(fraction)
 
-            summary = process(reader, nodes, writer.write_raw, progressed, apart=args.processes > 1, instead=instead)
+            summary = process(
+                reader, nodes, writer.write_raw, progressed, apart=args.processes > 1, instead=instead,
+                copy=writer.write_recorded,
+            )  # fmt: skip
         if not summary.nodes:
             raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
         if not summary.outputs:

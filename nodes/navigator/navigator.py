@@ -233,10 +233,11 @@ class Navigator(Node):
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
         if not math.isfinite(sum(force) + sum(rate)):
             raise ValueError("specific force or angular rate is not finite")
-        if max(map(abs, force)) > 500.0 or max(map(abs, rate)) > 50.0:
+        if max(force) > 500.0 or min(force) < -500.0 or max(rate) > 50.0 or min(rate) < -50.0:
             raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
-        if not 0 < body.interval_ns <= convert.SECOND_NS:
-            raise ValueError(f"interval {body.interval_ns} ns, wanted more than 0 and at most a second")
+        interval_ns = body.interval_ns
+        if not 0 < interval_ns <= convert.SECOND_NS:
+            raise ValueError(f"interval {interval_ns} ns, wanted more than 0 and at most a second")
         if not isinstance(self._engine, InertialNavigator):
             self._engine = inertial_engine(
                 self._configuration, body, filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s
@@ -247,8 +248,9 @@ class Navigator(Node):
             if wrong:
                 self.problem("inertial noise", f"sensor/imu: {wrong}")
                 self._notes.append(self._log(self._stamp_ns, f"sensor/imu: {wrong}", warning=True))
-        self._offset.sample(self._seconds(body.time_ns), body.interval_ns * 1e-9, *force, *rate)
-        return self._engine.add_inertial(self._seconds(body.time_ns), body.interval_ns * 1e-9, force, rate)
+        time_s, interval_s = self._seconds(body.time_ns), interval_ns * 1e-9
+        self._offset.sample(time_s, interval_s, *force, *rate)
+        return self._engine.add_inertial(time_s, interval_s, force, rate)
 
     def _attitude(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:
@@ -310,7 +312,7 @@ class Navigator(Node):
         self._check_time(message)
         frame = self._frame
         antenna_l = frame.from_geodetic(*geodetic)
-        R_l_enu = frame.R_ln(antenna_l) @ R_ENU_NED
+        R_l_enu = frame.R_ln_at(geodetic[0], geodetic[1]) @ R_ENU_NED
         time_s = self._seconds(self._time_ns(body))
         covariance_l = R_l_enu @ covariance.reshape(3, 3) @ R_l_enu.T
         velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
@@ -358,7 +360,14 @@ class Navigator(Node):
         return (time_ns - self._reference_ns) * 1e-9
 
     def _messages(self, poses: list[NavigationPose]) -> list[Message]:
-        if self._engine is None:
+        engine = self._engine
+        if engine is None:
+            return []
+        self.alarms["gnss"] = engine.alarm if isinstance(engine, InertialNavigator) else ""
+        for kind, n in engine.counters.items():
+            self.counters[kind] += n - self._seen[kind]
+            self._seen[kind] = n
+        if not (poses or self._notes or engine.has_events):  # after most samples
             return []
         out = [
             Message(
@@ -374,11 +383,7 @@ class Navigator(Node):
         ]  # fmt: skip
         out += self._notes
         self._notes = []
-        for kind, n in self._engine.counters.items():
-            self.counters[kind] += n - self._seen[kind]
-            self._seen[kind] = n
-        self.alarms["gnss"] = self._engine.alarm if isinstance(self._engine, InertialNavigator) else ""
-        for event in self._engine.take_events():
+        for event in engine.take_events():
             out.append(self._log(self._reference_ns + round(event.time_s * 1e9), event.text))
         return out
 

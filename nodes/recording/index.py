@@ -32,6 +32,8 @@ class Channel:
     every: int = 1
 
 
+#: A message as it stands in a recording: channel, stamp, sequence number, payload, time of reception.
+Recorded = tuple[Channel, int, int, bytes | memoryview, int]
 #: Times beyond are taken for it: the index holds signed numbers.
 LAST_NS = 0x7FFFFFFFFFFFFFFF
 

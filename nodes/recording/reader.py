@@ -26,7 +26,7 @@ from ...schemas.envelope import Envelope, RawMessage
 from ..errors import UserError
 from ..node import Message
 from . import mcap_scan as scan
-from .index import CHANNEL_METADATA, Channel, Index
+from .index import CHANNEL_METADATA, Channel, Index, Recorded
 from .ranges import Ranged, open_ranged
 from .remote import RemoteFile, RemotePath, path_of
 
@@ -311,7 +311,13 @@ class RecordingReader:
 
     def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
         """The same for many messages, one after the other."""
+        for channel, stamp, sequence, data, receive in self.recorded(numbers):
+            yield RawMessage(channel.topic, Envelope(stamp, channel.source, sequence, channel.start), data, receive)
+
+    def recorded(self, numbers: NDArray[np.int64]) -> Iterator[Recorded]:
+        """The same without their envelopes, which take half of the time."""
         index, channels = self._index, self.channels
+        content, of_chunk = self._buffer, -1
         for begin in range(0, len(numbers), _TOGETHER):
             part = numbers[begin : begin + _TOGETHER]
             if self._ranged is not None:
@@ -319,10 +325,9 @@ class RecordingReader:
                 self._ranged.payloads(part)
             columns = (index.chunk, index.place, index.channel, index.stamp_ns, index.sequence, index.receive_ns)
             for chunk, place, of, stamp, sequence, receive in zip(*(c[part].tolist() for c in columns), strict=True):
-                data = scan.payload_at(self._buffer if chunk < 0 else self._content(chunk), place)
-                channel = channels[of]
-                envelope = Envelope(stamp, channel.source, sequence, channel.start)
-                yield RawMessage(channel.topic, envelope, data, receive)
+                if chunk != of_chunk:
+                    content, of_chunk = self._buffer if chunk < 0 else self._content(chunk), chunk
+                yield channels[of], stamp, sequence, scan.payload_at(content, place), receive
 
     def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
         """Numbers of the messages of some topics (all known topics where none are named), in file order.

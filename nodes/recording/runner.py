@@ -19,6 +19,7 @@ from ..node import Message, Node
 from ..ordering import Key, StreamCheck, is_orderly, order_key
 from ..step_driver import StepDriver
 from ..voices import VERDICT
+from .index import Recorded
 from .reader import RecordingReader
 from .runner_apart import Ahead
 
@@ -121,6 +122,7 @@ def process(
     progress: Callable[[float], None] | None = None,
     apart: bool = False,
     instead: Mapping[str, bytes] | None = None,
+    copy: Callable[[Recorded], None] | None = None,
 ) -> ProcessSummary:
     """Run nodes over a recording, as fast as it goes.
 
@@ -133,7 +135,9 @@ def process(
     apart : the nodes before the last may run in a process of their own, if they need nothing of it; what comes out is
         the same
     instead : payload in place of the recorded one, by topic
+    copy : takes inputs in place of ``write``, in the same order; most of them need no envelope
     """
+    copy = copy or (lambda recorded: write(_raw(recorded)))
     summary = ProcessSummary()
     held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
     recorded = {c.topic for c in reader.channels.values() if c.known and c.id in held}
@@ -145,8 +149,10 @@ def process(
     numbers = _usable(reader, made, summary)
     told = _Progress(progress, len(numbers))
     if apart and Ahead.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
-        line = _Line(drivers[-1:], write, summary)
-        ahead = Ahead(lambda: _handed_on(recording, numbers, drivers[:-1]), " and ".join(summary.nodes[:-1]))
+        line = _Line(drivers[-1:], write, copy, summary, checked=True)
+        ahead = Ahead(
+            lambda: _handed_on(recording, numbers, drivers[:-1], drivers[-1:]), " and ".join(summary.nodes[:-1])
+        )
         try:
             for batch in ahead:
                 told.add(_take(batch, recording, line, summary))
@@ -154,9 +160,9 @@ def process(
             ahead.close()
         summary.counters = {name: summary.counters.get(name, {}) for name in summary.nodes[:-1]} | summary.counters
     else:
-        line = _Line(drivers, write, summary)
-        for raw in recording.raws(numbers):
-            line.take(raw)
+        line = _Line(drivers, write, copy, summary)
+        for recorded in recording.messages(numbers):
+            line.take(recorded)
             told.add(1)
     line.finish()
     return summary
@@ -169,29 +175,33 @@ Flat = tuple[str, int, str, int, bytes]
 Item = int | Flat | ProcessSummary | None
 
 
-def _handed_on(recording: _Recorded, numbers: NDArray[np.int64], drivers: Sequence[StepDriver]) -> Iterator[Item]:
-    """The first nodes over the recording: what they hand on to the last one, in order."""
+def _handed_on(
+    recording: _Recorded, numbers: NDArray[np.int64], drivers: Sequence[StepDriver], others: Sequence[StepDriver]
+) -> Iterator[Item]:
+    """The first nodes over the recording: what they hand on to the others, in order."""
     summary = ProcessSummary()
-    handed: list[RawMessage] = []
-    line = _Line(drivers, handed.append, summary)
-    for number, raw in zip(numbers.tolist(), recording.raws(numbers), strict=True):
-        line.take(raw)
+    handed: list[Flat | None] = []
+    line = _Line(
+        drivers, lambda raw: handed.append(_flat(raw)), lambda recorded: handed.append(None), summary, others
+    )  # fmt: skip
+    for number, recorded in zip(numbers.tolist(), recording.messages(numbers), strict=True):
+        line.take(recorded)
         for one in handed:
-            yield number if one is raw else _flat(one)
+            yield number if one is None else one
         handed.clear()
     line.settle()
-    yield from map(_flat, handed)
+    yield from handed
     handed.clear()
     yield None
     line.finish()
-    yield from map(_flat, handed)
+    yield from handed
     yield summary
 
 
 def _take(batch: list[Item], recording: _Recorded, line: _Line, summary: ProcessSummary) -> int:
     """The last node's part of a batch; returns how many recorded messages were in it."""
     numbers = [item for item in batch if isinstance(item, int)]
-    recorded = recording.raws(np.array(numbers, dtype=np.int64))
+    recorded = recording.messages(np.array(numbers, dtype=np.int64))
     for item in batch:
         if isinstance(item, int):
             line.take(next(recorded))
@@ -211,15 +221,17 @@ def _flat(raw: RawMessage) -> Flat:
 
 @dataclass
 class _Recorded:
-    """The messages of a recording as nodes have them: received when they were stamped, some with another payload."""
+    """The messages of a recording, some with another payload."""
 
     reader: RecordingReader
     instead: Mapping[str, bytes]
 
-    def raws(self, numbers: NDArray[np.int64]) -> Iterator[RawMessage]:
+    def messages(self, numbers: NDArray[np.int64]) -> Iterator[Recorded]:
         """Messages by their numbers."""
-        for topic, envelope, data, _ in self.reader.raws(numbers):
-            yield RawMessage(topic, envelope, self.instead.get(topic, data), envelope.stamp_ns)
+        recorded = self.reader.recorded(numbers)
+        if not self.instead:
+            return recorded
+        return ((of, t, number, self.instead.get(of.topic, data), at) for of, t, number, data, at in recorded)
 
 
 class _Progress:
@@ -242,43 +254,70 @@ def _feeds(node: Node, others: Sequence[Node]) -> bool:
     return any(topics.find(i).matches(o) for other in others for i in other.inputs for o in node.outputs)
 
 
+class _Listening(dict[str, list[StepDriver]]):
+    """Which of some drivers listen to a topic."""
+
+    def __init__(self, drivers: Sequence[StepDriver]) -> None:
+        super().__init__()
+        self._drivers = drivers
+
+    def __missing__(self, topic: str) -> list[StepDriver]:
+        self[topic] = [driver for driver in self._drivers if _listens(driver, topic)]
+        return self[topic]
+
+
 class _Line:
     """Nodes one after the other: hands inputs and outputs on in order, and has them written.
 
     Parameters
     ----------
     drivers : of the nodes, those that make another's input before it
-    write : takes what is handed on
+    write : takes what the nodes put out
+    copy : takes what is recorded, in the same order
     summary : where outputs and what nodes say are counted
+    others : who is handed messages, and finds those of the recording checked
+    checked : whether messages of the recording have been
     """
 
     def __init__(
-        self, drivers: Sequence[StepDriver], write: Callable[[RawMessage], None], summary: ProcessSummary
+        self,
+        drivers: Sequence[StepDriver],
+        write: Callable[[RawMessage], None],
+        copy: Callable[[Recorded], None],
+        summary: ProcessSummary,
+        others: Sequence[StepDriver] = (),
+        checked: bool = False,
     ) -> None:
-        self._drivers, self._write, self._summary = drivers, write, summary
-        self._listeners: dict[str, list[StepDriver]] = {}
+        self._drivers, self._write, self._copy, self._summary = drivers, write, copy, summary
+        self._listening, self._needed = _Listening(drivers), _Listening([*drivers, *others])
+        self._decode = codec.parse if checked else codec.decode
         self._pending: list[tuple[Key, Message, RawMessage]] = []
 
-    def take(self, raw: RawMessage) -> None:
+    def take(self, recorded: Recorded) -> None:
         """The next message of the recording; what cannot be decoded, and a node would need, is left out and counted."""
-        message = None
-        if self._listening(raw.topic):
+        channel, stamp_ns, sequence, data, _ = recorded
+        topic = channel.topic
+        body = None
+        if self._needed[topic]:
             try:
-                message = _message(raw, codec.decode(raw.topic, raw.data))
+                body = self._decode(topic, data)
             except ValueError as error:
-                e = raw.envelope
-                self._summary.drop("malformed", f"{raw.topic} {e.sequence} of {e.source!r}: {error}")
+                self._summary.drop("malformed", f"{topic} {sequence} of {channel.source!r}: {error}")
                 return
-        self._summary.inputs[raw.topic] += 1
+        self._summary.inputs[topic] += 1
         if self._pending:
-            self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        self._hand_on(message, raw)
+            self._hand_on_pending(order_key(topic, Envelope(stamp_ns, channel.source, sequence, channel.start)))
+        self._copy(recorded)
+        if listening := self._listening[topic]:
+            message = Message(topic, stamp_ns, body, channel.source, sequence, channel.start)
+            for driver in listening:
+                self._queue(driver.step(message))
 
     def take_made(self, raw: RawMessage) -> None:
         """The next message, of a node before these."""
         if self._pending:
             self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        heard = bool(self._listening(raw.topic))
+        heard = bool(self._listening[raw.topic])
         self._hand_on(_message(raw, codec.parse(raw.topic, raw.data)) if heard else None, raw)
 
     def settle(self) -> None:
@@ -297,11 +336,6 @@ class _Line:
             if node.last_problem:
                 self._summary.problems[node.name] = node.last_problem
 
-    def _listening(self, topic: str) -> list[StepDriver]:
-        if topic not in self._listeners:
-            self._listeners[topic] = [d for d in self._drivers if _listens(d, topic)]
-        return self._listeners[topic]
-
     def _queue(self, outputs: list[Message]) -> None:
         for output in outputs:
             raw = RawMessage(
@@ -314,7 +348,7 @@ class _Line:
     def _hand_on(self, message: Message | None, raw: RawMessage) -> None:
         self._write(raw)
         if message is not None:
-            for driver in self._listening(raw.topic):
+            for driver in self._listening[raw.topic]:
                 self._queue(driver.step(message))
 
     def _hand_on_pending(self, until: Key | None) -> None:
@@ -325,6 +359,12 @@ class _Line:
 
 def _listens(driver: StepDriver, topic: str) -> bool:
     return any(topics.find(name).matches(topic) for name in (*driver.inputs, *driver.node.decisions))
+
+
+def _raw(recorded: Recorded) -> RawMessage:
+    """A recorded message as nodes have it: received when it was stamped."""
+    channel, stamp_ns, sequence, data, _ = recorded
+    return RawMessage(channel.topic, Envelope(stamp_ns, channel.source, sequence, channel.start), data, stamp_ns)
 
 
 def _message(raw: RawMessage, body: Any) -> Message:

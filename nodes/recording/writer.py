@@ -1,4 +1,4 @@
-"""Writing recordings: MCAP files of messages with their envelopes. the MCAP library writes them.
+"""Writing recordings: MCAP files of messages with their envelopes.
 
 One channel stands for one run of one publisher on one topic. What all else depends on, the configuration, stands in a
 chunk of its own at the head, and once more at the end, on channels marked as copies; readers take a copy only where the
@@ -13,17 +13,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
 from ..node import Message
-from .index import CHANNEL_METADATA
+from .index import CHANNEL_METADATA, Recorded
+from .mcap_writer import McapWriter
 
 LIBRARY = "triline"
-COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+COMPRESSIONS = {"none": "", "lz4": "lz4", "zstd": "zstd"}
 _SEQUENCE_MASK = 0xFFFFFFFF
 
 
@@ -55,17 +55,16 @@ class RecordingWriter:
         self._stream: IO[bytes] = (
             open(target, "wb") if isinstance(target, (str, Path)) else target  # noqa: SIM115  # closed by close
         )
-        self._writer = Writer(self._stream, chunk_size, COMPRESSIONS[compression], enable_data_crcs=True)
+        self._writer = McapWriter(self._stream, chunk_size, COMPRESSIONS[compression], LIBRARY)
         self._platform = platform
         self._every = every
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str, int, str, bool], int] = {}
         self._configuring: dict[str, bool] = {}  # topics that were met
         self._last: dict[tuple[str, str], tuple[int, int]] = {}
-        self.counts: Counter[str] = Counter()
+        self._plain: dict[tuple[str, str, int], int] = {}  # channels of messages that need nothing else
         self._head = True
         self._configuration: list[tuple[RawMessage, str | None]] = []
-        self._writer.start(library=LIBRARY)
         self._stream.flush()
 
     def write(self, message: Message, receive_ns: int | None = None) -> None:
@@ -94,6 +93,25 @@ class RecordingWriter:
 
     def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
         """Add a message that is encoded already."""
+        topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
+        channel = self._plain.get((topic, source, start)) if platform is None else None
+        if channel is None:
+            self._write_first(raw, platform)
+        else:
+            self._writer.add_message(channel, receive_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
+
+    def write_recorded(self, recorded: Recorded) -> None:
+        """Add a message of another recording, received when it was stamped."""
+        of, stamp_ns, sequence, data, _ = recorded
+        channel = self._plain.get((of.topic, of.source, of.start))
+        if channel is None:
+            envelope = Envelope(stamp_ns, of.source, sequence, of.start)
+            self._write_first(RawMessage(of.topic, envelope, data, stamp_ns), None)
+        else:
+            self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
+
+    def _write_first(self, raw: RawMessage, platform: str | None) -> None:
+        """Add a message of the configuration, or one that may be the first of its channel or platform."""
         configuring = self._configuring.get(raw.topic)
         if configuring is None:
             configuring = topics.find(raw.topic).family is topics.Family.CONFIGURATION
@@ -104,23 +122,27 @@ class RecordingWriter:
         elif self._head:
             self._head = False
             self.flush()
-        self._add(raw, platform)
-        self.counts[raw.topic] += 1
+        channel = self._add(raw, platform)
+        if platform is None and not configuring:
+            self._plain[raw.topic, raw.envelope.source, raw.envelope.start] = channel
 
-    def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> None:
+    def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> int:
         topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
         key = (topic, source, start, platform or self._platform, copy)
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._register(*key)
         number = sequence & _SEQUENCE_MASK
-        self._writer.add_message(channel, receive_ns, data, stamp_ns, number)  # type: ignore[arg-type]  # a view serves
+        self._writer.add_message(channel, receive_ns, data, stamp_ns, number)
+        return channel
 
     def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
         row = topics.find(topic)
         schema = self._schemas.get(row.type_name)
         if schema is None:
-            schema = self._schemas[row.type_name] = register_schema(self._writer, row.type)
+            content = build_file_descriptor_set(row.type).SerializeToString()
+            schema = self._writer.register_schema(row.type_name, SchemaEncoding.Protobuf, content)
+            self._schemas[row.type_name] = schema
         metadata = {"source": source, "platform": platform}
         if start:
             metadata["start"] = str(start)
@@ -132,6 +154,15 @@ class RecordingWriter:
         # A channel stands in the first chunk that uses it; written once more outside chunks it survives that chunk.
         self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})
         return channel
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages by topic."""
+        counts, by_channel = Counter[str](), self._writer.counts
+        for (topic, _, _, _, copy), channel in self._channels.items():
+            if not copy:
+                counts[topic] += by_channel[channel]
+        return counts
 
     def channel_of(self, topic: str, source: str, start: int) -> int | None:
         """Id of the channel of a run of a publisher on a topic; None before its first message."""

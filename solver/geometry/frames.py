@@ -69,7 +69,11 @@ class LocalFrame:
     def R_ln(self, position_l: ArrayLike) -> Array:
         """North-east-down at a position (..., 3) to the local frame; includes meridian convergence and curvature."""
         g = self.to_geodetic(position_l)
-        return self.R_el.T @ earth.R_en(np.radians(g[..., 0]), np.radians(g[..., 1]))
+        return self.R_ln_at(g[..., 0], g[..., 1])
+
+    def R_ln_at(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
+        """The same at a latitude and longitude (...), degrees."""
+        return self.R_el.T @ earth.R_en(np.radians(lat_deg), np.radians(lon_deg))
 
     def from_crs(self, xyz: ArrayLike) -> Array:
         """Local coordinates of points (n, 3) in the project CRS (east, north, height order; degrees if geographic).

@@ -6,6 +6,8 @@ times as long, for one rotation and for a thousand (``python bench/rotation.py``
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -157,6 +159,18 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     return out
 
 
+def multiply_plain(p: Sequence[float], q: Sequence[float]) -> tuple[float, float, float, float]:
+    """The same of two quaternions as plain numbers: 0.6 us, with SciPy's Rotation 24 us."""
+    x1, y1, z1, w1 = p
+    x2, y2, z2, w2 = q
+    return (
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+    )
+
+
 def quaternion_conjugate(q: ArrayLike) -> Array:
     """Inverse of unit quaternions (scalar last)."""
     return np.asarray(q, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
@@ -191,6 +205,19 @@ def matrix_from_quaternion(q: ArrayLike) -> Array:
 
     q = np.asarray(q, dtype=float)
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
+
+
+def quaternion_from_angles(angles: ArrayLike) -> Array:
+    """Unit quaternions ``xyzw`` of ``Rx(omega) Ry(phi) Rz(kappa)``, (..., 3) to (..., 4); the scalar part not negative.
+
+    As `quaternion_from_matrix` of `matrix_from_angles`, in a quarter of the time for hundreds: SciPy looks at every
+    matrix whether it is orthogonal, and its own conversion of angles takes longer still.
+    """
+    half = 0.5 * np.moveaxis(np.asarray(angles, dtype=float), -1, 0)
+    (so, sp, sk), (co, cp, ck) = np.sin(half), np.cos(half)
+    a, b, c, d = co * cp, so * sp, so * cp, co * sp
+    q = np.stack([c * ck + d * sk, d * ck - c * sk, a * sk + b * ck, a * ck - b * sk], axis=-1)
+    return np.where(q[..., 3:] < 0, -q, q)
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:

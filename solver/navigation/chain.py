@@ -31,10 +31,10 @@ class Chunk:
 
     pieces: InertialData
     block: IncrementBlock | None
+    end_s: float = field(init=False)
 
-    @property
-    def end_s(self) -> float:
-        return float(self.pieces.time_s[-1])
+    def __post_init__(self) -> None:
+        self.end_s = float(self.pieces.time_s[-1])
 
 
 @dataclass(slots=True)

@@ -33,7 +33,7 @@ def local_fix(
     if np.linalg.eigvalsh(0.5 * (P + P.T)).min() <= 0.0:
         raise ValueError(f"covariance of the fix at {time_s} s is not positive definite")
     lat, lon, h = frame.to_geodetic(position).tolist()
-    R_ln = frame.R_ln(position)
+    R_ln = frame.R_ln_at(lat, lon)
     sigma = np.sqrt(np.diag(R_ln.T @ P @ R_ln))[None]
     fix = GnssData(np.array([time_s]), np.radians([lat]), np.radians([lon]), np.array([h]), np.maximum(sigma, 1e-4))
     if velocity_l is None or velocity_covariance is None:

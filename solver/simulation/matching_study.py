@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.rotation import matrix_from_angles, quaternion_from_matrix
+from ..geometry.rotation import quaternion_from_angles
 from ..matching.options import MatchedTie, MatchingOptions
 from ..matching.tie_matcher import TieMatcher
 from .flight import Flight
@@ -72,7 +72,7 @@ def match_strip(
     angles = truth.angles + np.radians(CONSTANT_DEG) * rng.standard_normal(3)
     angles += np.radians(SLOW_DEG) * np.sin(time_s[:, None] / 5.0 + rng.uniform(0, 6, 3))
     angles[:, 0] += wrong_rad * np.sin(2 * np.pi * time_s / 40.0)
-    quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
+    quaternion = quaternion_from_angles(angles)
     covariance = np.diag([1.0] * 3 + [np.radians(STATED_DEG) + wrong_rad] * 3) ** 2
     ties: list[MatchedTie] = []
     came, told, poses = [], [], 0

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.line_camera import LineCamera
-from ..geometry.rotation import matrix_from_angles, quaternion_from_matrix
+from ..geometry.rotation import quaternion_from_angles, quaternion_from_matrix
 from ..geometry.trajectory import Trajectory
 from ..quantiles import norm, student
 from .error_models import ErrorModel, ErrorRealisation, Three
@@ -158,7 +158,7 @@ class World:
         poses = truth.at(np.clip(wanted, truth.start_s, truth.end_s))
         beyond = (wanted - poses.time_s)[:, None]
         angles = poses.angles + beyond * poses.angle_rate
-        quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
+        quaternion = quaternion_from_angles(angles)
         return Trajectory(truth.time_s, poses.position_l + beyond * poses.velocity_l, quaternion)
 
     def image_noise(self, drawn: Array) -> Array:

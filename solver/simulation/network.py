@@ -17,7 +17,11 @@ from ..adjustment.network import Control, Measurements, Network, Strip, build_ne
 from ..camera.collinearity import collinearity
 from ..camera.line_camera import CcdLine, LineCamera
 from ..camera.self_calibration import SelfCalibration
-from ..geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_quaternion, quaternion_from_matrix
+from ..geometry.rotation import (
+    angles_from_matrix,
+    matrix_from_quaternion,
+    quaternion_from_angles,
+)
 from ..geometry.trajectory import Trajectory
 from ..models.base import CorrectionModel, Extent, ModelOptions
 from .spectra import band_limited_noise
@@ -282,7 +286,7 @@ def fly(line: FlightLine, noise: Noise, rate_hz: float, rng: np.random.Generator
     position[:, 2] = line.height_m
     angles = np.radians(noise.jitter_deg) * band_limited_noise(rng, len(t), step, np.ones(3), *noise.jitter_hz)
     angles[:, 2] += azimuth
-    return Trajectory(t + 0.5, position, quaternion_from_matrix(matrix_from_angles(*angles.T)))
+    return Trajectory(t + 0.5, position, quaternion_from_angles(angles))
 
 
 def measured_trajectory(
@@ -295,7 +299,7 @@ def measured_trajectory(
         step = float(truth.time_s[1] - truth.time_s[0])
         correction = correction + sigma * band_limited_noise(rng, len(truth), step, np.ones(6), *WANDER_HZ)
     angles = angles_from_matrix(matrix_from_quaternion(truth.quaternion)) - correction[:, 3:]
-    quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
+    quaternion = quaternion_from_angles(angles)
     return Trajectory(truth.time_s, truth.position_l - correction[:, :3], quaternion)
 
 

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from ..adjustment.network import Strip
 from ..camera.line_camera import LineCamera, three_line_camera
 from ..geometry.frames import LocalFrame, R_lc_from_navigation
-from ..geometry.rotation import matrix_from_angles, measured_angles, quaternion_from_matrix
+from ..geometry.rotation import measured_angles, quaternion_from_angles, quaternion_from_matrix
 from ..geometry.trajectory import Trajectory
 from .error_models import ErrorModel, ErrorRealisation
 from .flight import Flight, line_rate
@@ -166,4 +166,4 @@ def degrade(
     angles = measured_angles(poses.angles, error[:, 3:])
     angles += attitude.standard_normal((n, 3)) * np.radians(errors.attitude_noise_deg)
     place = truth.position_l + error[:, :3] + position.standard_normal((n, 3)) * errors.gnss_noise_m
-    return Trajectory(truth.time_s, place, quaternion_from_matrix(matrix_from_angles(*angles.T)))
+    return Trajectory(truth.time_s, place, quaternion_from_angles(angles))

@@ -147,8 +147,7 @@ class RayResidual(NamedTuple):
     rejected: bool
 
 
-@dataclass(frozen=True)
-class AdjustedPoint:
+class AdjustedPoint(NamedTuple):
     """An object point as it came out.
 
     Attributes

@@ -86,8 +86,11 @@ class Archive:
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept; drifts (negative numbers) are."""
-        kept = np.concatenate([self._shared, *(strip.numbers for strip in self.strips.values())])
-        return bool((np.isin(columns, kept) | (columns < 0)).all())
+        kept = (columns < 0) | np.isin(columns, self._shared)
+        for strip in self.strips.values():
+            if len(strip.numbers):
+                kept |= (columns >= strip.numbers[0]) & (columns <= strip.numbers[-1])
+        return bool(kept.all())
 
     @property
     def over(self) -> list[str]:
@@ -200,7 +203,7 @@ class Archive:
         if old is not None:
             seen |= old.strips
             n, looks = published.rays + old.point.rays, old.point.residuals + published.residuals
-            published = replace(published, rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
+            published = published._replace(rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
         self._keep(published.name, KeptPoint(LeftPoints(point, (published,)), 0, seen, time_s, before + control))
         if old is not None and old.single is not None:
@@ -234,7 +237,7 @@ class Archive:
         rows = kept.functions.rows(kept.place, origin)
         point, matrix, rhs, _ = eliminated([rows], np.diag(change), xyz_l, origin)
         self.add(point.columns, matrix, rhs)
-        left = LeftPoints(point, (replace(kept.point, role=role),))
+        left = LeftPoints(point, (kept.point._replace(role=role),))
         self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, kept.control + change)
 
     # -- solution ------------------------------------------------------------------------------------------------------

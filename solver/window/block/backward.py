@@ -69,7 +69,7 @@ class LeftPoints:
     def refined(self, solution: BlockSolution) -> list[AdjustedPoint]:
         """The points as a solution of whole strips gives them."""
         xyz_l, covariance = self.functions.at(*solution.of(self.functions.columns))
-        return [replace(p, xyz_l=xyz_l[i], covariance=covariance[i], whole=True) for i, p in enumerate(self.points)]
+        return [p._replace(xyz_l=xyz_l[i], covariance=covariance[i], whole=True) for i, p in enumerate(self.points)]
 
 
 @dataclass(frozen=True)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 import sample_messages as sample
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from mcap_protobuf.schema import register_schema
+from mcap_protobuf.schema import build_file_descriptor_set, register_schema
 from places import ROOT
 from recording_file import chunk_spans, write_recording
 
+from triline.nodes.recording.mcap_writer import McapWriter
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.summary import findings
+from triline.nodes.recording.writer import COMPRESSIONS
 from triline.schemas import codec, topics
 
 GOLDEN = ROOT / "recordings" / "strip.mcap"
@@ -60,6 +63,46 @@ def test_what_the_library_writes_is_read(tmp_path, compression, options):
     assert all(raw.receive_ns == raw.envelope.stamp_ns + 10**9 for raw in raws)
     assert [bytes(raw.data) for raw in raws] == [codec.encode(message.body) for message in messages]
     assert reader.complete and reader.damage == [] and reader.check_outside() is None
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("chunk_size", [1 << 20, 4096, 1])
+def test_files_are_those_of_the_librarys_writer_to_the_byte(tmp_path, compression, chunk_size):
+    with open(tmp_path / "theirs.mcap", "wb") as theirs, open(tmp_path / "ours.mcap", "wb") as ours:
+        library = Writer(theirs, chunk_size, CompressionType[compression.upper()], enable_data_crcs=True)
+        library.start(library="triline")
+        own = McapWriter(ours, chunk_size, COMPRESSIONS[compression], "triline")
+        channels: dict[str, int] = {}
+        for i, message in enumerate(sample.flight(lines=True)):
+            topic, stamp, data = message.topic, message.stamp_ns, codec.encode(message.body)
+            if topic not in channels:
+                row = topics.find(topic)
+                schema = register_schema(library, row.type)
+                content = build_file_descriptor_set(row.type).SerializeToString()
+                assert own.register_schema(row.type_name, "protobuf", content) == schema
+                channel = library.register_channel(topic, "protobuf", schema, {"source": "test"})
+                assert own.register_channel(topic, "protobuf", schema, {"source": "test"}) == channel
+                channels[topic] = channel
+                for writer in (library, own):
+                    writer.add_metadata("channel", {"topic": topic})
+            if i % 40 == 30:
+                library.flush()
+                own.flush()
+            received = stamp + (7 * i % 5 - 2) * 10**6  # not in the order of the stamps
+            library.add_message(channels[topic], received, data, stamp, i)
+            own.add_message(channels[topic], received, memoryview(data), stamp, i)
+        library.finish()
+        own.finish()
+    assert (tmp_path / "ours.mcap").read_bytes() == (tmp_path / "theirs.mcap").read_bytes()
+
+
+def test_a_recording_without_messages_is_that_of_the_librarys_writer(tmp_path):
+    ours, theirs = BytesIO(), BytesIO()
+    library = Writer(theirs, compression=CompressionType.NONE, enable_data_crcs=True)
+    library.start(library="triline")
+    library.finish()
+    McapWriter(ours, 1 << 20, "", "triline").finish()
+    assert ours.getvalue() == theirs.getvalue()
 
 
 def test_a_recording_of_an_earlier_version_is_read_like_the_library_reads_it():

@@ -43,12 +43,13 @@ def flights(tmp_path_factory):
     return found
 
 
-def processed(path, pace="load", apart=False):
-    """Bytes of what comes out."""
+def processed(path, pace="load", apart=False, copied=False):
+    """Bytes of what comes out; ``copied``: recorded messages go into the output without an envelope."""
     nodes = [build(registry.node_class(name), at_pace({}, pace)) for name in registry.ESTIMATING]
     out = io.BytesIO()
     with RecordingWriter(out) as writer:
-        summary = process(RecordingReader(path), nodes, writer.write_raw, apart=apart)
+        copy = writer.write_recorded if copied else None
+        summary = process(RecordingReader(path), nodes, writer.write_raw, apart=apart, copy=copy)
     assert summary.nodes == ["navigator", "adjuster"]
     assert not any("failed" in counters for counters in summary.counters.values())
     return summary, out.getvalue()
@@ -61,6 +62,23 @@ def test_two_processes_give_the_bytes_of_one(flights):
     (alone, expected), (apart, found) = processed(path), processed(path, apart=True)
     assert found == expected
     assert (apart.outputs, apart.counters, apart.states) == (alone.outputs, alone.counters, alone.states)
+
+
+@pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_only_the_last_node_needs_is_checked_by_the_process_ahead(flights, tmp_path, kind):
+    path, reader = tmp_path / "spoilt.mcap", RecordingReader(flights[kind][1])
+    spoilt = 0
+    with RecordingWriter(path) as writer:
+        for raw in reader.raws(reader.select()):
+            wrong = raw.topic in ("observation/tie", "sensor/gnss") and raw.envelope.sequence % 40 == 7
+            writer.write_raw(raw._replace(data=b"\xff\xff") if wrong else raw)
+            spoilt += wrong
+    (alone, expected), (apart, found) = (processed(path, "throughput", two, copied=two) for two in (False, True))
+    assert spoilt > 10 and alone.dropped == {"malformed": spoilt}
+    assert found == expected
+    assert (apart.inputs, apart.outputs, apart.dropped) == (alone.inputs, alone.outputs, alone.dropped)
+    assert (apart.counters, apart.states) == (alone.counters, alone.states)
 
 
 @pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")

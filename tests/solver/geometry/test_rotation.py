@@ -80,3 +80,17 @@ def test_quaternions_and_matrices_of_any_shape(shape):
 def test_skew_is_the_cross_product(shape):
     a, b = RNG.normal(size=shape), RNG.normal(size=shape)
     np.testing.assert_allclose(np.einsum("...ij,...j->...i", rot.skew(a), b), np.cross(a, b), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (2, 3)])
+def test_quaternions_of_angles_are_those_of_their_matrices(shape):
+    angles = np.random.default_rng(5).uniform(-np.pi, np.pi, (*shape, 3))
+    expected = rot.quaternion_from_matrix(rot.matrix_from_angles(*np.moveaxis(angles, -1, 0)))
+    q = rot.quaternion_from_angles(angles)
+    assert q.shape == (*shape, 4) and (q[..., 3] >= 0).all()
+    assert np.abs(q - expected).max() < 1e-14
+
+
+def test_the_product_of_plain_numbers_is_that_of_arrays():
+    p, q = rot.quaternion_from_vector(np.random.default_rng(6).normal(0, 1.0, (2, 3)))
+    assert np.abs(np.array(rot.multiply_plain(p.tolist(), q.tolist())) - rot.quaternion_multiply(p, q)).max() < 1e-15

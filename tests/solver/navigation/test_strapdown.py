@@ -141,9 +141,10 @@ def test_gravitation_agrees_with_the_ellipsoid_module():
     assert np.abs(scalar - gravitation(r)).max() < 1e-9
 
 
-def test_running_product_is_the_product_of_all_before():
+@pytest.mark.parametrize("blocks", [1, 3])  # one short block is multiplied as plain numbers
+def test_running_product_is_the_product_of_all_before(blocks):
     rng = np.random.default_rng(1)
-    q = quaternion_from_vector(rng.normal(0, 0.3, (3, 13, 4))[..., :3])
+    q = quaternion_from_vector(rng.normal(0, 0.3, (blocks, 13, 3)))
     expected = q[:, 0]
     product = running_product(q)
     for k in range(1, 13):
