@@ -261,32 +261,40 @@ def _add_batch(
 ) -> None:
     low = batch[0].low
     rays = elimination.by_cell[low : batch[-1].high]
-    orientation = lin.orientation.take(rays, axis=2)
-    coefficients = layout.coefficients.take(rays, axis=1)
-    T, slots = len(layout.node), lin.camera.shape[1]
-    J = np.empty((2, T + slots + 1, len(rays)))
-    for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
-        np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
-    J[:, T:-1] = lin.camera.take(rays, axis=2)
-    J[:, -1] = lin.residual.take(rays, axis=1)
-    m, first = layout.platform.n_unknowns, T
+    J = _rows(lin, layout, rays)
+    columns = np.stack([cell.columns for cell in batch])
+    m = layout.platform.n_unknowns
     if m:  # an unknown of the platform acts on several components: its terms, one after the other, are one
+        T = len(layout.node)
         first = T - int(np.isin(layout.columns[:, 0], layout.platform_columns).sum())
         ends = np.searchsorted(layout.columns[first:, 0], layout.platform_columns)
         sums = np.add.reduceat(J[:, first:T], ends, axis=1)
         J = np.concatenate([J[:, :first], sums, J[:, T:]], axis=1)
-    for cell in batch:
+        of_platform = np.broadcast_to(layout.platform_columns, (len(batch), m))
+        columns = np.concatenate([columns[:, :first], of_platform, columns[:, T:]], axis=1)
+    blocks = np.empty((len(batch), J.shape[1], J.shape[1]))
+    for cell, block in zip(batch, blocks, strict=True):
         x, y = J[:, :, cell.low - low : cell.high - low]
-        block = x @ x.T
+        np.matmul(x, x.T, out=block)
         block += y @ y.T
-        columns = cell.columns
-        if m:
-            columns = np.concatenate([columns[:first], layout.platform_columns, columns[T:]])
-        if columns.min() < 0:
-            used = np.flatnonzero(columns >= 0)
-            columns, block = columns[used], block[np.ix_(np.append(used, -1), np.append(used, -1))]
-        rhs[columns] += block[:-1, -1]
-        matrix.add(columns, block[:-1, :-1])
+    matrix.add_each(columns, blocks[:, :-1, :-1])
+    counts = columns >= 0
+    np.add.at(rhs, columns[counts], blocks[:, :-1, -1][counts])
+
+
+def _rows(lin: Linearisation, layout: Layout, rays: IntArray) -> Array:
+    """Whitened equations (2, q + 1, m) of some rays (m,) by the terms they have, and their residuals."""
+    T, slots = len(layout.node), lin.camera.shape[1]
+    J = np.empty((2, T + slots + 1, len(rays)))
+    orientation = lin.orientation.take(rays, axis=2)
+    coefficients = layout.coefficients.take(rays, axis=1)
+    for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
+        np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
+    for of_coordinate, camera, residual in zip(J, lin.camera, lin.residual, strict=True):
+        for s, of_slot in enumerate(camera, start=T):
+            of_slot.take(rays, out=of_coordinate[s], mode="clip")  # which spares a copy
+        residual.take(rays, out=of_coordinate[-1], mode="clip")
+    return J
 
 
 def couplings(

@@ -12,9 +12,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..arrays import Array, IntArray
-from .frontal import FrontalMatrix
+from .frontal import FrontalMatrix, that_count
 from .nested_dissection import Dissection, find_fronts
-from .reduced_system import BandedFactor, DenseFactor, Factor
+from .reduced_system import BandedFactor, DenseFactor, Factor, above_diagonal
 
 #: Systems up to this size are dense whatever their structure.
 DENSE_UP_TO = 600
@@ -25,6 +25,8 @@ WORTH = 4.0
 #: Elements of a block for each pair of ranges from which on it is added range by range: what a slice costs in elements,
 #: by order of magnitude.
 LONG_RANGES = 200
+#: Rows of a lower triangle that are copied to the upper one at a time, so that both stay in the cache.
+TRIANGLES = 64
 #: Levels of the band are joined to blocks of at least this size.
 BLOCK = 48
 
@@ -47,7 +49,11 @@ class NormalMatrix(Protocol):
     """A symmetric matrix that blocks are added to."""
 
     def add(self, columns: IntArray, block: Array) -> None:
-        """Add a symmetric block (m, m) at some unknowns (m,)."""
+        """Add a symmetric block (m, m) at some unknowns (m,), in ascending order."""
+        ...
+
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        """Add symmetric blocks (k, m, m), each at its unknowns (k, m) in any order; -1 for what does not count."""
         ...
 
     def add_sparse(self, matrix: csr_array) -> None:
@@ -70,32 +76,57 @@ class NormalMatrix(Protocol):
 
 
 class DenseMatrix:
-    """All of it."""
+    """All of it.
+
+    Attributes
+    ----------
+    lower : (n, n); what stands above the diagonal means nothing before `whole` is called
+    """
 
     def __init__(self, n: int):
-        self.values = np.zeros((n, n))
+        self.lower = np.zeros((n, n))
         self.reference: Array | None = None
 
     def add(self, columns: IntArray, block: Array) -> None:
-        _add_at(self.values, columns, columns, block)
+        ranges = _ranges(columns)
+        for i, (row, own_row) in enumerate(ranges):
+            band, part = self.lower[row], block[own_row]
+            for column, own_column in ranges[: i + 1]:
+                band[:, column] += part[:, own_column]
+
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        if columns.min(initial=0) < 0:
+            counts = columns >= 0
+            columns, blocks = np.maximum(columns, 0), blocks * (counts[:, :, None] & counts[:, None, :])
+        place = columns[:, :, None] * len(self.lower) + columns[:, None, :]
+        np.add.at(self.lower.reshape(-1), place.ravel(), blocks.ravel())
+
+    def whole(self) -> Array:
+        """(n, n) with both triangles."""
+        for low in range(0, len(self.lower), TRIANGLES):
+            own = slice(low, low + TRIANGLES)
+            self.lower[:low, own] = self.lower[own, :low].T
+            corner = self.lower[own, own]
+            np.copyto(corner, corner.T, where=above_diagonal(len(corner)))
+        return self.lower
 
     def add_sparse(self, matrix: csr_array) -> None:
         entries = matrix.tocoo()
         row, column = entries.coords
-        self.values[row, column] += entries.data
+        self.lower[row, column] += entries.data
 
     def damp(self, damping: float) -> None:
-        self.values[np.diag_indices_from(self.values)] *= 1.0 + damping
+        self.lower[np.diag_indices_from(self.lower)] *= 1.0 + damping
 
     def keep_scale(self) -> None:
-        self.reference = np.diagonal(self.values).copy()
+        self.reference = np.diagonal(self.lower).copy()
 
     def take_scale(self, diagonal: Array) -> None:
         self.reference = diagonal.copy()
 
     def factorise(self) -> Factor:
         """Factor, which overwrites the matrix."""
-        return DenseFactor(self.values, self.reference)
+        return DenseFactor(self.whole(), self.reference)
 
 
 class BandedMatrix:
@@ -110,6 +141,10 @@ class BandedMatrix:
         self.border: list[Array] = [np.zeros((edge, m)) for m in size]
         self.corner = np.zeros((edge, edge))
         self.reference: Array | None = None
+
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        for own, block in that_count(columns, blocks):
+            self.add(own, block)
 
     def add(self, columns: IntArray, block: Array) -> None:
         bounds = self.structure.bounds
@@ -205,7 +240,7 @@ def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> N
 
 def _ranges(places: IntArray) -> list[tuple[slice, slice]]:
     """Ranges of successive places (m,), and where among the m each of them stands."""
-    ends = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    ends = [0, *((places[1:] - places[:-1] != 1).nonzero()[0] + 1).tolist(), len(places)]
     return [
         (slice(first := int(places[low]), first + high - low), slice(low, high))
         for low, high in pairwise(ends)
