@@ -30,18 +30,18 @@ class FrontalMatrix:
         ]
         self.reference: Array | None = None
 
-    def add(self, columns: IntArray, block: Array) -> None:
+    def subtract(self, columns: IntArray, block: Array) -> None:
         place = self.dissection.position[columns]
         if not (np.diff(place) > 0).all():
             order = np.argsort(place)
             place, block = place[order], block[np.ix_(order, order)]
         for t, low, high in pieces(self.dissection, place):
             rows = self._local(t, place[low:])
-            self.panels[t][np.ix_(rows, rows[: high - low])] += block[low:, low:high]
+            self.panels[t][np.ix_(rows, rows[: high - low])] -= block[low:, low:high]
 
     def add_each(self, columns: IntArray, blocks: Array) -> None:
         for own, block in that_count(columns, blocks):
-            self.add(own, block)
+            self.subtract(own, -block)
 
     def add_sparse(self, matrix: csr_array) -> None:
         entries = matrix.tocoo()

@@ -325,8 +325,10 @@ def _terms(
         width = d.columns.shape[1]
         coefficients[:width, mine] = d.coefficients.T
         own = np.flatnonzero(node < width)
-        local = d.columns[:, node[own], component[own]].T
-        columns[own[:, None], mine] = np.where(local >= 0, local + first, -1)
+        of_set = np.full((len(node), len(mine)), -1, dtype=np.int32)
+        of_set[own] = d.columns[:, node[own], component[own]].T
+        of_set[of_set >= 0] += first
+        columns[:, mine] = of_set
     return node, component, columns, coefficients
 
 

@@ -26,8 +26,8 @@ from .surface_control import SurfaceRows
 POINT_PIVOT = 1e-10
 #: A singular value of a point's equations below this share of the largest counts as zero.
 DETERMINED = 1e-6
-#: Rays for which products are formed at a time.
-BATCH = 16384
+#: Equations for which products are formed at a time.
+BATCH = 32768
 #: Rays that clusters are joined up to while their rays are worked on.
 SHARED = 6144
 
@@ -60,10 +60,10 @@ def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
     keep = np.flatnonzero(np.isfinite(prior.sigma))
     weight = 1.0 / prior.sigma[keep]
     columns, coefficients = prior.columns[keep], prior.coefficients[keep] * weight[:, None]
-    row, term = np.nonzero(columns >= 0)
-    entries = (coefficients[row, term], (row, columns[row, term]))
-    matrix = csr_array(entries, shape=(len(keep), n_unknowns))
-    return Prior(matrix, prior.value[keep] * weight, csr_array(matrix.T @ matrix))
+    present = columns >= 0
+    ends = np.append(0, np.cumsum(present.sum(axis=1)))
+    matrix = csr_array((coefficients[present], columns[present], ends), shape=(len(keep), n_unknowns))
+    return Prior(matrix, prior.value[keep] * weight, csr_array(matrix.T.tocsr() @ matrix))
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def reduce_normals(
     surface, shift_m = control.surface, layout.shift_of(theta)
     if surface is not None:
         place = np.array([layout.shift_column])
-        matrix.add(place, np.array([[surface.weight.sum()]]))
+        matrix.add_each(place[None], surface.weight.sum()[None, None, None])
         rhs[place] += np.sqrt(surface.weight) @ surface.residual(points_l, shift_m)
     if damping:
         matrix.damp(damping)
@@ -232,8 +232,7 @@ def reduce_normals(
     points = point_normals(lin, elimination.point, elimination.n_points, control, points_l, damping, shift_m)
     for cluster, D in couplings(lin, layout, elimination, points):
         rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
-        block = D.T @ D
-        matrix.add(cluster.columns, np.negative(block, out=block))
+        matrix.subtract(cluster.columns, D.T @ D)
     return Reduced(matrix, rhs, points)
 
 
@@ -260,40 +259,46 @@ def _add_batch(
     batch: list[Cell],
 ) -> None:
     low = batch[0].low
-    rays = elimination.by_cell[low : batch[-1].high]
-    J = _rows(lin, layout, rays)
+    J = _rows(lin, layout, elimination.by_cell[low : batch[-1].high])
     columns = np.stack([cell.columns for cell in batch])
     m = layout.platform.n_unknowns
     if m:  # an unknown of the platform acts on several components: its terms, one after the other, are one
         T = len(layout.node)
         first = T - int(np.isin(layout.columns[:, 0], layout.platform_columns).sum())
         ends = np.searchsorted(layout.columns[first:, 0], layout.platform_columns)
-        sums = np.add.reduceat(J[:, first:T], ends, axis=1)
-        J = np.concatenate([J[:, :first], sums, J[:, T:]], axis=1)
+        J = np.concatenate([J[:first], np.add.reduceat(J[first:T], ends), J[T:]])
         of_platform = np.broadcast_to(layout.platform_columns, (len(batch), m))
         columns = np.concatenate([columns[:, :first], of_platform, columns[:, T:]], axis=1)
-    blocks = np.empty((len(batch), J.shape[1], J.shape[1]))
+    blocks = np.empty((len(batch), len(J), len(J)))
     for cell, block in zip(batch, blocks, strict=True):
-        x, y = J[:, :, cell.low - low : cell.high - low]
-        np.matmul(x, x.T, out=block)
-        block += y @ y.T
+        own = J[:, cell.low - low : cell.high - low]
+        np.matmul(own, own.T, out=block)
     matrix.add_each(columns, blocks[:, :-1, :-1])
     counts = columns >= 0
     np.add.at(rhs, columns[counts], blocks[:, :-1, -1][counts])
 
 
-def _rows(lin: Linearisation, layout: Layout, rays: IntArray) -> Array:
-    """Whitened equations (2, q + 1, m) of some rays (m,) by the terms they have, and their residuals."""
-    T, slots = len(layout.node), lin.camera.shape[1]
-    J = np.empty((2, T + slots + 1, len(rays)))
-    orientation = lin.orientation.take(rays, axis=2)
+def _rows(lin: Linearisation, layout: Layout, equations: IntArray) -> Array:
+    """Some whitened equations (m,), as `Elimination.by_cell` counts them: (q + 1, m) by their terms, and residuals."""
+    T, slots, n = len(layout.node), lin.camera.shape[1], lin.residual.shape[1]
+    of_y = equations >= n
+    rays = equations - n * of_y
+    J = np.empty((T + slots + 1, len(rays)))
+
+    def gather(values: Array, into: Array) -> None:
+        """Rows (k, n) of x and of y, each into a row (m,) of its own."""
+        flat, place = values.reshape(-1), rays + values.shape[1] * n * of_y
+        for row in into:
+            flat.take(place, out=row, mode="clip")  # the default mode would copy once more
+            place += n
+
+    orientation = np.empty((6, len(rays)))
+    gather(lin.orientation, orientation)
+    gather(lin.camera, J[T:-1])
+    gather(lin.residual[:, None], J[-1:])
     coefficients = layout.coefficients.take(rays, axis=1)
     for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
-        np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
-    for of_coordinate, camera, residual in zip(J, lin.camera, lin.residual, strict=True):
-        for s, of_slot in enumerate(camera, start=T):
-            of_slot.take(rays, out=of_coordinate[s], mode="clip")  # which spares a copy
-        residual.take(rays, out=of_coordinate[-1], mode="clip")
+        np.multiply(orientation[c], coefficients[k], out=J[t])
     return J
 
 
@@ -352,8 +357,7 @@ def change_of_rays(lin: Linearisation, layout: Layout, d_theta: Array) -> Array:
     d_eo = layout.corrections(d_theta)
     change = np.einsum("ckn,kn->cn", lin.orientation, d_eo)
     if layout.camera is not None:
-        of_slot = np.append(d_theta[layout.n_model :], 0.0)[layout.camera.columns].T
-        change += np.einsum("csn,sn->cn", lin.camera, of_slot[:, layout.camera.pattern])
+        change += np.einsum("csn,sn->cn", lin.camera, layout.camera.values_of(d_theta[layout.n_model :]))
     return change
 
 
