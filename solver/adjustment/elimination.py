@@ -6,6 +6,7 @@ Made once per network and model; each iteration then works with dense blocks onl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,7 @@ FEWEST_POINTS, MOST_RAYS = 8, 8192
 
 @dataclass(frozen=True)
 class Cell:
-    """Rays with the same columns: places ``low:high`` of their equations in `Elimination.by_cell`; ``columns`` (q,) with
-    -1 for none."""
+    """Rays with the same columns (q,), -1 for none; their equations are ``low:high`` of `Elimination.by_cell`."""
 
     low: int
     high: int
@@ -103,8 +103,8 @@ def plan_elimination(
     for low, high in _divided(0, len(first_ray) - 1, cell, touched, first_ray)[1]:
         rays = slice(int(first_ray[low]), int(first_ray[high]))
         of_ray = cell[rays]
-        used = np.bincount(of_ray, minlength=len(cells)).nonzero()[0]
-        columns = touched[used].any(axis=0).nonzero()[0]
+        used = np.flatnonzero(np.bincount(of_ray, minlength=len(cells)))
+        columns = np.flatnonzero(touched[used].any(axis=0))
         if layout.n_surface:
             columns = np.append(columns, layout.shift_column)
         width = len(columns) + 1
@@ -148,8 +148,7 @@ def _cells(layout: Layout) -> tuple[IntArray, IntArray, list[Cell]]:
     if layout.camera is not None:
         own = layout.camera.columns[layout.camera.pattern[examples]].astype(np.int64)
         columns = np.concatenate([columns, np.where(own >= 0, own + layout.n_model, -1)], axis=1)
-    equations = (2 * bounds).tolist()
-    return cell, by_cell, [Cell(*places, own) for *places, own in zip(equations[:-1], equations[1:], columns, strict=True)]
+    return cell, by_cell, [Cell(*p, own) for p, own in zip(pairwise((2 * bounds).tolist()), columns, strict=True)]
 
 
 def _divided(

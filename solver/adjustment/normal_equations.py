@@ -40,6 +40,11 @@ class Prior:
     value: Array
     normal: csr_array
 
+    @classmethod
+    def of(cls, matrix: csr_array, value: Array) -> Prior:
+        """From whitened equations."""
+        return cls(matrix, value, csr_array(matrix.T.tocsr() @ matrix))
+
     @property
     def n_observations(self) -> int:
         return len(self.value)
@@ -51,8 +56,7 @@ class Prior:
     def without(self, column: int) -> Prior:
         """Without the equations of an unknown, which is free then."""
         keep = np.flatnonzero(np.asarray(abs(self.matrix[:, [column]]).sum(axis=1)).ravel() == 0.0)
-        matrix = csr_array(self.matrix[keep])
-        return Prior(matrix, self.value[keep], csr_array(matrix.T @ matrix))
+        return Prior.of(csr_array(self.matrix[keep]), self.value[keep])
 
 
 def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
@@ -63,7 +67,7 @@ def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
     present = columns >= 0
     ends = np.append(0, np.cumsum(present.sum(axis=1)))
     matrix = csr_array((coefficients[present], columns[present], ends), shape=(len(keep), n_unknowns))
-    return Prior(matrix, prior.value[keep] * weight, csr_array(matrix.T.tocsr() @ matrix))
+    return Prior.of(matrix, prior.value[keep] * weight)
 
 
 @dataclass(frozen=True)

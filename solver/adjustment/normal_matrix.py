@@ -49,7 +49,7 @@ class NormalMatrix(Protocol):
     """A symmetric matrix that blocks are added to and subtracted from."""
 
     def add_each(self, columns: IntArray, blocks: Array) -> None:
-        """Add small symmetric blocks (k, m, m), each at its unknowns (k, m) in any order; -1 for what does not count."""
+        """Add small symmetric blocks (k, m, m), each at its unknowns (k, m) in any order, -1 for none."""
         ...
 
     def subtract(self, columns: IntArray, block: Array) -> None:
@@ -57,7 +57,7 @@ class NormalMatrix(Protocol):
         ...
 
     def add_sparse(self, matrix: csr_array) -> None:
-        """Add a symmetric sparse matrix (n, n)."""
+        """Add a symmetric sparse matrix (n, n), which has every entry once."""
         ...
 
     def damp(self, damping: float) -> None:
@@ -111,9 +111,8 @@ class DenseMatrix:
         return self.lower
 
     def add_sparse(self, matrix: csr_array) -> None:
-        entries = matrix.tocoo()
-        row, column = entries.coords
-        self.lower[row, column] += entries.data
+        row = np.repeat(np.arange(len(self.lower)), np.diff(matrix.indptr))
+        self.lower[row, matrix.indices] += matrix.data
 
     def damp(self, damping: float) -> None:
         self.lower[np.diag_indices_from(self.lower)] *= 1.0 + damping
@@ -268,10 +267,10 @@ def find_structure(
         return None
     group, n_groups = _alike(n_model, cliques)
     size = np.bincount(group, minlength=n_groups)
-    member = [np.unique(group[c[c < n_model]]) for c in cliques]
-    count = np.array([len(m) for m in member])
-    rows = np.repeat(np.arange(len(member)), count)
-    touch = csr_array((np.ones(len(rows)), (rows, np.concatenate(member))), shape=(len(member), n_groups))
+    member = np.zeros((len(cliques), n_groups), dtype=bool)
+    for own, c in zip(member, cliques, strict=True):
+        own[group[c[c < n_model]]] = True
+    touch = csr_array(member, dtype=float)
     row, column = (c.astype(np.int64) for c in prior.tocoo().coords)
     inner = (row < n_model) & (column < n_model)
     pairs = (np.ones(int(inner.sum())), (group[row[inner]], group[column[inner]]))
