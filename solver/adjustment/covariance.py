@@ -87,7 +87,8 @@ def _clusters(solution: Solution) -> Iterator[tuple[Cluster, Array]]:
     lin = solution.linearisation
     if not (solution.ray_weight == 1.0).all():
         lin = lin.reweighted(solution.ray_weight)
-    return couplings(lin, solution.layout, solution.problem.elimination, solution.points)
+    for cluster, D in couplings(lin, solution.layout, solution.problem.elimination, solution.points):
+        yield cluster, D[:, :-1]
 
 
 def _inverse_factors(solution: Solution, cluster: Cluster) -> Array:

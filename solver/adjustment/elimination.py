@@ -6,6 +6,7 @@ Made once per network and model; each iteration then works with dense blocks onl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ FEWEST_POINTS, MOST_RAYS = 8, 8192
 
 @dataclass(frozen=True)
 class Cell:
-    """Rays with the same columns: places ``low:high`` of `Elimination.by_cell`; ``columns`` (q,) with -1 for none."""
+    """Rays with the same columns (q,), -1 for none; their equations are ``low:high`` of `Elimination.by_cell`."""
 
     low: int
     high: int
@@ -61,7 +62,7 @@ class Elimination:
     ----------
     point : (n,) point of each ray
     n_points : number of points
-    by_cell : (n,) order of rays in which cells are contiguous
+    by_cell : (2 n,) order of equations in which cells are contiguous; those of y count after all of x
     cell : (n,) cell of each ray
     structure : order of the unknowns that makes a band; None for a dense system
     """
@@ -94,21 +95,25 @@ def plan_elimination(
     dense : whether the system is dense whatever its size
     """
     cell, by_cell, cells = _cells(layout)
+    every = np.stack([c.columns for c in cells])
+    touched = np.zeros((len(cells), layout.n_unknowns + 1), dtype=bool)
+    touched[np.arange(len(cells))[:, None], every] = True
+    touched[:, -1] = False
     clusters = []
-    for low, high in _cluster_bounds(layout.n_unknowns, cell, cells, first_ray):
+    for low, high in _divided(0, len(first_ray) - 1, cell, touched, first_ray)[1]:
         rays = slice(int(first_ray[low]), int(first_ray[high]))
-        used = np.flatnonzero(np.bincount(cell[rays], minlength=len(cells)))
-        columns = np.unique(np.concatenate([cells[k].columns for k in used])) if len(used) else np.empty(0, dtype=int)
-        columns = columns[columns >= 0]
+        of_ray = cell[rays]
+        used = np.flatnonzero(np.bincount(of_ray, minlength=len(cells)))
+        columns = np.flatnonzero(touched[used].any(axis=0))
         if layout.n_surface:
             columns = np.append(columns, layout.shift_column)
         width = len(columns) + 1
-        local = np.full(layout.n_unknowns + 1, width - 1)
+        local = np.full(layout.n_unknowns + 1, width - 1, dtype=np.int32)
         local[columns] = np.arange(width - 1)
-        table = np.zeros((len(cells), len(cells[0].columns)), dtype=np.int32)
-        table[used] = local[np.stack([cells[k].columns for k in used])] if len(used) else 0
-        place = np.empty((table.shape[1], len(point[rays])), dtype=np.int32)
-        np.add(table[cell[rays]].T, ((point[rays] - low) * width).astype(np.int32), out=place)
+        table = np.empty(every.shape, dtype=np.int32)
+        table[used] = local[every[used]]
+        place = np.empty((every.shape[1], len(of_ray)), dtype=np.int32)
+        np.add(table[of_ray].T, ((point[rays] - low) * width).astype(np.int32), out=place)
         clusters.append(Cluster(slice(low, high), rays, columns, place))
     cliques = [c.columns for c in clusters if len(c.columns)]
     structure = None if dense else find_structure(layout.n_of_sets, layout.n_unknowns, cliques, prior)
@@ -118,7 +123,7 @@ def plan_elimination(
 
 
 def _cells(layout: Layout) -> tuple[IntArray, IntArray, list[Cell]]:
-    """Cell of each ray, order by cell, cells."""
+    """Cell of each ray, order of the equations by cell, cells."""
     n = layout.columns.shape[1]
     key = np.zeros(n, dtype=np.uint64)
     with np.errstate(over="ignore"):
@@ -128,28 +133,22 @@ def _cells(layout: Layout) -> tuple[IntArray, IntArray, list[Cell]]:
         if layout.camera is not None:
             key = (key ^ layout.camera.pattern.astype(np.uint64)) * np.uint64(0xD6E8FEB86659FD93)
             key ^= key >> np.uint64(32)
-    by_cell = np.argsort(key, kind="stable")
-    begins = np.flatnonzero(np.diff(key[by_cell], prepend=key[by_cell[:1]] + np.uint64(1)))
+    rays = np.argsort(key, kind="stable")
+    begins = np.flatnonzero(np.diff(key[rays], prepend=key[rays[:1]] + np.uint64(1)))
     bounds = np.append(begins, n)
-    cell = np.empty(n, dtype=np.int64)
-    cell[by_cell] = np.repeat(np.arange(len(begins)), np.diff(bounds))
-    cells = []
-    for k, example in enumerate(by_cell[begins]):
-        columns = layout.columns[:, example].astype(np.int64)
-        if layout.camera is not None:
-            own = layout.camera.columns[layout.camera.pattern[example]].astype(np.int64)
-            columns = np.concatenate([columns, np.where(own >= 0, own + layout.n_model, -1)])
-        cells.append(Cell(int(bounds[k]), int(bounds[k + 1]), columns))
-    return cell, by_cell, cells
-
-
-def _cluster_bounds(n_unknowns: int, cell: IntArray, cells: list[Cell], first_ray: IntArray) -> list[tuple[int, int]]:
-    """Ranges of points: halves of halves, as far as a split saves work."""
-    touched = np.zeros((len(cells), n_unknowns + 1), dtype=bool)
-    for k, c in enumerate(cells):
-        touched[k, c.columns] = True
-    touched[:, -1] = False
-    return _divided(0, len(first_ray) - 1, cell, touched, first_ray)[1]
+    size = np.diff(bounds)
+    of_rays = np.repeat(np.arange(len(begins)), size)
+    cell, by_cell = np.empty(n, dtype=np.int64), np.empty(2 * n, dtype=np.int64)
+    cell[rays] = of_rays
+    place = np.arange(n) + begins[of_rays]  # two equations each of the rays before the cell
+    by_cell[place] = rays
+    by_cell[place + size[of_rays]] = rays + n
+    examples = rays[begins]
+    columns = layout.columns[:, examples].T.astype(np.int64)
+    if layout.camera is not None:
+        own = layout.camera.columns[layout.camera.pattern[examples]].astype(np.int64)
+        columns = np.concatenate([columns, np.where(own >= 0, own + layout.n_model, -1)], axis=1)
+    return cell, by_cell, [Cell(*p, own) for p, own in zip(pairwise((2 * bounds).tolist()), columns, strict=True)]
 
 
 def _divided(

@@ -8,6 +8,8 @@ points need them; libraries of sparse Cholesky factors leave them to the user.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
@@ -28,14 +30,18 @@ class FrontalMatrix:
         ]
         self.reference: Array | None = None
 
-    def add(self, columns: IntArray, block: Array) -> None:
+    def subtract(self, columns: IntArray, block: Array) -> None:
         place = self.dissection.position[columns]
         if not (np.diff(place) > 0).all():
             order = np.argsort(place)
             place, block = place[order], block[np.ix_(order, order)]
         for t, low, high in pieces(self.dissection, place):
             rows = self._local(t, place[low:])
-            self.panels[t][np.ix_(rows, rows[: high - low])] += block[low:, low:high]
+            self.panels[t][np.ix_(rows, rows[: high - low])] -= block[low:, low:high]
+
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        for own, block in that_count(columns, blocks):
+            self.subtract(own, -block)
 
     def add_sparse(self, matrix: csr_array) -> None:
         entries = matrix.tocoo()
@@ -241,6 +247,13 @@ class FrontalFactor:
         diagonal = np.concatenate([np.diagonal(columns) for columns in self._selected()])
         diagonal = diagonal - (self._null**2).sum(axis=1) / RAISED
         return (diagonal * self._scale**2)[self.dissection.position]
+
+
+def that_count(columns: IntArray, blocks: Array) -> Iterator[tuple[IntArray, Array]]:
+    """Unknowns (m,) and block (m, m) of some (k, m) and (k, m, m), without those that are -1."""
+    for own, block in zip(columns, blocks, strict=True):
+        used = np.flatnonzero(own >= 0)
+        yield (own, block) if len(used) == len(own) else (own[used], block[np.ix_(used, used)])
 
 
 def pieces(dissection: Dissection, place: IntArray) -> list[tuple[int, int, int]]:

@@ -489,7 +489,7 @@ def weaknesses(solution: Solution) -> tuple[Combination, ...] | None:
     assert isinstance(normal, DenseMatrix)
     prior = problem.prior.normal.toarray()
     alone = own_information(solution)
-    return tuple(undetermined(normal.values - prior, prior, alone, layout.names, len(layout.sets)))
+    return tuple(undetermined(normal.whole() - prior, prior, alone, layout.names, len(layout.sets)))
 
 
 def _refuse_hopeless(network: Network) -> None:

@@ -316,17 +316,21 @@ def _terms(
     """
     nodes = max(d.coefficients.shape[1] for _, _, d in designs)
     present = np.zeros((nodes, 6), dtype=bool)
-    for _, _, d in designs:
-        present[: d.columns.shape[1]] |= d.columns.max(axis=0) >= 0
+    # a model without segments has the same columns for all rays, which are one row in memory then
+    distinct = [d.columns[:1] if d.columns.strides[0] == 0 else d.columns for _, _, d in designs]
+    for own in distinct:
+        present[: own.shape[1]] |= own.max(axis=0) >= 0
     node, component = np.nonzero(present)
     columns = np.full((len(node), n), -1, dtype=np.int32)
     coefficients = np.zeros((nodes, n))
-    for mine, first, d in designs:
-        width = d.columns.shape[1]
+    for (mine, first, d), of_rays in zip(designs, distinct, strict=True):
+        width = of_rays.shape[1]
         coefficients[:width, mine] = d.coefficients.T
         own = np.flatnonzero(node < width)
-        local = d.columns[:, node[own], component[own]].T
-        columns[own[:, None], mine] = np.where(local >= 0, local + first, -1)
+        of_set = np.full((len(node), len(of_rays)), -1, dtype=np.int32)
+        of_set[own] = of_rays[:, node[own], component[own]].T
+        of_set[of_set >= 0] += first
+        columns[:, mine] = of_set
     return node, component, columns, coefficients
 
 

@@ -63,21 +63,21 @@ class Linearisation:
         return Linearisation(self.residual * root, self.orientation * root, self.camera * root, self.point * root)
 
 
-def residual_covariance(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:
+def residual_covariance(rays: Rays, d_orientation: Array, motion: Array | None = None) -> Array:
     """Covariance (3, n) of the residuals, elements xx, xy, yy in mm^2: ``Ju su^2 Ju^T + Jv sv^2 Jv^T``.
 
     ``Ju`` is the image motion during one line: platform velocity and attitude rate through the collinearity equations;
-    ``Jv`` the pixel pitch along the CCD line.
+    ``Jv`` the pixel pitch along the CCD line. The white noise of the orientation, where it is known, goes the same way:
+    `orientation_noise`.
 
     Parameters
     ----------
     rays : n rays
     d_orientation : (2, 6, n) derivative of the projection to the orientation
-    attitude_rate : False leaves the attitude rate out, which holds for a stabilised mount only
-
-    The white noise of the orientation, where it is known, goes the same way: `orientation_noise`.
+    motion : (2, n) image motion in mm/s where it has been computed already
     """
-    u = _image_motion(rays, d_orientation, attitude_rate) * (rays.line_period_s * rays.sigma_line_px)
+    motion = _image_motion(d_orientation, _rates(rays)) if motion is None else motion
+    u = motion * (rays.line_period_s * rays.sigma_line_px)
     v = rays.pitch_mm.T * rays.sigma_sample_px
     return _outer(u) + _outer(v) + orientation_noise(rays, d_orientation)
 
@@ -203,26 +203,35 @@ def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layou
     n = len(rays)
     fitted, moved, image = np.empty((2, n)), np.empty((n, 6)), np.empty((2, n))
     for part, own, residual, d_orientation, _, _ in _by_chunks(rays, layout, theta, points_l):
-        white = whiten(residual_covariance(own, d_orientation))
+        rates = _rates(own)
+        motion, pitch = _image_motion(d_orientation, rates), own.pitch_mm.T
+        white = whiten(residual_covariance(own, d_orientation, motion))
         a = white.apply(residual)
         multiplier = np.array([white.g[0] * a[0] + white.g[1] * a[1], white.g[2] * a[1]])  # C^-1 r
-        motion, pitch = _image_motion(own, d_orientation), own.pitch_mm.T
         later_s = (own.line_period_s * own.sigma_line_px) ** 2 * (motion * multiplier).sum(axis=0)
         samples = own.sigma_sample_px**2 * (pitch * multiplier).sum(axis=0)
         far = np.maximum(np.abs(later_s) / (MOST_PIXELS * own.line_period_s), np.abs(samples) / MOST_PIXELS)
         share = 1.0 / np.maximum(far, 1.0)
-        change = later_s[:, None] * np.hstack([own.velocity_l, own.angle_rate])
+        change = later_s * rates
         if own.orientation_noise is not None:
-            change += (own.orientation_noise @ np.einsum("cln,cn->nl", d_orientation, multiplier)[:, :, None])[:, :, 0]
-        moved[part] = share[:, None] * change
-        image[:, part] = np.einsum("ckn,nk->cn", d_orientation, moved[part])
+            acting = np.einsum("cln,cn->nl", d_orientation, multiplier)[:, :, None]
+            change += (own.orientation_noise @ acting)[:, :, 0].T
+        change *= share
+        image[:, part] = np.einsum("ckn,kn->cn", d_orientation, change)
+        moved[part] = change.T
         fitted[:, part] = own.xy_mm.T - share * samples * pitch
     return layout.fitted(fitted, RayShift(moved, image))
 
 
-def _image_motion(rays: Rays, d_orientation: Array, attitude_rate: bool = True) -> Array:
-    """Image motion (2, n) in mm/s by velocity and attitude rate of the platform; whitened if `d_orientation` is."""
-    rates = np.concatenate([rays.velocity_l.T, rays.angle_rate.T if attitude_rate else np.zeros((3, len(rays)))])
+def _rates(rays: Rays) -> Array:
+    """Velocity and attitude rate (6, n) of the platform."""
+    rates = np.empty((6, len(rays)))
+    rates[:3], rates[3:] = rays.velocity_l.T, rays.angle_rate.T
+    return rates
+
+
+def _image_motion(d_orientation: Array, rates: Array) -> Array:
+    """Image motion (2, n) in mm/s by rates (6, n) of the platform; whitened if `d_orientation` is."""
     return np.einsum("ckn,kn->cn", d_orientation, rates)
 
 
@@ -267,7 +276,7 @@ def _whiten_into(target: Array, raw: Array, g: Array, part: slice) -> None:
 
 def refresh_weights(rays: Rays, whitening: Whitening, lin: Linearisation) -> tuple[Whitening, Linearisation]:
     """Weights from the image motion at the linearisation, and the same equations with these weights."""
-    u = _image_motion(rays, lin.orientation) * (rays.line_period_s * rays.sigma_line_px)
+    u = _image_motion(lin.orientation, _rates(rays)) * (rays.line_period_s * rays.sigma_line_px)
     v = whitening.apply(rays.pitch_mm.T * rays.sigma_sample_px)
     turn = whiten(_outer(u) + _outer(v) + orientation_noise(rays, lin.orientation))
     a, b, c = turn.g

@@ -26,8 +26,8 @@ from .surface_control import SurfaceRows
 POINT_PIVOT = 1e-10
 #: A singular value of a point's equations below this share of the largest counts as zero.
 DETERMINED = 1e-6
-#: Rays for which products are formed at a time.
-BATCH = 16384
+#: Equations for which products are formed at a time.
+BATCH = 32768
 #: Rays that clusters are joined up to while their rays are worked on.
 SHARED = 6144
 
@@ -40,6 +40,11 @@ class Prior:
     value: Array
     normal: csr_array
 
+    @classmethod
+    def of(cls, matrix: csr_array, value: Array) -> Prior:
+        """From whitened equations."""
+        return cls(matrix, value, csr_array(matrix.T.tocsr() @ matrix))
+
     @property
     def n_observations(self) -> int:
         return len(self.value)
@@ -51,8 +56,7 @@ class Prior:
     def without(self, column: int) -> Prior:
         """Without the equations of an unknown, which is free then."""
         keep = np.flatnonzero(np.asarray(abs(self.matrix[:, [column]]).sum(axis=1)).ravel() == 0.0)
-        matrix = csr_array(self.matrix[keep])
-        return Prior(matrix, self.value[keep], csr_array(matrix.T @ matrix))
+        return Prior.of(csr_array(self.matrix[keep]), self.value[keep])
 
 
 def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
@@ -60,10 +64,10 @@ def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
     keep = np.flatnonzero(np.isfinite(prior.sigma))
     weight = 1.0 / prior.sigma[keep]
     columns, coefficients = prior.columns[keep], prior.coefficients[keep] * weight[:, None]
-    row, term = np.nonzero(columns >= 0)
-    entries = (coefficients[row, term], (row, columns[row, term]))
-    matrix = csr_array(entries, shape=(len(keep), n_unknowns))
-    return Prior(matrix, prior.value[keep] * weight, csr_array(matrix.T @ matrix))
+    present = columns >= 0
+    ends = np.append(0, np.cumsum(present.sum(axis=1)))
+    matrix = csr_array((coefficients[present], columns[present], ends), shape=(len(keep), n_unknowns))
+    return Prior.of(matrix, prior.value[keep] * weight)
 
 
 @dataclass(frozen=True)
@@ -224,16 +228,17 @@ def reduce_normals(
     surface, shift_m = control.surface, layout.shift_of(theta)
     if surface is not None:
         place = np.array([layout.shift_column])
-        matrix.add(place, np.array([[surface.weight.sum()]]))
+        matrix.add_each(place[None], surface.weight.sum()[None, None, None])
         rhs[place] += np.sqrt(surface.weight) @ surface.residual(points_l, shift_m)
     if damping:
         matrix.damp(damping)
     matrix.keep_scale()
     points = point_normals(lin, elimination.point, elimination.n_points, control, points_l, damping, shift_m)
     for cluster, D in couplings(lin, layout, elimination, points):
-        rhs[cluster.columns] -= D.T @ points.y[:, cluster.points].ravel()
-        block = D.T @ D
-        matrix.add(cluster.columns, np.negative(block, out=block))
+        D[:, -1] = points.y[:, cluster.points].ravel()
+        product = D.T @ D
+        rhs[cluster.columns] -= product[:-1, -1]
+        matrix.subtract(cluster.columns, product[:-1, :-1])
     return Reduced(matrix, rhs, points)
 
 
@@ -260,39 +265,53 @@ def _add_batch(
     batch: list[Cell],
 ) -> None:
     low = batch[0].low
-    rays = elimination.by_cell[low : batch[-1].high]
-    orientation = lin.orientation.take(rays, axis=2)
-    coefficients = layout.coefficients.take(rays, axis=1)
-    T, slots = len(layout.node), lin.camera.shape[1]
-    J = np.empty((2, T + slots + 1, len(rays)))
-    for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
-        np.multiply(orientation[:, c], coefficients[k], out=J[:, t])
-    J[:, T:-1] = lin.camera.take(rays, axis=2)
-    J[:, -1] = lin.residual.take(rays, axis=1)
-    m, first = layout.platform.n_unknowns, T
+    J = _rows(lin, layout, elimination.by_cell[low : batch[-1].high])
+    columns = np.stack([cell.columns for cell in batch])
+    m = layout.platform.n_unknowns
     if m:  # an unknown of the platform acts on several components: its terms, one after the other, are one
+        T = len(layout.node)
         first = T - int(np.isin(layout.columns[:, 0], layout.platform_columns).sum())
         ends = np.searchsorted(layout.columns[first:, 0], layout.platform_columns)
-        sums = np.add.reduceat(J[:, first:T], ends, axis=1)
-        J = np.concatenate([J[:, :first], sums, J[:, T:]], axis=1)
-    for cell in batch:
-        x, y = J[:, :, cell.low - low : cell.high - low]
-        block = x @ x.T
-        block += y @ y.T
-        columns = cell.columns
-        if m:
-            columns = np.concatenate([columns[:first], layout.platform_columns, columns[T:]])
-        if columns.min() < 0:
-            used = np.flatnonzero(columns >= 0)
-            columns, block = columns[used], block[np.ix_(np.append(used, -1), np.append(used, -1))]
-        rhs[columns] += block[:-1, -1]
-        matrix.add(columns, block[:-1, :-1])
+        J = np.concatenate([J[:first], np.add.reduceat(J[first:T], ends), J[T:]])
+        of_platform = np.broadcast_to(layout.platform_columns, (len(batch), m))
+        columns = np.concatenate([columns[:, :first], of_platform, columns[:, T:]], axis=1)
+    blocks = np.empty((len(batch), len(J), len(J)))
+    for cell, block in zip(batch, blocks, strict=True):
+        own = J[:, cell.low - low : cell.high - low]
+        np.matmul(own, own.T, out=block)
+    matrix.add_each(columns, blocks[:, :-1, :-1])
+    counts = columns >= 0
+    np.add.at(rhs, columns[counts], blocks[:, :-1, -1][counts])
+
+
+def _rows(lin: Linearisation, layout: Layout, equations: IntArray) -> Array:
+    """Some whitened equations (m,), as `Elimination.by_cell` counts them: (q + 1, m) by their terms, and residuals."""
+    T, slots, n = len(layout.node), lin.camera.shape[1], lin.residual.shape[1]
+    of_y = equations >= n
+    rays = equations - n * of_y
+    J = np.empty((T + slots + 1, len(rays)))
+
+    def gather(values: Array, into: Array) -> None:
+        """Rows (k, n) of x and of y, each into a row (m,) of its own."""
+        flat, place = values.reshape(-1), rays + values.shape[1] * n * of_y
+        for row in into:
+            flat.take(place, out=row, mode="clip")  # the default mode would copy once more
+            place += n
+
+    orientation = np.empty((6, len(rays)))
+    gather(lin.orientation, orientation)
+    gather(lin.camera, J[T:-1])
+    gather(lin.residual[:, None], J[-1:])
+    coefficients = layout.coefficients.take(rays, axis=1)
+    for t, (k, c) in enumerate(zip(layout.node, layout.component, strict=True)):
+        np.multiply(orientation[c], coefficients[k], out=J[t])
+    return J
 
 
 def couplings(
     lin: Linearisation, layout: Layout, elimination: Elimination, points: PointNormals
 ) -> Iterator[tuple[Cluster, Array]]:
-    """Clusters with their ``D`` (3 points, U), rows axis by axis."""
+    """Clusters with their ``D`` (3 points, U + 1), rows axis by axis; the last column is nothing."""
     clusters = elimination.clusters
     first = 0
     while first < len(clusters):  # neighbouring clusters share the work on single rays
@@ -331,12 +350,11 @@ def _coupling_terms(lin: Linearisation, layout: Layout, points: PointNormals, po
 
 
 def _coupling(terms: Array, cluster: Cluster) -> Array:
-    width = len(cluster.columns) + 1
     place = cluster.place.ravel().astype(np.intp)
-    D = np.empty((3, cluster.n_points * width))
-    for k in range(3):
-        D[k] = np.bincount(place, terms[k].ravel(), cluster.n_points * width)
-    return D.reshape(3 * cluster.n_points, width)[:, :-1]
+    D = np.zeros((3, cluster.n_points * (len(cluster.columns) + 1)))
+    for of_axis, values in zip(D, terms, strict=True):
+        np.add.at(of_axis, place, values.ravel())  # two thirds of what np.bincount takes
+    return D.reshape(3 * cluster.n_points, -1)
 
 
 def change_of_rays(lin: Linearisation, layout: Layout, d_theta: Array) -> Array:
@@ -344,8 +362,7 @@ def change_of_rays(lin: Linearisation, layout: Layout, d_theta: Array) -> Array:
     d_eo = layout.corrections(d_theta)
     change = np.einsum("ckn,kn->cn", lin.orientation, d_eo)
     if layout.camera is not None:
-        of_slot = np.append(d_theta[layout.n_model :], 0.0)[layout.camera.columns].T
-        change += np.einsum("csn,sn->cn", lin.camera, of_slot[:, layout.camera.pattern])
+        change += np.einsum("csn,sn->cn", lin.camera, layout.camera.values_of(d_theta[layout.n_model :]))
     return change
 
 

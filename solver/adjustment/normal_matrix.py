@@ -12,9 +12,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..arrays import Array, IntArray
-from .frontal import FrontalMatrix
+from .frontal import FrontalMatrix, that_count
 from .nested_dissection import Dissection, find_fronts
-from .reduced_system import BandedFactor, DenseFactor, Factor
+from .reduced_system import BandedFactor, DenseFactor, Factor, above_diagonal
 
 #: Systems up to this size are dense whatever their structure.
 DENSE_UP_TO = 600
@@ -25,6 +25,8 @@ WORTH = 4.0
 #: Elements of a block for each pair of ranges from which on it is added range by range: what a slice costs in elements,
 #: by order of magnitude.
 LONG_RANGES = 200
+#: Rows of a lower triangle that are copied to the upper one at a time, so that both stay in the cache.
+TRIANGLES = 64
 #: Levels of the band are joined to blocks of at least this size.
 BLOCK = 48
 
@@ -44,14 +46,18 @@ class Structure:
 
 
 class NormalMatrix(Protocol):
-    """A symmetric matrix that blocks are added to."""
+    """A symmetric matrix that blocks are added to and subtracted from."""
 
-    def add(self, columns: IntArray, block: Array) -> None:
-        """Add a symmetric block (m, m) at some unknowns (m,)."""
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        """Add small symmetric blocks (k, m, m), each at its unknowns (k, m) in any order, -1 for none."""
+        ...
+
+    def subtract(self, columns: IntArray, block: Array) -> None:
+        """Subtract a symmetric block (m, m) at some unknowns (m,), which ascend."""
         ...
 
     def add_sparse(self, matrix: csr_array) -> None:
-        """Add a symmetric sparse matrix (n, n)."""
+        """Add a symmetric sparse matrix (n, n), which has every entry once."""
         ...
 
     def damp(self, damping: float) -> None:
@@ -70,32 +76,56 @@ class NormalMatrix(Protocol):
 
 
 class DenseMatrix:
-    """All of it."""
+    """All of it.
+
+    Attributes
+    ----------
+    lower : (n, n); what stands above the diagonal means nothing before `whole` is called
+    """
 
     def __init__(self, n: int):
-        self.values = np.zeros((n, n))
+        self.lower = np.zeros((n, n))
         self.reference: Array | None = None
 
-    def add(self, columns: IntArray, block: Array) -> None:
-        _add_at(self.values, columns, columns, block)
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        if columns.min(initial=0) < 0:
+            counts = columns >= 0
+            columns, blocks = np.maximum(columns, 0), blocks * (counts[:, :, None] & counts[:, None, :])
+        place = columns[:, :, None] * len(self.lower) + columns[:, None, :]
+        np.add.at(self.lower.reshape(-1), place.ravel(), blocks.ravel())
+
+    def subtract(self, columns: IntArray, block: Array) -> None:
+        ranges = _ranges(columns)
+        for i, (row, own_row) in enumerate(ranges):
+            band, part = self.lower[row], block[own_row]
+            for column, own_column in ranges[: i + 1]:
+                band[:, column] -= part[:, own_column]
+
+    def whole(self) -> Array:
+        """(n, n) with both triangles."""
+        for low in range(0, len(self.lower), TRIANGLES):
+            own = slice(low, low + TRIANGLES)
+            self.lower[:low, own] = self.lower[own, :low].T
+            corner = self.lower[own, own]
+            np.copyto(corner, corner.T, where=above_diagonal(len(corner)))
+        return self.lower
 
     def add_sparse(self, matrix: csr_array) -> None:
-        entries = matrix.tocoo()
-        row, column = entries.coords
-        self.values[row, column] += entries.data
+        row = np.repeat(np.arange(len(self.lower)), np.diff(matrix.indptr))
+        self.lower[row, matrix.indices] += matrix.data
 
     def damp(self, damping: float) -> None:
-        self.values[np.diag_indices_from(self.values)] *= 1.0 + damping
+        self.lower[np.diag_indices_from(self.lower)] *= 1.0 + damping
 
     def keep_scale(self) -> None:
-        self.reference = np.diagonal(self.values).copy()
+        self.reference = np.diagonal(self.lower).copy()
 
     def take_scale(self, diagonal: Array) -> None:
         self.reference = diagonal.copy()
 
     def factorise(self) -> Factor:
         """Factor, which overwrites the matrix."""
-        return DenseFactor(self.values, self.reference)
+        return DenseFactor(self.whole(), self.reference)
 
 
 class BandedMatrix:
@@ -111,7 +141,11 @@ class BandedMatrix:
         self.corner = np.zeros((edge, edge))
         self.reference: Array | None = None
 
-    def add(self, columns: IntArray, block: Array) -> None:
+    def add_each(self, columns: IntArray, blocks: Array) -> None:
+        for own, block in that_count(columns, blocks):
+            self.subtract(own, -block)
+
+    def subtract(self, columns: IntArray, block: Array) -> None:
         bounds = self.structure.bounds
         place = self.structure.position[columns]
         if not (np.diff(place) > 0).all():
@@ -129,13 +163,13 @@ class BandedMatrix:
                     break
                 continue
             here = place[own] - bounds[i]
-            _add_at(self.diagonal[i], here, here, block[own, own])
+            _subtract_at(self.diagonal[i], here, here, block[own, own])
             if i + 1 < last and cut[i + 1] < cut[i + 2]:
                 following = slice(int(cut[i + 1]), int(cut[i + 2]))
-                _add_at(self.below[i], place[following] - bounds[i + 1], here, block[following, own])
+                _subtract_at(self.below[i], place[following] - bounds[i + 1], here, block[following, own])
             if len(at_edge):
-                _add_at(self.border[i], at_edge, here, block[edge, own])
-        _add_at(self.corner, at_edge, at_edge, block[edge, edge])
+                _subtract_at(self.border[i], at_edge, here, block[edge, own])
+        _subtract_at(self.corner, at_edge, at_edge, block[edge, edge])
 
     def add_sparse(self, matrix: csr_array) -> None:
         entries = matrix.tocoo()
@@ -186,8 +220,8 @@ def new_matrix(n: int, structure: Structure | Dissection | None) -> NormalMatrix
     return FrontalMatrix(structure) if isinstance(structure, Dissection) else BandedMatrix(structure)
 
 
-def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:
-    """``target[rows, columns] += block``, range by range where they are long, else by flat places.
+def _subtract_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> None:
+    """``target[rows, columns] -= block``, range by range where they are long, else by flat places.
 
     Flat places are three times as fast as rows and columns, ranges ten times.
     """
@@ -195,17 +229,17 @@ def _add_at(target: Array, rows: IntArray, columns: IntArray, block: Array) -> N
     of_columns = of_rows if columns is rows else _ranges(columns)
     if len(of_rows) * len(of_columns) * LONG_RANGES > block.size:
         place = (rows[:, None] * target.shape[1] + columns).ravel()
-        target.reshape(-1)[place] += block.ravel()
+        target.reshape(-1)[place] -= block.ravel()
         return
     for row, own_row in of_rows:
         band, part = target[row], block[own_row]
         for column, own_column in of_columns:
-            band[:, column] += part[:, own_column]
+            band[:, column] -= part[:, own_column]
 
 
 def _ranges(places: IntArray) -> list[tuple[slice, slice]]:
     """Ranges of successive places (m,), and where among the m each of them stands."""
-    ends = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    ends = [0, *((places[1:] - places[:-1] != 1).nonzero()[0] + 1).tolist(), len(places)]
     return [
         (slice(first := int(places[low]), first + high - low), slice(low, high))
         for low, high in pairwise(ends)
@@ -233,10 +267,10 @@ def find_structure(
         return None
     group, n_groups = _alike(n_model, cliques)
     size = np.bincount(group, minlength=n_groups)
-    member = [np.unique(group[c[c < n_model]]) for c in cliques]
-    count = np.array([len(m) for m in member])
-    rows = np.repeat(np.arange(len(member)), count)
-    touch = csr_array((np.ones(len(rows)), (rows, np.concatenate(member))), shape=(len(member), n_groups))
+    member = np.zeros((len(cliques), n_groups), dtype=bool)
+    for own, c in zip(member, cliques, strict=True):
+        own[group[c[c < n_model]]] = True
+    touch = csr_array(member, dtype=float)
     row, column = (c.astype(np.int64) for c in prior.tocoo().coords)
     inner = (row < n_model) & (column < n_model)
     pairs = (np.ones(int(inner.sum())), (group[row[inner]], group[column[inner]]))

@@ -13,6 +13,7 @@ from ..camera.self_calibration import SelfCalibration
 from ..models.base import ModelOptions
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .elimination import Elimination, plan_elimination
+from .freed_memory import keep_freed_memory
 from .layout import Layout, build_layout
 from .linearisation import Linearisation, Whitening, corrected
 from .network import Network
@@ -198,6 +199,7 @@ def pose_problem(
     platform: PlatformErrors = NO_PLATFORM_ERRORS,
 ) -> Problem:
     """Unknowns, priors and elimination plan of a network."""
+    keep_freed_memory()
     layout = build_layout(network, model, self_calibration, platform)
     network = with_left_out(network, layout)
     prior = whiten_prior(layout.prior, layout.n_unknowns)

@@ -318,10 +318,10 @@ def inverse_of(factor: Array | None) -> Array:
     if factor is None or not len(factor):
         return np.empty((0, 0))
     lower, _ = _potri(factor, lower=1)
-    return np.where(_upper(len(lower)), lower.T, lower)
+    return np.where(above_diagonal(len(lower)), lower.T, lower)
 
 
 @lru_cache(maxsize=8)
-def _upper(n: int) -> Bools:
+def above_diagonal(n: int) -> Bools:
     """Which elements of an (n, n) matrix stand above its diagonal."""
     return ~np.tri(n, dtype=bool)

@@ -87,7 +87,7 @@ class Scales:
         for group, rows in prior_groups(problem).items():
             f[rows] = 1.0 / self.factor[group]
         matrix = csr_array(problem.prior.matrix.multiply(f[:, None]))
-        prior = Prior(matrix, problem.prior.value * f, csr_array(matrix.T @ matrix))
+        prior = Prior.of(matrix, problem.prior.value * f)
         control = replace(problem.control, weight=problem.control.weight / self.factor["control"] ** 2)
         return replace(problem, prior=prior, control=control)
 

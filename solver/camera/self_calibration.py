@@ -84,8 +84,12 @@ class CameraDesign:
         """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
         if not np.any(values):
             return np.zeros(self.xy_mm[:, rays].shape)
-        of_slot = np.append(values, 0.0)[self.columns].T  # (slots, patterns)
-        return np.einsum("csn,sn->cn", self.coefficients(rays), of_slot[:, self.pattern[rays]])
+        return np.einsum("csn,sn->cn", self.coefficients(rays), self.values_of(values, rays))
+
+    def values_of(self, values: Array, rays: slice = slice(None)) -> Array:
+        """Those of the parameter values (n_unknowns,) that act on each ray: (slots, n)."""
+        of_slot = np.ascontiguousarray(np.append(values, 0.0)[self.columns].T)  # (slots, patterns)
+        return of_slot.take(self.pattern[rays], axis=1)
 
     def coefficients(self, rays: slice = slice(None)) -> Array:
         """Coefficients (2, slots, n) of all rays or a range of them, mm per unit of the parameter."""

@@ -144,12 +144,17 @@ def direct_observations(sigma: ArrayLike, labels: tuple[str, ...]) -> PseudoObse
 
 def join_observations(parts: list[PseudoObservations]) -> PseudoObservations:
     """Stack pseudo-observations of the same unknowns."""
-    width = max(part.columns.shape[1] for part in parts)
-    columns = [np.pad(p.columns, ((0, 0), (0, width - p.columns.shape[1])), constant_values=-1) for p in parts]
-    coefficients = [np.pad(p.coefficients, ((0, 0), (0, width - p.coefficients.shape[1]))) for p in parts]
+    shape = sum(len(part.columns) for part in parts), max(part.columns.shape[1] for part in parts)
+    columns, coefficients = np.full(shape, -1, dtype=np.int32), np.zeros(shape)
+    row = 0
+    for part in parts:
+        m, width = part.columns.shape
+        columns[row : row + m, :width] = part.columns
+        coefficients[row : row + m, :width] = part.coefficients
+        row += m
     return PseudoObservations(
-        np.concatenate(columns),
-        np.concatenate(coefficients),
+        columns,
+        coefficients,
         np.concatenate([p.value for p in parts]),
         np.concatenate([p.sigma for p in parts]),
         tuple(label for p in parts for label in p.labels),

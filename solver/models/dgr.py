@@ -67,7 +67,9 @@ class DirectGeoreferencing(CorrectionModel):
         t = np.asarray(time_s, dtype=float)
         share = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
         columns = np.broadcast_to(self._columns, (len(t), 2, 6))
-        return Design(columns, np.stack([np.ones_like(share), share], axis=1))
+        coefficients = np.ones((len(t), 2))
+        coefficients[:, 1] = share
+        return Design(columns, coefficients)
 
     def left_out_variance(self, time_s: ArrayLike) -> NDArray[np.floating]:
         sigma = np.concatenate([self.options.wander_sigma_m, np.radians(self.options.wander_sigma_deg)])

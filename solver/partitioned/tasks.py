@@ -210,10 +210,10 @@ def form(store: Store, key: int, read: int, write: int, n: int, changes: Changes
     _save(store, key, write, equations)
     assert isinstance(normals.matrix, DenseMatrix) and normals.matrix.reference is not None
     assert equations.points is not None
-    row, column = np.nonzero(np.tril(normals.matrix.values))
+    row, column = np.nonzero(np.tril(normals.matrix.lower))
     rhs, diagonal = np.zeros(n), np.zeros(n)
     rhs[part.columns], diagonal[part.columns] = normals.rhs, normals.matrix.reference
-    places = (normals.matrix.values[row, column], (part.columns[row], part.columns[column]))
+    places = (normals.matrix.lower[row, column], (part.columns[row], part.columns[column]))
     rank = int(equations.points.rank.sum())
     return Sums(csr_array(places, shape=(n, n)), rhs, diagonal, normals.squares, equations.cost, rank)
 

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 from adjustment_networks import CAMERA, simulate
+from scipy.sparse import csr_array
 
 from triline.solver.adjustment import normal_matrix
 from triline.solver.adjustment.adjustment import adjust, pose_problem
 from triline.solver.adjustment.covariance import cofactors
+from triline.solver.adjustment.nested_dissection import Dissection
+from triline.solver.adjustment.normal_matrix import DenseMatrix, Structure, new_matrix
 from triline.solver.adjustment.reduced_system import BandedFactor, DenseFactor
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.lim import LimOptions
@@ -85,3 +88,32 @@ def test_dense_factor_of_a_singular_matrix_holds_the_null_space():
     regular = DenseFactor((N + np.diag(np.diagonal(N))).copy())
     assert len(regular.undetermined) == 0
     np.testing.assert_allclose(regular.inverse() @ (N + np.diag(np.diagonal(N))), np.eye(9), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["dense", "band", "fronts"])
+def test_blocks_are_added_and_subtracted_where_they_belong(kind):
+    rng = np.random.default_rng(3)
+    n, everything = 150, np.arange(150)
+    bounds, position = np.array([0, 60, 120]), rng.permutation(n)
+    structure = {
+        "dense": None,
+        "band": Structure(position, bounds),
+        "fronts": Dissection(
+            position, np.append(bounds, n), (everything[60:], everything[120:], everything[:0]), np.array([1, 2, -1])
+        ),
+    }[kind]
+    matrix, wanted = new_matrix(n, structure), np.diag(np.full(n, 1000.0))
+    matrix.add_sparse(csr_array(wanted))
+    columns = np.array([[7, 3, 5, 140], [20, -1, 3, 21]])
+    blocks = rng.standard_normal((2, 4, 4))
+    blocks += blocks.transpose(0, 2, 1)
+    matrix.add_each(columns, blocks)
+    wanted[np.ix_(columns[0], columns[0])] += blocks[0]
+    wanted[np.ix_([20, 3, 21], [20, 3, 21])] += blocks[1][np.ix_([0, 2, 3], [0, 2, 3])]
+    many = np.concatenate([np.arange(2, 70), [90, 91, 149]])
+    root = rng.standard_normal((5, len(many)))
+    matrix.subtract(many, root.T @ root)
+    wanted[np.ix_(many, many)] -= root.T @ root
+    if isinstance(matrix, DenseMatrix):
+        np.testing.assert_allclose(matrix.whole(), wanted, atol=1e-12)
+    np.testing.assert_allclose(matrix.factorise().cofactors(everything), np.linalg.inv(wanted), rtol=1e-9, atol=1e-15)
