@@ -95,7 +95,8 @@ class LeftOrientation:
         change = A @ theta - old.correction
         angles = corrected_angles(old.angles, change[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = A @ Q @ np.swapaxes(A, 1, 2) + self.noise
+        through = (A.reshape(-1, len(columns)) @ Q).reshape(A.shape)
+        covariance = through @ np.swapaxes(A, 1, 2) + self.noise
         protection = old.protection
         if protection is not None:  # where control was taken out since, less is known than then
             now, then = np.einsum("nii->ni", covariance), np.einsum("nii->ni", old.covariance)
