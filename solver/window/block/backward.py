@@ -20,6 +20,7 @@ from ...geometry.rotation import corrected_angles
 from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
+from ..state.strip import TIMES_AT_ONCE
 from ..state.unknowns import Marginal, WindowState
 
 #: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
@@ -89,14 +90,16 @@ class LeftOrientation:
 
     def refined(self, solution: BlockSolution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""
-        old = self.published
-        columns, A = self.design.functions()
-        theta, Q = solution.of(columns)
-        change = A @ theta - old.correction
+        old, n = self.published, len(self.published.time_s)
+        change, covariance = -old.correction, self.noise.copy()
+        for part in (slice(i, i + TIMES_AT_ONCE) for i in range(0, n, TIMES_AT_ONCE)):
+            columns, A = self.design.part(part).functions()
+            theta, Q = solution.of(columns)
+            change[part] += A @ theta
+            through = (A.reshape(-1, len(columns)) @ Q).reshape(A.shape)
+            covariance[part] += through @ np.swapaxes(A, 1, 2)
         angles = corrected_angles(old.angles, change[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        through = (A.reshape(-1, len(columns)) @ Q).reshape(A.shape)
-        covariance = through @ np.swapaxes(A, 1, 2) + self.noise
         protection = old.protection
         if protection is not None:  # where control was taken out since, less is known than then
             now, then = np.einsum("nii->ni", covariance), np.einsum("nii->ni", old.covariance)

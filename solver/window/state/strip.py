@@ -18,6 +18,8 @@ from ..results import WindowOptions
 from .platform import LivePlatform
 from .unknowns import WindowState
 
+#: Times of orientation that are worked on at once: those of a longer stretch depend on more unknowns. Tuned.
+TIMES_AT_ONCE = 64
 #: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
 UNKNOWN_LENGTH_S = 600.0
 #: Sampling of the times at which an unknown is in use, share of a segment.
