@@ -53,17 +53,19 @@ class BlockNormals:
 
     def _enter(self, numbers: IntArray) -> IntArray:
         """Places of unknowns, with room for those that are new."""
-        new = numbers[self._places(numbers) < 0]
-        if len(new):
-            n = len(self.numbers) + len(new)
-            if n > len(self._rhs):
-                self._make_room(n)
-            self.numbers = np.concatenate([self.numbers, new])
+        place = self._places(numbers)
+        new = place < 0
+        if new.any():
+            before = len(self.numbers)
+            self.numbers = np.concatenate([self.numbers, numbers[new]])
+            if len(self.numbers) > len(self._rhs):
+                self._make_room(before, len(self.numbers))
             self._order = np.argsort(self.numbers)
-        return self._places(numbers)
+            place[new] = np.arange(before, len(self.numbers))
+        return place
 
-    def _make_room(self, n: int) -> None:
-        old, size = len(self.numbers), max(n, int(GROWTH * len(self._rhs)))
+    def _make_room(self, old: int, n: int) -> None:
+        size = max(n, int(GROWTH * len(self._rhs)))
         matrix, rhs = np.zeros((size, size)), np.zeros(size)
         for row in range(old):
             matrix[row, : row + 1] = self._matrix[row, : row + 1]
@@ -75,9 +77,10 @@ class BlockNormals:
         place = self._enter(numbers)
         self._rhs[place] += rhs
         order = np.argsort(place)
-        row, column = np.tril_indices(len(order))
-        row, column = order[row], order[column]
-        self._matrix[place[row], place[column]] += matrix[row, column]
+        place, matrix = place[order], matrix.take(order, axis=0).take(order, axis=1)
+        lower = np.tri(len(order), dtype=bool)
+        at = (place[:, None] * len(self._matrix) + place)[lower]
+        self._matrix.reshape(-1)[at] += matrix[lower]
 
     def _row(self, place: int, others: IntArray) -> Array:
         """Elements (m,) of a row."""

@@ -45,11 +45,16 @@ class BlockSolution:
 
     def of(self, numbers: IntArray) -> tuple[Array, Array]:
         """Values (m,) and cofactors (m, m) of some unknowns, drifts among them."""
-        known = (numbers >= 0) | np.isin(numbers, self.numbers)
+        known = numbers >= 0
+        if not known.all():
+            known |= np.isin(numbers, self.numbers)
         at = self.places(numbers[known])
-        values, Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
-        values[known], Q[np.ix_(known, known)] = self.values[at], self.cofactors[np.ix_(at, at)]
-        return values, Q
+        values, Q = self.values[at], self.cofactors.reshape(-1).take(at[:, None] * len(self.cofactors) + at)
+        if known.all():
+            return values, Q
+        all_values, all_Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
+        all_values[known], all_Q[np.ix_(known, known)] = values, Q
+        return all_values, all_Q
 
 
 @dataclass(frozen=True)
