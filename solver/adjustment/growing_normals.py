@@ -2,13 +2,14 @@
 
 The equations grow while a strip is flown and shrink when one is closed, hour after hour. Matrices of their own for
 strips and pairs of strips, made and given back with each strip, would leave gaps in memory that nothing else fits into.
-So all unknowns stand in the lower triangle of one matrix, in which they move up when others go, and a second buffer
-holds whatever a solution or an elimination needs. Both only grow.
+So all unknowns stand in the lower triangle of one matrix, row after row without the other half, in which they move up
+when others go, and a second buffer holds whatever a solution or an elimination needs. Both only grow.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -37,7 +38,7 @@ class BlockNormals:
     def __init__(self) -> None:
         self.numbers: IntArray = np.empty(0, dtype=np.int64)
         self._order: IntArray = np.empty(0, dtype=np.int64)
-        self._matrix, self._rhs = np.zeros((ROOM, ROOM)), np.zeros(ROOM)
+        self._lower, self._rhs = np.zeros(_begin(ROOM)), np.zeros(ROOM)
         self._memory = np.empty(0)
 
     def __len__(self) -> int:
@@ -66,11 +67,9 @@ class BlockNormals:
 
     def _make_room(self, old: int, n: int) -> None:
         size = max(n, int(GROWTH * len(self._rhs)))
-        matrix, rhs = np.zeros((size, size)), np.zeros(size)
-        for row in range(old):
-            matrix[row, : row + 1] = self._matrix[row, : row + 1]
-        rhs[:old] = self._rhs[:old]
-        self._matrix, self._rhs = matrix, rhs
+        lower, rhs = np.zeros(_begin(size)), np.zeros(size)
+        lower[: _begin(old)], rhs[:old] = self._lower[: _begin(old)], self._rhs[:old]
+        self._lower, self._rhs = lower, rhs
 
     def add(self, numbers: IntArray, matrix: Array, rhs: Array) -> None:
         """Add information (u, u), (u,) about different unknowns (u,)."""
@@ -79,12 +78,11 @@ class BlockNormals:
         order = np.argsort(place)
         place, matrix = place[order], matrix.take(order, axis=0).take(order, axis=1)
         lower = np.tri(len(order), dtype=bool)
-        at = (place[:, None] * len(self._matrix) + place)[lower]
-        self._matrix.reshape(-1)[at] += matrix[lower]
+        self._lower[(_begin(place)[:, None] + place)[lower]] += matrix[lower]
 
     def _row(self, place: int, others: IntArray) -> Array:
         """Elements (m,) of a row."""
-        return self._matrix[np.maximum(place, others), np.minimum(place, others)]
+        return self._lower.take(_begin(np.maximum(place, others)) + np.minimum(place, others))
 
     def rhs(self, numbers: IntArray) -> Array:
         """Right-hand side (n,) of unknowns; 0 where nothing is known."""
@@ -161,7 +159,7 @@ class BlockNormals:
             part = slice(begin, begin + ROWS)
             less = through[:, part].T @ through[:, : begin + ROWS]
             for i, row in enumerate(at[part].tolist()):
-                self._matrix[row, at[: begin + i + 1]] -= less[i, : begin + i + 1]
+                self._lower[_begin(row) + at[: begin + i + 1]] -= less[i, : begin + i + 1]
             yield 2.0 * n * less.size
         self.drop(numbers)
 
@@ -192,10 +190,17 @@ class BlockNormals:
         n = len(self)
         stay = np.setdiff1d(np.arange(n), self._places(numbers))
         for i, row in enumerate(stay.tolist()):
-            self._matrix[i, : i + 1] = self._matrix[row, stay[: i + 1]]
-        for i in range(len(stay), n):
-            self._matrix[i, : i + 1] = 0.0
+            self._lower[_begin(i) : _begin(i + 1)] = self._lower[_begin(row) + stay[: i + 1]]
+        self._lower[_begin(len(stay)) : _begin(n)] = 0.0
         self._rhs[: len(stay)] = self._rhs[stay]
         self._rhs[len(stay) : n] = 0.0
         self.numbers = self.numbers[stay]
         self._order = np.argsort(self.numbers)
+
+
+Places = TypeVar("Places", int, IntArray)
+
+
+def _begin(row: Places) -> Places:
+    """Where a row of the lower triangle begins."""
+    return row * (row + 1) // 2

@@ -7,8 +7,9 @@ It is the smoother that belongs to the window's filter, and agrees with a batch 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -49,12 +50,30 @@ class BlockSolution:
         if not known.all():
             known |= np.isin(numbers, self.numbers)
         at = self.places(numbers[known])
-        values, Q = self.values[at], self.cofactors.reshape(-1).take(at[:, None] * len(self.cofactors) + at)
+        values, Q = self.values[at], np.empty((len(at), len(at)))
+        for here, there in _runs(at):
+            self.cofactors[there].take(at, axis=1, out=Q[here], mode="clip")
         if known.all():
             return values, Q
         all_values, all_Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
         all_values[known], all_Q[np.ix_(known, known)] = values, Q
         return all_values, all_Q
+
+    def through(self, functions: Array, places: IntArray) -> Array:
+        """Cofactors (k, n) between functions (k, m) of unknowns at places (m,) and all unknowns."""
+        found = np.zeros((len(functions), len(self.numbers)))
+        for here, there in _runs(places):
+            found += functions[:, here] @ self.cofactors[there]
+        return found
+
+
+def _runs(places: IntArray) -> Iterator[tuple[slice, slice]]:
+    """Stretches of places (m,) that follow each other, among these and as places: unknowns stand together in a large
+    matrix, so that it need not be copied row by row."""
+    ends = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    for begin, end in pairwise(ends if len(places) else ()):
+        first = int(places[begin])
+        yield slice(begin, end), slice(first, first + end - begin)
 
 
 @dataclass(frozen=True)

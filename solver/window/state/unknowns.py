@@ -373,8 +373,11 @@ class WindowState:
         """Normal equations (n, n), (n,) of the batches alone that can still lose a ray."""
         return self._live, self._live_rhs
 
-    def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
-        """Factor and values (n,) with other unknowns held at zero."""
+    def conditioned(self, held: IntArray) -> tuple[Array, Array]:
+        """Cofactors (n, n) and values (n,) with other unknowns held at zero."""
+        if not len(held):
+            self.solve()
+            return self.covariance(self.numbers), self.theta
         matrix, rhs = self.normal()
         places = self.places(held)
         matrix[places, :] = 0.0
@@ -382,7 +385,7 @@ class WindowState:
         matrix[places, places] = HELD_WEIGHT  # cut off from the others: zero and certain
         rhs[places] = 0.0
         factor = DenseFactor(matrix)
-        return factor, factor.solve(rhs)
+        return factor.inverse(), factor.solve(rhs)
 
     def if_held(self, held: IntArray, numbers: IntArray) -> tuple[Array, Array]:
         """Values (m,) and cofactors (m, m) of unknowns if few others were held at zero: from those of the solution."""

@@ -45,10 +45,13 @@ def test_values_and_cofactors_if_others_were_held() -> None:
     state.observe(np.tile(state.numbers, (20, 1)).astype(np.int32), rng.normal(size=(20, 9)), np.ones(20), np.ones(20))
     state.solve()
     held, numbers = np.array([7, 1]), np.array([4, 0, 8])
-    factor, wanted = state.conditioned(held)
+    wanted_cofactors, wanted = state.conditioned(held)
     values, cofactors = state.if_held(held, numbers)
     np.testing.assert_allclose(values, wanted[numbers])
-    np.testing.assert_allclose(cofactors, factor.cofactors(numbers))
+    np.testing.assert_allclose(cofactors, wanted_cofactors[np.ix_(numbers, numbers)])
+    everything, values = state.conditioned(held[:0])
+    np.testing.assert_allclose(values, state.theta)
+    np.testing.assert_allclose(everything, np.linalg.inv(state.normal()[0]))
 
 
 def test_scores_of_drifts_are_those_of_the_residuals() -> None:
