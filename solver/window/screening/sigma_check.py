@@ -150,6 +150,7 @@ class SigmaCheck:
         if strip is None or not len(network.batches):
             return False, False
         network.state.solve()
+        network.state.expect(len(network.state))
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
         factor, of_image = self._slow_errors(strip, now_s)
@@ -216,13 +217,13 @@ class SigmaCheck:
             if not asked.any():
                 continue
             present = float(before[pair[0]]), float(before[pair[1]])
-            cost_of = self._cost(strip, pair)
-            *wanted, ratio = _likely(cost_of, present)
+            cost = self._cost(strip, pair)
+            *wanted, ratio = _likely(cost, present)
             noise = self._noise() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
             if noise is not None:
-                cost_of.noise = noise
-                *wanted, ratio = _likely(cost_of, present)
-                cost_of.noise = None
+                cost.noise = noise
+                *wanted, ratio = _likely(cost, present)
+                cost.noise = None
             for g, w, it in zip(pair, wanted, asked, strict=True):
                 if it:
                     factor[g] = _changed(float(factor[g]), w / float(factor[g]))
@@ -473,7 +474,7 @@ def _eliminated(matrix: Array, rhs: Array, first: int) -> _Eliminated | None:
     return _Eliminated(matrix[first:, first:] - X.T @ X, rhs[first:] - X.T @ y, log_det, float(y @ y))
 
 
-def _likely(cost_of: _Cost, present: tuple[float, float]) -> tuple[float, float, float]:
+def _likely(cost: _Cost, present: tuple[float, float]) -> tuple[float, float, float]:
     """Factors of errors of position and attitude of one kind, and what the noise of looks is to be multiplied by, from
     the likelihood of the data under a bank of them.
 
@@ -484,25 +485,25 @@ def _likely(cost_of: _Cost, present: tuple[float, float]) -> tuple[float, float,
 
     Parameters
     ----------
-    cost_of : choices of factors
+    cost : of a choice of factors
     present : factors in force
     """
-    banks = BANK, BANK, NOISES if cost_of.noise is not None else (1.0,)
+    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,)
     most = tuple(len(bank) for bank in banks)
-    cost = np.full(most, np.inf)
+    costs = np.full(most, np.inf)
     first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
     seen, waiting, least = {(*first, 0)}, [(*first, 0)], np.inf
     while waiting:
         place = waiting.pop()
-        cost[place] = cost_of.of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
-        least = min(least, cost[place])
-        if cost[place] > least + COUNTS and np.isfinite(least):
+        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
+        least = min(least, costs[place])
+        if costs[place] > least + COUNTS and np.isfinite(least):
             continue
         beside = {(place[0] + i, place[1] + j, place[2] + k) for i, j, k in STEPS} - seen
         near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
         seen.update(near)
         waiting.extend(near)
-    weight = np.exp(-0.5 * (cost - least))
+    weight = np.exp(-0.5 * (costs - least))
     weight /= weight.sum()
     square = [
         float(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)) for i, bank in enumerate(banks)
