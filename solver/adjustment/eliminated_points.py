@@ -42,10 +42,14 @@ class EliminatedPoints:
 
     def at(self, theta: Array, Q: Array) -> tuple[Array, Array]:
         """Coordinates (p, 3) and covariance (p, 3, 3) for values (u,) and cofactors (u, u) of the unknowns."""
+        D = self.coupling
+        return self.given(theta, (D.reshape(-1, len(theta)) @ Q).reshape(D.shape))
+
+    def given(self, theta: Array, through: Array) -> tuple[Array, Array]:
+        """The same, if the product (p, 3, u) of ``D`` and the cofactors is there."""
         D, back = self.coupling, np.swapaxes(self.factor, 1, 2)
         xyz_l = self.origin_l + np.einsum("pij,pj->pi", back, self.y - D @ theta)
-        inner = (D.reshape(-1, len(theta)) @ Q).reshape(D.shape) @ np.swapaxes(D, 1, 2) + np.eye(3)
-        return xyz_l, back @ inner @ self.factor
+        return xyz_l, back @ (through @ np.swapaxes(D, 1, 2) + np.eye(3)) @ self.factor
 
     def rows(self, place: int, origin_l: Array) -> Rows:
         """Three equations that say the same of a point as all those it was eliminated from, for an origin (3,)."""

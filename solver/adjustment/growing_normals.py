@@ -2,13 +2,14 @@
 
 The equations grow while a strip is flown and shrink when one is closed, hour after hour. Matrices of their own for
 strips and pairs of strips, made and given back with each strip, would leave gaps in memory that nothing else fits into.
-So all unknowns stand in the lower triangle of one matrix, in which they move up when others go, and a second buffer
-holds whatever a solution or an elimination needs. Both only grow.
+So all unknowns stand in the lower triangle of one matrix, row after row without the other half, in which they move up
+when others go, and a second buffer holds whatever a solution or an elimination needs. Both only grow.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -37,7 +38,7 @@ class BlockNormals:
     def __init__(self) -> None:
         self.numbers: IntArray = np.empty(0, dtype=np.int64)
         self._order: IntArray = np.empty(0, dtype=np.int64)
-        self._matrix, self._rhs = np.zeros((ROOM, ROOM)), np.zeros(ROOM)
+        self._lower, self._rhs = np.zeros(_begin(ROOM)), np.zeros(ROOM)
         self._memory = np.empty(0)
 
     def __len__(self) -> int:
@@ -53,35 +54,35 @@ class BlockNormals:
 
     def _enter(self, numbers: IntArray) -> IntArray:
         """Places of unknowns, with room for those that are new."""
-        new = numbers[self._places(numbers) < 0]
-        if len(new):
-            n = len(self.numbers) + len(new)
-            if n > len(self._rhs):
-                self._make_room(n)
-            self.numbers = np.concatenate([self.numbers, new])
+        place = self._places(numbers)
+        new = place < 0
+        if new.any():
+            before = len(self.numbers)
+            self.numbers = np.concatenate([self.numbers, numbers[new]])
+            if len(self.numbers) > len(self._rhs):
+                self._make_room(before, len(self.numbers))
             self._order = np.argsort(self.numbers)
-        return self._places(numbers)
+            place[new] = np.arange(before, len(self.numbers))
+        return place
 
-    def _make_room(self, n: int) -> None:
-        old, size = len(self.numbers), max(n, int(GROWTH * len(self._rhs)))
-        matrix, rhs = np.zeros((size, size)), np.zeros(size)
-        for row in range(old):
-            matrix[row, : row + 1] = self._matrix[row, : row + 1]
-        rhs[:old] = self._rhs[:old]
-        self._matrix, self._rhs = matrix, rhs
+    def _make_room(self, old: int, n: int) -> None:
+        size = max(n, int(GROWTH * len(self._rhs)))
+        lower, rhs = np.zeros(_begin(size)), np.zeros(size)
+        lower[: _begin(old)], rhs[:old] = self._lower[: _begin(old)], self._rhs[:old]
+        self._lower, self._rhs = lower, rhs
 
     def add(self, numbers: IntArray, matrix: Array, rhs: Array) -> None:
         """Add information (u, u), (u,) about different unknowns (u,)."""
         place = self._enter(numbers)
         self._rhs[place] += rhs
         order = np.argsort(place)
-        row, column = np.tril_indices(len(order))
-        row, column = order[row], order[column]
-        self._matrix[place[row], place[column]] += matrix[row, column]
+        place, matrix = place[order], matrix.take(order, axis=0).take(order, axis=1)
+        lower = np.tri(len(order), dtype=bool)
+        self._lower[(_begin(place)[:, None] + place)[lower]] += matrix[lower]
 
     def _row(self, place: int, others: IntArray) -> Array:
         """Elements (m,) of a row."""
-        return self._matrix[np.maximum(place, others), np.minimum(place, others)]
+        return self._lower.take(_begin(np.maximum(place, others)) + np.minimum(place, others))
 
     def rhs(self, numbers: IntArray) -> Array:
         """Right-hand side (n,) of unknowns; 0 where nothing is known."""
@@ -158,7 +159,7 @@ class BlockNormals:
             part = slice(begin, begin + ROWS)
             less = through[:, part].T @ through[:, : begin + ROWS]
             for i, row in enumerate(at[part].tolist()):
-                self._matrix[row, at[: begin + i + 1]] -= less[i, : begin + i + 1]
+                self._lower[_begin(row) + at[: begin + i + 1]] -= less[i, : begin + i + 1]
             yield 2.0 * n * less.size
         self.drop(numbers)
 
@@ -189,10 +190,17 @@ class BlockNormals:
         n = len(self)
         stay = np.setdiff1d(np.arange(n), self._places(numbers))
         for i, row in enumerate(stay.tolist()):
-            self._matrix[i, : i + 1] = self._matrix[row, stay[: i + 1]]
-        for i in range(len(stay), n):
-            self._matrix[i, : i + 1] = 0.0
+            self._lower[_begin(i) : _begin(i + 1)] = self._lower[_begin(row) + stay[: i + 1]]
+        self._lower[_begin(len(stay)) : _begin(n)] = 0.0
         self._rhs[: len(stay)] = self._rhs[stay]
         self._rhs[len(stay) : n] = 0.0
         self.numbers = self.numbers[stay]
         self._order = np.argsort(self.numbers)
+
+
+Places = TypeVar("Places", int, IntArray)
+
+
+def _begin(row: Places) -> Places:
+    """Where a row of the lower triangle begins."""
+    return row * (row + 1) // 2

@@ -70,6 +70,10 @@ class Design:
         padded = np.append(np.asarray(theta, dtype=float), 0.0)  # column -1 reads the zero
         return np.einsum("nk,nkc->nc", self.coefficients, padded[self.columns])
 
+    def part(self, which: slice) -> Design:
+        """That of some of the rays."""
+        return Design(self.columns[which], self.coefficients[which])
+
     def joined(self, other: Design, numbers: NDArray[np.int64]) -> Design:
         """With the corrections of another one of the same rays, whose columns are places in ``numbers``."""
         own = np.where(other.columns >= 0, numbers[other.columns], -1).astype(np.int32)

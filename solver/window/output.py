@@ -21,10 +21,8 @@ from .quality.light import Fit, QualityFindings
 from .results import AdjustedPoint, Parameter, RayResidual, RefinedOrientation, Update, checks
 from .state.batch import Batch
 from .state.network import LiveNetwork
-from .state.strip import WindowStrip
+from .state.strip import TIMES_AT_ONCE, WindowStrip
 
-#: Times worked on at once.
-CHUNK = 64
 #: After sigmas have changed sigma0 is told again when this share of the window's length has passed. Tuned.
 LEAST_SHARE = 0.5
 #: Sigma of a strip's parameter, in units of the a-priori one, from which the observations know it better.
@@ -91,7 +89,7 @@ class OrientationOutput:
     def at(self, strip: WindowStrip, times: Array) -> RefinedOrientation:
         """Orientation at times (n,) that have a measured one."""
         measured = self._network.trajectory.at(times)
-        chunks = [slice(i, i + CHUNK) for i in range(0, len(times), CHUNK)]
+        chunks = [slice(i, i + TIMES_AT_ONCE) for i in range(0, len(times), TIMES_AT_ONCE)]
         parts = [self._chunk(strip, times[chunk], measured.poses.part(chunk)) for chunk in chunks]
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])

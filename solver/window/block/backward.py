@@ -7,8 +7,9 @@ It is the smoother that belongs to the window's filter, and agrees with a batch 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -20,6 +21,7 @@ from ...geometry.rotation import corrected_angles
 from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
+from ..state.strip import TIMES_AT_ONCE
 from ..state.unknowns import Marginal, WindowState
 
 #: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
@@ -44,11 +46,34 @@ class BlockSolution:
 
     def of(self, numbers: IntArray) -> tuple[Array, Array]:
         """Values (m,) and cofactors (m, m) of some unknowns, drifts among them."""
-        known = (numbers >= 0) | np.isin(numbers, self.numbers)
+        known = numbers >= 0
+        if not known.all():
+            known |= np.isin(numbers, self.numbers)
         at = self.places(numbers[known])
-        values, Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
-        values[known], Q[np.ix_(known, known)] = self.values[at], self.cofactors[np.ix_(at, at)]
-        return values, Q
+        values, Q = self.values[at], np.empty((len(at), len(at)))
+        for here, there in _runs(at):
+            self.cofactors[there].take(at, axis=1, out=Q[here], mode="clip")
+        if known.all():
+            return values, Q
+        all_values, all_Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
+        all_values[known], all_Q[np.ix_(known, known)] = values, Q
+        return all_values, all_Q
+
+    def through(self, functions: Array, places: IntArray) -> Array:
+        """Cofactors (k, n) between functions (k, m) of unknowns at places (m,) and all unknowns."""
+        found = np.zeros((len(functions), len(self.numbers)))
+        for here, there in _runs(places):
+            found += functions[:, here] @ self.cofactors[there]
+        return found
+
+
+def _runs(places: IntArray) -> Iterator[tuple[slice, slice]]:
+    """Stretches of places (m,) that follow each other, among these and as places: unknowns stand together in a large
+    matrix, so that it need not be copied row by row."""
+    ends = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    for begin, end in pairwise(ends if len(places) else ()):
+        first = int(places[begin])
+        yield slice(begin, end), slice(first, first + end - begin)
 
 
 @dataclass(frozen=True)
@@ -89,13 +114,16 @@ class LeftOrientation:
 
     def refined(self, solution: BlockSolution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""
-        old = self.published
-        columns, A = self.design.functions()
-        theta, Q = solution.of(columns)
-        change = A @ theta - old.correction
+        old, n = self.published, len(self.published.time_s)
+        change, covariance = -old.correction, self.noise.copy()
+        for part in (slice(i, i + TIMES_AT_ONCE) for i in range(0, n, TIMES_AT_ONCE)):
+            columns, A = self.design.part(part).functions()
+            theta, Q = solution.of(columns)
+            change[part] += A @ theta
+            through = (A.reshape(-1, len(columns)) @ Q).reshape(A.shape)
+            covariance[part] += through @ np.swapaxes(A, 1, 2)
         angles = corrected_angles(old.angles, change[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = A @ Q @ np.swapaxes(A, 1, 2) + self.noise
         protection = old.protection
         if protection is not None:  # where control was taken out since, less is known than then
             now, then = np.einsum("nii->ni", covariance), np.einsum("nii->ni", old.covariance)

@@ -124,4 +124,5 @@ def rows_of(batch: Batch, point: int, cell: Cell | None) -> tuple[Rows, Array]:
         drifts = cell.on_rays(range(batch.first_ray[point], batch.first_ray[point + 1]))
         A = np.column_stack([A, np.pad(drifts, ((0, len(A) - rays), (0, 0)))])
         columns = np.concatenate([columns, cell.of_block])
-    return (columns, A, J, residual), origin
+    touched = A.any(axis=0)  # the batch has unknowns of its other points
+    return (columns[touched], A[:, touched], J, residual), origin

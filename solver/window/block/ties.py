@@ -127,7 +127,7 @@ class EarlierStrips:
         functions.append((solution.places(self._shared), np.eye(len(self._shared))))
         rows: list[Array] = []
         for i, (places, M) in enumerate(functions):
-            half = M @ solution.cofactors[places]
+            half = solution.through(M, places)
             rows.append(np.concatenate([half[:, at] @ other.T for at, other in functions[: i + 1]], axis=1))
             yield 2.0 * rows[-1].size * len(solution.numbers)
         self.points, self._covariance = points, rows
@@ -236,13 +236,15 @@ def _patch(
     own = [(k.functions, k.place) for k in kept]
     D = np.array([spread(f.coupling[i], f.columns, columns) for f, i in own])
     origin, factor, y = (np.array(v) for v in zip(*((f.origin_l[i], f.factor[i], f.y[i]) for f, i in own), strict=True))
-    xyz_l, covariance = EliminatedPoints(columns, origin, factor, y, D).at(theta, Q)
+    through = (D.reshape(-1, len(columns)) @ Q).reshape(D.shape)
+    xyz_l, covariance = EliminatedPoints(columns, origin, factor, y, D).given(theta, through)
     chosen = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), SAMPLED)).astype(int))
-    sample = -D[chosen].reshape(-1, len(columns))
-    values, vectors = np.linalg.eigh(sample @ Q @ sample.T)
+    sample, sample_through = (-half[chosen].reshape(-1, len(columns)) for half in (D, through))
+    values, vectors = np.linalg.eigh(sample_through @ sample.T)
     r = max(min(int((values * len(kept) / len(chosen) > NEGLIGIBLE).sum()), MOST_MODES), 1)
-    M = (vectors[:, -r:] / np.sqrt(np.maximum(values[-r:], 1e-300))).T @ sample
-    B = -np.swapaxes(factor, 1, 2) @ D @ (Q @ M.T)
+    main = (vectors[:, -r:] / np.sqrt(np.maximum(values[-r:], 1e-300))).T
+    M = main @ sample
+    B = -np.swapaxes(factor, 1, 2) @ D @ (main @ sample_through).T
     root = np.linalg.inv(np.linalg.cholesky(covariance - B @ np.swapaxes(B, 1, 2)))
     for i in np.flatnonzero([k.single is not None for k in kept]):  # nothing is known along the ray
         weight, axes = np.linalg.eigh(root[i].T @ root[i])

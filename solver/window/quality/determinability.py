@@ -134,8 +134,7 @@ class Determinability:
         gsd_m: float,
     ) -> Evidence:  # fmt: skip
         """Evidence of parameters (m,) of the set, the others being zero."""
-        factor, values = state.conditioned(np.delete(self._numbers, open_))
-        everything = factor.inverse()
+        everything, values = state.conditioned(np.delete(self._numbers, open_))
         places = state.places(self._numbers[open_])
         Q = everything[:, places]
         q = np.maximum(np.diagonal(Q[places]), 1e-300)

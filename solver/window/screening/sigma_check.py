@@ -45,7 +45,7 @@ from ...models.slow_errors import LEARNING_TIME_S
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
-from ..state.unknowns import WindowState
+from ..state.unknowns import WindowState, block_of
 
 Array = NDArray[np.floating]
 
@@ -132,6 +132,7 @@ class SigmaCheck:
         self._steady = 0
         self._enough = False
         self._told_platform: set[str] = set()
+        self._costs: dict[tuple[int, int], _Cost] = {}
         # largest factor of the wanders of position and attitude, and that of the other one then
         self._largest, self._beside = np.ones(2), np.ones(2)
         self.events: list[str] = []
@@ -165,6 +166,7 @@ class SigmaCheck:
         if strip is None or not len(network.batches):
             return False, False
         network.state.solve()
+        network.state.expect(len(network.state))
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
         factor, of_image = self._slow_errors(strip, now_s, due)
@@ -179,14 +181,21 @@ class SigmaCheck:
             elif judged is not None:
                 of_image = self._restate_looks(judged)
         if of_slow or of_image:
-            sigmas.apriori = np.clip(factor, 1.0, LARGEST)
-            kept = self._kept(sigmas.apriori[list(WANDERS)])
-            for flown in network.flown:
-                flown.restate_sigmas(sigmas.apriori, network.state, kept)
+            self._restate(strip, np.clip(factor, 1.0, LARGEST))
             network.state.solve()
         self._tell()
         self._tell_platform()
         return of_slow, of_image
+
+    def _restate(self, strip: WindowStrip, factor: Array) -> None:
+        """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for."""
+        sigmas, state = self._network.sigmas, self._network.state
+        sigmas.apriori, before = factor, state.changes
+        kept = self._kept(factor[list(WANDERS)])
+        changed = {each: each.restate_sigmas(factor, state, kept) for each in self._network.flown}
+        for pair, cost in self._costs.items():
+            if cost.changes == before and all(g <= ({*pair} if s is strip else set()) for s, g in changed.items()):
+                cost.changes = state.changes
 
     def _kept(self, factor: Array) -> tuple[bool, bool]:
         """Whether the wanders (2,) of position and attitude that are present keep the largest factors they have had.
@@ -225,7 +234,7 @@ class SigmaCheck:
             by_likelihood = pair == WANDERS and due and self._enough
             if not asked.any() and not by_likelihood:
                 continue
-            cost, present = _Cost(strip, state, pair), (float(before[pair[0]]), float(before[pair[1]]))
+            cost, present = self._cost(strip, pair), (float(before[pair[0]]), float(before[pair[1]]))
             if by_likelihood:
                 asked |= cost.prefers_larger(*present)
             if not asked.any():
@@ -233,7 +242,9 @@ class SigmaCheck:
             *wanted, ratio = _likely(cost, present)
             noise = self._noise() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
             if noise is not None:
-                *wanted, ratio = _likely(_Cost(strip, state, pair, noise), present)
+                cost.noise = noise
+                *wanted, ratio = _likely(cost, present)
+                cost.noise = None
             for g, w, it in zip(pair, wanted, asked, strict=True):
                 if it:
                     factor[g] = _changed(float(factor[g]), w / float(factor[g]))
@@ -246,14 +257,23 @@ class SigmaCheck:
                 break  # what wanders is looked at first; the rest when that is settled
         return factor, of_looks
 
+    def _cost(self, strip: WindowStrip, pair: tuple[int, int]) -> _Cost:
+        """The cost of factors of a pair: as it was where nothing has changed since but these factors."""
+        cost = self._costs.get(pair)
+        if cost is None or cost.strip is not strip or cost.changes != self._network.state.changes:
+            cost = self._costs[pair] = _Cost(strip, self._network.state, pair)
+        return cost
+
     def _offset_or_mounting(self, strip: WindowStrip, now_s: float) -> bool:
         """Whether an offset would be contradicted if focal length and lever arm were as stated. These explain a height
         or a place as well as an offset does, so that both may be wrong where one of them is."""
         network = self._network
         if not len(network.like_an_offset):
             return False
-        group, square, redundancy = strip.apriori_fit(network.state, now_s - MEMORY_S, network.like_an_offset)
-        mine = (group == OFFSET) & (redundancy >= LEAST_REDUNDANCY)
+        _, square, redundancy = strip.apriori_fit(
+            network.state, now_s - MEMORY_S, network.like_an_offset, np.array([OFFSET])
+        )
+        mine = redundancy >= LEAST_REDUNDANCY
         return bool((square[mine] > redundancy[mine] * chi2.isf(QUESTIONED[OFFSET], 1)).any())
 
     def _noise(self) -> _Noise | None:
@@ -391,27 +411,38 @@ class _Cost:
 
     It is ``log det N + sum 2 m log f + q - n' N^-1 n``, with m equations of a group and the squares q of the looks at
     unknowns of zero. The factors of a pair act on unknowns of its own each; all others are eliminated once, those of
-    the position once for each of its factors: a choice costs a factorisation of the size of the attitude's alone.
+    the position once for each of its factors: a choice costs a factorisation of the size of the attitude's alone, and
+    one that was asked for before nothing.
 
     Parameters
     ----------
     pair : groups of position and attitude
-    noise : of looks; None where it stays as it is
+
+    Attributes
+    ----------
+    noise : of looks; None while it stays as it is
+    changes : of the state for which it holds
     """
 
-    def __init__(
-        self, strip: WindowStrip, state: WindowState, pair: tuple[int, int], noise: _Noise | None = None
-    ) -> None:
-        (A, A_now, self._a), (B, B_now, self._b) = (strip.apriori_information(g, state) for g in pair)
-        N, self._rhs = state.normal()
-        self._rest, self.noise = N - A_now - B_now, noise
-        position, attitude = A.any(axis=0), B.any(axis=0)
-        assert not (position & attitude).any()
-        self._others = np.flatnonzero(~(position | attitude))
-        self._places = [np.flatnonzero(position), np.flatnonzero(attitude)]
-        self._A, self._B = (M[np.ix_(own, own)] for M, own in zip((A, B), self._places, strict=True))
+    def __init__(self, strip: WindowStrip, state: WindowState, pair: tuple[int, int]) -> None:
+        self.noise: _Noise | None = None
+        self.strip, self.changes = strip, state.changes
+        matrix, rhs = state.normal()
+        own, self._apriori, self._rows = [], [], []
+        for group in pair:
+            numbers, as_stated, in_force, rows = strip.apriori_information(group, state)
+            own.append(state.places(numbers))
+            self._apriori.append(as_stated)
+            self._rows.append(rows)
+            matrix[np.ix_(own[-1], own[-1])] -= in_force
+        others = np.setdiff1d(np.arange(len(state)), np.concatenate(own))
+        self._order = np.concatenate([others, *own])
+        assert len(self._order) == len(state)
+        self._first = len(others)
+        self._matrix, self._rhs = block_of(matrix, self._order), rhs[self._order]
         self._of_noise: dict[float, _Eliminated | None] = {}
         self._of_position: dict[tuple[float, float], _Eliminated | None] = {}
+        self._known: dict[tuple[float, float, float], float] = {}
 
     def prefers_larger(self, f: float, g: float) -> bool:
         """Whether larger factors than these, of position or attitude or both, are clearly more likely."""
@@ -420,18 +451,23 @@ class _Cost:
 
     def of(self, f: float, g: float, h: float) -> float:
         """Of factors of position, attitude and noise; infinite where the equations have no solution."""
+        if (f, g, h) not in self._known:
+            self._known[f, g, h] = self._weighed(f, g, h)
+        return self._known[f, g, h]
+
+    def _weighed(self, f: float, g: float, h: float) -> float:
         if h not in self._of_noise:
             self._of_noise[h] = self._without_others(h)
-        both = self._of_noise[h]
+        both, (A, B), (a, b) = self._of_noise[h], self._apriori, self._rows
         if both is None:
             return np.inf
         if (f, h) not in self._of_position:
-            m = len(self._A)
+            m = len(A)
             matrix = both.matrix.copy()
-            matrix[:m, :m] += self._A / f**2
+            matrix[:m, :m] += A / f**2
             self._of_position[f, h] = _eliminated(matrix, both.rhs, m)
         one = self._of_position[f, h]
-        last = None if one is None else _eliminated(one.matrix + self._B / g**2, one.rhs, len(self._B))
+        last = None if one is None else _eliminated(one.matrix + B / g**2, one.rhs, len(B))
         if one is None or last is None:
             return np.inf
         gained = sum(part.log_det - part.square for part in (both, one, last))
@@ -439,16 +475,16 @@ class _Cost:
         if self.noise is not None and h > 1.0:
             of_looks = 2.0 * self.noise.rows * np.log(h) - (1.0 - h**-2) * self.noise.square
         far = (np.log(f) ** 2 + np.log(g) ** 2 + np.log(h) ** 2) / USUAL_LOG**2
-        return float(gained + 2.0 * (self._a * np.log(f) + self._b * np.log(g)) + of_looks + far)
+        return float(gained + 2.0 * (a * np.log(f) + b * np.log(g)) + of_looks + far)
 
     def _without_others(self, h: float) -> _Eliminated | None:
         """The equations of the pair, without what is stated of it."""
-        order = np.concatenate([self._others, *self._places])
-        matrix, rhs = self._rest, self._rhs
+        matrix, rhs = self._matrix, self._rhs
         if self.noise is not None and h > 1.0:
             less = 1.0 - h**-2
-            matrix, rhs = matrix - less * self.noise.matrix, rhs - less * self.noise.rhs
-        return _eliminated(matrix[np.ix_(order, order)], rhs[order], len(self._others))
+            matrix = matrix - less * block_of(self.noise.matrix, self._order)
+            rhs = rhs - less * self.noise.rhs[self._order]
+        return _eliminated(matrix, rhs, self._first)
 
 
 @dataclass(frozen=True)

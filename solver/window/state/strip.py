@@ -18,6 +18,8 @@ from ..results import WindowOptions
 from .platform import LivePlatform
 from .unknowns import WindowState
 
+#: Times of orientation that are worked on at once: those of a longer stretch depend on more unknowns. Tuned.
+TIMES_AT_ONCE = 64
 #: Length assumed of a strip that does not say how long it will be, s; what the drift is counted over.
 UNKNOWN_LENGTH_S = 600.0
 #: Sampling of the times at which an unknown is in use, share of a segment.
@@ -192,7 +194,7 @@ class WindowStrip:
         return columns, p.coefficients[rows], p.value[rows], p.sigma[rows] * self._scale[rows]
 
     def apriori_fit(
-        self, state: WindowState, since_s: float, held: IntArray | None = None
+        self, state: WindowState, since_s: float, held: IntArray | None = None, of: IntArray | None = None
     ) -> tuple[IntArray, Array, Array]:
         """How well the solution agrees with what was known beforehand of the unknowns that are present.
 
@@ -201,6 +203,7 @@ class WindowStrip:
         state : solved
         since_s : only what speaks of unknowns that are in use after this time, and of those of the whole strip
         held : unknowns that are held at zero for this
+        of : groups that are looked at; None for all
 
         Returns
         -------
@@ -209,30 +212,40 @@ class WindowStrip:
         """
         rows = self._rows_present(state)
         rows = rows[(self._need[rows] > since_s) | (self._group[rows] < 2)]
+        if of is not None:
+            rows = rows[np.isin(self._group[rows], of)]
         columns, coefficients, value, sigma = self._rows(rows)
-        place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), -1)
-        b = np.where(place >= 0, coefficients, 0.0) / sigma[:, None]
+        numbers, place = _touched(columns)
+        b = np.where(columns >= 0, coefficients, 0.0) / sigma[:, None]
         if held is None:
-            values, Q = state.theta, state.covariance(state.numbers)
+            theta, Q = state.values(numbers), state.covariance(numbers)
         else:
-            factor, values = state.conditioned(held)
-            Q = factor.inverse()
-        theta = np.append(values, 0.0)
+            theta, Q = state.if_held(held, numbers)
         residual = np.einsum("mt,mt->m", b, theta[place]) - value / sigma
         known = np.einsum("mt,mtu,mu->m", b, Q[place[:, :, None], place[:, None, :]], b)
         return self._group[rows], residual**2, np.clip(1.0 - known, 0.0, 1.0)
 
-    def apriori_information(self, group: int, state: WindowState) -> tuple[Array, Array, int]:
-        """Information (n, n) about all unknowns of the state from the a-priori equations of a group that are present:
-        as if their sigmas were as stated, and with those that are in force; the number of these equations."""
+    def apriori_information(self, group: int, state: WindowState) -> tuple[IntArray, Array, Array, int]:
+        """Information from the a-priori equations of a group that are present.
+
+        Returns
+        -------
+        numbers : (u,) of the unknowns that they speak of
+        as_stated, in_force : (u, u) about these, as if the sigmas were as stated, and with those that are in force
+        rows : number of the equations
+        """
         rows = self._rows_present(state)
         rows = rows[self._group[rows] == group]
         columns, coefficients, _, sigma = self._rows(rows)
-        place = np.where(columns >= 0, state.places(np.maximum(columns, 0)), len(state))
-        b = np.zeros((len(rows), len(state) + 1))
-        np.add.at(b, (np.arange(len(rows))[:, None], place), coefficients / sigma[:, None])
-        in_force, as_stated = b[:, :-1], b[:, :-1] * self._scale[rows, None]
-        return as_stated.T @ as_stated, in_force.T @ in_force, len(rows)
+        numbers, place = _touched(columns)
+        b = np.where(columns >= 0, coefficients, 0.0) / sigma[:, None]
+        u, products = len(numbers), b[:, :, None] * b[:, None, :]
+        at = (place[:, :, None] * u + place[:, None, :]).ravel()
+        stated = products * self._scale[rows, None, None] ** 2
+        as_stated, in_force = (
+            np.bincount(at, p.ravel(), u * u).astype(float).reshape(u, u) for p in (stated, products)
+        )
+        return numbers, as_stated, in_force, len(rows)
 
     def _rows_present(self, state: WindowState) -> IntArray:
         """A-priori equations whose unknowns are all in the state."""
@@ -241,8 +254,9 @@ class WindowStrip:
         present = (columns < 0) | (state.places(self.numbers[np.maximum(columns, 0)]) >= 0)
         return rows[present.all(axis=1)]
 
-    def restate_sigmas(self, factor: Array, state: WindowState, kept: tuple[bool, bool] = (False, False)) -> None:
-        """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come.
+    def restate_sigmas(self, factor: Array, state: WindowState, kept: tuple[bool, bool] = (False, False)) -> set[int]:
+        """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come; returns the
+        groups of which equations that are present have others now.
 
         Parameters
         ----------
@@ -262,6 +276,7 @@ class WindowStrip:
             columns, coefficients, value, before = self._rows(rows)
             self._scale[rows] = scale
             state.reweigh(columns, coefficients, value, before, self._prior.sigma[rows] * self._scale[rows])
+        return set(self._group[rows].tolist())
 
     def activate(self, to_s: float, state: WindowState) -> bool:
         """Make unknowns present that times up to this one need; whether there were any."""
@@ -308,3 +323,11 @@ class WindowStrip:
     def is_over(self, state: WindowState) -> bool:
         """Whether it has been in the state and will not be again."""
         return self._over or (self.ended and bool(self._entered.any()) and self.is_gone(state))
+
+
+def _touched(columns: NDArray[np.int32]) -> tuple[IntArray, NDArray[np.int64]]:
+    """Numbers (u,) of the unknowns of equations with columns (m, t), ascending, and their places (m, t) among these;
+    any place where there is none."""
+    numbers = np.unique(columns)
+    numbers = numbers[numbers >= 0].astype(np.int64)
+    return numbers, np.minimum(np.searchsorted(numbers, columns), max(len(numbers) - 1, 0))

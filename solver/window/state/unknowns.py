@@ -179,6 +179,7 @@ class WindowState:
     square : cost of everything so far at theta = 0 of the present unknowns
     redundancy : observations so far less unknowns so far
     solution : number of solutions computed so far
+    changes : number of times so far that something else was known of them, or of others
     """
 
     def __init__(self) -> None:
@@ -194,7 +195,7 @@ class WindowState:
         self._cofactors: Array | None = None
         self._asked = 0
         self._solved = True
-        self.solution = 0
+        self.solution = self.changes = 0
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -323,6 +324,7 @@ class WindowState:
         """Something else is known."""
         self._factor = self._cofactors = None
         self._solved, self._asked = False, 0
+        self.changes += 1
 
     def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
         """Add a batch's information to the live part, or take it back (``sign = -1``)."""
@@ -344,6 +346,7 @@ class WindowState:
         _add(self._fixed, place, information.matrix)
         self._live_rhs[place] -= information.rhs
         self._fixed_rhs[place] += information.rhs
+        self.changes += 1
 
     def normal(
         self, less: Iterable[tuple[IntArray, Information]] = (), more: Iterable[tuple[IntArray, Information]] = ()
@@ -370,8 +373,11 @@ class WindowState:
         """Normal equations (n, n), (n,) of the batches alone that can still lose a ray."""
         return self._live, self._live_rhs
 
-    def conditioned(self, held: IntArray) -> tuple[DenseFactor, Array]:
-        """Factor and values (n,) with other unknowns held at zero."""
+    def conditioned(self, held: IntArray) -> tuple[Array, Array]:
+        """Cofactors (n, n) and values (n,) with other unknowns held at zero."""
+        if not len(held):
+            self.solve()
+            return self.covariance(self.numbers), self.theta
         matrix, rhs = self.normal()
         places = self.places(held)
         matrix[places, :] = 0.0
@@ -379,7 +385,14 @@ class WindowState:
         matrix[places, places] = HELD_WEIGHT  # cut off from the others: zero and certain
         rhs[places] = 0.0
         factor = DenseFactor(matrix)
-        return factor, factor.solve(rhs)
+        return factor.inverse(), factor.solve(rhs)
+
+    def if_held(self, held: IntArray, numbers: IntArray) -> tuple[Array, Array]:
+        """Values (m,) and cofactors (m, m) of unknowns if few others were held at zero: from those of the solution."""
+        m = len(numbers)
+        Q = self.covariance(np.concatenate([numbers, held]))
+        K = np.linalg.solve(Q[m:, m:], Q[m:, :m]).T
+        return self.values(numbers) - K @ self.values(held), Q[:m, :m] - K @ Q[m:, :m]
 
     @property
     def factor(self) -> DenseFactor:
@@ -413,7 +426,7 @@ class WindowState:
             if 3 * self._asked <= len(self):
                 return factor.few_cofactors(place)
             self._cofactors = factor.inverse()
-        return _block(self._cofactors, place)
+        return block_of(self._cofactors, place)
 
     def propagated(self, functions: Array) -> Array:
         """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
@@ -438,16 +451,17 @@ class WindowState:
         R12 = solve_triangular(R11, self._fixed[np.ix_(gone, stay)], trans=1, check_finite=False)
         d = solve_triangular(R11, self._fixed_rhs[gone], trans=1, check_finite=False)
         marginal = Marginal(self.numbers[gone].copy(), self.numbers[stay].copy(), R11, R12, d)
-        self._fixed = _block(self._fixed, stay) - R12.T @ R12
+        self._fixed = block_of(self._fixed, stay) - R12.T @ R12
         self._fixed_rhs = self._fixed_rhs[stay] - R12.T @ d
-        self._live, self._live_rhs = _block(self._live, stay), self._live_rhs[stay]
+        self._live, self._live_rhs = block_of(self._live, stay), self._live_rhs[stay]
         self.square -= float(d @ d)
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))
         # of what stays, the cofactors are what they were
         self._factor, self._asked = None, 0
-        self._cofactors = None if self._cofactors is None else _block(self._cofactors, stay)
+        self.changes += 1
+        self._cofactors = None if self._cofactors is None else block_of(self._cofactors, stay)
         return marginal
 
 
@@ -460,7 +474,7 @@ def places_of(numbers: IntArray, wanted: IntArray) -> IntArray:
     return np.where(numbers[at] == wanted, at, -1)
 
 
-def _block(matrix: Array, places: IntArray) -> Array:
+def block_of(matrix: Array, places: IntArray) -> Array:
     """Rows and columns of a large symmetric matrix; one after the other is several times faster than both at once."""
     return matrix.take(places, axis=0).take(places, axis=1)
 

@@ -13,6 +13,7 @@ from triline.solver.simulation.window_study import adjust_online, navigate
 from triline.solver.window.datum.drift_monitor import DriftMonitor
 from triline.solver.window.results import WindowOptions
 from triline.solver.window.state.maker import BatchMaker, Draft
+from triline.solver.window.state.unknowns import WindowState
 from triline.solver.window.window import Window
 
 
@@ -36,6 +37,21 @@ def test_cofactors_of_few_unknowns_of_a_singular_matrix() -> None:
     columns = np.array([1, 6])
     np.testing.assert_allclose(factor.few_cofactors(columns), factor.inverse()[np.ix_(columns, columns)])
     assert len(factor.undetermined.eigenvalues) == 3
+
+
+def test_values_and_cofactors_if_others_were_held() -> None:
+    rng, state = np.random.default_rng(3), WindowState()
+    state.enter(state.new_numbers(9))
+    state.observe(np.tile(state.numbers, (20, 1)).astype(np.int32), rng.normal(size=(20, 9)), np.ones(20), np.ones(20))
+    state.solve()
+    held, numbers = np.array([7, 1]), np.array([4, 0, 8])
+    wanted_cofactors, wanted = state.conditioned(held)
+    values, cofactors = state.if_held(held, numbers)
+    np.testing.assert_allclose(values, wanted[numbers])
+    np.testing.assert_allclose(cofactors, wanted_cofactors[np.ix_(numbers, numbers)])
+    everything, values = state.conditioned(held[:0])
+    np.testing.assert_allclose(values, state.theta)
+    np.testing.assert_allclose(everything, np.linalg.inv(state.normal()[0]))
 
 
 def test_scores_of_drifts_are_those_of_the_residuals() -> None:

@@ -302,6 +302,14 @@ def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
     assert found == pytest.approx(expected, rel=1e-6)
 
 
+def over_all(state, numbers, as_stated, in_force, rows):
+    """Information of a-priori equations about all unknowns of the state."""
+    place, n = state.places(numbers), len(state)
+    spread = np.zeros((2, n, n))
+    spread[:, place[:, None], place] = as_stated, in_force
+    return *spread, rows
+
+
 @pytest.mark.parametrize("pair", [(OFFSET, SHIFT), WANDERS])
 def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
     """Elimination in parts beside the formula, with all unknowns at once."""
@@ -314,8 +322,9 @@ def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
     state.solve()
     N, rhs = state.normal()
     noise = _Noise(0.1, 1e-4, 0.3, 30, 40.0, J.T @ J, J.T @ np.ones(30))
-    (A, A_now, a), (B, B_now, b) = (strip.apriori_information(g, state) for g in pair)
-    cost, expected = _Cost(strip, state, pair, noise).of, []
+    (A, A_now, a), (B, B_now, b) = (over_all(state, *strip.apriori_information(g, state)) for g in pair)
+    cost, expected = _Cost(strip, state, pair), []
+    cost.noise = noise
     choices = [(1.0, 1.0, 1.0), (3.5, 1.0, 1.0), (1.0, 9.0, 1.45), (60.0, 2.3, 2.1)]
     for f, g, h in choices:
         less = 1.0 - 1.0 / h**2
@@ -324,7 +333,25 @@ def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
         value = np.linalg.slogdet(matrix)[1] + 2.0 * (a * np.log(f) + b * np.log(g)) - n @ np.linalg.solve(matrix, n)
         value += 2.0 * noise.rows * np.log(h) - less * noise.square
         expected.append(value + np.sum(np.square(np.log([f, g, h]))) / USUAL_LOG**2)
-    assert [cost(*choice) for choice in choices] == pytest.approx(expected, rel=1e-6)
+    assert [cost.of(*choice) for choice in choices] == pytest.approx(expected, rel=1e-6)
+
+
+def test_costs_hold_while_nothing_changes_but_their_factors(camera_network):
+    state, check = camera_network.state, SigmaCheck(camera_network)
+    strip = camera_network.strips["S1"] = strip_in(state)
+    seen(strip, state)
+    cost = check._cost(strip, WANDERS)
+    assert check._cost(strip, WANDERS) is cost
+    choices = [(1.0, 1.0, 1.0), (3.5, 9.0, 1.0)]
+    before = [cost.of(*choice) for choice in choices]
+    check._restate(strip, np.array([1.0, 1.0, 2.0, 5.0]))
+    assert check._cost(strip, WANDERS) is cost
+    assert [_Cost(strip, state, WANDERS).of(*choice) for choice in choices] == pytest.approx(before, rel=1e-6)
+    check._restate(strip, np.array([2.0, 1.0, 2.0, 5.0]))  # those of another pair
+    assert check._cost(strip, WANDERS) is not cost
+    cost = check._cost(strip, WANDERS)
+    seen(strip, state)  # another look
+    assert check._cost(strip, WANDERS) is not cost
 
 
 def test_residuals_and_redundancies_of_what_was_known_beforehand():
@@ -335,7 +362,7 @@ def test_residuals_and_redundancies_of_what_was_known_beforehand():
     state.solve()
     group, square, redundancy = strip.apriori_fit(state, -np.inf)
     total = np.trace(np.eye(len(state)) - state.covariance(state.numbers) @ sum(
-        strip.apriori_information(g, state)[0] for g in range(4)))  # fmt: skip
+        over_all(state, *strip.apriori_information(g, state))[0] for g in range(4)))  # fmt: skip
     assert len(state) - total == pytest.approx(len(group) - redundancy.sum(), abs=1e-6)
     assert (square >= 0).all() and (np.bincount(group, redundancy) <= np.bincount(group) + 1e-9).all()
 
