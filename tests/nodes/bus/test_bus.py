@@ -272,12 +272,12 @@ def test_the_port_is_taken_over_when_its_owner_is_killed(rig):
     with Bus(port=rig.port, source="a") as a:
         wait_for(lambda: a.peers() == 1, 20, "the owner")
         with Bus(port=rig.port, source="b") as b:
-            wait_for(lambda: b.peers() == 2, what="links")
+            wait_for(lambda: a.peers() == b.peers() == 2, what="links")
             got = []
             b.subscribe("sensor/gnss", lambda raw: got.append((raw.envelope.source, raw.envelope.sequence)))
-            wait_for_listener(a._session, a.key("sensor/gnss"))
             first.kill()
             wait_for(lambda: a.peers() == 1, what="the end of the owner")
+            wait_for_listener(a._session, a.key("sensor/gnss"))  # b: the owner listened, too
             a.publish(sample.message("sensor/gnss", source="a"))
             wait_for(lambda: got == [("a", 0)], what="a message without the owner")
             with Bus(port=rig.port, source="c") as c:  # comes later: takes the port, and all find it
