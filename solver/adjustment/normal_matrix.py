@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from ..arrays import Array, IntArray
 from .frontal import FrontalMatrix, that_count
 from .nested_dissection import Dissection, find_fronts
-from .reduced_system import BandedFactor, DenseFactor, Factor, above_diagonal
+from .reduced_system import BandedFactor, DenseFactor, Factor, mirror
 
 #: Systems up to this size are dense whatever their structure.
 DENSE_UP_TO = 600
@@ -25,8 +25,6 @@ WORTH = 4.0
 #: Elements of a block for each pair of ranges from which on it is added range by range: what a slice costs in elements,
 #: by order of magnitude.
 LONG_RANGES = 200
-#: Rows of a lower triangle that are copied to the upper one at a time, so that both stay in the cache.
-TRIANGLES = 64
 #: Levels of the band are joined to blocks of at least this size.
 BLOCK = 48
 
@@ -103,11 +101,7 @@ class DenseMatrix:
 
     def whole(self) -> Array:
         """(n, n) with both triangles."""
-        for low in range(0, len(self.lower), TRIANGLES):
-            own = slice(low, low + TRIANGLES)
-            self.lower[:low, own] = self.lower[own, :low].T
-            corner = self.lower[own, own]
-            np.copyto(corner, corner.T, where=above_diagonal(len(corner)))
+        mirror(self.lower)
         return self.lower
 
     def add_sparse(self, matrix: csr_array) -> None:

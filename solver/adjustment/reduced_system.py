@@ -21,6 +21,9 @@ _potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
 SINGULAR, ROUNDING = 1e-11, 1e-13
 #: What the diagonal of a singular banded matrix is raised by.
 RAISED = 1e-12
+#: Rows of a lower triangle that are copied to the upper one at a time, so that both stay in the cache. Tuned: between
+#: 32 and 128 it is the same.
+MIRRORED = 64
 
 
 @dataclass(frozen=True)
@@ -318,10 +321,23 @@ def inverse_of(factor: Array | None) -> Array:
     if factor is None or not len(factor):
         return np.empty((0, 0))
     lower, _ = _potri(factor, lower=1)
-    return np.where(above_diagonal(len(lower)), lower.T, lower)
+    mirror(lower)
+    return lower.T  # the same numbers, row by row
 
 
-@lru_cache(maxsize=8)
-def above_diagonal(n: int) -> Bools:
+def mirror(matrix: Array) -> None:
+    """Make a matrix (n, n) symmetric by what stands below its diagonal.
+
+    Part by part: a whole matrix and its transpose are not both near the processor, which takes as long as its inverse.
+    """
+    for begin in range(0, len(matrix), MIRRORED):
+        here, after = slice(begin, begin + MIRRORED), slice(begin + MIRRORED, None)
+        matrix[here, after] = matrix[after, here].T
+        corner = matrix[here, here]
+        np.copyto(corner, corner.T.copy(), where=_above_diagonal(len(corner)))
+
+
+@lru_cache(maxsize=MIRRORED + 1)
+def _above_diagonal(n: int) -> Bools:
     """Which elements of an (n, n) matrix stand above its diagonal."""
     return ~np.tri(n, dtype=bool)

@@ -208,6 +208,13 @@ class MeasuredTrajectory:
         near = (times[i + 1] - times[i] <= self.gap_s) | (t == times[i])
         return near & (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
 
+    def _only(self, by_smoothed: NDArray[np.bool_]) -> GrowingTrajectory | None:
+        """The samples that all times hang on, if these are either smoothed or filtered."""
+        if not len(by_smoothed) or by_smoothed.any() != by_smoothed.all():
+            return None
+        source = self._smoothed if by_smoothed[0] else self._filtered
+        return source if len(source) >= 2 else None
+
     def at(self, time_s: ArrayLike) -> MeasuredPoses:
         """Orientation at times (n,) that are covered.
 
@@ -217,6 +224,9 @@ class MeasuredTrajectory:
         """
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
         by_smoothed = self._is_smoothed(t)
+        if (source := self._only(by_smoothed)) is not None:
+            covariance = noise_between(source.time_s, source.covariance, t)
+            return MeasuredPoses(source.at(t), covariance, by_smoothed, source.open_end(t))
         values = np.empty((4, len(t), 3))
         covariance, open_end = np.empty((len(t), 6, 6)), np.zeros((len(t), 6))
         for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
@@ -234,6 +244,8 @@ class MeasuredTrajectory:
         """Omega, phi, kappa (n, 3) at times (n,) that are covered."""
         t = np.atleast_1d(np.asarray(time_s, dtype=float))
         by_smoothed = self._is_smoothed(t)
+        if (source := self._only(by_smoothed)) is not None:
+            return source.angles_at(t)
         angles = np.empty((len(t), 3))
         for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
             if mine.any():

@@ -70,8 +70,7 @@ class BatchMaker:
         measured = self.network.trajectory.at(time_s)
         covariance = self.network.pose_noise.of_rays(measured)
         ids = list(self.network.strips)
-        for i in np.unique(strip):
-            mine = strip == i
+        for i, mine in _by_strip(strip):
             extra = self.network.strips[ids[i]].model.left_out_variance(time_s[mine])
             covariance[mine] += extra[:, :, None] * np.eye(6)
         return measured, covariance
@@ -117,8 +116,7 @@ class BatchMaker:
         rays, covariance, weight, measured = self.rays([point for draft in drafts for point in draft.points])
         ids = list(self.network.strips)
         parts = []
-        for i in np.unique(rays.strip):
-            mine = np.flatnonzero(rays.strip == i)
+        for i, mine in _by_strip(rays.strip):
             poses = measured.poses.part(mine)
             parts.append((mine, self.network.strips[ids[i]].design(rays.time_s[mine], poses)))
         design = join_designs(parts, len(rays))
@@ -237,8 +235,18 @@ class BatchMaker:
             batch.provisional = not bool(measured.smoothed[part].all())
 
 
-def join_designs(parts: Sequence[tuple[IntArray, Design]], n: int) -> Design:
+def _by_strip(strip: IntArray) -> list[tuple[int, slice | IntArray]]:
+    """Which of n rays are of each strip, from the strips (n,) of all."""
+    first = int(strip[0])
+    if (strip == first).all():
+        return [(first, slice(None))]
+    return [(i, np.flatnonzero(strip == i)) for i in np.unique(strip).tolist()]
+
+
+def join_designs(parts: Sequence[tuple[slice | IntArray, Design]], n: int) -> Design:
     """One design for n rays from designs of groups of them (places, design)."""
+    if len(parts) == 1:
+        return parts[0][1]
     width = max(d.coefficients.shape[1] for _, d in parts)
     columns = np.full((n, width, 6), -1, dtype=np.int32)
     coefficients = np.zeros((n, width))
