@@ -10,7 +10,7 @@ import numpy as np
 
 from ...solver.adjustment.surface_control import SurfaceControl
 from ...solver.camera.line_camera import finest_pixel
-from ...solver.camera.self_calibration import SELF_CALIBRATIONS
+from ...solver.camera.self_calibration import LEFT, SELF_CALIBRATIONS
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.window.output import WindowUpdate
 from ...solver.window.results import Look, Refusal, WindowOptions
@@ -59,8 +59,8 @@ class Adjuster(Node):
         the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
         of long flights: an update every 5 s with what came till then, from smoothed poses alone where there are any,
         and the live orientation with the update
-    self_calibration : set of additional parameters, or "none"; "focal" is the focal length alone, as it is known from a
-        calibration
+    self_calibration : set of additional parameters, or "none"; "calibrated" is what a calibration leaves open, and more
+        where the data contradict it; "focal" the focal length alone
     camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of
         the image): 0.03 for a camera that a calibration left half a pixel off
     clock_sigma_s : what is known beforehand of the difference between the clocks of poses and image lines, which is an
@@ -114,7 +114,7 @@ class Adjuster(Node):
         update_s: float = 0.2,
         update_rays: int = 12,
         pace: str = "load",
-        self_calibration: str = "focal",
+        self_calibration: str = LEFT,
         camera_sigma: float = 1.0,
         clock_sigma_s: float = USUAL_PLATFORM.clock_sigma_s,
         lever_arm_sigma_m: float = USUAL_PLATFORM.lever_arm_sigma_m,

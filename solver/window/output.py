@@ -189,7 +189,7 @@ def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Stan
         kinds = [f"d{c}" for c in COMPONENTS] + [f"{c} drift" for c in COMPONENTS[3:]]
         names = list(zip(kinds, ["m"] * 3 + ["rad"] * 6, strip_globals.tolist(), strict=True))
     platform = network.platform
-    apriori = np.concatenate([apriori[: len(names)], platform.sigma, network.surface.sigma])
+    apriori = np.concatenate([apriori[: len(names)], platform.sigma, network.surface.sigma, network.calibration.sigma])
     for name, number in zip(platform.errors.unknown_names, platform.numbers.tolist(), strict=True):
         names.append((name, platform.errors.UNITS[name], number))
     names += [(SURFACE_SHIFT, "m", number) for number in network.surface.numbers.tolist()]
@@ -206,13 +206,14 @@ def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Stan
     strongest = np.argmax(np.abs(correlation), axis=1).tolist()
     values = state.values(numbers)
     of_strip = len(names) - len(camera_columns)
+    weighed = len(names) if self_calibration is not None and self_calibration.as_calibrated else of_strip
     result = []
     strongest_r = correlation[np.arange(len(names)), strongest].tolist()
     for i, ((name, unit, _), v, s) in enumerate(zip(names, values.tolist(), sigma.tolist(), strict=True)):
         known = Standing(ESTIMATED, "")
         if i >= of_strip and standing:
             known = standing[i - of_strip]
-        elif i < of_strip and s > BETTER * apriori[i]:
+        elif i < weighed and s > BETTER * apriori[i]:
             known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
         partner = names[strongest[i]][0] if strongest_r[i] else ""
         result.append(Parameter(name, unit, v, s, known.status, known.reason, strongest_r[i], partner))

@@ -50,7 +50,8 @@ class Block:
         self.earlier = EarlierStrips(network.state, network.shared_columns)
         self.events: list[str] = []
         self.drifts: Sequence[Named] = ()
-        self._archive = Archive(network.shared_columns, network.shared_sigma)
+        self._shared_sigma = network.shared_sigma
+        self._archive = Archive(network.shared_columns, self._shared_sigma)
         self._touched: set[str] = set()
         self._new: list[str] = []
         self._full = 0
@@ -168,7 +169,15 @@ class Block:
                 return
         self._work = None
 
+    def _restate_shared(self) -> None:
+        """Have sigmas of unknowns that all strips share count as they have been restated."""
+        before, self._shared_sigma = self._shared_sigma, self._network.shared_sigma
+        change = self._shared_sigma**-2.0 - before**-2.0
+        if change.any():
+            self._archive.add(self._network.shared_columns, np.diag(change), np.zeros(len(change)))
+
     def _begin_work(self, steps: list[Step], at_the_end: bool) -> None:
+        self._restate_shared()
         archive, over = self._archive, self._archive.over
         new, self._new = self._new, []
         alone = [id for id in new if id not in archive.strips]

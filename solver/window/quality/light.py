@@ -21,6 +21,7 @@ from ...adjustment.reliability import CRITICAL_W, HEAVY_TAILS
 from ...arrays import Array
 from ...models.base import ERROR_GROUPS
 from ...quantiles import chi2
+from .camera_check import CameraDoubt
 from .determinability import Standing
 from .exposure import Exposure
 from .ground import WHERE
@@ -80,6 +81,8 @@ class QualityFindings:
     narrowly : share of looks that fail narrowly, see `Tails`
     disagreement, trajectory : see `SigmaFactors`; the latter of offset, of shift and drift, and of the wander of
         position: that of the attitude shows in the images, and its sigma is what these say
+    camera : in what it is not as calibrated, see `CameraCheck`; None where nothing says so
+    calibration : how many times as large its errors are as stated, see `LiveCalibration`
     light, reason : that are shown, see `LightDisplay`
     events : for the operator
     held_by : what holds the datum where no control is in the window
@@ -109,6 +112,8 @@ class QualityFindings:
     narrowly: float = 0.0
     disagreement: float = 1.0
     trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    camera: CameraDoubt | None = None
+    calibration: float = 1.0
     light: str = GOOD
     reason: str = ""
     events: tuple[str, ...] = ()
@@ -128,6 +133,8 @@ def light(s: QualityFindings) -> tuple[str, str]:
 
 def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     """What contradicts what, None if nothing does: it casts doubt on all of the strip, not on the present alone."""
+    if s.camera is not None:  # everything else contradicts everything then
+        return FAILED if s.camera.spoils else WEAK, str(s.camera)
     chance = sigma0_by_chance(s.fit.redundancy)
     if s.fit.sigma0 > max(CONTRADICTION, chance):
         return FAILED, f"observations contradict each other: sigma0 {s.fit.sigma0:.1f}"
@@ -146,6 +153,11 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.narrowly > HEAVY_TAILS:
         share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
         return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
+    if s.calibration > DOUBTED:
+        return (
+            WEAK,
+            f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are being estimated",
+        )
     names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if names:
         return WEAK, f"the trajectory is worse than stated: {', '.join(names)}"

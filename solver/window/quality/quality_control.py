@@ -13,6 +13,7 @@ from ..datum.surface import SurfaceTests
 from ..results import RefinedOrientation, WindowOptions
 from ..state.network import LiveNetwork
 from ..state.strip import WindowStrip
+from .camera_check import CameraCheck
 from .determinability import Determinability
 from .exposure import Exposure, Integrity
 from .ground import GroundBelow
@@ -40,8 +41,10 @@ class QualityControl:
         self._network, self._control, self._sources = network, control, control.sources
         self._limit_m, self._below, self._display = options.alert_limit_m, GroundBelow(network.camera), LightDisplay()
         self._parameters: Determinability | None = None
-        if network.self_calibration is not None and options.determine:
-            self._parameters = Determinability(network.self_calibration, network.camera_columns, network.camera)
+        estimated = network.self_calibration
+        if estimated is not None and options.determine and not estimated.as_calibrated:
+            self._parameters = Determinability(estimated, network.camera_columns, network.camera)
+        self._camera = CameraCheck(network)
         self.integrity = Integrity(options.critical, network)
         self.last: QualityFindings | None = None
 
@@ -91,6 +94,7 @@ class QualityControl:
         if self._parameters is not None:
             gsd_m = 1.0 if ground is None else ground.gsd_m
             events = self._parameters.step(now_s, network.state, batches, fit.sigma0_total, fit.redundancy_total, gsd_m)
+        events += self._camera.look(now_s)
         left = [b.points_left for b in batches]
         rays = np.concatenate([np.empty(0, np.int64), *left])
         tied = int((rays >= 2).sum())
@@ -110,6 +114,8 @@ class QualityControl:
             control_doubt="; ".join(filter(None, (self._control.doubt, self._surface.doubt))),
             held_by="the elevation model" if self._surface.holds else "earlier control",
             control_failed=self._control.fails(self._alert_limit_m),
+            camera=self._camera.doubt,
+            calibration=network.calibration.factor,
             apriori_m=np.ones(3) if strip is None else strip.slow.position_sigma,
             sources=self._sources.biased,
             time_s=time_s,

@@ -93,6 +93,8 @@ MOVED = 2.0
 WITHIN, SURELY_GOOD, MOST_ROUNDS = 2.5, 0.3, 30
 #: What is left of the variance of a normal distribution within these. Derived.
 KEPT_INSIDE = float((1.0 - chi2.sf(WITHIN**2, 3)) / (1.0 - chi2.sf(WITHIN**2, 1)))
+#: What the operator is told of the additional parameters.
+CALIBRATION = "calibration of the camera"
 #: A factor is told again when it differs by so much from what was told last.
 TOLD_AGAIN = 1.5
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
@@ -103,6 +105,8 @@ NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
+#: How often the camera is questioned in one look. Tuned.
+MOST_ROUNDS_OF_CAMERA = 3
 #: An error of the platform contradicts what was known of it beforehand if its normalised residual is larger (a
 #: probability of 1 %); it is told when it is so many times its sigma, and so many times the a-priori one. Tuned.
 PLATFORM_QUESTIONED, CERTAIN, SURPRISING = 2.6, 5.0, 2.0
@@ -127,7 +131,7 @@ class SigmaCheck:
         self._pairs = (WANDERS, CONSTANT)[: 1 + constants]
         self._ratios: deque[float] = deque(maxlen=REMEMBERED)
         self._of_two: deque[float] = deque(maxlen=REMEMBERED)
-        self._told = np.ones(len(ERROR_GROUPS) + 1)
+        self._told = np.ones(len(ERROR_GROUPS) + 2)
         self._vibration = self._shared = 0.0
         self._steady = 0
         self._enough = False
@@ -169,6 +173,7 @@ class SigmaCheck:
         network.state.expect(len(network.state))
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
+        self._question_camera()
         factor, of_image = self._slow_errors(strip, now_s, due)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
@@ -186,6 +191,14 @@ class SigmaCheck:
         self._tell()
         self._tell_platform()
         return of_slow, of_image
+
+    def _question_camera(self) -> None:
+        """State larger errors of the camera where its calibration is contradicted by more than looks disagree."""
+        calibration, sigmas = self._network.calibration, self._network.sigmas
+        for _ in range(MOST_ROUNDS_OF_CAMERA if calibration.is_questioned else 0):
+            if not calibration.question(max(sigmas.disagreement**2, self._median_ratio(), 1.0)):
+                break
+            self._network.state.solve()
 
     def _restate(self, strip: WindowStrip, factor: Array) -> None:
         """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for."""
@@ -358,8 +371,9 @@ class SigmaCheck:
                 if vibration
                 else "sigmas: the attitude does not vibrate any more"
             )
-        now = np.append(self._network.sigmas.apriori, self._network.sigmas.image)
-        for i, name in enumerate((*ERROR_GROUPS, "image")):
+        calibration = self._network.calibration
+        now = np.array([*self._network.sigmas.apriori, self._network.sigmas.image, calibration.factor])
+        for i, name in enumerate((*ERROR_GROUPS, "image", CALIBRATION)):
             if max(now[i] / self._told[i], self._told[i] / now[i]) < TOLD_AGAIN:
                 continue
             self._told[i] = now[i]
@@ -368,6 +382,10 @@ class SigmaCheck:
                 if now[i] > 1.0
                 else f"sigmas: {name} is as stated"
             )
+            if name == CALIBRATION:
+                self.events.append(
+                    f"camera: looks are off its calibration by {calibration.worst(self._network.camera)}"
+                )
 
     def _tell_platform(self) -> None:
         """Say once which errors of the platform are certain, and more than was expected."""

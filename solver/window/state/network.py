@@ -15,6 +15,7 @@ from ...camera.self_calibration import SelfCalibration
 from ...geometry.measured_trajectory import MeasuredTrajectory
 from ...models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .batch import Batch, Counts
+from .calibration import LiveCalibration
 from .platform import LivePlatform
 from .points import Intake
 from .sigma_factors import SigmaFactors
@@ -153,7 +154,7 @@ class LiveNetwork:
     sigmas : what a-priori sigmas are multiplied by
     tails : how many looks fail narrowly
     platform : constant errors of the platform
-    camera_columns : (m,) numbers of the additional parameters
+    calibration : additional parameters of the camera
     surface : on which tie points lie
     """
 
@@ -174,14 +175,13 @@ class LiveNetwork:
         self.sigmas = SigmaFactors()
         self.tails = Tails()
         self.platform = LivePlatform(platform, self.trajectory, self.state)
-        self._camera_sigma = np.empty(0) if self_calibration is None else self_calibration.apriori_sigma
-        m = len(self._camera_sigma)
-        self.camera_columns = self.state.new_numbers(m)
-        if m:
-            columns = self.camera_columns[:, None].astype(np.int32)
-            self.state.enter(self.camera_columns)
-            self.state.observe(columns, np.ones((m, 1)), np.zeros(m), self._camera_sigma)
+        self.calibration = LiveCalibration(self_calibration, self.state)
         self.surface = LiveSurface(surface, self.state)
+
+    @property
+    def camera_columns(self) -> IntArray:
+        """(m,) numbers of the additional parameters."""
+        return self.calibration.numbers
 
     @property
     def shared_columns(self) -> IntArray:
@@ -190,14 +190,16 @@ class LiveNetwork:
 
     @property
     def shared_sigma(self) -> Array:
-        """What is known of these beforehand."""
-        return np.concatenate([self.platform.errors.sigma, self._camera_sigma, self.surface.sigma])
+        """What is known of these beforehand, as stated or as restated."""
+        return np.concatenate([self.platform.sigma, self.calibration.sigma, self.surface.sigma])
 
     @property
     def like_an_offset(self) -> IntArray:
         """Numbers of the unknowns that explain what an offset of the trajectory would explain as well: the focal length
-        where it is the only additional parameter, and the lever arm."""
-        one = self.camera_columns if len(self.camera_columns) == 1 else self.camera_columns[:0]
+        where no free parameters are beside it, and the lever arm."""
+        parameters, one = self.self_calibration, self.camera_columns[:0]
+        if parameters is not None and (parameters.as_calibrated or parameters.n_unknowns == 1):
+            one = self.camera_columns[[name.startswith("dc") for name in parameters.unknown_names]]
         return np.concatenate([self.platform.numbers[~self.platform.errors.questioned], one])
 
     @property

@@ -111,7 +111,16 @@ def test_reports_add_up(done):
     assert busy.observations - busy.unknowns > 0 and busy.control >= 3 and busy.strip == "S1"
     names = [p.name for p in busy.parameters]
     of_strip = ["dX", "dY", "dZ", "domega", "dphi", "dkappa", "omega drift", "phi drift", "kappa drift"]
-    assert names == [*of_strip, "clock", "dc"]
+    assert names == [
+        *of_strip,
+        "clock",
+        "dc",
+        "k1",
+        "k2",
+        "p1",
+        "p2",
+        *(f"{k}_{line}" for k in ("xp", "yp", "sy", "th") for line in "BF"),
+    ]
     assert all(p.sigma > 0 and p.t == pytest.approx(p.value / p.sigma) for p in busy.parameters)
     assert 0.0 < busy.data_latency_s < 1.0
 

@@ -49,7 +49,7 @@ def test_names_and_counts():
     three = LineCamera("prism", tuple(Lens(i, 2000.0) for i in "FNB"), tuple(triplet))
     assert prism(three).n_unknowns == 30 and prism(three).name == "prism30"
     assert lens(two_lenses()).n_unknowns == 18
-    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens", "boresight", "focal"}
+    assert set(SELF_CALIBRATIONS) == {"tls18", "tls16", "tls12", "prism30", "lens", "boresight", "focal", "calibrated"}
     assert focal_length(CAMERA).names == ("dc",) and focal_length(CAMERA).apriori_sigma == [FOCAL_SIGMA]
 
 

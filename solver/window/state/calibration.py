@@ -1,0 +1,74 @@
+"""The additional parameters of the camera as unknowns of the window."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...camera.displacement import Displacement, most_certain
+from ...camera.line_camera import LineCamera
+from ...camera.self_calibration import SelfCalibration
+from ...quantiles import chi2
+from .beforehand import KnownBeforehand
+from .unknowns import WindowState
+
+#: Probability that a camera as calibrated is questioned by one look (statistical level).
+QUESTIONED = 1e-3
+#: All sigmas are stated so many times as large in one look, at least and at most. Tuned.
+LEAST, MOST = 1.5, 3.0
+#: Combinations of parameters count of which the observations say so much, as a share of the a-priori variance: where
+#: they say hardly anything nothing speaks against the sigma either. Tuned.
+LEAST_SEEN = 0.04
+
+
+class LiveCalibration(KnownBeforehand):
+    """What a calibration leaves open; see `KnownBeforehand`.
+
+    Attributes
+    ----------
+    parameters : None without any
+    factor : what the sigmas of those that are questioned have been multiplied by
+    """
+
+    def __init__(self, parameters: SelfCalibration | None, state: WindowState) -> None:
+        super().__init__(np.empty(0) if parameters is None else parameters.apriori_sigma, state)
+        self.parameters, self.factor = parameters, 1.0
+        names = () if parameters is None else parameters.unknown_names
+        open_ = parameters is not None and parameters.as_calibrated
+        #: (m,) not the camera constant: over one strip an offset in Z explains as much
+        self._questioned = np.array([open_ and not name.startswith("dc") for name in names], dtype=bool)
+
+    @property
+    def is_questioned(self) -> bool:
+        """Whether sigmas may be stated larger."""
+        return bool(self._questioned.any())
+
+    def question(self, variance: float) -> bool:
+        """State sigmas larger that the solution contradicts as a whole; whether it does.
+
+        A lens, or the place of a CCD line, that is not as calibrated is in many parameters, which are correlated: so
+        they are questioned together. What was known of them less what the solution knows is the covariance of its
+        values.
+
+        Parameters
+        ----------
+        variance : of looks, as they disagree, over that of right sigmas; 1 at least
+        """
+        which = self._questioned
+        value, Q = self.values()
+        scale = self.sigma[which]
+        value, left = value[which] / scale, np.eye(len(scale)) - Q[np.ix_(which, which)] / np.outer(scale, scale)
+        share, vectors = np.linalg.eigh(left)
+        seen = share > LEAST_SEEN
+        test, m = float(((vectors.T @ value)[seen] ** 2 / share[seen]).sum()), int(seen.sum())
+        test /= variance
+        if not m or test <= chi2.isf(QUESTIONED, m):
+            return False
+        factor = min(max(float(np.sqrt(test / m)), LEAST), MOST)
+        self.restate(np.where(which, factor * self.sigma, self.sigma))
+        self.factor *= factor
+        return True
+
+    def worst(self, camera: LineCamera) -> Displacement:
+        """Where looks are most certainly off, by what is known of the parameters."""
+        assert self.parameters is not None
+        return most_certain(camera, self.parameters, *self.values())
