@@ -103,6 +103,7 @@ KEYS: dict[str, Key] = {
     "boresight": Key("boresight_deg", "deg, one or roll,pitch,heading", _three, _shown),
     "lever-arm": Key("lever_arm_m", "m, one or three in the body frame", _three, _shown),
     "focal-length": Key("focal_length_um", "um", _unit(("um", 1.0), ("mm", 1e3)), _number),
+    "distortion": Key("distortion_px", "px at the corner of the image, radial", _one, _number),
     "clock": Key(
         "clock_s", "s, or ms with its unit: stamps of GNSS and INS minus image time",
         _unit(("ms", 1e-3), ("s", 1.0)), _number,

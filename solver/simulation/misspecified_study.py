@@ -104,6 +104,7 @@ ROWS: dict[str, Row] = {
         Row("boresight", "boresight 0.05 deg", World(boresight_deg=(0.05, 0.05, 0.05))),
         Row("lever-arm", "lever arm 0.2 m", World(lever_arm_m=(0.2, 0.2, 0.2))),
         Row("focal-length", "focal length 20 um", World(focal_length_um=20.0)),
+        Row("distortion", "lens distortion 3 px", World(distortion_px=3.0)),
         Row("clock", "clock 5 ms", World(clock_s=0.005)),
         Row("noise-t3", "tie noise t(3)", World(heavy_tails=True), looks_wrong=True),
         Row("noise", "tie noise x 2", World(noise_factor=2.0), over_stated=2.0),

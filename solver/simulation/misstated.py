@@ -65,6 +65,8 @@ class World:
     boresight_deg : roll, pitch, heading of the true boresight minus the stated one
     lever_arm_m : body frame, true minus stated
     focal_length_um : true minus stated
+    distortion_px : of the lenses, radial, with the cube of the radius, pixels at the corner of the image; outwards if
+        positive
     clock_s : stamps of GNSS and INS minus time of the image lines: what is stamped t was so at ``t - clock_s``
     heavy_tails : noise of image measurements has Student's distribution of 3 degrees of freedom, in units of the
         stated sigma; its variance is three times the stated one
@@ -84,6 +86,7 @@ class World:
     boresight_deg: Three = ZERO
     lever_arm_m: Three = ZERO
     focal_length_um: float = 0.0
+    distortion_px: float = 0.0
     clock_s: float = 0.0
     heavy_tails: bool = False
     noise_factor: float = 1.0
@@ -111,6 +114,8 @@ class World:
                 raise ValueError(f"true world: frequency of a sine must be positive, got {sine.frequency_hz}")
         if not abs(self.focal_length_um) < np.inf:
             raise ValueError(f"true world: focal_length_um must be finite, got {self.focal_length_um}")
+        if not abs(self.distortion_px) <= MOST:
+            raise ValueError(f"true world: distortion wants at most {MOST:g} px, got {self.distortion_px}")
 
     @property
     def as_stated(self) -> bool:
@@ -131,12 +136,14 @@ class World:
         )
 
     def camera(self, stated: LineCamera) -> LineCamera:
-        """The true camera: longer by the error of its focal length, everything else as stated.
+        """The true camera: longer by the error of its focal length, with the distortion; everything else as stated.
 
         Raises
         ------
         ValueError : a change that is no error of a calibration any more
         """
+        if self.distortion_px:
+            stated = _distorted(stated, self.distortion_px)
         if not self.focal_length_um:
             return stated
         for lens in stated.lenses:
@@ -283,3 +290,17 @@ def _sine(sine: Sine, phase: Array) -> Callable[[Array], Array]:
         return np.hstack([np.zeros((len(time_s), 3)), amplitude * np.sin(angle)])
 
     return at
+
+
+def _distorted(camera: LineCamera, corner_px: float) -> LineCamera:
+    """The camera whose pixels look where its lenses have a radial distortion of so many pixels at the corner."""
+    reduced = [line.xy_mm - camera.principal_point_mm[k] for k, line in enumerate(camera.lines)]
+    corner_mm = max(float(np.linalg.norm(xy, axis=1).max()) for xy in reduced)
+    pitch_mm = float(np.median(np.concatenate([np.linalg.norm(np.diff(xy, axis=0), axis=1) for xy in reduced])))
+    k1 = corner_px * pitch_mm / corner_mm**3
+    lines = [
+        # a look at a pixel comes from further in where the lens moves its image outwards
+        replace(line, xy_mm=line.xy_mm - k1 * (xy**2).sum(axis=1, keepdims=True) * xy)
+        for line, xy in zip(camera.lines, reduced, strict=True)
+    ]
+    return replace(camera, lines=tuple(lines))

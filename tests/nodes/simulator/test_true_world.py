@@ -16,7 +16,8 @@ from triline.solver.simulation.misstated import AS_STATED, Sine, Step
 SHORT = ["--seconds", "8", "--lead-in", "1", "--attitude-rate", "20", "--ties", "2", "--seed", "5"]
 TERMS = [
     "wander-factor=2", "wander-time-factor=0.333", "random-walk=0.03", "step=0.3", "step=0.1,0,0.2@12",
-    "sine=0.02@0.1", "sine=0.01,0,0@3", "boresight=0.05,0,0.1", "lever-arm=0.2", "focal-length=20", "clock=0.005",
+    "sine=0.02@0.1", "sine=0.01,0,0@3", "boresight=0.05,0,0.1", "lever-arm=0.2", "focal-length=20",
+    "distortion=3", "clock=0.005",
     "tie-noise=t3", "tie-noise-factor=2", "gnss-datum=0.5", "control-datum=0,0,-0.5",
 ]  # fmt: skip
 

@@ -72,6 +72,7 @@ def changed(simulation, stated):
         (World(boresight_deg=(0.05, 0.0, 0.0)), {"gnss", "attitude"}),  # the antenna is turned with the body
         (World(lever_arm_m=(0.2, 0.0, 0.0)), {"gnss"}),
         (World(focal_length_um=20.0), {"images"}),
+        (World(distortion_px=3.0), {"images"}),
         (World(clock_s=0.005), {"gnss", "attitude"}),
         (World(heavy_tails=True), {"images"}),
         (World(noise_factor=2.0), {"images"}),
@@ -215,6 +216,21 @@ def test_a_focal_length_is_in_the_images_and_not_in_the_camera_that_is_stated():
     assert off[0.0] == pytest.approx(xy * (-0.02 / 62.7), abs=2e-4)
     assert len(simulation.images) == pytest.approx(len(stated.images), abs=10)
     assert simulation.seen_flight.camera.focal_length_mm == pytest.approx(camera.focal_length_mm + 0.02)
+
+
+def test_a_distortion_grows_with_the_cube_of_the_radius():
+    simulation, stated = flown_without_noise(World(distortion_px=3.0)), flown_without_noise()
+    looks, camera = simulation.images.looks, simulation.flight.camera
+    at = simulation.flight.truth.at(looks.time_s)
+    xy, pitch = camera.image_coordinates(looks.ccd, simulation.images.sample)
+    f = camera.focal_length_mm[looks.ccd]
+    off = xy - project(at.position_l, at.angles, simulation.points.xyz_l[looks.point], f).xy_mm
+    radius, corner = np.linalg.norm(xy, axis=1), max(np.linalg.norm(line.xy_mm, axis=1).max() for line in camera.lines)
+    size = 3.0 * np.linalg.norm(pitch, axis=1) * (radius / corner) ** 3
+    assert off == pytest.approx(xy / radius[:, None] * size[:, None], abs=2e-5)
+    assert len(simulation.images) == pytest.approx(len(stated.images), abs=10)
+    with pytest.raises(ValueError, match="distortion wants at most 1000 px"):
+        World(distortion_px=np.inf)
 
 
 def test_noise_of_other_looks_stays_with_a_focal_length(stated):

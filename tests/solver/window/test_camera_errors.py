@@ -59,7 +59,7 @@ def test_what_a_calibration_leaves_open():
         {name: expected[name] for name in one.unknown_names}
     )
     assert not any(name.endswith(f"_{ADS40.nadir_line.id}") or name == "k3" for name in one.unknown_names)
-    many = preset("si-290")
+    many = preset("alos-prism")
     assert len(many.lenses) > 1 and left_by_calibration(many).names == lens(many).names
 
 
