@@ -102,7 +102,7 @@ def _search(M: Array, m: Array, usable: IntArray, price: float) -> dict[frozense
         places = _with_one_more(beam, usable)
         blocks = M[places[:, :, None], places[:, None]] + UNTOLD * np.eye(size)
         right = m[places]
-        drop = np.einsum("ki,ki->k", right, np.linalg.solve(blocks, right[:, :, None])[:, :, 0])
+        drop = np.einsum("ki,ki->k", right, _solved(blocks, right))
         score = price * size - drop
         order = np.argsort(score, kind="stable")[:BEAM]
         beam = places[order]
@@ -112,6 +112,14 @@ def _search(M: Array, m: Array, usable: IntArray, price: float) -> dict[frozense
         if idle == 2:
             break
     return scores
+
+
+def _solved(blocks: Array, right: Array) -> Array:
+    """Solutions (k, s) of symmetric equations (k, s, s); of those that have none the least ones."""
+    try:
+        return np.linalg.solve(blocks, right[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        return (np.linalg.pinv(blocks, hermitian=True) @ right[:, :, None])[:, :, 0]
 
 
 def _with_one_more(sets: IntArray, usable: IntArray) -> IntArray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from triline.solver.adjustment.bias_search import judge
+from triline.solver.adjustment.bias_search import UNTOLD, _search, judge
 from triline.solver.adjustment.reliability import CRITICAL_W
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
@@ -272,3 +272,9 @@ def test_control_in_another_height_system_moves_no_strip_of_a_block(datum):
         errors = orientation_errors(simulation, run)
         errors.error[:, 2] -= 47.0 if datum == "control" else 0.0
         assert not beyond(errors).any()
+
+
+def test_biases_whose_equations_are_singular_are_weighed():
+    """In a flight whose camera is hundreds of pixels off this ended the adjuster."""
+    scores = _search(-UNTOLD * np.eye(2), np.array([3.0, 1.0]), np.arange(2), 2.0)
+    assert all(np.isfinite(score) for score in scores.values())
