@@ -1,0 +1,32 @@
+"""A block of another program whose camera has never been calibrated, 29 px off at the edge, through import and process.
+
+Before, points were 4 m off in height with sigmas of centimetres, and nothing said why.
+"""
+
+import json
+
+import numpy as np
+from places import BLOCKS, needs_blocks
+
+from triline.nodes.cli import main
+from triline.nodes.recording.access import Recording
+
+
+@needs_blocks
+def test_a_camera_that_was_never_calibrated(tmp_path):
+    flight, done = tmp_path / "flight.mcap", tmp_path / "done.mcap"
+    assert main(["import", str(BLOCKS / "selfcal"), "-o", str(flight), "-q"]) == 0
+    assert main(["process", str(flight), "-o", str(done), "-q"]) == 0
+    truth = json.loads((BLOCKS / "selfcal" / "truth.json").read_text())["points"]
+    recording = Recording(done)
+    whole = {m.body.point: m.body for m in recording.messages("point/object") if m.body.status == m.body.WHOLE}
+    assert len(whole) > 0.95 * len(truth)
+    error = np.array([[p.x, p.y, p.z] for p in whole.values()]) - [truth[name] for name in whole]
+    assert (np.sqrt((error**2).mean(axis=0)) < (0.04, 0.04, 0.08)).all()
+    C = np.array([p.covariance for p in whole.values()]).reshape(-1, 3, 3)
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(C, error[:, :, None])[:, :, 0]) / 3.0
+    assert 0.6 < nees.mean() < 1.6
+    texts = [m.body.message for m in recording.messages("event/log")]
+    assert any(text.startswith("camera: looks are off its calibration by") for text in texts)
+    light = list(recording.messages("adjustment/report"))[-1].body
+    assert light.light == "weak" and "the camera is calibrated" in light.light_reason
