@@ -163,6 +163,7 @@ def blueprint(layout: ViewLayout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
     tabs = [_overview(layout), *([_residuals(layout)] if layout.lines else [])]
     tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(layout), _adjustment(layout)]
+    tabs += [_parameters(layout)] if layout.units else []
     return _arranged(rrb.Tabs(*tabs, active_tab=0))
 
 
@@ -303,8 +304,13 @@ def _adjustment(layout: ViewLayout) -> rrb.Container:
             _plot("errors/position", "Position error against truth [m]"),
             _plot("errors/attitude", "Attitude error against truth [mdeg]"),
         ]
-    views += [_plot(f"parameters/{unit}", f"Parameters [{unit}]") for unit in layout.units]
     return rrb.Grid(*views, grid_columns=2, name="Adjustment")
+
+
+def _parameters(layout: ViewLayout) -> rrb.Container:
+    """Errors of strip, platform and camera as they are estimated, by their units."""
+    views = [_plot(f"parameters/{unit}", f"Parameters [{unit}]") for unit in layout.units]
+    return rrb.Grid(*views, grid_columns=2, name="Parameters")
 
 
 def viewpoint(layout: ViewLayout) -> tuple[Array, Array]:
