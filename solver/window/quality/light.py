@@ -156,7 +156,7 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.calibration > DOUBTED:
         return (
             WEAK,
-            f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are being estimated",
+            f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are estimated",
         )
     names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if names:
