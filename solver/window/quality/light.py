@@ -34,6 +34,8 @@ CONTRADICTION, BY_CHANCE, CONTRADICTION_REDUNDANCY = 1.5, 1e-6, 30
 #: Looks that disagree by so much more than all sigmas allow, and errors of the trajectory that are so many times as
 #: large as stated, make the light weak (tuned).
 DISAGREE, DOUBTED = 1.3, 2.0
+#: So do errors of the camera that are so many times as large as a calibration leaves them: a pixel, about (tuned).
+BADLY_CALIBRATED = 10.0
 #: Share of the points in the window without a ray left that says the same, and the points needed to say so (tuned).
 MOSTLY_REFUSED, ENOUGH_POINTS = 0.5, 20
 #: Sigma of the position, in units of the a-priori one, below which earlier control holds the datum (tuned).
@@ -153,7 +155,7 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.narrowly > HEAVY_TAILS:
         share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
         return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
-    if s.calibration > DOUBTED:
+    if s.calibration > BADLY_CALIBRATED:
         return (
             WEAK,
             f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are estimated",

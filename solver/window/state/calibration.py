@@ -16,9 +16,9 @@ QUESTIONED = 1e-3
 #: All sigmas are stated so many times as large in one look, at least and at most. Tuned.
 LEAST, MOST = 1.5, 3.0
 #: Combinations of parameters count of which the observations say so much, as a share of the a-priori variance: where
-#: they say hardly anything nothing speaks against the sigma either. Tuned: with 0.04 cameras 100 px off are not
-#: followed; their sigmas are far from what is stated, so that looks say little of them at first.
-LEAST_SEEN = 0.002
+#: they say hardly anything nothing speaks against the sigma either. Tuned: the sigmas of a camera 100 px off are far
+#: from what is stated, so that looks say little of them at first; with a share of some per cent it is not followed.
+LEAST_SEEN = 0.0003
 
 
 class LiveCalibration(KnownBeforehand):

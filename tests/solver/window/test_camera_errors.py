@@ -24,7 +24,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
 from triline.solver.simulation.scenario import simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors, point_errors
-from triline.solver.window.quality.light import FAILED, GOOD, WEAK
+from triline.solver.window.quality.light import BADLY_CALIBRATED, FAILED, GOOD, WEAK
 from triline.solver.window.results import WindowOptions
 
 PLAN, OPTIONS = FlightPlan(strip_s=40.0), WindowOptions(grid_hz=4.0)
@@ -86,7 +86,7 @@ def test_a_camera_that_is_worse_than_calibrated_is_estimated(share):
     assert rmse(simulation, online) < 1.6 * good
     assert orientation_errors(simulation, online.whole).nees.mean() < 2.5
     assert point_errors(simulation, online.whole_points).nees.mean() < 2.5
-    if calibration.factor > 2.0:
+    if calibration.factor > BADLY_CALIBRATED:
         assert online.reports[-1].quality.light == WEAK and "camera is calibrated" in online.reports[-1].quality.reason
 
 
