@@ -124,6 +124,12 @@ BENCHMARKS = (
         8,
     ),
     Benchmark(
+        "camera-errors",
+        "And where the camera is not as calibrated?",
+        ("python bench/camera_errors.py",),
+        3,
+    ),
+    Benchmark(
         "disturbed-folders",
         "And in block folders of another program, disturbed by hand?",
         ("python bench/disturbed_folders.py",),

@@ -11,7 +11,6 @@ from ...adjustment.drift_hypotheses import EACH
 from ...adjustment.ray_statistics import pixels_of_motion
 from ...arrays import IntArray
 from ..state.batch import Batch
-from ..state.unknowns import Border
 from .drifts import MOST_GROUPS, Cell
 
 
@@ -35,10 +34,7 @@ class Drifting:
 
 def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: float) -> list[Cell]:
     """Cells of batches whose rays belong to the same groups; what goes ray by ray is computed for all of them at once.
-
-    With the equations ``A theta + W t = r`` of rays, where ``t`` stands for the points, and what all else says of a
-    point, ``t + D theta = y``, the effect B of drifts has the coupling ``C = sum W^T B`` to the points of a batch,
-    ``A^T B - D^T C`` to the unknowns, and at unknowns of zero the scores ``B^T r - C^T y``.
+    For the equations see `Batch.border`.
 
     Parameters
     ----------
@@ -74,16 +70,9 @@ def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: f
     cells: list[Cell] = []
     point = used = 0
     for d, low, high in zip(drifting, firsts.tolist(), ends.tolist(), strict=True):
-        batch, rows = d.batch, d.batch.full_rows.reshape(2 * (high - low), -1)
+        batch = d.batch
         own, of_batch = effect[low:high].copy(), coupling[point : point + batch.n_points].copy()
-        B, C = own.reshape(-1, k), of_batch.reshape(-1, k)
-        residual = batch.lin.residual.T.ravel() + rows @ batch.theta
-        border = Border(
-            batch.columns,
-            rows.T @ B - batch.coupling.reshape(len(C), -1).T @ C,
-            B.T @ B - C.T @ C,
-            residual @ B - batch.normals.y.T.ravel() @ C,
-        )
+        border = batch.border(own, of_batch)
         counts = np.zeros(MOST_GROUPS, dtype=np.int64)
         counts[present] = np.bincount(d.of_ray, minlength=len(present))
         shared = 0.5 * float(variances[used : used + len(d.use)].sum())

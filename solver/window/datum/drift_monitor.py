@@ -32,7 +32,6 @@ from ...adjustment.drift_hypotheses import (
     covers,
     hypotheses,
 )
-from ...adjustment.reduced_system import DenseFactor
 from ...arrays import Array, IntArray
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from ..state.batch import Batch, Information
@@ -258,10 +257,8 @@ class DriftMonitor:
             now.append((batch.columns, batch.information))
             if cell is not None:
                 then.append((batch.columns, cell.information))
-        N, rhs = self._network.state.normal(less=now, more=then)
-        solved = DenseFactor(N).solve(np.column_stack([rhs, border.G]))
-        V = border.H - border.G.T @ solved[:, 1:]
-        return Scores(border.r - border.G.T @ solved[:, 0], 0.5 * (V + V.T), self._age(now_s), DRIFT_S)
+        score, V = border.scores(*self._network.state.normal(less=now, more=then))
+        return Scores(score, V, self._age(now_s), DRIFT_S)
 
     def least_score(self, control: float) -> float:
         """Lower bound of the score of a drift, see `hypotheses`, where biases of control explain so much.

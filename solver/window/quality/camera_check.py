@@ -19,13 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjustment.reduced_system import DenseFactor
 from ...arrays import Array
 from ...camera.displacement import Displacement, displacements, most_certain
 from ...camera.self_calibration import lens, tls
 from ...quantiles import chi2
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
+from ..state.unknowns import Border
 
 #: Kinds of parameters that others watch.
 WATCHED = ("dc", "xp", "yp", "dx", "dy")
@@ -126,26 +126,16 @@ class CameraCheck:
     def _scores(self) -> tuple[Array, Array, int]:
         """Scores (m,) of the parameters at the solution and their cofactors (m, m), from the newest rays; their
         number."""
-        state, m = self._network.state, self._set.n_unknowns
-        G, H, r = np.zeros((len(state), m)), np.zeros((m, m)), np.zeros(m)
-        rays = 0
+        state, m, rays = self._network.state, self._set.n_unknowns, 0
+        border = Border.of(m, state.numbers)
         for batch, use in self._newest():
-            n = len(batch.rays)
             effect = np.where(use[:, None, None], self._effect(batch), 0.0)
             coupling = np.add.reduceat(np.swapaxes(batch.through_points, 1, 2) @ effect, batch.first_ray[:-1], axis=0)
-            rows, B, C = batch.full_rows.reshape(2 * n, -1), effect.reshape(-1, m), coupling.reshape(-1, m)
-            residual = batch.lin.residual.T.ravel() + rows @ batch.theta
-            # as in `cells`: what all else says of the points is eliminated
-            G[state.places(batch.columns)] += rows.T @ B - batch.coupling.reshape(len(C), -1).T @ C
-            H += B.T @ B - C.T @ C
-            r += residual @ B - batch.normals.y.T.ravel() @ C
+            border.join(np.arange(m), batch.border(effect, coupling))
             rays += int(use.sum())
         if rays < LEAST_RAYS:
-            return r, H, rays
-        N, rhs = state.normal()
-        solved = DenseFactor(N).solve(np.column_stack([rhs, G]))
-        V = H - G.T @ solved[:, 1:]
-        return r - G.T @ solved[:, 0], 0.5 * (V + V.T), rays
+            return border.r, border.H, rays
+        return *border.scores(*state.normal()), rays
 
     def _newest(self) -> Iterator[tuple[Batch, Array]]:
         """Batches from the newest one on, and which of their rays (n,) have weight at points that are known."""

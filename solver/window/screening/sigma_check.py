@@ -194,9 +194,12 @@ class SigmaCheck:
 
     def _question_camera(self) -> None:
         """State larger errors of the camera where its calibration is contradicted by more than looks disagree."""
-        calibration, sigmas = self._network.calibration, self._network.sigmas
-        for _ in range(MOST_ROUNDS_OF_CAMERA if calibration.is_questioned else 0):
-            if not calibration.question(max(sigmas.disagreement**2, self._median_ratio(), 1.0)):
+        calibration = self._network.calibration
+        if not calibration.is_questioned:
+            return
+        variance = max(self._network.sigmas.disagreement**2, self._median_ratio(), 1.0)
+        for _ in range(MOST_ROUNDS_OF_CAMERA):
+            if not calibration.question(variance):
                 break
             self._network.state.solve()
 

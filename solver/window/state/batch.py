@@ -20,7 +20,7 @@ from ...adjustment.normal_equations import ControlWeights, inverse_factors, poin
 from ...adjustment.ray_statistics import RayStatistics, statistics_of_rays
 from ...adjustment.surface_control import SurfaceControl
 from ...arrays import Array, Bools, IntArray
-from .unknowns import Information, WindowState
+from .unknowns import Border, Information, WindowState
 
 
 @dataclass(frozen=True)
@@ -352,6 +352,28 @@ class Batch:
             W = self.through_points
             self._without_points = W, self.full_rows - W @ self.coupling[self.rays.point]
         return self._without_points
+
+    def border(self, effect: Array, coupling: Array) -> Border:
+        """Equations of k quantities that are held at zero, beside the unknowns of the batch, at unknowns of zero.
+
+        With the equations ``A theta + W t = r`` of rays, where ``t`` stands for the points, and what all else says of a
+        point, ``t + D theta = y``, the effect B of the quantities has the coupling ``C = sum W^T B`` to the points,
+        ``A^T B - D^T C`` to the unknowns, and the scores ``B^T r - C^T y``.
+
+        Parameters
+        ----------
+        effect : (n, 2, k) on the equations of the rays at full weight
+        coupling : (p, 3, k) its sums ``W^T B`` over the rays of each point
+        """
+        k = effect.shape[2]
+        rows, B, C = self.full_rows.reshape(2 * len(self.rays), -1), effect.reshape(-1, k), coupling.reshape(-1, k)
+        residual = self.lin.residual.T.ravel() + rows @ self.theta
+        return Border(
+            self.columns,
+            rows.T @ B - self.coupling.reshape(len(C), -1).T @ C,
+            B.T @ B - C.T @ C,
+            residual @ B - self.normals.y.T.ravel() @ C,
+        )
 
     def _design_rows(self) -> Array:
         """Derivatives (n, 2, u) of all rays to the unknowns."""

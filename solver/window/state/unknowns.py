@@ -131,6 +131,13 @@ class Border:
         for places, total in sums.values():
             self.join(places, total)
 
+    def scores(self, N: Array, rhs: Array) -> tuple[Array, Array]:
+        """Scores (c,) of the quantities at the solution of normal equations (n, n), (n,) of the same unknowns; their
+        cofactors (c, c)."""
+        solved = DenseFactor(N).solve(np.column_stack([rhs, self.G]))
+        V = self.H - self.G.T @ solved[:, 1:]
+        return self.r - self.G.T @ solved[:, 0], 0.5 * (V + V.T)
+
     def rows(self, numbers: IntArray) -> Array:
         """Rows (m, c) of G, zero for unknowns it does not have."""
         at = places_of(self.numbers, numbers)
