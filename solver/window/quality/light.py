@@ -145,7 +145,10 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     # that drifting tie points contradict control has been said
     if not s.sources and s.control_refused >= max(2, int(s.control.max())):
         return FAILED, f"{s.control_refused} control points contradict the orientation"
-    doubts = [s.control_doubt] if s.control_doubt else []
+    camera = ""
+    if s.calibration > BADLY_CALIBRATED:
+        camera = f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are estimated"
+    doubts = [doubt for doubt in (camera, s.control_doubt) if doubt]
     if doubts or s.sources:
         return FAILED if s.control_failed else WEAK, "; ".join([*doubts, *map(str, s.sources)])
     if s.fit.sigma0 > chance:
@@ -155,11 +158,6 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.narrowly > HEAVY_TAILS:
         share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
         return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
-    if s.calibration > BADLY_CALIBRATED:
-        return (
-            WEAK,
-            f"the camera is calibrated {s.calibration:.1f} times worse than stated; its errors are estimated",
-        )
     names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if names:
         return WEAK, f"the trajectory is worse than stated: {', '.join(names)}"

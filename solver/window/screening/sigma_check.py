@@ -195,8 +195,8 @@ class SigmaCheck:
     def _question_camera(self) -> None:
         """State larger errors of the camera where its calibration is contradicted by more than looks disagree."""
         calibration = self._network.calibration
-        if not calibration.is_questioned:
-            return
+        if not calibration.is_questioned or len(self._controlled()) < LEAST_LOOKS:
+            return  # few looks do not tell noise from anything else
         variance = max(self._network.sigmas.disagreement**2, self._median_ratio(), 1.0)
         for _ in range(MOST_ROUNDS_OF_CAMERA):
             if not calibration.question(variance):
