@@ -44,6 +44,12 @@ class Listener:
         """When something was heard last."""
         return max(times[-1] for (name, _), times in self.heard.items() if name == topic)
 
+    def followed(self, node: str, told: int, other: str) -> int:
+        """How often both nodes have said something of themselves since the first one did, after so many statuses."""
+        names = [status.node for status in self.statuses[told:]]
+        since = names[names.index(node) :] if node in names else []
+        return min(since.count(node), since.count(other))
+
     def runs(self, topic: str) -> int:
         return sum(name == topic for name, _ in self.heard)
 
@@ -70,8 +76,9 @@ def test_each_node_killed_in_turn(tmp_path):
         nodes["recorder"] = rig.start("node", "recorder", "-o", tmp_path / "0.mcap")
 
         # the navigator: the adjuster waits for it and goes on with the restarted one. Before that the recorder has to
-        # be back: what it missed while it began it asks the navigator for, which has to be there to answer
-        wait_for(lambda: sum(s.node == "recorder" for s in listener.statuses[told:]) > 2, 30, "the recorder's return")
+        # be back: what it missed while it began it asks the navigator for, which has to be there to answer. That one is
+        # missing it learns from the next one: of what the navigator says of itself, from what it says a second later
+        wait_for(lambda: listener.followed("recorder", told, "navigator") > 2, 30, "the recorder's return")
         assert listener.since("adjustment/report", moment) > 0
         runs = listener.runs("trajectory/filtered")
         moment = time.monotonic()
