@@ -327,7 +327,8 @@ def _sigma0_note(result: BatchResult) -> str:
     test, image = result.test, result.image_test
     said = f"sigma0 {test.sigma0:.3f} outside [{test.low:.3f}, {test.high:.3f}] (95 %)"
     if test.sigma0 > test.high:
-        return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit"
+        asked = "" if result.components else "; --variance-components asks which, clock and camera with them"
+        return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit{asked}"
     _, squares, redundancy = result.groups.get("surface", (0, 0.0, 0.0))
     surface = global_test(squares, round(redundancy))
     if redundancy > 1.0 and surface.sigma0 < surface.low:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ...solver.adjustment.variance_components import CONSTANTS
+
 Content = Mapping[str, Any]
 
 #: Rejected image points that are listed; the others are in ``result.json``.
@@ -125,7 +127,7 @@ def _parameters(c: Content) -> Iterator[str]:
 
 def _components(c: Content) -> Iterator[str]:
     for group, v in c["variance_components"].items():
-        said = "a-priori kept, too little redundancy"
+        said = "a-priori kept, " + ("nothing contradicts it" if group in CONSTANTS else "too little redundancy")
         if v["estimated"]:
             said = f"a-priori times {v['sigma_factor']:.3f} +- {_number(v['sigma_factor_sigma'])}"
         yield f"sigma of {group}: {said} ({v['observations']} observations, redundancy {v['redundancy']:.1f})"

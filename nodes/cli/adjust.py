@@ -26,12 +26,12 @@ from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
 from ...solver.adjustment.straightened import straightened
 from ...solver.adjustment.surface_control import SurfaceControl
-from ...solver.camera.self_calibration import SELF_CALIBRATIONS, SelfCalibration
+from ...solver.camera.self_calibration import LEFT, SELF_CALIBRATIONS, SelfCalibration
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
-from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, PlatformErrors
+from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
 from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
@@ -93,15 +93,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--sets", choices=SETS, help="satellite scenes: corrections a lens, or a scene (lens)")
     group.add_argument("--fixes", type=int, metavar="N", help="orientation fixes a strip, for lim")
     group.add_argument(
-        "--clock-sigma", type=float, default=0.0, metavar="S",
-        help="clocks of poses and image lines differ by an unknown constant, beforehand known to S seconds (0)",
+        "--clock-sigma", type=float, metavar="S",
+        help="clocks of poses and image lines differ by an unknown constant, beforehand known to S seconds (0; with "
+        "--variance-components 0.001)",
     )  # fmt: skip
     group.add_argument(
         "--lever-arm-sigma", type=float, default=0.0, metavar="M",
         help="each component of the lever arm is off by an unknown constant, beforehand known to M metres (0)",
     )  # fmt: skip
     selfcal = ["none", *SELF_CALIBRATIONS]
-    group.add_argument("--selfcal", choices=selfcal, default="none", help="additional parameters of the camera (none)")
+    group.add_argument(
+        "--selfcal", choices=selfcal,
+        help="additional parameters of the camera (none; with --variance-components calibrated)",
+    )  # fmt: skip
     group.add_argument(
         "--camera", type=Path, metavar="FILE",
         help="camera.json in place of that of the input: one that an adjustment with --selfcal wrote",
@@ -120,8 +124,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--robust", choices=sorted(WEIGHT_FUNCTIONS), help="robust estimation; with --snoop its start")
     group.add_argument("--reweight", action="store_true", help="re-estimate the image sigma")
     group.add_argument(
-        "--variance-components", action="store_true", help="estimate sigmas of image, control, position and attitude"
-    )
+        "--variance-components", action="store_true",
+        help="estimate sigmas of image, control, position and attitude; question clock and calibration of the camera",
+    )  # fmt: skip
     add_dem_options(group)
     group.add_argument(
         "--refraction", nargs="*", type=float, metavar="VALUE", help="take the bending of rays in the air off: as in "
@@ -172,11 +177,16 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
         if args.workers or args.scheduler:
             raise UserError("--workers and --scheduler do not go with satellite scenes")
+        args.selfcal = args.selfcal or "none"
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
     if len(paths) > 1 and args.clock_sigma:
         raise UserError("--clock-sigma goes with one recording: each has a clock of its own")
+    questions = args.variance_components and not args.free
+    args.selfcal = args.selfcal or (LEFT if questions else "none")
+    if args.clock_sigma is None:
+        args.clock_sigma = USUAL_PLATFORM.clock_sigma_s if questions and len(paths) == 1 else 0.0
     recordings = [read_input(path) for path in paths]
     joined = join_inputs(recordings, paths) if len(paths) > 1 else None
     block = recordings[0] if joined is None else joined.block

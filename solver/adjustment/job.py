@@ -79,7 +79,7 @@ class Job:
     snoop, critical : data snooping and its critical value
     robust : weight function; with `snoop` it gives the start of the search only
     reweight : re-estimate the image sigma
-    components : estimate the sigmas of image, control, position and attitude
+    components : estimate the sigmas of image, control, position and attitude, and question those of constants
     weights, max_iterations : see `AdjustmentOptions`
     platform : constant errors of the platform that are unknowns
     """
@@ -97,6 +97,12 @@ class Job:
     weights: str = "motion"
     max_iterations: int = 30
     platform: PlatformErrors = NO_PLATFORM_ERRORS
+
+    @property
+    def eliminates(self) -> bool:
+        """Whether additional parameters are tested: not what a calibration leaves open, of which enough is known
+        beforehand, and which is in the sigmas of all else."""
+        return self.eliminate and self.self_calibration is not None and not self.self_calibration.as_calibrated
 
     @property
     def options(self) -> AdjustmentOptions:
@@ -251,7 +257,7 @@ def refuse_in_parts(network: Network, job: Job) -> None:
     """Raise NotAdjustableError, with the reason, for what blocks in partitions cannot do."""
     wanted = {
         "a second model (--then)": job.then is not None,
-        "the tests of additional parameters (--keep all goes)": job.self_calibration is not None and job.eliminate,
+        "the tests of additional parameters (--keep all goes)": job.eliminates,
         "a surface of tie points (--dem)": network.surface is not None,
     }
     for what, asked in wanted.items():
@@ -330,7 +336,7 @@ class _Stage:
             self._snoop_with_start()
         if job.reweight:
             self._reweigh()
-        if last and job.self_calibration is not None and job.eliminate and self.solution.layout.n_camera:
+        if last and job.eliminates and self.solution.layout.n_camera:
             self.tell(Phase("determinability of the additional parameters"))
             outcome = eliminate(self.solution, job.limits, job.on_the_way, self._adapt, self.tell)
             self.removed, self.kept = outcome.removed, outcome.kept
@@ -341,7 +347,7 @@ class _Stage:
             self.tell(Phase("variance components"))
             found = estimate_components(self.solution, options=job.on_the_way, start=self.scales)
             self.components = found.components
-            self.scales = Scales({c.group: c.factor for c in found.components})
+            self.scales = Scales(self.scales.factor | {c.group: c.factor for c in found.components})
             self._keep(found.solution)
             if job.snoop:
                 self._snoop()

@@ -3,7 +3,8 @@
 For each group of observations the squares of its residuals are compared with its share of the redundancy,
 ``s_g^2 = v_g^T P_g v_g / r_g`` with ``r_g = n_g - tr(P_g A_g Q A_g^T)``; its sigma is multiplied by ``s_g`` and the
 block adjusted again until nothing changes. A-priori sigmas of trajectories are guesses; this says what they should have
-been.
+been. Constants, the clock and what a calibration leaves open of the camera, are known better than one flight tells:
+their sigmas become larger where the solution contradicts them, and never smaller.
 """
 
 from __future__ import annotations
@@ -24,7 +25,11 @@ from .linearisation import Whitening
 from .normal_equations import Prior
 from .normal_matrix import DENSE_UP_TO
 
-GROUPS = ("image", "control", *ERROR_GROUPS)
+#: Constants that are known beforehand better than anything else says: what they are stated to be is only questioned
+#: where the solution contradicts it.
+CLOCK, CALIBRATION = "clock", "calibration"
+CONSTANTS = (CLOCK, CALIBRATION)
+GROUPS = ("image", "control", *ERROR_GROUPS, *CONSTANTS)
 
 #: A group with less redundancy keeps its a-priori sigma: the estimate would be chance, unless the squares are beyond
 #: what has this probability. The estimate is then that of so many more observations that are as stated.
@@ -93,12 +98,18 @@ class Scales:
 
 
 def prior_groups(problem: Problem) -> dict[str, IntArray]:
-    """Rows of the a-priori equations that belong to each group of slow errors, by the words of their labels."""
+    """Rows of the a-priori equations of each group of slow errors and constants, by the words of their labels."""
     given = problem.layout.prior
     labels = [label for label, s in zip(given.labels, given.sigma, strict=True) if np.isfinite(s)]
-    of_model = given.columns[np.isfinite(given.sigma)].max(axis=1) < problem.layout.n_of_sets
+    column = given.columns[np.isfinite(given.sigma)].max(axis=1)
+    of_model = column < problem.layout.n_of_sets
     group = error_groups(labels)
-    return {name: np.flatnonzero(of_model & (group == g)) for g, name in enumerate(ERROR_GROUPS)}
+    rows = {name: np.flatnonzero(of_model & (group == g)) for g, name in enumerate(ERROR_GROUPS)}
+    rows[CLOCK] = np.flatnonzero(~of_model & (np.array(labels) == "clock"))
+    calibration = problem.self_calibration
+    questioned = calibration.questioned_names if calibration is not None else ()
+    rows[CALIBRATION] = np.flatnonzero((column >= problem.layout.n_model) & np.isin(labels, questioned))
+    return rows
 
 
 def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float, float]]:
@@ -137,11 +148,20 @@ def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float,
 def _can_be_estimated(sums: dict[str, tuple[int, float, float]], group: str) -> bool:
     """Enough redundancy in the group and in the image points; a-priori values that nothing contradicts do not count."""
     n, squares, redundancy = sums[group]
-    if not n or sums["image"][2] < LEAST_REDUNDANCY or redundancy < HARDLY_ANY:
+    if not n or sums["image"][2] < LEAST_REDUNDANCY:
+        return False
+    if group in CONSTANTS:
+        return True
+    if redundancy < HARDLY_ANY:
         return False
     if redundancy < LEAST_REDUNDANCY:
-        return group in ERROR_GROUPS and bool(squares > chi2.isf(BY_CHANCE, redundancy))
+        return group in ERROR_GROUPS and _contradicted(squares, redundancy)
     return squares > SMALLEST**2 * redundancy
+
+
+def _contradicted(squares: float, redundancy: float) -> bool:
+    """Whether residuals are larger than the stated sigmas let them be by chance."""
+    return redundancy > 0 and bool(squares > chi2.isf(BY_CHANCE, redundancy))
 
 
 def _row_variances(solution: Solution) -> Array:
@@ -195,10 +215,13 @@ def estimate_components(
         change = {}
         for group in groups:
             _, squares, redundancy = sums[group]
+            if group in CONSTANTS and scales.factor[group] == 1.0 and not _contradicted(squares, redundancy):
+                continue
             more = AS_STATED if redundancy < LEAST_REDUNDANCY else 0.0
             ratio = (max(squares, 0.0) + more / scales.factor[group] ** 2) / (max(redundancy, 1e-6) + more)
             total = scales.factor[group] * np.sqrt(ratio)
-            change[group] = float(np.clip(total, SMALLEST, LARGEST)) / scales.factor[group]
+            least = 1.0 if group in CONSTANTS else SMALLEST
+            change[group] = float(np.clip(total, least, LARGEST)) / scales.factor[group]
         if all(abs(f - 1.0) <= TOLERANCE for f in change.values()):
             converged = True
             break
@@ -208,11 +231,14 @@ def estimate_components(
         sums = group_sums(solution, cofactors(solution))
         if progress:
             progress(number, scales.factor)
+    estimated = {g for g in groups if g not in CONSTANTS or scales.factor[g] != 1.0}
     components = []
     for group in GROUPS:
         n, _, redundancy = sums[group]
+        if group in CONSTANTS and not n:
+            continue
         uncertainty = 1.0 / np.sqrt(2.0 * redundancy) if redundancy > 0 else np.inf
-        components.append(Component(group, n, redundancy, scales.factor[group], float(uncertainty), group in groups))
+        components.append(Component(group, n, redundancy, scales.factor[group], float(uncertainty), group in estimated))
     return VarianceComponents(solution, tuple(components), number, converged)
 
 

@@ -146,6 +146,12 @@ class SelfCalibration:
         """Whether it is what a calibration leaves open, which is stated to be more where the data contradict it."""
         return self.name == LEFT
 
+    @property
+    def questioned_names(self) -> tuple[str, ...]:
+        """Estimated parameters whose sigmas may be stated larger: of what a calibration leaves open all but the camera
+        constant, since over one strip an offset in Z explains as much."""
+        return tuple(n for n in self.unknown_names if self.as_calibrated and not n.startswith("dc"))
+
     def without(self, names: Sequence[str]) -> SelfCalibration:
         """The set with some parameters no longer estimated.
 

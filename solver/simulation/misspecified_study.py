@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..adjustment.drift_hypotheses import ALL
 from ..adjustment.job import Job, NotAdjustableError
 from ..adjustment.job import run as run_batch
+from ..camera.self_calibration import left_by_calibration
 from ..models.platform import USUAL_PLATFORM
 from ..models.wander import WanderOptions
 from ..window.quality.light import GOOD
@@ -309,7 +310,11 @@ def adjust_in_batch(
     errors = simulation.errors
     model = WanderOptions.from_settings({key: getattr(errors, key) for key in _STATED})
     try:
-        found = run_batch(network_of(simulation, poses), Job(model, components=components))
+        network, job = network_of(simulation, poses), Job(model)
+        if components:
+            camera = left_by_calibration(network.camera)
+            job = Job(model, self_calibration=camera, components=True, platform=USUAL_PLATFORM)
+        found = run_batch(network, job)
     except (NotAdjustableError, ValueError):
         return Quality(np.nan), {}
     datum = np.array(simulation.world.control_datum_m)

@@ -34,9 +34,8 @@ class LiveCalibration(KnownBeforehand):
         super().__init__(np.empty(0) if parameters is None else parameters.apriori_sigma, state)
         self.parameters, self.factor = parameters, 1.0
         names = () if parameters is None else parameters.unknown_names
-        open_ = parameters is not None and parameters.as_calibrated
-        #: (m,) not the camera constant: over one strip an offset in Z explains as much
-        self._questioned = np.array([open_ and not name.startswith("dc") for name in names], dtype=bool)
+        questioned = () if parameters is None else parameters.questioned_names
+        self._questioned = np.array([name in questioned for name in names], dtype=bool)
 
     @property
     def is_questioned(self) -> bool:

@@ -356,7 +356,7 @@ def test_everything_at_once_with_pictures(folder, tmp_path):
     assert adjust(folder, *options, "-q", "-o", tmp_path) == 0
     result = result_in(tmp_path)
     of_trajectory = {"offset", "shift and drift", "wander of position", "wander of attitude"}
-    assert set(result["variance_components"]) == {"image", "control"} | of_trajectory
+    assert set(result["variance_components"]) == {"image", "control", "clock"} | of_trajectory
     assert result["sigma0"] == pytest.approx(1.0, abs=0.03)
     for name in ("residuals.png", "points.png", "corrections.png"):
         assert (tmp_path / name).stat().st_size > 20_000

@@ -1,4 +1,4 @@
-"""A block of another program whose camera has never been calibrated, 29 px off at the edge, through import and process.
+"""A block of another program whose camera has never been calibrated, 29 px off at the edge, on line and in batch.
 
 Before, points were 4 m off in height with sigmas of centimetres, and nothing said why.
 """
@@ -6,10 +6,30 @@ Before, points were 4 m off in height with sigmas of centimetres, and nothing sa
 import json
 
 import numpy as np
+import pandas as pd
+import pytest
 from places import BLOCKS, needs_blocks
 
 from triline.nodes.cli import main
 from triline.nodes.recording.access import Recording
+
+
+@needs_blocks
+def test_the_batch_says_what_is_wrong_and_finds_it(tmp_path, capsys):
+    plain, asked = (["adjust", str(BLOCKS / "selfcal"), "-q", "-o", str(tmp_path / n)] for n in ("plain", "asked"))
+    assert main(plain) == 0 and "--variance-components asks which" in capsys.readouterr().out
+    assert main([*asked, "--variance-components"]) == 0
+    out = capsys.readouterr().out
+    assert "sigma of clock: a-priori kept, nothing contradicts it" in out
+    result = json.loads((tmp_path / "asked" / "result.json").read_text())
+    calibration = result["variance_components"]["calibration"]
+    assert calibration["estimated"] and calibration["sigma_factor"] > 50.0
+    assert result["sigma0"] == pytest.approx(1.0, abs=0.03)
+    truth = json.loads((BLOCKS / "selfcal" / "truth.json").read_text())["points"]
+    points = pd.read_csv(tmp_path / "asked" / "points.csv")
+    error = points[["X_m", "Y_m", "Z_m"]].to_numpy() - [truth[name] for name in points["point"]]
+    assert (np.sqrt((error**2).mean(axis=0)) < (0.04, 0.04, 0.08)).all()
+    assert 0.6 < np.mean((error / points[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy()) ** 2) < 1.6
 
 
 @needs_blocks

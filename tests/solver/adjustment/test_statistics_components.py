@@ -10,8 +10,14 @@ from triline.solver.adjustment.covariance import cofactors, point_cofactors
 from triline.solver.adjustment.direct_georeferencing import georeference
 from triline.solver.adjustment.job import Job, run
 from triline.solver.adjustment.statistics import global_test
-from triline.solver.adjustment.variance_components import GROUPS, estimate_components, group_sums
-from triline.solver.camera.self_calibration import tls
+from triline.solver.adjustment.variance_components import (
+    CALIBRATION,
+    CONSTANTS,
+    GROUPS,
+    estimate_components,
+    group_sums,
+)
+from triline.solver.camera.self_calibration import left_by_calibration, tls
 from triline.solver.camera.sensors import preset
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.ppm import PpmOptions
@@ -61,7 +67,7 @@ def test_components_recover_sigmas_that_were_stated_wrongly():
         found = estimate_components(adjust(network, scaled_model(4.0, 0.5)))
         assert found.converged and found.solution.sigma0 == pytest.approx(1.0, abs=0.02)
         factors.append([c.factor for c in found.components])
-    assert [c.group for c in found.components] == list(GROUPS)
+    assert [c.group for c in found.components] == [g for g in GROUPS if g not in CONSTANTS]
     rms = np.sqrt(np.mean(np.square(factors), axis=0))
     np.testing.assert_allclose(rms, [2.0, 1 / 3, 0.25, 2.0, 1.0, 1.0], rtol=0.2)
 
@@ -77,6 +83,26 @@ def test_components_work_with_continuity_constraints():
     network = wrong_by(block(2, errors=options).network, image=0.5)
     found = estimate_components(adjust(network, options))
     assert next(c for c in found.components if c.group == "image").factor == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 40.0])
+def test_a_camera_is_questioned_where_it_contradicts_its_calibration(share):
+    """As perfect, as calibrated, and some pixels off; then the sigma is stated anew, and that of points is right."""
+    left, factors, ratio = left_by_calibration(CAMERA), [], []
+    for seed in range(6):
+        drawn = np.random.default_rng(seed).normal(0.0, left.apriori_sigma)
+        drawn[np.isin(left.unknown_names, left.questioned_names)] *= share
+        values = dict(zip(left.unknown_names, drawn.tolist(), strict=True))
+        simulated = block(seed, control=12, self_calibration=left, camera_parameters=values)
+        found = estimate_components(adjust(simulated.network, MODEL, left))
+        calibration = next(c for c in found.components if c.group == CALIBRATION)
+        assert calibration.estimated == (share > 1.0)
+        factors.append(calibration.factor)
+        error = found.solution.state.points_l - simulated.points_l
+        Q = point_cofactors(found.solution)
+        ratio.append(np.einsum("pi,pi->p", error, np.linalg.solve(Q, error[:, :, None])[:, :, 0]).mean() / 3.0)
+    assert 0.7 < np.sqrt(np.mean(np.square(factors))) / max(share, 1.0) < 1.4
+    assert 0.6 < np.mean(ratio) < 1.6
 
 
 def test_components_refuse_unknown_groups():
