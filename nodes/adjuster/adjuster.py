@@ -29,8 +29,9 @@ from .strips import AdjustedStrips
 DEFAULT_IMAGE_SIGMA_PX = 0.3
 APRIORI = ("trajectory", "project")
 PACES = ("load", "normal", "throughput")
-#: Platform time between updates at the pace for throughput, s.
-THROUGHPUT_S = 5.0
+#: Platform time between updates at the pace for throughput, s, and while sigmas are in doubt there: what is wrong has
+#: to be known before the next looks are judged.
+THROUGHPUT_S, IN_DOUBT_S = 7.0, 1.0
 #: How far the time of a pose can be after the stamp of its message, s: what goes beyond is no flight, and unknowns for
 #: all of it would take the memory and the time of the others.
 POSE_AHEAD_S = 60.0
@@ -57,8 +58,8 @@ class Adjuster(Node):
     update_rays : waiting image points after which an update does not wait for its time
     pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
         the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
-        of long flights: an update every 5 s with what came till then, from smoothed poses alone where there are any,
-        and the live orientation with the update
+        of long flights: an update every 7 s with what came till then, each second while sigmas are in doubt, from
+        smoothed poses alone where there are any, and the live orientation with the update
     self_calibration : set of additional parameters, or "none"; "calibrated" is what a calibration leaves open, and more
         where the data contradict it; "focal" the focal length alone
     camera_sigma : what is known of them beforehand, as a share of their usual a-priori sigmas (0.1 mm at the edge of
@@ -154,6 +155,7 @@ class Adjuster(Node):
         )  # fmt: skip
         self._early = pace != "throughput"  # whether answers are wanted early
         self._update_ns = round((update_s if self._early else max(update_s, THROUGHPUT_S)) * convert.SECOND_NS)
+        self._in_doubt_ns = round(IN_DOUBT_S * convert.SECOND_NS)
         self._update_rays = update_rays if self._early else sys.maxsize
         self._by_load = pace == "load"
         self._rays_waiting = 0
@@ -441,6 +443,8 @@ class Adjuster(Node):
         if self._window is None:
             return []
         interval = self._interval_ns
+        if not self._early and self._window.in_doubt:
+            interval = min(interval, self._in_doubt_ns)
         if self._next_update_ns is None:
             self._next_update_ns = (stamp_ns // interval + 1) * interval
         if stamp_ns < self._next_update_ns:

@@ -160,6 +160,11 @@ class Window:
         """Length of the window; 0 while it is not known yet."""
         return self._length_s
 
+    @property
+    def in_doubt(self) -> bool:
+        """Whether new looks disagree more than the sigmas say, or are too few to tell."""
+        return self.options.snoop and self._sigma_check.in_doubt
+
     def begin_strip(
         self,
         id: str,
@@ -312,8 +317,9 @@ class Window:
     def _question_sigmas(self, due: bool, result: WindowUpdate) -> int:
         """Variance components, before any look is thrown out; number of solutions computed."""
         solutions = 0
-        for _ in range(min(self._duties.turns[QUESTION], MOST_QUESTIONS) if due else 1):
-            of_slow, of_image = self._sigma_check.look(self._now_s, due)
+        turns = min(self._duties.turns[QUESTION], MOST_QUESTIONS) if due else 1
+        for turn in range(turns):
+            of_slow, of_image = self._sigma_check.look(self._now_s, due, turns - turn)
             if of_image:
                 self._relinearisation.reweigh()
                 self.state.solve()

@@ -141,6 +141,11 @@ class SigmaCheck:
         self._largest, self._beside = np.ones(2), np.ones(2)
         self.events: list[str] = []
 
+    @property
+    def in_doubt(self) -> bool:
+        """Whether new looks disagree more than the sigmas say, or are too few to tell."""
+        return not self._enough or self._network.sigmas.disagreement > 1.0
+
     def entered(self, squares: Iterable[tuple[float, int, bool]]) -> None:
         """Points have come, each as `entry.disagreement` judges it. Those of two looks count until enough have more."""
         for square, redundancy, spared in squares:
@@ -157,10 +162,14 @@ class SigmaCheck:
             self._enough = False
         self._network.sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
 
-    def look(self, now_s: float, due: bool) -> tuple[bool, bool]:
+    def look(self, now_s: float, due: bool, turns: int = 1) -> tuple[bool, bool]:
         """Compare residuals with sigmas where that is due; whether those of slow errors and of looks were changed.
 
         Where looks disagree more than expected it is due in every update.
+
+        Parameters
+        ----------
+        turns : how often it is due before anything new comes: what changes nothing would not the next time either
         """
         network = self._network
         sigmas = network.sigmas
@@ -177,7 +186,7 @@ class SigmaCheck:
         factor, of_image = self._slow_errors(strip, now_s, due)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
-        self._steady = 0 if of_slow or of_image else self._steady + 1
+        self._steady = 0 if of_slow or of_image else self._steady + turns
         if self._steady >= STEADY:
             judged = self._judged()
             if judged is not None and judged.last():
