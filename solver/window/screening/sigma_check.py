@@ -64,6 +64,8 @@ TWICE = ((1.0, 2.0), (2.0, 1.0), (2.0, 2.0))
 #: Where the wander of position is not as stated, but guessed from the covariance of a pose, the likelihood of a bank
 #: says what it is as soon as there is so much redundancy; no test has to ask for it first. Tuned.
 PLENTY = 10.0
+#: Factors on errors of position and attitude that are tried beside a worse camera, or others of these. Tuned.
+LARGER = (1.0, 3.0, 10.0)
 #: Redundancy of a group below which nothing is said about it.
 LEAST_REDUNDANCY = 0.2
 #: A factor is applied if it differs by so much from the one in force, and changes by so much at most in one look.
@@ -182,7 +184,7 @@ class SigmaCheck:
         network.state.expect(len(network.state))
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
-        self._question_camera()
+        self._question_camera(strip)
         factor, of_image = self._slow_errors(strip, now_s, due)
         of_slow = bool((factor != sigmas.apriori).any())
         # what the trajectory explains is no noise of looks
@@ -201,16 +203,30 @@ class SigmaCheck:
         self._tell_platform()
         return of_slow, of_image
 
-    def _question_camera(self) -> None:
-        """State larger errors of the camera where its calibration is contradicted by more than looks disagree."""
+    def _question_camera(self, strip: WindowStrip) -> None:
+        """State larger errors of the camera where its calibration is contradicted by more than looks disagree, and no
+        constant error of the trajectory makes the data as likely."""
         calibration = self._network.calibration
         if not calibration.is_questioned or len(self._controlled()) < LEAST_LOOKS:
             return  # few looks do not tell noise from anything else
         variance = max(self._network.sigmas.disagreement**2, self._median_ratio(), 1.0)
         for _ in range(MOST_ROUNDS_OF_CAMERA):
-            if not calibration.question(variance):
+            if self._constants_instead(strip) or not calibration.question(variance):
                 break
             self._network.state.solve()
+
+    def _constants_instead(self, strip: WindowStrip) -> bool:
+        """Whether larger offsets, shifts and drifts make the data more likely than a worse camera does."""
+        return self._gain(strip, CONSTANT) > self._network.calibration.gain()
+
+    def _gain(self, strip: WindowStrip, pair: tuple[int, int]) -> float:
+        """By how much minus twice the logarithm of the likelihood of the data falls where the factors of a pair are as
+        much larger as is likely best; 0 where they are not questioned."""
+        if pair not in self._pairs:
+            return 0.0
+        cost, apriori = self._cost(strip, pair), self._network.sigmas.apriori
+        f, g = (float(apriori[group]) for group in pair)
+        return cost.of(f, g, 1.0) - min(cost.of(i * f, j * g, 1.0) for i in LARGER for j in LARGER)
 
     def _restate(self, strip: WindowStrip, factor: Array) -> None:
         """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for."""
@@ -260,8 +276,11 @@ class SigmaCheck:
             if not asked.any() and not by_likelihood:
                 continue
             cost, present = self._cost(strip, pair), (float(before[pair[0]]), float(before[pair[1]]))
-            if by_likelihood:
-                asked |= cost.prefers_larger(*present)
+            if by_likelihood and cost.prefers_larger(*present):
+                if self._gain(strip, CONSTANT) > self._gain(strip, WANDERS):
+                    contradicted = True  # a mounting that is off bends the trajectory, too, until it is known
+                else:
+                    asked |= True
             if not asked.any():
                 continue
             *wanted, ratio = _likely(cost, present)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...arrays import Array
 from ...camera.displacement import Displacement, most_certain
 from ...camera.line_camera import LineCamera
 from ...camera.self_calibration import SelfCalibration
@@ -15,6 +16,8 @@ from .unknowns import WindowState
 QUESTIONED = 1e-3
 #: All sigmas are stated so many times as large in one look, at least and at most. Tuned.
 LEAST, MOST = 1.5, 3.0
+#: Factors that are tried for the likelihood. Tuned.
+BANK = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 #: Combinations of parameters count of which the observations say so much, as a share of the a-priori variance: where
 #: they say hardly anything nothing speaks against the sigma either. Tuned: the sigmas of a camera 100 px off are far
 #: from what is stated, so that looks say little of them at first; with a share of some per cent it is not followed.
@@ -53,20 +56,33 @@ class LiveCalibration(KnownBeforehand):
         ----------
         variance : of looks, as they disagree, over that of right sigmas; 1 at least
         """
+        found, unseen = self._found()
+        test, m = float((found**2 / (1.0 + unseen)).sum()) / variance, len(found)
+        if not m or test <= chi2.isf(QUESTIONED, m):
+            return False
+        factor = min(max(float(np.sqrt(test / m)), LEAST), MOST)
+        self.restate(np.where(self._questioned, factor * self.sigma, self.sigma))
+        self.factor *= factor
+        return True
+
+    def gain(self) -> float:
+        """By how much minus twice the logarithm of the likelihood of the data falls where the sigmas are stated as much
+        larger as is likely best."""
+        found, unseen = self._found()
+        variance = np.square(BANK)[:, None] + unseen
+        cost = (found**2 / variance + np.log(variance)).sum(axis=1)
+        return float(cost[0] - cost.min())
+
+    def _found(self) -> tuple[Array, Array]:
+        """What the observations alone say of independent combinations (m,) of those that are questioned, in units of
+        their a-priori sigmas, and its variances."""
         which = self._questioned
         value, Q = self.values()
         scale = self.sigma[which]
         value, left = value[which] / scale, np.eye(len(scale)) - Q[np.ix_(which, which)] / np.outer(scale, scale)
         share, vectors = np.linalg.eigh(left)
         seen = share > LEAST_SEEN
-        test, m = float(((vectors.T @ value)[seen] ** 2 / share[seen]).sum()), int(seen.sum())
-        test /= variance
-        if not m or test <= chi2.isf(QUESTIONED, m):
-            return False
-        factor = min(max(float(np.sqrt(test / m)), LEAST), MOST)
-        self.restate(np.where(which, factor * self.sigma, self.sigma))
-        self.factor *= factor
-        return True
+        return (vectors.T @ value)[seen] / share[seen], 1.0 / share[seen] - 1.0
 
     def worst(self, camera: LineCamera) -> Displacement:
         """Where looks are most certainly off, by what is known of the parameters."""
