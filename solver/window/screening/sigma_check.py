@@ -211,8 +211,9 @@ class SigmaCheck:
             return  # few looks do not tell noise from anything else
         variance = max(self._network.sigmas.disagreement**2, self._median_ratio(), 1.0)
         for _ in range(MOST_ROUNDS_OF_CAMERA):
-            if self._constants_instead(strip) or not calibration.question(variance):
+            if not calibration.is_contradicted(variance) or self._constants_instead(strip):
                 break
+            calibration.state_larger(variance)
             self._network.state.solve()
 
     def _constants_instead(self, strip: WindowStrip) -> bool:

@@ -45,25 +45,30 @@ class LiveCalibration(KnownBeforehand):
         """Whether sigmas may be stated larger."""
         return bool(self._questioned.any())
 
-    def question(self, variance: float) -> bool:
-        """State sigmas larger that the solution contradicts as a whole; whether it does.
+    def is_contradicted(self, variance: float) -> bool:
+        """Whether the solution contradicts the sigmas as a whole.
 
         A lens, or the place of a CCD line, that is not as calibrated is in many parameters, which are correlated: so
-        they are questioned together. What was known of them less what the solution knows is the covariance of its
-        values.
+        they are questioned together.
 
         Parameters
         ----------
         variance : of looks, as they disagree, over that of right sigmas; 1 at least
         """
-        found, unseen = self._found()
-        test, m = float((found**2 / (1.0 + unseen)).sum()) / variance, len(found)
-        if not m or test <= chi2.isf(QUESTIONED, m):
-            return False
+        test, m = self._test(variance)
+        return m > 0 and bool(test > chi2.isf(QUESTIONED, m))
+
+    def state_larger(self, variance: float) -> None:
+        """State the sigmas as much larger as the solution asks for; they are contradicted."""
+        test, m = self._test(variance)
         factor = min(max(float(np.sqrt(test / m)), LEAST), MOST)
         self.restate(np.where(self._questioned, factor * self.sigma, self.sigma))
         self.factor *= factor
-        return True
+
+    def _test(self, variance: float) -> tuple[float, int]:
+        """Chi-square value of what has been found, and its degrees of freedom."""
+        found, unseen = self._found()
+        return float((found**2 / (1.0 + unseen)).sum()) / variance, len(found)
 
     def gain(self) -> float:
         """By how much minus twice the logarithm of the likelihood of the data falls where the sigmas are stated as much

@@ -9,7 +9,7 @@ import pytest
 from places import MOTION, needs_motion
 
 from triline.nodes.cli import main
-from triline.nodes.cli.misspecified_nodes import answer_of, processed
+from triline.nodes.cli.misspecified_nodes import answer_of, processed, through_nodes
 from triline.nodes.report.evaluation import evaluate
 from triline.nodes.report.flight import collect
 from triline.nodes.report.source import messages_of
@@ -160,3 +160,12 @@ def test_what_was_taken_back_is_not_refused():
         Refusal("GCP1", NO_LOOK, "contradicts", coordinate="X"),
     ]  # fmt: skip
     assert still_refused(refusals) == {("T2", "S1", "F", ""), ("GCP1", "", "", "X")}
+
+
+def test_a_boresight_is_not_taken_for_the_camera():
+    """It was in this flight, 380 times worse than calibrated, and its points were 0.26 m off."""
+    plan = FlightPlan(strip_s=60.0, turns=False, gap_s=8.0, lead_in_s=5.0, lead_out_s=3.0)
+    simulation = simulate(plan, 4, SETTINGS["rtk"], OBSERVED, world=ROWS["boresight"].world)
+    answer = through_nodes(simulation, [])
+    assert not any("calibration of the camera" in event for event in answer.events)
+    assert online_quality(simulation, answer, np.zeros(3)).points_m < 0.2
