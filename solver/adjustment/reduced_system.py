@@ -113,14 +113,15 @@ class DenseFactor:
         """Block (m, m) of the cofactor matrix."""
         return self.inverse()[np.ix_(columns, columns)]
 
-    def few_cofactors(self, columns: IntArray) -> Array:
-        """Block (m, m) of the cofactor matrix for few columns, ``(L^-1 E)^T (L^-1 E)``, without all of it."""
-        if self._factor is None or self._inverse is not None:
-            return self.cofactors(columns)
-        unit = np.zeros((len(self.scale), len(columns)), order="F")
-        unit[columns, np.arange(len(columns))] = self.scale[columns]
-        Y = solve_triangular(self._factor, unit, lower=True, overwrite_b=True, check_finite=False)
-        return Y.T @ Y
+    def last_cofactors(self, first: int) -> Array:
+        """Block (n - first, n - first) of the cofactor matrix, of the unknowns from one on: ``(L L^T)^-1`` with what
+        stands there of L."""
+        if self._factor is None or self._inverse is not None or not first:
+            return self.inverse()[first:, first:]
+        block, scale = inverse_of(self._factor[first:, first:]), self.scale[first:]
+        block *= scale[:, None]
+        block *= scale
+        return block
 
     def variances(self) -> Array:
         """(n,) diagonal of the cofactor matrix."""

@@ -128,7 +128,7 @@ class Wander(CorrectionModel):
         self._observations = self._stated()
 
     def design(self, time_s: ArrayLike) -> Design:
-        return self._design(*self._located(time_s))
+        return self._design(*self._located(time_s))[0]
 
     def left_out_variance(self, time_s: ArrayLike) -> Array:
         """Variance (n, 6) of what the wander does between borders beyond the interpolation, m^2 and rad^2."""
@@ -136,7 +136,8 @@ class Wander(CorrectionModel):
 
     def design_and_left_out(self, time_s: ArrayLike) -> tuple[Design, Array]:
         located = self._located(time_s)
-        return self._design(*located), self._left_out(*located[1:])
+        design, between = self._design(*located)
+        return design, self._left_out(*located[1:], between if self._as_stated else None)
 
     def _located(self, time_s: ArrayLike) -> tuple[Array, IntArray, IntArray, Array]:
         """Times (n,); for each group of `_alike` the borders in use around them, (n, g) each, and the time (n, g) since
@@ -149,9 +150,10 @@ class Wander(CorrectionModel):
         inside = np.minimum(np.maximum(t[:, None] - self.borders[begin], 0.0), self.step_s * (end - begin))
         return t, begin, end, inside
 
-    def _design(self, t: Array, begin: IntArray, end: IntArray, inside: Array) -> Design:
+    def _design(self, t: Array, begin: IntArray, end: IntArray, inside: Array) -> tuple[Design, Array]:
+        """The design, and the variance (n, g) of what is left out of wanders as stated for sigma 1."""
         n, groups = begin.shape
-        _, part = self._between(inside, self.options.slow.wander_times_s[self._first], end - begin)
+        variance, part = self._between(inside, self.options.slow.wander_times_s[self._first], end - begin)
         coefficients = np.empty((n, 2 + 4 * groups))
         coefficients[:, 0] = 1.0
         coefficients[:, 1] = (t - self.extent.start_s) / (self.extent.end_s - self.extent.start_s)
@@ -159,10 +161,11 @@ class Wander(CorrectionModel):
         border = np.zeros((n, 2 + 4 * groups, 1), dtype=np.int32)
         border[:, 2::4, 0] = border[:, 3::4, 0] = begin
         border[:, 4::4, 0] = border[:, 5::4, 0] = end
-        return Design(np.where(self._column >= 0, self._column + 12 * border, np.int32(-1)), coefficients)
+        return Design(np.where(self._column >= 0, self._column + 12 * border, np.int32(-1)), coefficients), variance
 
-    def _left_out(self, begin: IntArray, end: IntArray, inside: Array) -> Array:
-        variance, _ = self._between(inside, self._time_s[end, self._first], end - begin)
+    def _left_out(self, begin: IntArray, end: IntArray, inside: Array, variance: Array | None = None) -> Array:
+        if variance is None:
+            variance, _ = self._between(inside, self._time_s[end, self._first], end - begin)
         part = inside / (self.step_s * (end - begin))
         jump = np.minimum(np.maximum(part * (1.0 - part), 0.0), 0.25)  # where a wander becomes another is unknown
         g, components = self._group, np.arange(6)
@@ -234,6 +237,7 @@ class Wander(CorrectionModel):
         alike = self._alike()
         self._first = np.array([components[0] for components in alike])
         self._use = [self.used[component] for component in self._first]
+        self._as_stated = bool((self._time_s == self.options.slow.wander_times_s).all())
         self._group = np.empty(6, dtype=np.int64)
         # (k, 6) columns of a time's coefficients, of its two borders as if both were the first one
         self._column = np.full((2 + 4 * len(alike), 6), -1, dtype=np.int32)

@@ -92,7 +92,7 @@ class Leaving:
     def _older_than(self, limits: list[float]) -> list[Batch]:
         """Batches with rays older than the limit of one of their strips."""
         latest = max(limits, default=-np.inf)
-        old = [b for b in self._network.batches if b.oldest_s <= latest]
+        old = self._network.batches.older_than(latest)
         return [b for b in old if b.oldest_s <= max(limits[i] for i in b.strips)]
 
     def _last_test(self, leaving: list[Batch], update: Update) -> None:
@@ -154,7 +154,7 @@ class Leaving:
         """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
             return limit_s
-        old = [b for b in self._network.batches if b.oldest_s <= limit_s]
+        old = self._network.batches.older_than(limit_s)
         return _until(old, max(LEAST_LEAVING, sum([len(b.rays) for b in old]) * passed_s / LEAVING_S), limit_s)
 
     def _marginalise(self, numbers: IntArray, final: LeftOrientation | None = None) -> None:
@@ -182,7 +182,7 @@ class Leaving:
         if not np.isfinite(limit_s) and limit_s < 0:
             return
         self._network.intake.forget(limit_s - length_s)
-        used = min([b.oldest_s for b in self._network.batches], default=np.inf)
+        used = self._network.batches.oldest_s
         waiting = self._network.intake.oldest_waiting_s
         finals = min(
             (s.final_to_s for s in self._network.strips.values() if not s.is_gone(self._network.state)), default=np.inf

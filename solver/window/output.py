@@ -201,20 +201,21 @@ def parameters(network: LiveNetwork, strip: WindowStrip, standing: Sequence[Stan
         return ()
     covariance = state.covariance(numbers)
     sigma = np.sqrt(np.diagonal(covariance))
-    correlation = (covariance / np.outer(sigma, sigma)).clip(-1.0, 1.0)
+    correlation = covariance / (sigma[:, None] * sigma)
     np.fill_diagonal(correlation, 0.0)
-    strongest = np.argmax(np.abs(correlation), axis=1).tolist()
+    strongest = np.abs(correlation).argmax(axis=1)
+    strongest_r = correlation[np.arange(len(names)), strongest].clip(-1.0, 1.0).tolist()
+    partners = strongest.tolist()
     values = state.values(numbers)
     of_strip = len(names) - len(camera_columns)
     weighed = len(names) if self_calibration is not None and self_calibration.as_calibrated else of_strip
-    result = []
-    strongest_r = correlation[np.arange(len(names)), strongest].tolist()
+    result, before = [], apriori.tolist()
     for i, ((name, unit, _), v, s) in enumerate(zip(names, values.tolist(), sigma.tolist(), strict=True)):
-        known = Standing(ESTIMATED, "")
+        status, reason = ESTIMATED, ""
         if i >= of_strip and standing:
-            known = standing[i - of_strip]
-        elif i < weighed and s > BETTER * apriori[i]:
-            known = Standing(NOT_YET, f"its sigma is {s / max(apriori[i], 1e-300):.2f} of the a-priori one")
-        partner = names[strongest[i]][0] if strongest_r[i] else ""
-        result.append(Parameter(name, unit, v, s, known.status, known.reason, strongest_r[i], partner))
+            status, reason = standing[i - of_strip].status, standing[i - of_strip].reason
+        elif i < weighed and s > BETTER * before[i]:
+            status, reason = NOT_YET, f"its sigma is {s / max(before[i], 1e-300):.2f} of the a-priori one"
+        partner = names[partners[i]][0] if strongest_r[i] else ""
+        result.append(Parameter(name, unit, v, s, status, reason, strongest_r[i], partner))
     return tuple(result)

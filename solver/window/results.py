@@ -173,8 +173,7 @@ class AdjustedPoint(NamedTuple):
     whole: bool = False
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(NamedTuple):
     """A parameter of the present strip or of the camera; status "estimated" or "not yet determined", and why.
 
     ``correlation`` is the strongest one with another of these parameters, ``partner`` that one's name.

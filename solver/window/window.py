@@ -244,6 +244,8 @@ class Window:
             self._relinearisation.look_after(self._now_s)
         iterations = self._solve(fresh) + self._weigh_surface(fresh + joined, RETEST in duties, result)
         if self.options.snoop:
+            # what leaves is tested once more in this update
+            self.state.expect([batch.columns for batch in self.network.batches.older_than(self._limit_s())])
             iterations += self._question_sigmas(QUESTION in duties, result)
             due = joined or (self._due_for_test() if RETEST in duties else [])
             iterations += self._screen(fresh, fresh + due, result)

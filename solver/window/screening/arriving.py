@@ -59,7 +59,7 @@ class Arrivals:
                 intake.place(name, batch)
             drop_weak(batch)
         if self._snoop:
-            network.state.expect(sum(len(batch.columns) for batch in fresh))
+            network.state.expect([batch.columns for batch in fresh])
             equations = [EntryEquations.of(batch, network.state) for batch in fresh]
             for of_batch in equations:
                 self._check.entered(disagreement(of_batch))

@@ -68,7 +68,8 @@ class ConsensusSchedule:
         if step == np.inf and count < asked:  # points that were counted have left
             asked = max(count, YOUNG[-1])
         due = count >= step or refused > before
-        if not due and count < asked + RECENT:
+        few_lost = batches.counts.lost <= REFUSED_SHARE * RECENT
+        if not due and (few_lost or count < asked + RECENT):
             self.asked[strip], self.refused[strip] = asked, refused
             return []
         mine = [batch for batch in batches if strip in batch.strips]

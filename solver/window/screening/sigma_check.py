@@ -181,7 +181,7 @@ class SigmaCheck:
         if strip is None or not len(network.batches):
             return False, False
         network.state.solve()
-        network.state.expect(len(network.state))
+        network.state.expect([network.state.numbers])
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
         self._question_camera(strip)

@@ -133,7 +133,7 @@ def snoop(batches: list[Batch], network: LiveNetwork, control: ControlTests, blo
         state.solve()
     pending, weighed = batches, False
     for _ in range(ROUNDS_OF_UPDATE):
-        state.expect(sum(len(batch.columns) for batch in pending))
+        state.expect([batch.columns for batch in pending])
         tested = [_Tested(batch, state, critical, network.sigmas.disagreement) for batch in pending]
         worst = max((float(t.w[t.used].max(initial=0.0)) for t in tested), default=0.0)
         if max((t.control_w for t in tested), default=0.0) > max(critical, worst) and not weighed:

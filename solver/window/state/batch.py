@@ -103,6 +103,7 @@ class Counts(NamedTuple):
     determined : object coordinates
     rays, control : with weight; of control whole points
     points : with or without any
+    lost : points no ray of which has weight
     """
 
     redundancy: int
@@ -110,6 +111,7 @@ class Counts(NamedTuple):
     rays: int
     control: int
     points: int
+    lost: int
 
 
 @dataclass
@@ -258,7 +260,8 @@ class Batch:
             rows += int(self.ties.observations[tied.active].sum())
         self.normals, self.information = normals, Information(matrix, rhs, square, rows)
         control = int(np.count_nonzero(self.control.weight.any(axis=1)))
-        self.counts = Counts(rows, determined, active_rays, control, p)
+        lost = 0 if active_rays == n else int((self.points_left == 0).sum())
+        self.counts = Counts(rows, determined, active_rays, control, p, lost)
         self.judged = self._without_points = None
         self._rows, self.coupling = A, D
 

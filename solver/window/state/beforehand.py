@@ -26,6 +26,7 @@ class KnownBeforehand:
         m = len(sigma)
         self.numbers: IntArray = state.new_numbers(m)
         self._equations = self.numbers[:, None].astype(np.int32), np.ones((m, 1)), np.zeros(m)
+        state.last(self.numbers)
         if m:
             state.enter(self.numbers)
             state.observe(*self._equations, sigma)

@@ -20,6 +20,8 @@ from .points import PointLooks
 
 _NO_PRIOR = PseudoObservations(np.empty((0, 1), np.int32), np.empty((0, 1)), np.empty(0), np.empty(0), ())
 
+_DIAGONAL = np.eye(6)
+
 #: Rounds in which the known point nearest to where a ray meets the ground is looked for.
 NEAREST = 3
 
@@ -40,7 +42,10 @@ class BatchMaker:
     network: LiveNetwork
 
     def rays(self, points: list[PointLooks]) -> tuple[Rays, Array, Array, MeasuredPoses]:
-        """Rays of points, the white noise (n, 6, 6) of their orientation, weights (n,), and the orientation itself."""
+        """Rays of points, the white noise (n, 6, 6) of their orientation, weights (n,), and the orientation itself.
+
+        To the noise belongs what the model leaves out, which is added where its design is looked up.
+        """
         place = {id: i for i, id in enumerate(self.network.strips)}
         line_index = self.network.camera.line_index
         rows = []
@@ -56,7 +61,8 @@ class BatchMaker:
         line, sample, sigma_line, sigma_sample, time, weight = table[:, 4:].T
         xy, pitch = self.network.camera.image_coordinates(ccd, sample)
         period = np.array([1.0 / s.line_rate_hz for s in self.network.strips.values()])[strip]
-        measured, covariance = self._measured(time, strip)
+        measured = self.network.trajectory.at(time)
+        covariance = self.network.pose_noise.of_rays(measured)
         poses, focal = measured.poses, self.network.camera.focal_length_mm[ccd]
         sigma_line, sigma_sample = sigma_line * self.network.sigmas.image, sigma_sample * self.network.sigmas.image
         rays = Rays(
@@ -72,7 +78,7 @@ class BatchMaker:
         ids = list(self.network.strips)
         for i, mine in _by_strip(strip):
             extra = self.network.strips[ids[i]].model.left_out_variance(time_s[mine])
-            covariance[mine] += extra[:, :, None] * np.eye(6)
+            covariance[mine] += extra[:, :, None] * _DIAGONAL
         return measured, covariance
 
     def make(self, draft: Draft, known: dict[str, Array]) -> Batch | None:
@@ -117,15 +123,18 @@ class BatchMaker:
         ids = list(self.network.strips)
         parts = []
         for i, mine in _by_strip(rays.strip):
-            poses = measured.poses.part(mine)
-            parts.append((mine, self.network.strips[ids[i]].design(rays.time_s[mine], poses)))
+            strip, poses = self.network.strips[ids[i]], measured.poses.part(mine)
+            of_strip, extra = strip.design_and_left_out(rays.time_s[mine], poses)
+            covariance[mine] += extra[:, :, None] * _DIAGONAL
+            parts.append((mine, of_strip))
         design = join_designs(parts, len(rays))
         made, point = [], 0
         for draft in drafts:
             low, high = np.searchsorted(rays.point, (point, point + len(draft.names))).tolist()
             part = slice(low, high)
             own = rays.part(part)
-            own = replace(own, point=own.point - point)
+            if point:
+                own = replace(own, point=own.point - point)
             columns = Design(design.columns[part], design.coefficients[part])
             provisional = not bool(measured.smoothed[part].all())
             made.append(self._batch(draft, known, own, columns, covariance[part], weight[part], provisional))

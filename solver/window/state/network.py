@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Iterator, KeysView
+from operator import itemgetter
 
 import numpy as np
 
@@ -39,7 +41,10 @@ class Batches:
     def __init__(self, state: WindowState) -> None:
         self._state = state
         self._by_id: dict[int, Batch] = {}
-        self._counts, self._points = Counts(0, 0, 0, 0, 0), Counter[int]()
+        self._counts, self._points = Counts(0, 0, 0, 0, 0, 0), Counter[int]()
+        self._by_age: list[tuple[float, int, Batch]] = []  # time of the oldest ray, and which came first
+        self._place: dict[int, int] = {}  # in the order in which they came
+        self._came = 0
         self._with_control: dict[int, Batch] = {}
         self._provisional: dict[int, Batch] = {}
         self.gone = 0
@@ -75,9 +80,22 @@ class Batches:
         self._provisional = {key: batch for key, batch in self._provisional.items() if batch.provisional}
         return list(self._provisional.values())
 
+    @property
+    def oldest_s(self) -> float:
+        """Time of the oldest ray; infinite without any."""
+        return self._by_age[0][0] if self._by_age else float("inf")
+
+    def older_than(self, time_s: float) -> list[Batch]:
+        """Those with a ray that is not newer than this, in the order in which they came."""
+        old = self._by_age[: bisect_right(self._by_age, time_s, key=itemgetter(0))]
+        return [batch for *_, batch in sorted(old, key=itemgetter(1))]
+
     def enter(self, batch: Batch) -> None:
         """A batch comes."""
         self._by_id[id(batch)] = batch
+        self._came += 1
+        self._place[id(batch)] = self._came
+        insort(self._by_age, (batch.oldest_s, self._came, batch))
         self._points.update(dict.fromkeys(batch.strips, batch.n_points))
         self._count(batch, batch.counts, 1)
         if batch.provisional:
@@ -96,6 +114,7 @@ class Batches:
 
     def _forget(self, batch: Batch) -> None:
         del self._by_id[id(batch)]
+        del self._by_age[bisect_left(self._by_age, (batch.oldest_s, self._place.pop(id(batch))))]
         self.gone += 1
         self._points.subtract(dict.fromkeys(batch.strips, batch.n_points))
         self._count(batch, batch.counts, -1)

@@ -122,6 +122,8 @@ class WindowStrip:
         self._step_s = segment_length(slow, options)
         self._over = False
         self._look_up_uses()
+        always = (self._first_use <= start_s) & (self._last_use >= self.model.extent.end_s)
+        state.last(self.numbers[always])
 
     def restate(self, from_s: float, slow: SlowErrors, another: bool = False) -> float:
         """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""

@@ -22,6 +22,7 @@ class LiveSurface:
         self.control, self._state = control, state
         self.numbers = state.new_numbers(0 if control is None else 1)
         self.free = False
+        state.last(self.numbers)
         if control is not None:
             state.enter(self.numbers)
             state.observe(self._columns, np.ones((1, 1)), np.zeros(1), self.sigma)

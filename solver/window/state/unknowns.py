@@ -181,7 +181,7 @@ class WindowState:
 
     Attributes
     ----------
-    numbers : (n,) unknowns present, in the order of the matrices
+    numbers : (n,) unknowns present, in the order of the matrices: as they came, the lasting ones after all others
     theta : (n,) values
     square : cost of everything so far at theta = 0 of the present unknowns
     redundancy : observations so far less unknowns so far
@@ -198,9 +198,10 @@ class WindowState:
         self._fixed_rhs, self._live_rhs = np.empty(0), np.empty(0)
         self.square = 0.0
         self.redundancy = 0
+        self._lasting = np.zeros(256, dtype=bool)
         self._factor: DenseFactor | None = None
         self._cofactors: Array | None = None
-        self._asked = 0
+        self._expected: list[IntArray] = []
         self._solved = True
         self.solution = self.changes = 0
 
@@ -213,7 +214,12 @@ class WindowState:
         self._next += n
         if self._next > len(self._place):
             self._place = np.concatenate([self._place, np.full(self._next, -1, dtype=np.int64)])
+            self._lasting = np.concatenate([self._lasting, np.zeros(self._next, dtype=bool)])
         return numbers
+
+    def last(self, numbers: IntArray) -> None:
+        """Looks of all times touch these unknowns, not those of a time only, as long as they are present."""
+        self._lasting[numbers] = True
 
     def _present(self, numbers: IntArray) -> IntArray:
         """Places of unknowns that must be present.
@@ -234,17 +240,21 @@ class WindowState:
     def values(self, numbers: ArrayLike) -> Array:
         """Values of unknowns; 0 for those that are not present."""
         place = self.places(numbers)
-        return np.where(place >= 0, np.append(self.theta, 0.0)[place], 0.0)
+        absent = place < 0
+        if not absent.any():
+            return self.theta.take(place)
+        return np.where(absent, 0.0, np.append(self.theta, 0.0)[place])
 
     def enter(self, numbers: IntArray) -> None:
-        """Make unknowns present; until observed they have no information."""
-        n = len(self.numbers)
-        self._place[numbers] = n + np.arange(len(numbers))
-        self.numbers = np.concatenate([self.numbers, numbers])
+        """Make unknowns present, before the lasting ones; until observed they have no information."""
         m = len(numbers)
-        self.theta = np.concatenate([self.theta, np.zeros(m)])
-        self._fixed, self._live = (np.pad(a, ((0, m), (0, m))) for a in (self._fixed, self._live))
-        self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m)) for a in (self._fixed_rhs, self._live_rhs))
+        both = np.concatenate([self.numbers, numbers])
+        order = np.argsort(self._lasting[both], kind="stable")
+        self.numbers = both[order]
+        self._place[self.numbers] = np.arange(len(order))
+        self.theta = np.pad(self.theta, (0, m))[order]
+        self._fixed, self._live = (block_of(np.pad(a, ((0, m), (0, m))), order) for a in (self._fixed, self._live))
+        self._fixed_rhs, self._live_rhs = (np.pad(a, (0, m))[order] for a in (self._fixed_rhs, self._live_rhs))
         self.redundancy -= m
         self._changed()
 
@@ -283,29 +293,30 @@ class WindowState:
         Where there are as many as unknowns, these follow from what is known of the others: values and cofactors of
         those stay what they are, and there is nothing to solve.
         """
-        solved, cofactors, n = self._solved, self._cofactors, len(self)
+        solved, before, cofactors = self._solved, self.numbers, self._cofactors
         self.enter(numbers)
         places, rows, rhs = self._rows(columns, coefficients, value, sigma)
         self._observe(places, rows, rhs)
-        old, new = np.flatnonzero(places < n), np.flatnonzero(places >= n)
-        if not solved or not len(rows) == len(new) == len(numbers):
+        new = np.isin(self.numbers[places], numbers)
+        own, others = rows[:, new], rows[:, ~new]
+        if not solved or not len(own) == own.shape[1] == len(numbers):
             return
-        own = np.empty((len(new), len(new)))
-        own[:, places[new] - n] = rows[:, new]
+        old, new = places[~new], places[new]
         try:
-            given = np.linalg.solve(own, np.column_stack([-rows[:, old], rhs, np.eye(len(own))]))
+            given = np.linalg.solve(own, np.column_stack([rhs, -others, np.eye(len(own))]))
         except np.linalg.LinAlgError:
             return
-        m, places = len(old), places[old]
-        self.theta[n:] = given[:, :m] @ self.theta[places] + given[:, m]
+        through, noise = given[:, 1 : 1 + len(old)], given[:, 1 + len(old) :]
+        self.theta[new] = given[:, 0] + through @ self.theta[old]
         self._solved = True
-        if cofactors is not None:
-            through = cofactors[:, places] @ given[:, :m].T
-            noise = given[:, m + 1 :]
-            self._cofactors = np.empty((len(self), len(self)))
-            self._cofactors[:n, :n] = cofactors
-            self._cofactors[:n, n:], self._cofactors[n:, :n] = through, through.T
-            self._cofactors[n:, n:] = given[:, :m] @ through[places] + noise @ noise.T
+        if cofactors is None or (m := len(before) - len(cofactors)) > old.min(initial=m):
+            return
+        there, old, new = self.places(before[m:]) - m, old - m, new - m
+        known = self._cofactors = np.empty((len(self) - m, len(self) - m))
+        known[there[:, None], there] = cofactors
+        known[new[:, None], there] = through @ known[old[:, None], there]
+        known[there[:, None], new] = known[new[:, None], there].T
+        known[new[:, None], new] = known[new[:, None], old] @ through.T + noise @ noise.T
 
     def _rows(
         self, columns: NDArray[np.int32], coefficients: Array, value: Array, sigma: Array
@@ -330,7 +341,7 @@ class WindowState:
     def _changed(self) -> None:
         """Something else is known."""
         self._factor = self._cofactors = None
-        self._solved, self._asked = False, 0
+        self._solved, self._expected = False, []
         self.changes += 1
 
     def add(self, columns: IntArray, information: Information, sign: int = 1) -> None:
@@ -419,25 +430,29 @@ class WindowState:
         """Weighted squares of everything so far, at the present solution."""
         return max(self.square - float((self._fixed_rhs + self._live_rhs) @ self.theta), 0.0)
 
-    def expect(self, numbers: int) -> None:
-        """Cofactors of so many unknowns, not all of them different, will be asked for."""
-        self._asked += numbers
+    def expect(self, numbers: Iterable[IntArray]) -> None:
+        """Cofactors of these unknowns, all of them present, will be asked for."""
+        self._expected += numbers
 
     def covariance(self, numbers: IntArray) -> Array:
-        """Cofactors (m, m) of present unknowns."""
-        place = self.places(numbers)
-        if self._cofactors is None:
-            factor = self.factor
-            # the whole inverse costs as much as the columns of a third of it
-            self._asked += len(place)
-            if 3 * self._asked <= len(self):
-                return factor.few_cofactors(place)
-            self._cofactors = factor.inverse()
-        return block_of(self._cofactors, place)
+        """Cofactors (m, m) of present unknowns.
+
+        Mostly those of the newest times and lasting ones are asked for. They stand last, so that theirs follow from a
+        small part of the factor.
+        """
+        n, place = len(self), self.places(numbers)
+        first = int(place.min(initial=n))
+        if self._cofactors is None or n - len(self._cofactors) > first:
+            for expected in self._expected:
+                first = min(first, int(self.places(expected).min(initial=n)))
+            self._expected = []
+            self._cofactors = self.factor.last_cofactors(max(first, 0))
+        return block_of(self._cofactors, place - (n - len(self._cofactors)))
 
     def propagated(self, functions: Array) -> Array:
         """Cofactors (n, k) between all unknowns and functions (n, k) of them."""
-        return self.factor.solve(functions) if self._cofactors is None else self._cofactors @ functions
+        known = self._cofactors
+        return known @ functions if known is not None and len(known) == len(self) else self.factor.solve(functions)
 
     def marginalise(self, numbers: IntArray) -> Marginal:
         """Take unknowns out; batches that touch them must have been fixed before.
@@ -465,10 +480,11 @@ class WindowState:
         self._place[self.numbers[gone]] = -1
         self.numbers, self.theta = self.numbers[stay], self.theta[stay]
         self._place[self.numbers] = np.arange(len(stay))
-        # of what stays, the cofactors are what they were
-        self._factor, self._asked = None, 0
+        self._factor, self._expected = None, []
         self.changes += 1
-        self._cofactors = None if self._cofactors is None else block_of(self._cofactors, stay)
+        if self._cofactors is not None:  # of what stays, they are what they were
+            m = len(self) + len(gone) - len(self._cofactors)
+            self._cofactors = block_of(self._cofactors, stay[stay >= m] - m)
         return marginal
 
 

@@ -17,26 +17,60 @@ from triline.solver.window.state.unknowns import WindowState
 from triline.solver.window.window import Window
 
 
-def test_cofactors_of_few_unknowns() -> None:
+def test_cofactors_of_the_last_unknowns() -> None:
     rng = np.random.default_rng(1)
     A = rng.normal(size=(60, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
-    columns = np.array([3, 38, 0, 17])
-    wanted = np.linalg.inv(A.T @ A)[np.ix_(columns, columns)]
+    wanted = np.linalg.inv(A.T @ A)[25:, 25:]
     factor = DenseFactor(A.T @ A)
-    few = factor.few_cofactors(columns)
+    last = factor.last_cofactors(25)
     scale = np.sqrt(np.diagonal(wanted))
-    np.testing.assert_allclose(few / scale / scale[:, None], wanted / scale / scale[:, None], atol=1e-9)
+    np.testing.assert_allclose(last / scale / scale[:, None], wanted / scale / scale[:, None], atol=1e-9)
     factor.inverse()
-    np.testing.assert_allclose(factor.few_cofactors(columns), few, rtol=1e-9, atol=1e-12 * np.abs(few).max())
+    np.testing.assert_allclose(factor.last_cofactors(25), last, rtol=1e-9, atol=1e-12 * np.abs(last).max())
 
 
-def test_cofactors_of_few_unknowns_of_a_singular_matrix() -> None:
+def test_cofactors_of_the_last_unknowns_of_a_singular_matrix() -> None:
     rng = np.random.default_rng(2)
     A = rng.normal(size=(30, 5)) @ rng.normal(size=(5, 8))
     factor = DenseFactor(A.T @ A)
-    columns = np.array([1, 6])
-    np.testing.assert_allclose(factor.few_cofactors(columns), factor.inverse()[np.ix_(columns, columns)])
+    np.testing.assert_allclose(factor.last_cofactors(5), factor.inverse()[5:, 5:])
     assert len(factor.undetermined.eigenvalues) == 3
+
+
+def test_lasting_unknowns_stand_last_and_cofactors_are_those_of_the_whole_inverse() -> None:
+    rng, state = np.random.default_rng(5), WindowState()
+    lasting, other = state.new_numbers(2), [state.new_numbers(4) for _ in range(3)]
+    state.last(lasting)
+    state.enter(lasting)
+    for numbers in other:
+        state.enter(numbers)
+        columns = np.concatenate([numbers, lasting])
+        rows = rng.normal(size=(9, 6))
+        state.observe(np.tile(columns, (9, 1)).astype(np.int32), rows, rng.normal(size=9), np.ones(9))
+    assert state.numbers.tolist() == [*np.concatenate(other), *lasting]
+    state.solve()
+    matrix, rhs = state.normal()
+    Q = np.linalg.inv(matrix)
+    np.testing.assert_allclose(state.theta, Q @ rhs)
+    for numbers in (np.append(other[2], lasting[1]), other[1], np.append(lasting, other[0]), lasting[:0]):
+        places = state.places(numbers)
+        np.testing.assert_allclose(state.covariance(numbers), Q[np.ix_(places, places)], atol=1e-12)
+    more = state.new_numbers(2)
+    columns = np.stack([more, other[2][:2], lasting], axis=1).astype(np.int32)
+    state.covariance(other[2])
+    state.extend(more, columns, rng.normal(size=(2, 3)), np.ones(2), np.array([0.5, 2.0]))
+    assert state.numbers.tolist() == [*np.concatenate(other), *more, *lasting]
+    Q, solution = np.linalg.inv(state.normal()[0]), state.solution
+    state.solve()
+    assert state.solution == solution  # nothing to solve
+    np.testing.assert_allclose(state.theta, Q @ state.normal()[1])
+    np.testing.assert_allclose(state.covariance(more), Q[12:14, 12:14], atol=1e-12)
+    np.testing.assert_allclose(state.covariance(state.numbers[8:]), Q[8:, 8:], atol=1e-12)
+    left = state.marginalise(other[0])
+    assert left.stayed.tolist() == state.numbers.tolist() == [*other[1], *other[2], *more, *lasting]
+    places = np.r_[4:16]
+    np.testing.assert_allclose(state.covariance(more), Q[12:14, 12:14], atol=1e-12)
+    np.testing.assert_allclose(state.covariance(state.numbers), Q[np.ix_(places, places)], atol=1e-12)
 
 
 def test_values_and_cofactors_if_others_were_held() -> None:
