@@ -6,6 +6,7 @@ value. Arguments broadcast; degrees of freedom are positive.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -87,3 +88,9 @@ class fisher:
     def ppf(q: ArrayLike, dfn: ArrayLike, dfd: ArrayLike) -> Any:
         """Value that is exceeded with probability ``1 - q``."""
         return special.fdtri(dfn, dfd, q)
+
+
+@lru_cache
+def median_square(redundancy: int) -> float:
+    """Median of a sum of so many squares of standard normal values."""
+    return float(chi2.median(redundancy))

@@ -35,6 +35,7 @@ from .quality.quality_control import QualityControl
 from .results import Look, RefinedOrientation, WindowOptions
 from .screening.arriving import Arrivals, look_time
 from .screening.consensus import ConsensusSchedule, consensus_weights
+from .screening.disagreement import Disagreement
 from .screening.sigma_check import SigmaCheck
 from .screening.snooping import reweigh, snoop
 from .state.batch import Batch
@@ -137,8 +138,9 @@ class Window:
         self.trajectory, self.state, self.strips = network.trajectory, network.state, network.strips
         self._block = Block(network)
         step_s = segment_length(slow, options)
-        self._sigma_check = SigmaCheck(network, constants=options.datum == "control")
-        self._arrivals = Arrivals(network, self._block, self._sigma_check, step_s, options.snoop)
+        self._disagreement = Disagreement(network.sigmas)
+        self._sigma_check = SigmaCheck(network, self._disagreement, constants=options.datum == "control")
+        self._arrivals = Arrivals(network, self._block, self._disagreement, step_s, options.snoop)
         self._relinearisation = Relinearisation(network, step_s)
         self._consensus = ConsensusSchedule()
         self._sources = DriftMonitor(network, follows=options.follows_wander)
@@ -163,7 +165,7 @@ class Window:
     @property
     def in_doubt(self) -> bool:
         """Whether new looks disagree more than the sigmas say, or are too few to tell."""
-        return self.options.snoop and self._sigma_check.in_doubt
+        return self.options.snoop and self._disagreement.in_doubt
 
     def begin_strip(
         self,

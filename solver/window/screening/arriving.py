@@ -11,8 +11,8 @@ from ..results import Update
 from ..state.batch import Batch
 from ..state.maker import BatchMaker, Draft
 from ..state.network import LiveNetwork
+from .disagreement import Disagreement
 from .entry import EntryEquations, disagreement
-from .sigma_check import SigmaCheck
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, set_apart
 
@@ -26,8 +26,8 @@ class Arrivals:
     snoop : whether looks are tested before they enter
     """
 
-    def __init__(self, network: LiveNetwork, block: Block, check: SigmaCheck, step_s: float, snoop: bool) -> None:
-        self._network, self._block, self._check, self._maker = network, block, check, BatchMaker(network)
+    def __init__(self, network: LiveNetwork, block: Block, newest: Disagreement, step_s: float, snoop: bool) -> None:
+        self._network, self._block, self._newest, self._maker = network, block, newest, BatchMaker(network)
         self._step_s, self._snoop = step_s, snoop
 
     def take(self, update: Update) -> list[Batch]:
@@ -62,7 +62,7 @@ class Arrivals:
             network.state.expect([batch.columns for batch in fresh])
             equations = [EntryEquations.of(batch, network.state) for batch in fresh]
             for of_batch in equations:
-                self._check.entered(disagreement(of_batch))
+                self._newest.entered(disagreement(of_batch))
             for batch, of_batch in zip(fresh, equations, strict=True):
                 update.refused += admit(batch, of_batch, network)
                 set_apart(batch, contradicting(batch, network.state, ON_ENTRY), network, update)

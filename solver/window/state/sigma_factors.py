@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...models.base import ERROR_GROUPS
 
-Array = NDArray[np.floating]
+#: A factor is applied if it differs by so much from the one in force, and changes by so much at most in one look.
+CHANGED, MOST_UP, MOST_DOWN = 1.15, 3.0, 0.7
+#: No factor becomes larger.
+LARGEST = 1000.0
 
 
 @dataclass
@@ -29,3 +32,9 @@ class SigmaFactors:
     image: float = 1.0
     version: int = 0
     disagreement: float = 1.0
+
+
+def changed(factor: float, ratio: float) -> float:
+    """A factor that residuals ask to be multiplied by a ratio: itself where that makes little difference."""
+    new = min(max(factor * min(max(ratio, MOST_DOWN), MOST_UP), 1.0), LARGEST)
+    return factor if max(new / factor, factor / new) < CHANGED and new > 1.0 else new

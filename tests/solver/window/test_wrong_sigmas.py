@@ -26,16 +26,9 @@ from triline.solver.simulation.window_study import (
 )
 from triline.solver.window.quality.light import GOOD
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
-from triline.solver.window.screening.sigma_check import (
-    ENOUGH,
-    RIGHT,
-    USUAL_LOG,
-    SigmaCheck,
-    _Cost,
-    _likely,
-    _Noise,
-    _variance_of_most,
-)
+from triline.solver.window.screening.disagreement import ENOUGH, RIGHT, Disagreement, variance_of_most
+from triline.solver.window.screening.likelihood import USUAL_LOG, Likelihood, LookNoise, likely
+from triline.solver.window.screening.sigma_check import SigmaCheck
 from triline.solver.window.state.network import LiveNetwork
 from triline.solver.window.state.strip import WindowStrip
 from triline.solver.window.state.unknowns import WindowState
@@ -232,7 +225,7 @@ def test_a_wander_that_is_present_keeps_its_factor_when_that_falls():
 
 @pytest.mark.parametrize(("image", "left"), [(1.0, 5.0), (2.0, 1.0)])
 def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, monkeypatch, image, left):
-    state, check = camera_network.state, SigmaCheck(camera_network)
+    state, check = camera_network.state, SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
     strip = strip_in(state)
     stated = strip.apriori()[3]
     camera_network.strips["S1"], camera_network.sigmas.image = strip, image
@@ -245,9 +238,9 @@ def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, mo
 
 def test_a_wander_falls_where_the_other_one_was_meant(camera_network):
     """A step of the GNSS stays large; what the position was blamed for and the attitude did does not."""
-    step = SigmaCheck(camera_network)
+    step = SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
     assert [step._kept(np.array(f)) for f in ([3.0, 1.0], [4.0, 1.5], [1.0, 1.2])] == [(True, True)] * 3
-    swing = SigmaCheck(camera_network)
+    swing = SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
     assert swing._kept(np.array([4.0, 7.0])) == (True, True)
     assert swing._kept(np.array([3.0, 12.0])) == (True, True)
     assert swing._kept(np.array([2.0, 26.0])) == (False, True)
@@ -263,7 +256,7 @@ def test_the_variance_of_two_looks_is_that_of_the_good_ones(sigma, spoilt):
         value = sigma * rng.standard_normal(30)
         gross = rng.random(30) < spoilt
         value[gross] += rng.choice([-1.0, 1.0], gross.sum()) * rng.uniform(8.0, 60.0, gross.sum()) * sigma
-        found.append(_variance_of_most(value**2) / sigma**2)
+        found.append(variance_of_most(value**2) / sigma**2)
     assert 0.8 < np.median(found) < 1.15
     assert np.percentile(found, 2) > 0.3 and np.percentile(found, 98) < 2.4
 
@@ -297,7 +290,7 @@ def test_the_likelihood_of_a_factor_is_that_of_one_for_all_that_is_present():
         state.solve()
     assert np.linalg.norm(mixed.theta - as_stated.theta) > 1e-6
     expected, found = (
-        _likely(_Cost(s, of, WANDERS), (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True)
+        likely(Likelihood(s, of, WANDERS), (1.0, 1.0)) for s, of in zip(strips, (as_stated, mixed), strict=True)
     )
     assert found == pytest.approx(expected, rel=1e-6)
 
@@ -321,9 +314,9 @@ def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
     state.observe(np.tile(state.numbers, (30, 1)), J, np.ones(30), np.ones(30))
     state.solve()
     N, rhs = state.normal()
-    noise = _Noise(0.1, 1e-4, 0.3, 30, 40.0, J.T @ J, J.T @ np.ones(30))
+    noise = LookNoise(0.1, 1e-4, 0.3, 30, 40.0, J.T @ J, J.T @ np.ones(30))
     (A, A_now, a), (B, B_now, b) = (over_all(state, *strip.apriori_information(g, state)) for g in pair)
-    cost, expected = _Cost(strip, state, pair), []
+    cost, expected = Likelihood(strip, state, pair), []
     cost.noise = noise
     choices = [(1.0, 1.0, 1.0), (3.5, 1.0, 1.0), (1.0, 9.0, 1.45), (60.0, 2.3, 2.1)]
     for f, g, h in choices:
@@ -337,21 +330,21 @@ def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
 
 
 def test_costs_hold_while_nothing_changes_but_their_factors(camera_network):
-    state, check = camera_network.state, SigmaCheck(camera_network)
+    state, check = camera_network.state, SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
     strip = camera_network.strips["S1"] = strip_in(state)
     seen(strip, state)
-    cost = check._cost(strip, WANDERS)
-    assert check._cost(strip, WANDERS) is cost
+    cost = check._likelihood(strip, WANDERS)
+    assert check._likelihood(strip, WANDERS) is cost
     choices = [(1.0, 1.0, 1.0), (3.5, 9.0, 1.0)]
     before = [cost.of(*choice) for choice in choices]
     check._restate(strip, np.array([1.0, 1.0, 2.0, 5.0]))
-    assert check._cost(strip, WANDERS) is cost
-    assert [_Cost(strip, state, WANDERS).of(*choice) for choice in choices] == pytest.approx(before, rel=1e-6)
+    assert check._likelihood(strip, WANDERS) is cost
+    assert [Likelihood(strip, state, WANDERS).of(*choice) for choice in choices] == pytest.approx(before, rel=1e-6)
     check._restate(strip, np.array([2.0, 1.0, 2.0, 5.0]))  # those of another pair
-    assert check._cost(strip, WANDERS) is not cost
-    cost = check._cost(strip, WANDERS)
+    assert check._likelihood(strip, WANDERS) is not cost
+    cost = check._likelihood(strip, WANDERS)
     seen(strip, state)  # another look
-    assert check._cost(strip, WANDERS) is not cost
+    assert check._likelihood(strip, WANDERS) is not cost
 
 
 def test_residuals_and_redundancies_of_what_was_known_beforehand():
@@ -375,30 +368,30 @@ def test_groups_go_by_the_words_of_the_labels():
 
 def test_looks_that_disagree_make_tests_wider(camera_network):
     rng = np.random.default_rng(1)
-    check = SigmaCheck(camera_network)
+    newest = Disagreement(camera_network.sigmas)
     good = RIGHT * rng.chisquare(1, 100)
-    check.entered((s, 1, True) for s in good)
+    newest.entered((s, 1, True) for s in good)
     assert camera_network.sigmas.disagreement == 1.0
-    check.entered((9.0 * s, 1, True) for s in good)
+    newest.entered((9.0 * s, 1, True) for s in good)
     assert 2.2 < camera_network.sigmas.disagreement < 4.0
 
 
 def test_points_of_two_looks_tell_until_there_are_others(camera_network):
     """Of them no look can be spared: they disagree three times as much where nothing is wrong."""
     rng = np.random.default_rng(1)
-    check = SigmaCheck(camera_network)
+    newest = Disagreement(camera_network.sigmas)
     of_two = rng.chisquare(1, 40)
-    check.entered((s, 1, False) for s in of_two)
+    newest.entered((s, 1, False) for s in of_two)
     assert camera_network.sigmas.disagreement == 1.0
-    check.entered((9.0 * s, 1, False) for s in rng.chisquare(1, 60))
+    newest.entered((9.0 * s, 1, False) for s in rng.chisquare(1, 60))
     assert 2.2 < camera_network.sigmas.disagreement < 4.0
-    check.entered((RIGHT * s, 1, True) for s in rng.chisquare(1, ENOUGH))
+    newest.entered((RIGHT * s, 1, True) for s in rng.chisquare(1, ENOUGH))
     assert camera_network.sigmas.disagreement == 1.0
 
 
 def test_a_few_points_say_nothing(camera_network):
-    check = SigmaCheck(camera_network)
-    check.entered([(100.0, 3, True)] * (ENOUGH - 1))
+    newest = Disagreement(camera_network.sigmas)
+    newest.entered([(100.0, 3, True)] * (ENOUGH - 1))
     assert camera_network.sigmas.disagreement == 1.0
 
 

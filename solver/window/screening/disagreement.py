@@ -1,0 +1,83 @@
+"""Whether looks that come disagree more than the sigmas say.
+
+Each point that comes is compared with the orientation as it is known without it, and without the look that disagrees
+most. Its weighted squares over their median under the chi-square distribution have a median of about 0.3 over many
+points if all sigmas are right, also where every fifth look is a gross error. Where that of the newest points is clearly
+larger, tests of single looks are made wider by that much. A strip begins with points of two looks, of which none can be
+spared; they count until there are others.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from ...arrays import Array
+from ...quantiles import chi2, median_square
+from ..state.sigma_factors import SigmaFactors
+
+#: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
+#: median of chi-square values of one degree of freedom that are the least of three), and that from which it counts.
+#: Tuned.
+REMEMBERED, ENOUGH, RIGHT, CLEARLY = 60, 15, 0.3, 1.5
+#: Disagreements of two looks beyond so many standard deviations may be gross errors, and this share of them is taken
+#: for good: usual, and tuned, for points of which a third are spoilt. Rounds that find out.
+WITHIN, SURELY_GOOD, MOST_ROUNDS = 2.5, 0.3, 30
+#: What is left of the variance of a normal distribution within these. Derived.
+KEPT_INSIDE = float((1.0 - chi2.sf(WITHIN**2, 3)) / (1.0 - chi2.sf(WITHIN**2, 1)))
+
+
+class Disagreement:
+    """Of the points that came last; says in `SigmaFactors.disagreement` by how much tests are to be wider.
+
+    Attributes
+    ----------
+    enough : whether enough points have come to tell
+    """
+
+    def __init__(self, sigmas: SigmaFactors) -> None:
+        self._sigmas = sigmas
+        self._ratios: deque[float] = deque(maxlen=REMEMBERED)
+        self._of_two: deque[float] = deque(maxlen=REMEMBERED)
+        self.enough = False
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether they disagree more than the sigmas say, or are too few to tell."""
+        return not self.enough or self._sigmas.disagreement > 1.0
+
+    def entered(self, squares: Iterable[tuple[float, int, bool]]) -> None:
+        """Points have come, each as `entry.disagreement` judges it. Those of two looks count until enough have more."""
+        for square, redundancy, spared in squares:
+            if spared:
+                self._ratios.append(square / median_square(redundancy))
+            else:
+                self._of_two.append(square)
+        self.enough, ratio = True, RIGHT
+        if len(self._ratios) >= ENOUGH:
+            ratio = float(np.median(self._ratios))
+        elif len(self._of_two) >= ENOUGH:
+            ratio = RIGHT * variance_of_most(np.array(self._of_two))
+        else:
+            self.enough = False
+        self._sigmas.disagreement = np.sqrt(ratio / RIGHT) if ratio > CLEARLY else 1.0
+
+
+def variance_of_most(squares: Array) -> float:
+    """Variance of which squares (n,) with one degree of freedom each are, but for gross errors among them.
+
+    With one gross error among three values their median is three times that of good ones. So the search begins with a
+    smaller quantile, and goes on with the mean of those within `WITHIN` standard deviations, until nothing changes. It
+    is not more than their median says: a vibration has fewer small squares than a normal distribution.
+
+    Source: P. J. Rousseeuw, A. M. Leroy, Robust regression and outlier detection, 1987, section 5.1 (reweighted).
+    """
+    variance = float(np.quantile(squares, SURELY_GOOD)) / float(chi2.ppf(SURELY_GOOD, 1))
+    for _ in range(MOST_ROUNDS):
+        inside = squares < WITHIN**2 * variance
+        before, variance = variance, float(squares[inside].mean()) / KEPT_INSIDE if inside.any() else variance
+        if np.isclose(variance, before):
+            break
+    return min(variance, float(np.median(squares)) / median_square(1))

@@ -1,0 +1,199 @@
+"""How likely the data are where sigmas of slow errors, and of looks, are multiplied by factors.
+
+A choice of factors is weighed by its restricted likelihood: that of what the observations say beyond the unknowns.
+
+Source: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin geodesique 60, 1986.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ...arrays import Array
+from ..state.strip import WindowStrip
+from ..state.unknowns import WindowState, block_of
+
+#: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
+BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
+NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
+#: The steps from a choice of factors to its neighbours.
+STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+#: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
+COUNTS = 20.0
+#: Wanders are weighed where twice as large a one is more likely by so much, as minus twice the logarithm of a
+#: likelihood ratio: chi-square of two degrees of freedom, 0.5 %. Tuned: between 6 and 18 flights as stated are the
+#: same, and points of flights whose wander is twice as large and seen by few looks are within 3 %.
+CLEARLY_LIKELIER = 10.6
+#: Factors on position and attitude that are tried for that.
+TWICE = ((1.0, 2.0), (2.0, 1.0), (2.0, 2.0))
+#: By what they are tried to be larger where another explanation is weighed against them. Tuned.
+LARGER = (1.0, 3.0, 10.0)
+
+
+@dataclass(frozen=True)
+class LookNoise:
+    """What the looks in the window say, and the noise that is stated of them.
+
+    Attributes
+    ----------
+    variance : of a sample, pixels squared, with the vibration of the attitude
+    pixel, sigma_px : angle that a pixel subtends, rad, and the sigma of a sample as stated at first
+    rows, square : their observations less object coordinates, and the squares of these where all unknowns are zero
+    matrix, rhs : (n, n), (n,) normal equations
+    """
+
+    variance: float
+    pixel: float
+    sigma_px: float
+    rows: int
+    square: float
+    matrix: Array
+    rhs: Array
+
+
+class Likelihood:
+    """Minus twice the logarithm of the restricted likelihood of a choice of factors, its *cost*.
+
+    It is ``log det N + sum 2 m log f + q - n' N^-1 n``, with m equations of a group and the squares q of the looks at
+    unknowns of zero. The factors of a pair act on unknowns of its own each; all others are eliminated once, those of
+    the position once for each of its factors: a choice costs a factorisation of the size of the attitude's alone, and
+    one that was asked for before nothing.
+
+    Parameters
+    ----------
+    pair : groups of position and attitude
+
+    Attributes
+    ----------
+    noise : of looks; None while it stays as it is
+    changes : of the state for which it holds
+    """
+
+    def __init__(self, strip: WindowStrip, state: WindowState, pair: tuple[int, int]) -> None:
+        self.noise: LookNoise | None = None
+        self.strip, self.changes = strip, state.changes
+        matrix, rhs = state.normal()
+        own, self._apriori, self._rows = [], [], []
+        for group in pair:
+            numbers, as_stated, in_force, rows = strip.apriori_information(group, state)
+            own.append(state.places(numbers))
+            self._apriori.append(as_stated)
+            self._rows.append(rows)
+            matrix[np.ix_(own[-1], own[-1])] -= in_force
+        others = np.setdiff1d(np.arange(len(state)), np.concatenate(own))
+        self._order = np.concatenate([others, *own])
+        assert len(self._order) == len(state)
+        self._first = len(others)
+        self._matrix, self._rhs = block_of(matrix, self._order), rhs[self._order]
+        self._of_noise: dict[float, _Eliminated | None] = {}
+        self._of_position: dict[tuple[float, float], _Eliminated | None] = {}
+        self._known: dict[tuple[float, float, float], float] = {}
+
+    def prefers_larger(self, f: float, g: float) -> bool:
+        """Whether larger factors than these, of position or attitude or both, are clearly more likely."""
+        larger = min(self.of(i * f, j * g, 1.0) for i, j in TWICE)
+        return self.of(f, g, 1.0) - larger > CLEARLY_LIKELIER
+
+    def gain(self, f: float, g: float) -> float:
+        """By how much the cost falls where the factors are as much larger than these as is likely best."""
+        return self.of(f, g, 1.0) - min(self.of(i * f, j * g, 1.0) for i in LARGER for j in LARGER)
+
+    def of(self, f: float, g: float, h: float) -> float:
+        """Of factors of position, attitude and noise; infinite where the equations have no solution."""
+        if (f, g, h) not in self._known:
+            self._known[f, g, h] = self._weighed(f, g, h)
+        return self._known[f, g, h]
+
+    def _weighed(self, f: float, g: float, h: float) -> float:
+        if h not in self._of_noise:
+            self._of_noise[h] = self._without_others(h)
+        both, (A, B), (a, b) = self._of_noise[h], self._apriori, self._rows
+        if both is None:
+            return np.inf
+        if (f, h) not in self._of_position:
+            m = len(A)
+            matrix = both.matrix.copy()
+            matrix[:m, :m] += A / f**2
+            self._of_position[f, h] = _eliminated(matrix, both.rhs, m)
+        one = self._of_position[f, h]
+        last = None if one is None else _eliminated(one.matrix + B / g**2, one.rhs, len(B))
+        if one is None or last is None:
+            return np.inf
+        gained = sum(part.log_det - part.square for part in (both, one, last))
+        of_looks = 0.0
+        if self.noise is not None and h > 1.0:
+            of_looks = 2.0 * self.noise.rows * np.log(h) - (1.0 - h**-2) * self.noise.square
+        far = (np.log(f) ** 2 + np.log(g) ** 2 + np.log(h) ** 2) / USUAL_LOG**2
+        return float(gained + 2.0 * (a * np.log(f) + b * np.log(g)) + of_looks + far)
+
+    def _without_others(self, h: float) -> _Eliminated | None:
+        """The equations of the pair, without what is stated of it."""
+        matrix, rhs = self._matrix, self._rhs
+        if self.noise is not None and h > 1.0:
+            less = 1.0 - h**-2
+            matrix = matrix - less * block_of(self.noise.matrix, self._order)
+            rhs = rhs - less * self.noise.rhs[self._order]
+        return _eliminated(matrix, rhs, self._first)
+
+
+def likely(cost: Likelihood, present: tuple[float, float]) -> tuple[float, float, float]:
+    """Factors of errors of position and attitude of one kind, and what the noise of looks is to be multiplied by, from
+    the likelihood of the data under a bank of them.
+
+    Whether a position is off, or an attitude, or the looks are less good shows in the images by little. So each choice
+    of factors is weighed by its restricted likelihood, and variances are averaged: where the data cannot tell, all are
+    larger, and no sigma is too small. Most of the bank is far from likely: the search goes from the factors in force to
+    neighbours as long as they count.
+
+    Parameters
+    ----------
+    cost : of a choice of factors
+    present : factors in force
+    """
+    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,)
+    most = tuple(len(bank) for bank in banks)
+    costs = np.full(most, np.inf)
+    first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
+    seen, waiting, least = {(*first, 0)}, [(*first, 0)], np.inf
+    while waiting:
+        place = waiting.pop()
+        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
+        least = min(least, costs[place])
+        if costs[place] > least + COUNTS and np.isfinite(least):
+            continue
+        beside = {(place[0] + i, place[1] + j, place[2] + k) for i, j, k in STEPS} - seen
+        near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
+        seen.update(near)
+        waiting.extend(near)
+    weight = np.exp(-0.5 * (costs - least))
+    weight /= weight.sum()
+    square = [
+        float(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)) for i, bank in enumerate(banks)
+    ]
+    return float(np.sqrt(square[0])), float(np.sqrt(square[1])), float(np.sqrt(square[2]))
+
+
+@dataclass(frozen=True)
+class _Eliminated:
+    """Normal equations (m, m), (m,) without their first unknowns; what these add to ``log det N``, ``n' N^-1 n``."""
+
+    matrix: Array
+    rhs: Array
+    log_det: float
+    square: float
+
+
+def _eliminated(matrix: Array, rhs: Array, first: int) -> _Eliminated | None:
+    """Without the first unknowns; None where these are not determined."""
+    try:
+        root = np.linalg.cholesky(matrix[:first, :first])
+    except np.linalg.LinAlgError:
+        return None
+    y = solve_triangular(root, np.column_stack([matrix[:first, first:], rhs[:first]]), lower=True, check_finite=False)
+    X, y = y[:, :-1], y[:, -1]
+    log_det = 2.0 * float(np.log(np.diagonal(root)).sum())
+    return _Eliminated(matrix[first:, first:] - X.T @ X, rhs[first:] - X.T @ y, log_det, float(y @ y))
