@@ -44,6 +44,14 @@ class LinkWatch:
         self._heard_s[topic] = now_s
         self._told.pop(topic, None)
 
+    def unwanted(self, name: str) -> None:
+        """This node does not listen any more to a topic of the table: nothing of it is missed until it is heard again
+        by somebody else here."""
+        row = topics.find(name)
+        for topic in [topic for topic in self._heard_s if row.matches(topic)]:
+            del self._heard_s[topic]
+            self._told.pop(topic, None)
+
     def told(self, topic: str, now_s: float) -> None:
         """Another node says that it receives a topic at this time."""
         last = self._heard_s.get(topic)

@@ -261,12 +261,14 @@ class Bus:
         return self._subscribe(topics.key_expression("*", name), name, receive, malformed)
 
     def _subscribe(self, key: str, name: str, receive: ReceiveOf, malformed: Malformed | None) -> Callable[[], None]:
+        listens = True
+
         def take(sample: Any, generation: int) -> None:
             receive_ns = time.time_ns()
             _, platform, topic = str(sample.key_expr).split("/", 2)
             if sample.kind != zenoh.SampleKind.PUT or generation != self._generation:
                 return
-            if platform == self.platform:
+            if platform == self.platform and listens:
                 self._links.heard(topic, time.monotonic())
             try:
                 if sample.attachment is None:
@@ -289,7 +291,15 @@ class Bus:
                 )
             return session.declare_subscriber(key, handler)
 
-        return self._declare(declare)
+        withdraw = self._declare(declare)
+
+        def end() -> None:
+            nonlocal listens
+            listens = False
+            withdraw()
+            self._links.unwanted(name)
+
+        return end
 
     def recall(self, names: Iterable[str], seconds: float = KEPT_S, timeout_s: float = 3.0) -> list[RawMessage]:
         """What others have said lately on topics (names of the table), as far as they live and keep it, in any order.

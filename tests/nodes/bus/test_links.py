@@ -69,6 +69,39 @@ def test_a_publisher_that_has_ended_is_not_missed():
     assert beats(watch, 0.0, 60.0) == []
 
 
+def test_a_topic_that_a_node_has_ended_is_not_missed():
+    watch = LinkWatch()
+    for topic in ("sensor/lines/F", "sensor/lines/B", "sensor/gnss"):
+        watch.heard(topic, 0.0)
+    watch.unwanted("sensor/lines/*")
+    watch.unwanted("sensor/gnss")
+    watch.heard("sensor/gnss", 0.1)  # by another part of this node
+    for i in range(40):
+        for topic in ("sensor/lines/F", "sensor/lines/B"):
+            watch.told(topic, 0.25 * i)
+        watch.heard("sensor/gnss", 0.25 * i)
+        assert watch.beat(0.25 * i, PEERS) == ""
+    found = []
+    for i in range(40, 60):
+        watch.told("sensor/gnss", 0.25 * i)
+        found.append(watch.beat(0.25 * i, PEERS))
+    assert found[-1].startswith("sensor/gnss is received by others and not here")
+
+
+def test_who_has_ended_a_subscription_goes_on_with_its_session():
+    port = free_port()
+    with Bus(port=port, source="test") as bus, Bus(port=port, source="sender") as sender:
+        heard: list[object] = []
+        end = bus.subscribe("sensor/attitude", heard.append)
+        wait_for(lambda: bus.peers() == 1, 10, "the link")
+        wait_for(lambda: sender.publish(sample.message("sensor/attitude")) or heard, 10, "an attitude")
+        end()
+        assert not bus._links._heard_s
+        sender.publish(sample.message("sensor/attitude", 1))
+        time.sleep(0.3)
+        assert not bus._links._heard_s
+
+
 class Keeps(Node):
     name = "keeps"
     inputs = ("configuration/camera", "sensor/attitude", "trajectory/filtered")
