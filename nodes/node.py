@@ -34,6 +34,10 @@ class Message:
     start: int = 0
 
 
+#: State of a node that has been told to end.
+STOPPING = "stopping"
+
+
 class Node:
     """Base of all nodes.
 
@@ -47,6 +51,8 @@ class Node:
     outputs: ClassVar[tuple[str, ...]]
     #: Outputs that are decided live by the load of the machine; in `process` the recorded ones are inputs instead.
     decisions: ClassVar[tuple[str, ...]] = ()
+    #: Whether it only shows what others do, so that there may be several of it on a platform.
+    onlooker: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()

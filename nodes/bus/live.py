@@ -14,7 +14,7 @@ from ...schemas import codec, topics
 from ...schemas.envelope import RawMessage
 from ...schemas.topics import Family, Queue
 from ..garbage_collection import RareCollections
-from ..node import Message, Node
+from ..node import STOPPING, Message, Node
 from ..ordering import Sequencer, StreamCheck, TopicCounts, order_key
 from ..step_driver import StepDriver
 from .inbox import NEWEST_BYTES, NEWEST_DEPTH, Inbox
@@ -206,7 +206,7 @@ class BusRunner:
             outputs = self._driver.finish()
         for output in outputs:
             self._publish(output)
-        self._tell(force=True, state="stopping")
+        self._tell(force=True, state=STOPPING)
         self._inbox.close()
         time.sleep(LAST_WORDS_S)
 

@@ -65,7 +65,7 @@ class StatusPublisher:
         now = time.monotonic()
         if self._bus.opened_anew:
             node.counters["session opened anew"] = len(self._bus.opened_anew)
-        node.alarms["another"] = self._another()
+        node.alarms["another"] = "" if node.onlooker else self._another()
         light, reason = node.light()
         if node.alarm and light:  # not all is well, whatever the figures say
             worse = "failed" if NO_TRAJECTORY in node.alarm else "weak" if light == "good" else light

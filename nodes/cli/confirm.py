@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         heard = _Heard(args.point)
         for name in ("status/*", "trajectory/filtered", "observation/control", "observation/target", "event/log"):
             bus.subscribe(name, heard.take)
+        if args.source:
+            bus.subscribe(topic, heard.take_source)
         bus.prepare(["observation/verdict"])
         _wait(lambda: heard.stamp_ns > 0, NOBODY_S)
         time.sleep(LISTEN_S)
@@ -67,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"no node sends on the bus of platform {bus.platform}")
         if not topic and heard.points and args.point not in heard.points:
             raise UserError(f"{args.point} is no ground point of this flight, there are {_few(heard.points)}")
+        if args.source and heard.sources and args.source not in heard.sources and not args.reject:
+            raise UserError(f"--source {args.source}: does not speak on {topic}; heard {_few(heard.sources)}")
         verdict = m.Verdict(point=args.point, accepted=not args.reject, by=args.by)
         if topic:
             verdict = m.Verdict(topic=topic, publisher=args.source, accepted=not args.reject, by=args.by)
@@ -86,15 +90,20 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Heard:
-    """Messages about the point, and the newest platform time."""
+    """Messages about the point or by whom the topic is spoken on, and the newest platform time."""
 
     def __init__(self, point: str) -> None:
         self._point = point
         self.sent = threading.Event()
         self.stamp_ns = 0
         self.points: set[str] = set()
+        self.sources: set[str] = set()
         self.answer = ""
         self.looks = 0
+
+    def take_source(self, raw: RawMessage) -> None:
+        """Who speaks on the topic."""
+        self.sources.add(raw.envelope.source)
 
     def take(self, raw: RawMessage) -> None:
         if find(raw.topic).family is not Family.OBSERVATION:

@@ -21,7 +21,7 @@ from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
 from ..bus.program import end_by_signal
 from ..errors import UserError
-from ..monitor.monitor import display
+from ..monitor.monitor import ENDING, display
 
 if TYPE_CHECKING:
     from ..bus.session import Bus
@@ -220,6 +220,9 @@ class LiveFlight:
 
     def _land(self, group: NodeGroup, overview: Any, show: Callable[[], None]) -> None:
         """Wait until the nodes have processed all messages, then stop them along the data flow, the recorder last."""
+        overview.ending = True
+        self.say(ENDING)
+        show()
         # messages long after the last image line, as the navigator's last second of smoothing, concern no image line
         late = self._lost_so_far(("late",))
         until = time.monotonic() + self.drain_s()

@@ -36,7 +36,11 @@ def run(args: argparse.Namespace) -> int:
         timer.start()
     report = reporter(args.quiet)
     if not args.fleet:
-        return monitor.run(ProgramOptions("monitor", bus_file=args.bus, stop=stop, report=report, **where))
+        options = ProgramOptions("monitor", bus_file=args.bus, stop=stop, report=report, **where)
+        seen = monitor.watch_platform(options, quiet=args.quiet or args.json)
+        if args.json:
+            print(json.dumps(seen.as_json(), indent=2))
+        return 0
     if args.platform is not None:
         raise UserError("--fleet and --platform: wanted one of them")
     where["platform"] = fleet.FLEET

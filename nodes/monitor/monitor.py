@@ -14,7 +14,7 @@ from ...schemas import messages as m
 from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
 from ..config import build
-from ..node import Message, Node
+from ..node import STOPPING, Message, Node
 from ..terminal import drawing, plain
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ LOSSES: tuple[str, ...] = ("gaps", "duplicates", "late", "malformed", "dropped")
 MOST_NODES, LONGEST_NAME, LONGEST_TEXT = 40, 24, 200
 #: Alarms on the screen, at most.
 MOST_ALARMS = 6
+#: Said while nodes are stopped along the flow of data.
+ENDING = "ending: nodes finish what they have"
 
 
 @dataclass
@@ -40,6 +42,7 @@ class Overview:
     rejected: int = 0
     final_until_ns: int = 0
     events: deque[tuple[int, str, str]] = field(default_factory=lambda: deque(maxlen=5))  # stamp, level, text
+    ending: bool = False  # nodes are being stopped on purpose: that they fall silent is no alarm
 
     @property
     def estimated(self) -> int:
@@ -70,12 +73,35 @@ class Overview:
         return sums
 
     def alarms(self) -> list[str]:
-        """What nodes want an operator to look at, each once."""
-        return list(dict.fromkeys(plain(s.alarm, LONGEST_TEXT) for s in self.nodes.values() if s.alarm))
+        """What nodes want an operator to look at, each once; not those that are being stopped."""
+        if self.ending:
+            return []
+        running = [s for s in self.nodes.values() if s.state != STOPPING]
+        return list(dict.fromkeys(plain(s.alarm, LONGEST_TEXT) for s in running if s.alarm))
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs: state, light and troubles of each node, rates of topics, figures of the newest report."""
+        nodes = {
+            name: {
+                "state": s.state, "lag_s": s.lag_s, "queued": s.queued, "light": s.light, "reason": s.light_reason,
+                "alarm": s.alarm, "last_problem": s.last_problem, "counters": {c.name: c.value for c in s.counters},
+                **{kind: sum(getattr(t, kind) for t in s.topics) for kind in LOSSES},
+            }
+            for name, s in sorted(self.nodes.items())
+        }  # fmt: skip
+        r = self.report
+        report = None if r is None else {
+            "updates": self.updates, "sigma0": r.sigma0 if r.redundancy > 0 else None, "redundancy": r.redundancy,
+            "window_s": _window_s(r), "rays": r.rays, "points": r.points, "control": r.control,
+            "rejected": self.rejected, "update_ms": 1e3 * r.compute_s,
+        }  # fmt: skip
+        rates = {topic: rate for topic, rate in sorted(self.topic_rates().items()) if rate > 0}
+        return {"nodes": nodes, "rates_hz": rates, "alarms": self.alarms(), "losses": self.losses(), "report": report}
 
     def line(self) -> str:
         """One line for logs and terminals that cannot be redrawn."""
-        parts = [f"{len(self.nodes)} nodes"]
+        parts = [ENDING] if self.ending else []
+        parts.append(f"{len(self.nodes)} nodes")
         if self.report is not None:
             r = self.report
             parts += [
@@ -106,6 +132,7 @@ class Monitor(Node):
     name = "monitor"
     inputs = ("status/*", "adjustment/report", "event/log")
     outputs = ()
+    onlooker = True
 
     def __init__(self) -> None:
         super().__init__()
@@ -180,6 +207,8 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
         rest = overview.not_yet(3)
         text += f"; not yet {plain(rest, LONGEST_TEXT)}" if rest else ""
         lines.append(Text(text, no_wrap=True, overflow="ellipsis"))
+    if overview.ending:
+        lines.append(Text(ENDING, style="bold"))
     lines += [Text(text, style="bold red") for text in overview.alarms()[:MOST_ALARMS]]
     lines += [Text(text, style="red" if level in ("error", "fatal") else "dim") for _, level, text in overview.events]
     return Panel(Group(*lines), title=Text(plain(title)), title_align="left")
@@ -218,7 +247,8 @@ def display(
     """
 
     def look() -> list[str]:
-        return [] if watch is None else watch.look(overview.nodes)
+        told = [] if watch is None else watch.look(overview.nodes)
+        return [] if overview.ending else told  # that a sensor falls silent is meant then
 
     if quiet:
         yield lambda: (look(), None)[1]
@@ -254,14 +284,23 @@ def display(
 
 def run(options: ProgramOptions) -> int:
     """Watch a platform until told to stop."""
+    watch_platform(options)
+    return 0
+
+
+def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
+    """The same; what is known in the end. Shows nothing meanwhile if ``quiet``."""
     from ..bus.live import BusRunner, in_thread
 
     monitor = build(Monitor, options.tables)
     title = f"platform {options.platform}"
-    with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title) as show:
+    with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title, quiet) as show:
         while not options.stop.wait(0.25):
             show()
-    return 0
+    if not quiet and not sys.stdout.isatty():
+        sys.stdout.write(f"{monitor.overview.line()}\n")
+        sys.stdout.flush()
+    return monitor.overview
 
 
 def _counted(n: int, kind: str) -> str:

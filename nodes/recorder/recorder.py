@@ -22,7 +22,7 @@ from ..bus.recall import Recall
 from ..bus.session import Bus
 from ..bus.status import StatusPublisher
 from ..errors import UserError
-from ..node import Node
+from ..node import STOPPING, Node
 from ..ordering import StreamCheck, order_key
 from ..recording.reread import Reread, Stream
 from ..recording.seal import Seal
@@ -492,4 +492,4 @@ def record(recorder: Recorder, bus: Bus, options: ProgramOptions) -> None:
     backlog.close()
     while raws := backlog.take(0.0):  # a disk that is slow has left some
         recorder.take(raws)
-    status.publish("stopping", dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)
+    status.publish(STOPPING, dict(recorder.statistics), recorder, 0.0, len(backlog), recorder.newest_ns)

@@ -39,6 +39,7 @@ class Viewer(Node):
     name = "viewer"
     inputs = scene.TOPICS + scene.TRUTH_TOPICS
     outputs = ()
+    onlooker = True
 
     def __init__(
         self, mode: str = "native", queue_size: int = 20_000, truth: bool = True, canvas: Canvas | None = None

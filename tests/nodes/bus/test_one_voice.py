@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import threading
 
 import sample_messages as sample
@@ -42,6 +43,49 @@ def test_two_nodes_of_one_name_are_told_and_no_longer_when_one_has_ended():
             told = "2 nodes 'adjuster' run on platform demo: stop all but one of them"
             assert monitor.overview.alarms() == [told] and told in monitor.overview.line()
         wait_for(lambda: not monitor.overview.alarms(), 10, "the end of the alarm")
+
+
+def test_several_may_look_on_and_one_may_count():
+    """A second monitor disturbs nobody; what a node said last before it ended is no alarm for ever."""
+    port, monitor = free_port(), Monitor()
+    node = Listening("adjuster")
+    node.alarms["test"] = "no sensor/gnss for 9 s"
+    with Bus(port=port, source="monitor") as bus, in_thread(BusRunner(monitor, bus)):
+        with Bus(port=port, source="adjuster") as one, in_thread(BusRunner(node, one)):
+            wait_for(monitor.overview.alarms, 10, "the alarm of the node")
+            done = triline("monitor", "--json", "--seconds", 3, "--port", port)
+            assert done.returncode == 0, done.stderr
+            seen = json.loads(done.stdout)
+            assert seen["nodes"]["adjuster"]["state"] == "running" and seen["report"] is None
+            assert seen["alarms"] == monitor.overview.alarms() == ["no sensor/gnss for 9 s"]
+            monitor.overview.ending = True
+            assert not monitor.overview.alarms() and monitor.overview.line().startswith("ending: nodes finish")
+            monitor.overview.ending = False
+        wait_for(lambda: not monitor.overview.alarms(), 10, "the end of the alarm with its node")
+
+
+def test_a_source_that_nobody_heard_is_not_chosen():
+    port, node, stop = free_port(), Listening("navigator"), threading.Event()
+    with (
+        Bus(port=port, source="chain") as bus,
+        Bus(port=port, source="receiver") as sender,
+        in_thread(BusRunner(node, bus)),
+    ):
+        wait_for(lambda: "navigator" in sender.alive(), 10, "the node")
+
+        def fly() -> None:
+            i = 0
+            while not stop.wait(0.02):
+                i += 4
+                sender.publish(sample.message("sensor/attitude", i, "receiver"))
+
+        flight = threading.Thread(target=fly, daemon=True)
+        flight.start()
+        done = triline("confirm", "sensor/attitude", "--source", "reciever", "--port", port)
+        stop.set()
+        flight.join()
+    assert done.returncode == 1
+    assert "--source reciever: does not speak on sensor/attitude; heard receiver" in done.stderr
 
 
 def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
