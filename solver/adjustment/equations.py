@@ -217,8 +217,12 @@ class BlockEquations:
 
 
 def residual_scale(absolute: Array) -> float:
-    """Sigma of whitened residuals from the median of their absolute values; 1 without any."""
-    return float(np.median(absolute)) / 0.6745 if absolute.size else 1.0
+    """Sigma of whitened residuals from the median of their absolute values, but not less than 1; 1 without any.
+
+    Residuals are smaller than errors by what the unknowns have taken of these, much where points have few rays. A scale
+    that followed them would leave out good rays, whose residuals grow by that, and become smaller still.
+    """
+    return max(float(np.median(absolute)) / 0.6745, 1.0) if absolute.size else 1.0
 
 
 def _weighted(lin: Linearisation, weight: Array) -> Linearisation:

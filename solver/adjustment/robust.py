@@ -1,8 +1,12 @@
-"""Weight functions of robust estimation: factor on a ray's weight from its normalised residual."""
+"""Weight functions of robust estimation: factor on a ray's weight from its normalised residual.
+
+They can be sent to other processes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -16,35 +20,47 @@ class WeightFunction(Protocol):
     def __call__(self, w: Array) -> Array: ...
 
 
-def huber(k: float = 2.0) -> WeightFunction:
+@dataclass(frozen=True)
+class Huber:
     """``k / w`` beyond k."""
 
-    def weight(w: Array) -> Array:
-        return np.where(w <= k, 1.0, k / np.maximum(w, k))
+    k: float = 2.5
 
-    return weight
+    def __call__(self, w: Array) -> Array:
+        return np.where(w <= self.k, 1.0, self.k / np.maximum(w, self.k))
 
 
-def danish(k: float = 2.0) -> WeightFunction:
+@dataclass(frozen=True)
+class Danish:
     """``exp(1 - (w / k)^2)`` beyond k."""
 
-    def weight(w: Array) -> Array:
-        return np.where(w <= k, 1.0, np.exp(1.0 - np.minimum(w / k, 20.0) ** 2))
+    k: float = 3.0
 
-    return weight
+    def __call__(self, w: Array) -> Array:
+        return np.where(w <= self.k, 1.0, np.exp(1.0 - np.minimum(w / self.k, 20.0) ** 2))
 
 
-def igg3(k0: float = 1.5, k1: float = 4.0) -> WeightFunction:
-    """IGG III: 1 up to k0, falling to 0 at k1, 0 beyond."""
-    if not 0 < k0 < k1:
-        raise ValueError(f"IGG III wants 0 < k0 < k1, got {k0} and {k1}")
+@dataclass(frozen=True)
+class Igg3:
+    """IGG III: 1 up to k0, falling to 0 at k1, 0 beyond.
 
-    def weight(w: Array) -> Array:
+    Raises
+    ------
+    ValueError : k0 and k1 that are not positive and rising
+    """
+
+    k0: float = 3.0
+    k1: float = 6.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.k0 < self.k1:
+            raise ValueError(f"IGG III wants 0 < k0 < k1, got {self.k0} and {self.k1}")
+
+    def __call__(self, w: Array) -> Array:
+        k0, k1 = self.k0, self.k1
         falling = k0 / np.maximum(w, k0) * ((k1 - np.minimum(w, k1)) / (k1 - k0)) ** 2
         return np.where(w <= k0, 1.0, falling)
 
-    return weight
-
 
 #: By the name the command line uses.
-WEIGHT_FUNCTIONS: dict[str, Callable[[], WeightFunction]] = {"huber": huber, "danish": danish, "igg3": igg3}
+WEIGHT_FUNCTIONS: dict[str, Callable[[], WeightFunction]] = {"huber": Huber, "danish": Danish, "igg3": Igg3}

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..arrays import Array, Bools
 from .reliability import CRITICAL_W
-from .robust import igg3
+from .robust import Igg3
 
 #: Distances from the surface, in its sigmas, up to which a height counts in full, and from which it does not count at
 #: all (weight function IGG III). Tuned: of heights with normal errors one in a hundred loses some weight.
@@ -137,7 +137,7 @@ class SurfaceControl:
 
     def weights(self, off_m: Array, scale_m: float) -> Array:
         """Factors 0..1 (n,) on the weights of heights, by the distance of their points from the surface."""
-        return igg3(FULL, NONE)(np.abs(off_m) / scale_m)
+        return Igg3(FULL, NONE)(np.abs(off_m) / scale_m)
 
 
 @dataclass(frozen=True)

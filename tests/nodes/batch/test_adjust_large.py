@@ -42,6 +42,13 @@ def test_workers_give_the_tables_of_one_process(folder, tmp_path, capsys):
     assert not list(tmp_path.glob("triline-*"))
 
 
+def test_robust_estimation_goes_in_partitions(folder, tmp_path):
+    assert adjust(folder, "--robust", "danish", "-o", tmp_path / "one") == 0
+    assert adjust(folder, "--robust", "danish", "-o", tmp_path / "two", "--workers", 1, "--partition-rays", 300) == 0
+    one, two = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("one", "two"))
+    assert two["sigma0"] == pytest.approx(one["sigma0"], rel=1e-6)
+
+
 def split(folder, tmp_path, strips):
     """A block folder with the image points of some strips alone."""
     part = tmp_path / f"part-{strips[0]}"

@@ -15,7 +15,7 @@ from triline.solver.adjustment.covariance import cofactors, point_cofactors, poi
 from triline.solver.adjustment.linearisation import linearise
 from triline.solver.adjustment.network import Control
 from triline.solver.adjustment.refined_orientation import correction_cofactors, corrections_at, find_set
-from triline.solver.adjustment.robust import danish, huber, igg3
+from triline.solver.adjustment.robust import Danish, Huber, Igg3
 from triline.solver.camera.collinearity import project
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.dgr import DgrOptions
@@ -304,7 +304,7 @@ def test_bad_starting_points_are_reached_by_damping():
     assert bad.cost == pytest.approx(good.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize("function", [huber(), danish(), igg3()], ids=["huber", "danish", "igg3"])
+@pytest.mark.parametrize("function", [Huber(), Danish(), Igg3()], ids=["huber", "danish", "igg3"])
 def test_robust_estimation_bounds_the_damage(function):
     simulated, _ = block(MODELS["dgr"], False)
     rays = simulated.network.rays

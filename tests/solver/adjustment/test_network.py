@@ -7,7 +7,7 @@ import pytest
 from adjustment_networks import simulate
 
 from triline.solver.adjustment.network import Control, Measurements, build_network, neighbourhood_order
-from triline.solver.adjustment.robust import danish, huber, igg3
+from triline.solver.adjustment.robust import Danish, Huber, Igg3
 from triline.solver.camera.line_camera import Lens, LineCamera, straight_line
 from triline.solver.geometry.ray_intersection import intersect_rays
 from triline.solver.models.dgr import DgrOptions
@@ -175,7 +175,7 @@ def test_drawn_unknowns_have_their_apriori_sigmas():
     np.testing.assert_allclose(draws.std(axis=0), model.pseudo_observations().sigma, rtol=0.08)
 
 
-@pytest.mark.parametrize("function", [huber(2.0), danish(2.0), igg3(1.5, 4.0)], ids=["huber", "danish", "igg3"])
+@pytest.mark.parametrize("function", [Huber(2.0), Danish(2.0), Igg3(1.5, 4.0)], ids=["huber", "danish", "igg3"])
 def test_weight_functions_fall_from_one(function):
     w = np.linspace(0, 100, 1001)
     weight = function(w)
@@ -183,4 +183,4 @@ def test_weight_functions_fall_from_one(function):
     assert (np.diff(weight) <= 1e-12).all() and (weight >= 0).all()
     assert weight[-1] < 0.05
     with pytest.raises(ValueError, match="IGG III"):
-        igg3(4.0, 1.5)
+        Igg3(4.0, 1.5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from triline.solver.adjustment.job import Job, NotAdjustableError, refuse_in_parts, run
-from triline.solver.adjustment.robust import huber
+from triline.solver.adjustment.robust import Huber
 from triline.solver.camera.line_camera import three_line_camera
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.dgr import DgrOptions
@@ -22,7 +22,7 @@ from triline.solver.simulation.network import regular_block
 CAMERA = three_line_camera("test", 62.7, 12000, 0.0065, {"F": 26.0, "N": 0.0, "B": -16.0})
 JOBS = {
     "dgr, snooping, components": Job(DgrOptions(), snoop=True, reweight=True, components=True),
-    "lim, robust start": Job(LimOptions(fixes=10), snoop=True, robust=huber()),
+    "lim, robust start": Job(LimOptions(fixes=10), snoop=True, robust=Huber()),
     "dgr, self-calibration": Job(DgrOptions(), self_calibration=tls(CAMERA), eliminate=False),
 }
 
