@@ -24,7 +24,7 @@ from .point_consensus import Doubt, doubts
 from .pose_noise import with_noise_left
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
-from .robust import WeightFunction, huber
+from .robust import Huber, WeightFunction
 from .snooping import Rejected, Round, Snooping, image_scale, joint_limit, snoop
 from .statistics import GlobalTest, PointAccuracy, global_test, point_accuracy
 from .surface_control import SurfaceFit, SurfaceRows, SurfaceShift
@@ -48,6 +48,8 @@ SURFACE_ROUNDS, SURFACE_STILL = 12, 0.02
 
 #: Re-estimations of the image sigma, each followed by a new search for outliers.
 REWEIGHTINGS = 3
+#: Change of the factor of the image from which they go on. Numerical: far below its standard deviation.
+SETTLED = 0.01
 
 
 class NotAdjustableError(ValueError):
@@ -302,7 +304,7 @@ class _Stage:
             problem = (pose or pose_problem)(network, model, job.self_calibration, job.platform)
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
-            start = solve(problem, points, weight, replace(job.options, robust=huber()), tell)
+            start = solve(problem, points, weight, replace(job.options, robust=Huber()), tell)
         self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
         self._read_surface()
         if not before:
@@ -344,15 +346,25 @@ class _Stage:
             if job.snoop:
                 self._snoop()
         if last and job.components:
+            self._estimate_components()
+        self._keep(solve(self.solution.problem, self.solution, self.solution.ray_weight, job.options))
+        self._read_surface()
+
+    def _estimate_components(self) -> None:
+        """Variance components; with data snooping in turn, until that of the image stays: what is left out depends on
+        it, and it on what is left out."""
+        for _ in range(REWEIGHTINGS):
             self.tell(Phase("variance components"))
-            found = estimate_components(self.solution, options=job.on_the_way, start=self.scales)
+            before = self.scales.factor["image"]
+            found = estimate_components(self.solution, options=self.job.on_the_way, start=self.scales)
             self.components = found.components
             self.scales = Scales(self.scales.factor | {c.group: c.factor for c in found.components})
             self._keep(found.solution)
-            if job.snoop:
-                self._snoop()
-        self._keep(solve(self.solution.problem, self.solution, self.solution.ray_weight, job.options))
-        self._read_surface()
+            if not self.job.snoop:
+                return
+            self._snoop()
+            if abs(self.scales.factor["image"] / before - 1.0) < SETTLED:
+                return
 
     def _read_surface(self) -> None:
         """Put points onto the surface as it is where they are now, until they stay, and see whether its shift agrees.
@@ -458,7 +470,9 @@ class _Stage:
             Q = cofactors(self.solution)
             first = tuple(Rejected(int(i), -1, -1, 0.0, "snooping") for i in out)
             self.snooping = Snooping(self.solution, Q, ray_statistics(self.solution, Q), first, 0)
-        if self.job.reweight:  # a wrong a-priori sigma would make the test reject good rays or pass bad ones
+        if (
+            self.job.reweight or self.job.components
+        ):  # a wrong a-priori sigma would make the test reject good rays or pass bad ones
             self._scale_image(_robust_scale(self.solution))
         self._snoop()
 
@@ -474,7 +488,7 @@ class _Stage:
             change = found.components[0].factor / self.scales.factor["image"]
             self.scales = self.scales.times({"image": change})
             self._keep(found.solution)
-            if not self.job.snoop or abs(change - 1.0) < 0.01:
+            if not self.job.snoop or abs(change - 1.0) < SETTLED:
                 return
             self._snoop()
 

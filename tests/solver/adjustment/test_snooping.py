@@ -1,5 +1,6 @@
 """Data snooping: what it finds, what it loses, what it gives back."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from triline.solver.adjustment.network import Control, Measurements, build_netwo
 from triline.solver.adjustment.point_consensus import consensus
 from triline.solver.adjustment.ray_statistics import ray_statistics
 from triline.solver.adjustment.reliability import CRITICAL_W
-from triline.solver.adjustment.robust import danish, huber, igg3
+from triline.solver.adjustment.robust import Danish, Huber, Igg3
 from triline.solver.adjustment.snooping import control_tests, joint_limit, snoop
 from triline.solver.camera.self_calibration import tls
 from triline.solver.camera.sensors import preset
@@ -284,7 +285,7 @@ def test_critical_value_must_be_positive():
         snoop(adjust(block(1, points=30).network, MODEL), critical=0.0)
 
 
-@pytest.mark.parametrize("weights", [huber(), danish(), igg3()])
+@pytest.mark.parametrize("weights", [Huber(), Danish(), Igg3()])
 def test_robust_estimation_withstands_outliers(weights):
     clean = block(7).network
     network, _ = with_outliers(clean, 0.05, 1)
@@ -296,9 +297,21 @@ def test_robust_estimation_withstands_outliers(weights):
     assert of_plain > 2.0 * of_robust
 
 
+@pytest.mark.parametrize("weights", [Huber(), Danish(), Igg3()])
+def test_robust_estimation_leaves_good_rays_alone(weights):
+    """Points have few rays, and residuals are half as large as errors: a scale that followed these threw out many."""
+    network = block(7).network
+    plain, robust = run(network, Job(MODEL)), run(network, Job(MODEL, robust=weights))
+    assert len(robust.rejected) < 0.002 * len(network.rays)
+    assert robust.solution.sigma0 == pytest.approx(plain.solution.sigma0, rel=0.03)
+    sigmas = [np.sqrt(np.einsum("pii->p", cofactors(r.solution).points)) for r in (plain, robust)]
+    assert np.median(sigmas[1] / sigmas[0]) == pytest.approx(1.0, abs=0.02)
+    assert pickle.loads(pickle.dumps(weights)) == weights  # partitions are adjusted by other processes
+
+
 def test_igg3_names_what_it_left_without_weight():
     network, bad = with_outliers(block(7).network, 0.05, 1)
-    result = run(network, Job(MODEL, robust=igg3()))
+    result = run(network, Job(MODEL, robust=Igg3()))
     out = rejected_rays(network, result.rejected)
     assert {r.reason for r in result.rejected} == {"robust"}
     assert (out & bad).sum() / bad.sum() >= 0.98
@@ -316,6 +329,20 @@ def test_wrong_image_sigma_is_mended_before_outliers_are_sought():
     assert (out & bad).sum() / bad.sum() >= 0.98 and (out & ~bad).sum() / (~bad).sum() < 0.005
     without = run(network, Job(MODEL, snoop=True))
     assert (rejected_rays(network, without.rejected) & ~bad).sum() > 5 * (out & ~bad).sum()
+
+
+def test_variance_components_and_snooping_agree_in_the_end():
+    """What is left out depends on the sigma of the image, and that on what is left out."""
+    simulated = block(8, noise=0.6).network
+    half = {"sigma_line_px": np.full(len(simulated.rays), 0.3), "sigma_sample_px": np.full(len(simulated.rays), 0.3)}
+    simulated = replace(simulated, rays=replace(simulated.rays, **half))
+    network, bad = with_outliers(simulated, 0.05, 2)
+    result = run(network, Job(MODEL, snoop=True, components=True))
+    (image,) = (c for c in result.components if c.group == "image")
+    assert image.factor == pytest.approx(2.0, rel=0.05)
+    assert result.solution.sigma0 == pytest.approx(1.0, abs=0.02)
+    out = rejected_rays(network, result.rejected)
+    assert (out & bad).sum() / bad.sum() >= 0.98 and (out & ~bad).sum() / (~bad).sum() < 0.005
 
 
 def test_snooping_goes_through_self_calibration():
