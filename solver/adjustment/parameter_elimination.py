@@ -13,6 +13,7 @@ from .covariance import point_cofactors, point_unknown_cofactors
 from .determinability import Evidence, Limits, Removal, examine, point_sigmas, ranks, strongest_correlations
 from .network import Network
 from .network_weakness import PART, describe
+from .problem import with_left_out
 
 #: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
 #: rounding.
@@ -227,7 +228,8 @@ def without(
     old = left.solution.problem
     assert old.self_calibration is not None
     smaller = old.self_calibration.without(gone)
-    problem = adapt(pose_problem(old.network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
+    network = with_left_out(old.network, old.layout, -1.0)  # it is put in again with the unknowns
+    problem = adapt(pose_problem(network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
     problem = replace(problem, control=old.control, earlier=old.earlier)
     start = left.state
     if last := [k for k, name in enumerate(left.names) if name in gone]:  # it could not be taken out of the cofactors

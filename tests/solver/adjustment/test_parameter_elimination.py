@@ -9,6 +9,8 @@ from triline.solver.adjustment.determinability import Limits, examine
 from triline.solver.adjustment.parameter_elimination import Reduced, eliminate, gather_evidence
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.dgr import DgrOptions
+from triline.solver.models.slow_errors import SlowErrors
+from triline.solver.models.wander import WanderOptions
 
 MODEL, PARAMETERS = DgrOptions(), tls(CAMERA)
 #: True values of parameters; those of the others are zero.
@@ -69,3 +71,15 @@ def test_what_only_the_pivot_tells_apart_or_lies_far_from_zero_is_adjusted_anew(
     t = np.abs(known.theta[known.solution.layout.n_model :]) / np.sqrt(np.diag(gather_evidence(full).cofactors))
     near, far = known.names[int(np.argmin(t))], known.names[int(np.argmax(t))]
     assert t.max() > 10.0 and known.without(near) is not None and known.without(far) is None
+
+
+def test_what_the_model_leaves_out_counts_once_however_many_parameters_go():
+    wander = SlowErrors((0.1, 0.1, 0.2), (1e-4,) * 3, (1e-4,) * 3, (0.1, 0.1, 0.2), (2e-4,) * 3, 20.0)
+    model = WanderOptions(wander, left_out_m=0.05, left_out=1e-4)
+    network = simulate(5, MODEL, points=80).network
+    plain = pose_problem(network, model)
+    assert plain.network.rays.orientation_noise is not None and plain.network.rays.orientation_noise.max() > 0.0
+    found = eliminate(solve(pose_problem(network, model, PARAMETERS)), Limits(), AdjustmentOptions())
+    assert found.removed
+    noise = found.solution.network.rays.orientation_noise
+    np.testing.assert_allclose(noise, plain.network.rays.orientation_noise, rtol=1e-9, atol=1e-18)
