@@ -300,6 +300,8 @@ def notes_of(adjustment: Adjustment) -> list[str]:
         )
     elif not result.test.passed:
         notes.append(_sigma0_note(result))
+    if adjustment.job.self_calibration is not None and adjustment.camera() is None:
+        notes.append(f"no additional parameter is determined: the camera stays as it is, and no {CAMERA} is written")
     notes += _test_notes(adjustment)
     notes += _control_notes(result)
     notes += _weakness_notes(result)
@@ -412,7 +414,17 @@ def _spread_notes(network: Any, control: Control) -> list[str]:
     full = np.isfinite(control.sigma_m)
     if not full.any():
         return ["no control: position, rotation and scale of the block come from its trajectories"]
-    xyz = control.xyz_l[full.any(axis=1)]
+    known = full.any(axis=1)
+    measured = (network.rays_per_point[control.point] > 0) & known
+    n, never = np.count_nonzero(known), np.count_nonzero(known & ~measured)
+    if never == n:
+        return [f"no control point of {n} is measured in an image: position, rotation and scale of the block come from "
+                "its trajectories"]  # fmt: skip
+    notes = [f"{never} of {n} control points are measured in no image"] if never else []
+    return notes + _notes_on_spread(network, control.xyz_l[measured])
+
+
+def _notes_on_spread(network: Any, xyz: Array) -> list[str]:
     if len(xyz) < 3:
         return [f"{len(xyz)} control point{'s' if len(xyz) > 1 else ''}: too few to check the datum of the block"]
     spread = np.linalg.svd(xyz[:, :2] - xyz[:, :2].mean(axis=0), compute_uv=False)

@@ -183,8 +183,10 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
     if len(paths) > 1 and args.clock_sigma:
         raise UserError("--clock-sigma goes with one recording: each has a clock of its own")
-    questions = args.variance_components and not args.free
+    questions = args.variance_components
     args.selfcal = args.selfcal or (LEFT if questions else "none")
+    if args.free and args.selfcal == "none":
+        raise UserError("--free goes with additional parameters, wanted --selfcal")
     if args.clock_sigma is None:
         args.clock_sigma = USUAL_PLATFORM.clock_sigma_s if questions and len(paths) == 1 else 0.0
     recordings = [read_input(path) for path in paths]

@@ -14,6 +14,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import CrsError, Frame, LocalFrame
 from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ...solver.geometry.trajectory import Trajectory
+from ...solver.models import WANDER_TIMES, setting_names
 from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
@@ -60,8 +61,6 @@ _IMAGE = (
 
 #: Settings of trajectory models that are whole numbers.
 _WHOLE = ("segments", "fixes", "order", "continuity")
-#: Correlation times of the wander that a project may state.
-WANDER_TIMES = ("wander_time_s", "attitude_wander_time_s")
 
 Key = tuple[str, str | None]  # strip and lens
 
@@ -152,6 +151,10 @@ def _project(folder: Path, notes: list[str]) -> tuple[str, str, Apriori]:
     settings, then = trajectory_settings(trajectory)
     for table in (file, project, apriori):
         notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
+    known = setting_names()
+    for table, stated in (("trajectory", settings), ("trajectory.then", then)):
+        unknown = [key for key in stated if key not in known]
+        notes.extend(f"project.toml: {table}: key {key} is not known and was ignored" for key in unknown)
     return name, crs, Apriori(sigma, settings, then)
 
 

@@ -14,10 +14,10 @@ from ...schemas.topics import rank
 from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
 from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
+from ...solver.models import WANDER_TIMES
 from ...solver.models.dgr import DgrOptions
 from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
 from ..node import Message
-from .block_folder import WANDER_TIMES
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0

@@ -13,11 +13,11 @@ from ...schemas import messages as m
 from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from ...solver.adjustment.network import Strip
 from ...solver.geometry.trajectory import Trajectory
+from ...solver.models import WANDER_TIMES
 from ...solver.models.slow_errors import SlowErrors
 from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of
 from ..errors import UserError
 from ..node import Message
-from .block_folder import WANDER_TIMES
 from .block_messages import SIGMAS
 
 #: What `block_from_messages` reads.

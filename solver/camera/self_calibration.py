@@ -117,6 +117,7 @@ class SelfCalibration:
     columns : (patterns, slots) int32 parameter behind each slot, for each pattern (CCD line or chip); -1 none
     estimated : (m,) which are unknowns; the others are zero
     chips : per CCD line the first sample of each of its patterns
+    weighted : whether the a-priori sigmas carry weight
     """
 
     name: str
@@ -126,6 +127,7 @@ class SelfCalibration:
     columns: NDArray[np.int32]
     estimated: NDArray[np.bool_]
     chips: tuple[tuple[int, ...], ...] = field(repr=False)
+    weighted: bool = True
 
     @property
     def unknown_names(self) -> tuple[str, ...]:
@@ -150,7 +152,8 @@ class SelfCalibration:
     def questioned_names(self) -> tuple[str, ...]:
         """Estimated parameters whose sigmas may be stated larger: of what a calibration leaves open all but the camera
         constant, since over one strip an offset in Z explains as much."""
-        return tuple(n for n in self.unknown_names if self.as_calibrated and not n.startswith("dc"))
+        questioned = self.as_calibrated and self.weighted
+        return tuple(n for n in self.unknown_names if questioned and not n.startswith("dc"))
 
     def without(self, names: Sequence[str]) -> SelfCalibration:
         """The set with some parameters no longer estimated.
@@ -187,7 +190,7 @@ class SelfCalibration:
 
     def free(self) -> SelfCalibration:
         """The set with a-priori sigmas so large that they carry no weight."""
-        return replace(self, sigma=self.sigma * FREE)
+        return replace(self, sigma=self.sigma * FREE, weighted=False)
 
     def design(self, ccd: NDArray[np.int64], sample: Array, xy_mm: Array, focal_length_mm: Array) -> CameraDesign:
         """Coefficients for rays (n,) at image coordinates (n, 2) reduced to the principal point."""

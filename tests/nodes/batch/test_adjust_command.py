@@ -362,6 +362,24 @@ def test_everything_at_once_with_pictures(folder, tmp_path):
         assert (tmp_path / name).stat().st_size > 20_000
 
 
+def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder, tmp_path, capsys):
+    block = tmp_path / "block"
+    shutil.copytree(folder, block)
+    path = block / "image_points.csv"
+    control = set(pd.read_csv(block / "ground_points.csv").query("role == 'control'")["point"])
+    image = pd.read_csv(path)
+    image[~image["point"].isin(control - {min(control)})].to_csv(path, index=False)
+    project = block / "project.toml"
+    project.write_text(project.read_text().replace("[trajectory]\n", "[trajectory]\nofset_sigma_m = 0.1\n"))
+    code, out, _ = adjust(block, "-q", capsys=capsys)
+    assert code == 0
+    assert f"note: {len(control) - 1} of {len(control)} control points are measured in no image" in out
+    assert "note: project.toml: trajectory: key ofset_sigma_m is not known and was ignored" in out
+    image[~image["point"].isin(control)].to_csv(path, index=False)
+    code, out, _ = adjust(block, "-q", capsys=capsys)
+    assert code == 0 and f"note: no control point of {len(control)} is measured in an image" in out
+
+
 def test_summary_says_what_matters(folder, capsys):
     code, out, err = adjust(folder, "--selfcal", "tls18", "--snoop", "-v", capsys=capsys)
     assert code == 0

@@ -33,6 +33,16 @@ def test_the_batch_says_what_is_wrong_and_finds_it(tmp_path, capsys):
 
 
 @needs_blocks
+def test_parameters_without_weight_keep_the_other_unknowns(capsys):
+    """``--free`` took away camera and clock without a word, and points were a metre off with sigma0 1.00."""
+    assert main(["adjust", str(BLOCKS / "selfcal"), "-q", "--variance-components", "--free"]) == 0
+    out = capsys.readouterr().out
+    assert "self-calibration calibrated" in out and "clock:" in out and "sigma of calibration" not in out
+    assert main(["adjust", str(BLOCKS / "dgr"), "-q", "--free"]) == 1
+    assert "--free goes with additional parameters, wanted --selfcal" in capsys.readouterr().err
+
+
+@needs_blocks
 def test_a_camera_that_was_never_calibrated(tmp_path):
     flight, done = tmp_path / "flight.mcap", tmp_path / "done.mcap"
     assert main(["import", str(BLOCKS / "selfcal"), "-o", str(flight), "-q"]) == 0
