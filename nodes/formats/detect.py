@@ -31,7 +31,7 @@ from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
 from .scene_images import with_scene_images
 from .scene_recording import local_block
-from .sensor_recording import sensor_messages
+from .sensor_recording import sensor_extent, sensor_messages
 from .tie_points import statistics, tie_point_messages
 from .tiff_image import is_tiff
 from .time_columns import same_day
@@ -228,6 +228,8 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             messages = _at_height(path, kind, messages, options, notes)
         images = options.lines is not None and options.lines.files and (topics is None or topics.topics is None)
         strip = _strip_of(options, options.lines) if images and options.lines is not None else None
+        if strip is not None and kind == "sensors":
+            strip = within(strip, *sensor_extent(path)[0], "sensors")
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
@@ -239,7 +241,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         strip = None
         if options.lines is not None:  # the images are the strip, not the poses
             strip = _strip_of(options, options.lines, track if track.line_rate_hz > 0 else None)
-            check_within(strip, track)
+            strip = within(strip, int(track.time_ns[0]), int(track.time_ns[-1]), "poses")
         if strip is not None or options.poses_only:
             track = replace(track, line_rate_hz=0.0)
         frame = replace(frame_of(track), height_m=options.ground.height(path, track.geodetic, notes))
@@ -290,14 +292,29 @@ def _image_alone(path: Path, options: Options) -> Imported:
     return Imported("lines", with_lines(first, strip, notes), notes)
 
 
-def check_within(strip: ImageStrip, track: NavigationTrack) -> None:
-    """Raise UserError where no line of a strip was imaged while there are poses."""
-    begin, end = int(strip.time_ns[0]), int(strip.time_ns[-1])
-    if end < track.time_ns[0] or begin > track.time_ns[-1]:
-        spans = [f"{_utc(a)} to {_utc(b)}" for a, b in ((begin, end), (int(track.time_ns[0]), int(track.time_ns[-1])))]
+def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStrip:
+    """The strip, with a note about lines that were imaged before or after there was any of something.
+
+    Parameters
+    ----------
+    begin_ns, end_ns : UTC of the first and the last one
+    what : poses or sensors
+
+    Raises
+    ------
+    UserError : no line was imaged between these
+    """
+    first, last = int(strip.time_ns[0]), int(strip.time_ns[-1])
+    if last < begin_ns or first > end_ns:
+        spans = [f"{_utc(a)} to {_utc(b)}" for a, b in ((first, last), (begin_ns, end_ns))]
         raise UserError(
-            f"strip {strip.id}: lines from {spans[0]}, but poses from {spans[1]}; wanted the same time scale"
+            f"strip {strip.id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale"
         )
+    out = int(np.count_nonzero((strip.time_ns < begin_ns) | (strip.time_ns > end_ns)))
+    if not out:
+        return strip
+    note = f"strip {strip.id}: {out} of {len(strip.time_ns)} lines outside the time of the {what}: without orientation"
+    return replace(strip, notes=(*strip.notes, note))
 
 
 def _utc(time_ns: int) -> str:

@@ -14,19 +14,22 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import Apriori
+from ...solver.arrays import Array
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
+from ...solver.geometry.earth import ecef_from_geodetic
 from ...solver.geometry.frames import CrsError, LocalFrame
+from ...solver.models import WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
 from ..convert import camera_message, ground_point_message
 from ..errors import UserError
 from ..node import Message
-from .block_folder import WANDER_TIMES, read_ground_points
+from .block_folder import read_ground_points
 from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
-from .detect import KINDS, Imported, Options, check_within, kind_of_path, read_any, read_track
+from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track, within
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import NOT_GIVEN, GroundGiven
@@ -34,10 +37,13 @@ from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
 from .projection import missing_grids
 from .sensor_folder import read_grade
+from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
 from .track import Accuracy, Mounting, NavigationTrack
 
 FILE = "flight.toml"
+#: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
+FAR_M = 50e3
 #: What `navigation.file` may be.
 NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
 #: Slow errors of positions by kind of GNSS solution, m: constant in a strip, and wandering (east, north, up), and the
@@ -100,6 +106,8 @@ class Flight:
     mounting : of the camera on the body
     navigation, kind, day : file of poses or sensors, one of `NAVIGATION`, and the day of the flight
     track : the poses, where the file has poses and not sensors
+    places_deg : (n, 2) latitude and longitude of some places that were flown over; None where they are not known
+    span_ns : UTC of the first and the last pose, or of sensors that make poses; None where it is not known
     sigmas : slow errors, named as in `configuration/project`
     grade : of the inertial unit
     control : file, or None
@@ -125,6 +133,8 @@ class Flight:
     kind: str = ""
     day: date | None = None
     track: NavigationTrack | None = None
+    places_deg: Array | None = None
+    span_ns: tuple[int, int] | None = None
     sigmas: dict[str, Any] = field(default_factory=dict)
     grade: InertialGrade = MEMS
     control: Path | None = None
@@ -413,8 +423,11 @@ def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
     options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
     if kind in ("sensors", "ros2"):
         next(iter(read_any(path, kind, options).messages), None)
+        if kind == "sensors":
+            flight.span_ns, flight.places_deg = sensor_extent(path)
     else:
-        flight.track = read_track(path, kind, options)
+        track = flight.track = read_track(path, kind, options)
+        flight.span_ns, flight.places_deg = (int(track.time_ns[0]), int(track.time_ns[-1])), some(track.geodetic[:, :2])
     flight.navigation, flight.kind = path, kind
 
 
@@ -491,9 +504,22 @@ def _control(flight: Flight, keys: Keys, general: Keys) -> None:
         flight.notes.append(
             f"{path.name}: median height {flight.ground_height_m:g} m above the ellipsoid is the origin's"
         )
+    if flight.places_deg is not None and len(points.xyz_l):
+        away = _distance_m(frame.to_geodetic(points.xyz_l)[:, :2], flight.places_deg)
+        if away > FAR_M:
+            raise UserError(
+                f"{path.name}: no point lies within {1e-3 * away:.0f} km of the flight, "
+                f"wanted coordinates in flight.crs ({flight.crs})"
+            )
     flight.control = path
     if flight.origin_deg is None:
         flight.origin_deg = frame.lat_deg, frame.lon_deg
+
+
+def _distance_m(one_deg: Array, other_deg: Array) -> float:
+    """Least distance between places (n, 2) and (m, 2) of latitude and longitude in degrees, m; a chord."""
+    a, b = (ecef_from_geodetic(lat, lon, 0.0) for lat, lon in (np.radians(one_deg).T, np.radians(other_deg).T))
+    return float(np.sqrt(((a[:, None] - b[None]) ** 2).sum(axis=2).min()))
 
 
 def _announced(flight: Flight, keys: Keys) -> None:
@@ -540,9 +566,11 @@ def _strip(flight: Flight, keys: Keys) -> None:
         raise UserError(
             f"{keys.path}: {keys.where}: times of the lines missing, wanted line_times, or first_time and line_rate_hz"
         )
+    if raw is not None and not raw[1] and flight.camera is None:
+        return  # how long its lines are would be known from the camera, and what is wrong with that is told
     strip = open_strip(given, flight.camera, pose_times)
-    if track is not None:
-        check_within(strip, track)
+    if flight.span_ns is not None:
+        strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
     if flight.camera is None:  # told once, with the camera
         strip = replace(strip, notes=())
     flight.strips.append(strip)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...schemas import messages as m
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import Apriori
+from ...solver.arrays import Array
 from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
 from ...solver.navigation.inertial_data import InertialData, InertialGrade
@@ -19,6 +20,9 @@ from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..node import Message
 from .sensor_folder import SensorFolder, read_sensor_folder
+
+#: Places of a flight that are enough to tell where it was.
+SOME = 300
 
 
 def sensor_messages(
@@ -42,6 +46,8 @@ def sensor_messages(
     if not messages:
         raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")
     messages.sort(key=lambda message: (message.stamp_ns, rank(message.topic)))
+    if folder.gnss is None:
+        notes.append(f"{path / 'gnss.csv'}: no such file: without GNSS the navigator makes no poses")
     platform = folder.platform
     arm = np.asarray(platform.lever_arm_m) - np.asarray(platform.camera_lever_arm_m)
     project = m.Project(
@@ -56,6 +62,30 @@ def sensor_messages(
         project.origin_longitude = round(float(np.degrees(np.nanmedian(folder.gnss.lon))), 6)
     yield Message("configuration/project", messages[0].stamp_ns, project, source)
     yield from messages
+
+
+def sensor_extent(path: Path) -> tuple[tuple[int, int], Array]:
+    """UTC of the first and the last moment at which a sensor folder has GNSS and, where it has any, inertial data or
+    attitudes; (n, 2) latitude and longitude of some of its fixes, degrees.
+
+    Raises
+    ------
+    UserError : as `sensor_messages`; no GNSS
+    """
+    folder = read_sensor_folder(path)
+    if folder.gnss is None:
+        raise UserError(f"{path / 'gnss.csv'}: no such file, wanted GNSS positions")
+    times = [folder.gnss.time_s]
+    times += [folder.time_s] if folder.time_s is not None else []
+    times += [folder.attitude.time_s] if folder.attitude is not None and folder.time_s is None else []
+    begin, end = _ns(np.array([max(np.nanmin(t) for t in times), min(np.nanmax(t) for t in times)]))
+    places = np.degrees(np.column_stack([folder.gnss.lat, folder.gnss.lon]))
+    return (begin, end), some(places[np.isfinite(places).all(axis=1)])
+
+
+def some(places: Array) -> Array:
+    """Some hundred rows (n, k) of many."""
+    return places[:: max(len(places) // SOME, 1)]
 
 
 def _ns(time_s: NDArray[np.floating]) -> list[int]:

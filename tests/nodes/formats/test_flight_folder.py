@@ -163,10 +163,10 @@ def test_the_origin_lies_on_the_ground_by_raster_or_height_above_it(folder, tmp_
 def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
     at = folder / "sensors"
     at.mkdir()
-    t = 1591012800 + np.arange(300) * 0.01
+    t = 1591012800 + np.arange(500) * 0.01
     rows = [f"{x:.2f},0,0,-9.81,0,0,0" for x in t]
     (at / "imu.csv").write_text("time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s\n" + "\n".join(rows) + "\n")
-    fixes = [f"{1591012800 + i},{LAT},{LON},2000,0.1,0.1,0.2" for i in range(4)]
+    fixes = [f"{1591012800 + i},{LAT},{LON},2000,0.1,0.1,0.2" for i in range(6)]
     (at / "gnss.csv").write_text(
         "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n" + "\n".join(fixes) + "\n"
     )
@@ -178,6 +178,43 @@ def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
     assert next(iter(reader.messages(["configuration/project"]))).body.origin_height == GROUND
     imu = next(iter(reader.messages(["sensor/imu"]))).body
     assert imu.rate_sigma == pytest.approx(np.radians(0.06) / 60 / np.sqrt(imu.interval_ns * 1e-9), rel=1e-6)
+
+
+def test_lines_and_sensors_of_different_times_are_told(folder, tmp_path, capsys):
+    at = folder / "sensors"
+    at.mkdir()
+    text = TOML.replace('"poses.csv"', '"sensors"')
+
+    def sensors(begin_s, seconds):
+        t = begin_s + np.arange(int(100 * seconds)) * 0.01
+        rows = [f"{x:.2f},0,0,-9.81,0,0,0" for x in t]
+        head = "time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s"
+        (at / "imu.csv").write_text("\n".join([head, *rows]) + "\n")
+        fixes = [f"{begin_s + i},{LAT},{LON},2000,0.1,0.1,0.2" for i in range(int(seconds) + 1)]
+        (at / "gnss.csv").write_text(
+            "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n" + "\n".join(fixes) + "\n"
+        )
+
+    (folder / "flight.toml").write_text(text)
+    sensors(1591012800 - 7200, 5.0)  # two hours off
+    problems = read_flight(folder).problems
+    assert any("strip S1: lines from 2020-06-01T12:00:00Z" in p and "but sensors from" in p for p in problems)
+    sensors(1591012800 + 0.5, 5.0)
+    flight = read_flight(folder)
+    assert not flight.problems
+    notes = [note for strip in flight.strips for note in strip.notes]
+    assert any("strip S1: 25 of 50 lines outside the time of the sensors: without orientation" in n for n in notes)
+    (at / "gnss.csv").unlink()
+    (problem,) = (p for p in read_flight(folder).problems if "gnss.csv" in p)
+    assert problem.endswith("gnss.csv: no such file, wanted GNSS positions")
+
+
+def test_control_far_from_the_flight_is_refused(folder):
+    """Such as that of another UTM zone: the flight went on without a word, and found no tie points."""
+    zone = next(text for text in ("EPSG:32632", "EPSG:32633") if text in TOML)
+    (folder / "flight.toml").write_text(TOML.replace(zone, "EPSG:32635"))
+    (problem,) = read_flight(folder).problems
+    assert problem.startswith("control.csv: no point lies within ") and "flight.crs (EPSG:32635)" in problem
 
 
 def test_lines_with_a_pose_each_need_no_times(folder, tmp_path):
