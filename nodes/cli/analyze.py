@@ -57,7 +57,8 @@ def _nothing(held: Holdings) -> str:
     """Why there is nothing to analyse."""
     topics = ", ".join(row.topic for row in held.topics if row.messages)
     why = "; ".join(held.damage)
-    return f"no measurement and no result in it, only {topics or 'no message at all'}{'; ' + why if why else ''}"
+    what = f"no measurement and no result in it, only {topics}" if topics else "no message in it"
+    return f"{what}{'; ' + why if why else ''}"
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
+from .damage import tell_damage
 from .progress import progress
 from .rectify_recording import cells_of, prepared
 
@@ -102,7 +103,9 @@ def run(args: argparse.Namespace) -> int:
     done = work.finish()
     if done is None or not done.mosaic.tiles:
         left = ", ".join(f"{n} lines {why}" for why, n in (done.left_out if done else {}).items())
-        raise UserError(f"{args.input}: nothing to rectify: {left or 'no lines of that strip'}")
+        if not left:
+            left = "no lines of that strip" if done is None else f"no ray meets the ground: {ground}"
+        raise UserError(f"{args.input}: nothing to rectify: {left}")
     tags = {
         "TIFFTAG_SOFTWARE": "triline",
         "TIFFTAG_IMAGEDESCRIPTION": f"{camera.name} {camera.lines[ccd].id}, {name} orientation, {ground}",
@@ -118,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args)
+    tell_damage("rectify", recording.reader)
     return 0
 
 

@@ -15,6 +15,7 @@ from ..convert import iso
 from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
 from .bus_options import add_bus_arguments, bus_of, reporter
+from .damage import tell_damage
 from .progress import progress
 
 EXAMPLE = "triline replay flight.mcap --rate 4 --from 20 --to 50"
@@ -51,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
         bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
         brake = Brake(bus, args.wait_for, stop, args.rate)
         report(f"{args.recording}: from {iso(first)} at rate {args.rate:g}")
+        tell_damage("replay", reader)
         if nobody:
             report(nobody)
         with progress("playing", args.quiet or args.json) as told:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ..errors import UserError
 from .bus_options import add_bus_arguments, bus_of, reporter
+from .damage import tell_damage
 
 EXAMPLE = """triline view flight.mcap --web
   triline view --fleet --secure survey/ann      # all aircraft in the air: docs/fleet.md"""
@@ -53,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         if not counts.total():
             raise UserError(f"{args.recording}: nothing in it that can be shown")
         _say(args, mode, counts, None if process is None else process.web_url)
+        tell_damage("view", reader)
         if process is not None:
             process.wait()
     except KeyboardInterrupt:

@@ -215,6 +215,9 @@ def _world(values: Mapping[str, Any]) -> World:
 
 
 def _planned(values: Mapping[str, Any]) -> SimulatedFlight:
+    for name, value in values.items():
+        if BY_NAME[name].group == "motion" and name != "motion" and value is not False:
+            raise UserError(f"simulation: {name.replace('_', '-')} belongs to a real motion, wanted motion as well")
     plan = _fields(values, "plan")
     for name, field in (("seconds", "strip_s"), ("relief", "relief_m")):
         if name in values:
