@@ -17,6 +17,7 @@ from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability,
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
 from ...solver.adjustment.surface_control import SurfaceFit
+from ...solver.adjustment.variance_components import CONSTANTS
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
 from .json_values import plain
@@ -35,6 +36,9 @@ MANY_WEAK = 30
 #: Files beside ``result.json``.
 TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
 CAMERA, PER_LINE = "camera.json", "orientation_lines.csv"
+#: Sigmas so many times as large as stated are a fault of something else.
+UNLIKELY = 20.0
+LIKELIER = "a wrong unit, datum, time or camera is likelier"
 PLOTS = ("residuals.png", "points.png", "corrections.png")
 
 
@@ -302,6 +306,9 @@ def notes_of(adjustment: Adjustment) -> list[str]:
         notes.append(_sigma0_note(result))
     if adjustment.job.self_calibration is not None and adjustment.camera() is None:
         notes.append(f"no additional parameter is determined: the camera stays as it is, and no {CAMERA} is written")
+    for c in result.components or ():
+        if c.estimated and c.factor > UNLIKELY and c.group not in CONSTANTS:
+            notes.append(f"sigma of {c.group} {c.factor:.0f} times as large as stated: {LIKELIER}")
     notes += _test_notes(adjustment)
     notes += _control_notes(result)
     notes += _weakness_notes(result)
@@ -328,6 +335,8 @@ def _sigma0_note(result: BatchResult) -> str:
     """Why the chi-square test may have failed."""
     test, image = result.test, result.image_test
     said = f"sigma0 {test.sigma0:.3f} outside [{test.low:.3f}, {test.high:.3f}] (95 %)"
+    if test.sigma0 > UNLIKELY:
+        return f"{said}: {LIKELIER} than such errors"
     if test.sigma0 > test.high:
         asked = "" if result.components else "; --variance-components asks which, clock and camera with them"
         return f"{said}: errors are left in the data or the model, or the a-priori sigmas do not fit{asked}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ...solver.adjustment.variance_components import CONSTANTS
+from ...solver.adjustment.variance_components import CONSTANTS, LARGEST
 
 Content = Mapping[str, Any]
 
@@ -128,7 +128,9 @@ def _parameters(c: Content) -> Iterator[str]:
 def _components(c: Content) -> Iterator[str]:
     for group, v in c["variance_components"].items():
         said = "a-priori kept, " + ("nothing contradicts it" if group in CONSTANTS else "too little redundancy")
-        if v["estimated"]:
+        if v["estimated"] and v["sigma_factor"] > 0.999 * LARGEST:
+            said = f"a-priori times {LARGEST:g} or more: are units and datum of these observations right?"
+        elif v["estimated"]:
             said = f"a-priori times {v['sigma_factor']:.3f} +- {_number(v['sigma_factor_sigma'])}"
         yield f"sigma of {group}: {said} ({v['observations']} observations, redundancy {v['redundancy']:.1f})"
 

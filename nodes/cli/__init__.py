@@ -126,7 +126,9 @@ def _run(argv: list[str], job: bool) -> int:
         print(f"triline {args.command}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
     except FileNotFoundError as error:
         print(f"triline {args.command}: {error.filename}: no such file or folder", file=sys.stderr)
-    except (PermissionError, IsADirectoryError, NotADirectoryError) as error:
+    except IsADirectoryError as error:
+        print(f"triline {args.command}: {error.filename}: is a folder, wanted a file", file=sys.stderr)
+    except (PermissionError, NotADirectoryError) as error:
         print(f"triline {args.command}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
     except MemoryError as error:
         print(f"triline {args.command}: not enough memory: {str(error) or 'out of memory'}", file=sys.stderr)

@@ -66,8 +66,9 @@ Key = tuple[str, str | None]  # strip and lens
 
 
 def is_block_folder(path: Path) -> bool:
-    """Whether a folder looks like a block folder."""
-    return path.is_dir() and any((path / name).is_file() for name in ("camera.json", "image_points.csv", "strips.csv"))
+    """Whether a folder looks like a block folder; not one of results, which may have a camera."""
+    names = ["image_points.csv", "strips.csv", *([] if (path / "result.json").is_file() else ["camera.json"])]
+    return path.is_dir() and any((path / name).is_file() for name in names)
 
 
 def read_block(folder: Path | str) -> BlockData:

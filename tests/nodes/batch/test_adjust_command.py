@@ -380,6 +380,18 @@ def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder
     assert code == 0 and f"note: no control point of {len(control)} is measured in an image" in out
 
 
+def test_control_in_another_unit_is_no_matter_of_sigmas(folder, tmp_path, capsys):
+    block = tmp_path / "block"
+    shutil.copytree(folder, block)
+    points = pd.read_csv(block / "ground_points.csv")
+    points[["X_m", "Y_m", "Z_m"]] /= 0.3048
+    points.to_csv(block / "ground_points.csv", index=False)
+    _, out, _ = adjust(block, "-q", capsys=capsys)
+    assert "a wrong unit, datum, time or camera is likelier than such errors" in out
+    _, out, _ = adjust(block, "-q", "--variance-components", capsys=capsys)
+    assert "times as large as stated: a wrong unit, datum, time or camera is likelier" in out
+
+
 def test_summary_says_what_matters(folder, capsys):
     code, out, err = adjust(folder, "--selfcal", "tls18", "--snoop", "-v", capsys=capsys)
     assert code == 0
