@@ -34,6 +34,10 @@ LOWEST_GROUND_M = -450.0
 #: Platform time between two words on how far the matcher is, ns.
 PROGRESS_NS = 40_000_000
 
+#: Topics that follow from what the matcher says: they tell nothing of time, and when one comes depends on how a flight
+#: ends.
+FOLLOW = ("orientation/live", "adjustment/report", "matching/pace")
+
 
 class Matcher(Node):
     """Runs a `TieMatcher`, or a `StripMatcher` for cameras with several lenses or with one line.
@@ -127,7 +131,8 @@ class Matcher(Node):
             self._told_ns = message.stamp_ns
             progress = m.Progress(time_ns=message.stamp_ns - 1)
             out.append(Message("observation/progress", message.stamp_ns - 1 + self._delay_ns, progress))
-        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
+        if message.topic not in FOLLOW:
+            self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         out += self._begin_pace(message.stamp_ns)
         if self._keeps_time(message.topic):
             out += self._ended(self._found.ended(message.stamp_ns))
@@ -165,9 +170,8 @@ class Matcher(Node):
 
     @staticmethod
     def _keeps_time(topic: str) -> bool:
-        """Whether a message tells how far the flight is; not those of the adjuster, which goes by the matcher."""
-        told_by_others = "orientation/live", "adjustment/report", *Matcher.decisions
-        return topic not in told_by_others and not find(topic).latched
+        """Whether a message tells how far the flight is."""
+        return topic not in FOLLOW and not find(topic).latched
 
     def state(self) -> str:
         if self._matcher is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sample_messages as sample
 from driven_flight import SETTINGS
 
 from triline.nodes.convert import camera_message
@@ -77,6 +78,19 @@ def test_a_strip_that_begins_anew_under_its_name_is_refused():
     node.step(Message("sensor/lines/N", EPOCH_NS, block("S1", 0), "x"))
     node.step(Message("sensor/lines/N", EPOCH_NS + 10**11, block("S1", 20, late_ns=10**11), "x"))
     assert node.counters["malformed"] >= 1 and "wants another name" in node.last_problem
+
+
+def test_what_follows_from_the_matcher_does_not_move_the_end_of_a_strip():
+    """The adjuster's last words come before or after the matcher's, as it happens when a flight is ended."""
+    ends = []
+    for late in (False, True):
+        node = Matcher()
+        node.step(Message("configuration/camera", EPOCH_NS, camera_message(preset("ads40-small")), "x"))
+        node.step(Message("sensor/lines/N", EPOCH_NS, block("S1", 0), "x"))
+        if late:
+            node.step(Message("adjustment/report", EPOCH_NS + 10**9, sample.body("adjustment/report"), "adjuster"))
+        ends += [message.stamp_ns for message in node.finish() if message.topic == "configuration/strip"]
+    assert len(ends) == 2 and ends[0] == ends[1]
 
 
 def test_ties_are_those_of_the_announced_strip():
