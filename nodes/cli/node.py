@@ -50,7 +50,7 @@ def run_on_bus(node: Node, options: ProgramOptions) -> int:
             options.report(f"{node.name} at {url}")
         runner.run()
     counted = ", ".join(f"{n} {kind}" for kind, n in sorted(node.counters.items()))
-    options.report(f"{node.name} stopped" + (f"; {counted}; {node.last_problem}" if counted else ""))
+    options.report("; ".join(filter(None, (f"{node.name} stopped", counted, counted and node.last_problem))))
     return 0
 
 

@@ -12,6 +12,7 @@ from ..bus.brake import Brake
 from ..bus.program import stop_on_signals
 from ..bus.session import Bus
 from ..convert import iso
+from ..errors import UserError
 from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
 from .bus_options import add_bus_arguments, bus_of, reporter
@@ -40,6 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording)
+    if not len(reader.index.stamp_ns):
+        raise UserError(f"{args.recording}: nothing to play: no message in it")
     first = first_stamp_ns(reader)
     report = reporter(args.quiet or args.json)
     stop = threading.Event()
