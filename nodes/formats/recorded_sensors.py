@@ -16,6 +16,7 @@ from .. import convert
 from ..errors import UserError
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
+from ..recording.summary import damage_lines
 from .sensor_folder import Platform, SensorFolder, read_platform
 
 _FIELDS = {
@@ -62,7 +63,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     time_s = (np.array([b.time_ns for b in imu], dtype=np.int64) - start_ns) * 1e-9
     rate = np.array([(b.rate_x, b.rate_y, b.rate_z) for b in imu])
     force = np.array([(b.force_x, b.force_y, b.force_z) for b in imu])
-    notes: list[str] = []
+    notes = damage_lines(reader)
     if platform_file is not None:
         platform = read_platform(platform_file, notes)
     else:

@@ -126,6 +126,21 @@ def test_process_tells_what_it_skipped(tmp_path, capsys):
     assert code == 0 and "skipped 1 damaged place: a chunk" in err and len(err.splitlines()) == 1
 
 
+def test_commands_that_work_on_what_is_left_say_that_something_is_missing(tmp_path, capsys):
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    flight = ("--seconds", 8, "--lead-in", 30, "--images", "--pixels", 100, "--imu", "tactical", "-q")
+    assert run_main(capsys, "simulate", "-o", whole, *flight)[0] == 0
+    data = whole.read_bytes()
+    cut.write_bytes(data[: int(0.8 * len(data))])
+    for command in (
+        ("navigate", cut, "-o", tmp_path / "navigation"),
+        ("rectify", cut, "-o", tmp_path / "o.tif", "--orientation", "truth", "-q"),
+        ("view", cut, "--rrd", tmp_path / "v.rrd"),
+    ):
+        code, out, err = run_main(capsys, *command)
+        assert code == 0 and "skipped 1 damaged place: the file ends" in out + err, command
+
+
 # ---- commands
 
 
