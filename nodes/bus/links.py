@@ -45,8 +45,8 @@ class LinkWatch:
         self._told.pop(topic, None)
 
     def unwanted(self, name: str) -> None:
-        """This node does not listen any more to a topic of the table: nothing of it is missed until it is heard again
-        by somebody else here."""
+        """A subscription to a topic of the table has been ended on purpose: the topic is not missed, unless another
+        subscription of this session still hears it."""
         row = topics.find(name)
         for topic in [topic for topic in self._heard_s if row.matches(topic)]:
             del self._heard_s[topic]

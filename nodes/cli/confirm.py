@@ -67,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
         time.sleep(LISTEN_S)
         if not heard.stamp_ns:
             raise UserError(f"no node sends on the bus of platform {bus.platform}")
+        if args.source:  # GNSS may come once a second
+            _wait(lambda: bool(heard.sources), NOBODY_S)
         if not topic and heard.points and args.point not in heard.points:
             raise UserError(f"{args.point} is no ground point of this flight, there are {_few(heard.points)}")
         if args.source and heard.sources and args.source not in heard.sources and not args.reject:

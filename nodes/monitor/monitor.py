@@ -282,14 +282,8 @@ def display(
         yield line
 
 
-def run(options: ProgramOptions) -> int:
-    """Watch a platform until told to stop."""
-    watch_platform(options)
-    return 0
-
-
 def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
-    """The same; what is known in the end. Shows nothing meanwhile if ``quiet``."""
+    """Watch a platform until told to stop; returns what is known in the end. Shows nothing meanwhile if ``quiet``."""
     from ..bus.live import BusRunner, in_thread
 
     monitor = build(Monitor, options.tables)

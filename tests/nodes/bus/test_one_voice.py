@@ -30,6 +30,20 @@ class Listening(Node):
         return ()
 
 
+def attitudes(sender: Bus, source: str, stop: threading.Event) -> threading.Thread:
+    """Publishes attitudes until told to stop."""
+
+    def fly() -> None:
+        i = 0
+        while not stop.wait(0.02):
+            i += 4
+            sender.publish(sample.message("sensor/attitude", i, source))
+
+    flight = threading.Thread(target=fly, daemon=True)
+    flight.start()
+    return flight
+
+
 def test_two_nodes_of_one_name_are_told_and_no_longer_when_one_has_ended():
     port, monitor = free_port(), Monitor()
     with (
@@ -53,7 +67,7 @@ def test_several_may_look_on_and_one_may_count():
     with Bus(port=port, source="monitor") as bus, in_thread(BusRunner(monitor, bus)):
         with Bus(port=port, source="adjuster") as one, in_thread(BusRunner(node, one)):
             wait_for(monitor.overview.alarms, 10, "the alarm of the node")
-            done = triline("monitor", "--json", "--seconds", 3, "--port", port)
+            done = triline("monitor", "--json", "--seconds", 8, "--port", port)
             assert done.returncode == 0, done.stderr
             seen = json.loads(done.stdout)
             assert seen["nodes"]["adjuster"]["state"] == "running" and seen["report"] is None
@@ -73,14 +87,7 @@ def test_a_source_that_nobody_heard_is_not_chosen():
     ):
         wait_for(lambda: "navigator" in sender.alive(), 10, "the node")
 
-        def fly() -> None:
-            i = 0
-            while not stop.wait(0.02):
-                i += 4
-                sender.publish(sample.message("sensor/attitude", i, "receiver"))
-
-        flight = threading.Thread(target=fly, daemon=True)
-        flight.start()
+        flight = attitudes(sender, "receiver", stop)
         done = triline("confirm", "sensor/attitude", "--source", "reciever", "--port", port)
         stop.set()
         flight.join()
@@ -101,15 +108,8 @@ def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malfor
     ):
         wait_for(lambda: "navigator" in sender.alive(), 10, "the node")
 
-        def fly() -> None:
-            i = 0
-            while not stop.wait(0.02):
-                i += 4
-                sender.publish(sample.message("sensor/attitude", i, "test"))
-
         sender.publish(Message("configuration/camera", sample.EPOCH_NS, camera, "test"))
-        flight = threading.Thread(target=fly, daemon=True)
-        flight.start()
+        flight = attitudes(sender, "test", stop)
         wait_for(lambda: len(node.given) > 10, 10, "attitudes")
         envelope = Envelope(sample.EPOCH_NS, "intruder", 0, 5)
         sender.publish_raw(RawMessage("configuration/camera", envelope, b""))

@@ -317,12 +317,17 @@ def test_igg3_names_what_it_left_without_weight():
     assert (out & bad).sum() / bad.sum() >= 0.98
 
 
+def with_half_the_sigma():
+    """A network with gross errors whose image sigma is stated half as large as it is; which rays are spoilt."""
+    network = block(8, noise=0.6).network
+    half = np.full(len(network.rays), 0.3)
+    rays = replace(network.rays, sigma_line_px=half, sigma_sample_px=half)
+    return with_outliers(replace(network, rays=rays), 0.05, 2)
+
+
 def test_wrong_image_sigma_is_mended_before_outliers_are_sought():
     """With a sigma half as large as it should be, every eighth good ray would fail the test."""
-    simulated = block(8, noise=0.6).network
-    half = {"sigma_line_px": np.full(len(simulated.rays), 0.3), "sigma_sample_px": np.full(len(simulated.rays), 0.3)}
-    simulated = replace(simulated, rays=replace(simulated.rays, **half))
-    network, bad = with_outliers(simulated, 0.05, 2)
+    network, bad = with_half_the_sigma()
     result = run(network, Job(MODEL, snoop=True, reweight=True))
     out = rejected_rays(network, result.rejected)
     assert result.image_factor == pytest.approx(2.0, rel=0.05)
@@ -333,10 +338,7 @@ def test_wrong_image_sigma_is_mended_before_outliers_are_sought():
 
 def test_variance_components_and_snooping_agree_in_the_end():
     """What is left out depends on the sigma of the image, and that on what is left out."""
-    simulated = block(8, noise=0.6).network
-    half = {"sigma_line_px": np.full(len(simulated.rays), 0.3), "sigma_sample_px": np.full(len(simulated.rays), 0.3)}
-    simulated = replace(simulated, rays=replace(simulated.rays, **half))
-    network, bad = with_outliers(simulated, 0.05, 2)
+    network, bad = with_half_the_sigma()
     result = run(network, Job(MODEL, snoop=True, components=True))
     (image,) = (c for c in result.components if c.group == "image")
     assert image.factor == pytest.approx(2.0, rel=0.05)
