@@ -282,6 +282,12 @@ def display(
         yield line
 
 
+def run(options: ProgramOptions) -> int:
+    """Watch a platform until told to stop: what `triline node monitor` calls, by the name in `nodes.registry`."""
+    watch_platform(options)
+    return 0
+
+
 def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
     """Watch a platform until told to stop; returns what is known in the end. Shows nothing meanwhile if ``quiet``."""
     from ..bus.live import BusRunner, in_thread
