@@ -31,7 +31,7 @@ APRIORI = ("trajectory", "project")
 PACES = ("load", "normal", "throughput")
 #: Platform time between updates at the pace for throughput, s, and while sigmas are in doubt there: what is wrong has
 #: to be known before the next looks are judged.
-THROUGHPUT_S, IN_DOUBT_S = 5.0, 1.0
+THROUGHPUT_S, IN_DOUBT_S = 10.0, 1.0
 #: How far the time of a pose can be after the stamp of its message, s: what goes beyond is no flight, and unknowns for
 #: all of it would take the memory and the time of the others.
 POSE_AHEAD_S = 60.0
@@ -58,7 +58,7 @@ class Adjuster(Node):
     update_rays : waiting image points after which an update does not wait for its time
     pace : "load", larger batches and fewer tie points where updates take too long, and in `process` where they did when
         the flight was recorded; "normal", everything at its time, however long it takes; "throughput", for `process`
-        of long flights: an update every 5 s with what came till then, each second while sigmas are in doubt, from
+        of long flights: an update every 10 s with what came till then, each second while sigmas are in doubt, from
         smoothed poses alone where there are any, and the live orientation with the update
     self_calibration : set of additional parameters, or "none"; "calibrated" is what a calibration leaves open, and more
         where the data contradict it; "focal" the focal length alone

@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     for line in _lines(summary, reader, args.output, seconds):
         print(line)
     if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
-        print("  live orientation is that of updates 5 s apart; that of a flight comes with --pace load")
+        print("  live orientation is that of updates 10 s apart; that of a flight comes with --pace load")
     tell_damage("process", reader)
     return 0
 
