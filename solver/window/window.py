@@ -59,10 +59,10 @@ LEARNT_S = 2.0
 #: Updates that follow each other faster than this, s, share the work that can wait: each does one part of it.
 HURRIED_S = 0.1
 #: Parts of the work that can wait: linearise what has moved, question the sigmas, test old batches again, judge the
-#: quality.
-LOOK_AFTER, QUESTION, RETEST, WATCH = "look after", "question", "retest", "watch"
+#: quality, test sources of tie points for drifts.
+LOOK_AFTER, QUESTION, RETEST, WATCH, SOURCES = "look after", "question", "retest", "watch", "sources"
 #: Time between two turns of each part, s; it is done in the first update after that.
-TURN_S = {LOOK_AFTER: 0.1, QUESTION: 1.0, RETEST: 0.1, WATCH: 0.3}
+TURN_S = {LOOK_AFTER: 0.1, QUESTION: 1.0, RETEST: 0.1, WATCH: 0.3, SOURCES: 1.0}
 #: Where an update comes late and what was found has changed sigmas, they are questioned again, as often as updates in
 #: quick succession would have done it, but no more than this.
 MOST_QUESTIONS = 5
@@ -256,7 +256,7 @@ class Window:
         self._learn_noise()
         self._publish(fresh, result)
         self._leaving.let_go(result, self._limit_s(), self._length_s)
-        result.report = self._report(iterations, fresh + joined, WATCH in duties, result)
+        result.report = self._report(iterations, fresh + joined, duties, result)
         return result
 
     def finish(self) -> WindowUpdate:
@@ -276,7 +276,7 @@ class Window:
         for strip in self.strips.values():
             strip.end(0)
         self._leaving.let_go(result, np.inf, self._length_s, at_the_end=True)
-        result.report = self._report(iterations, joined, True, result)
+        result.report = self._report(iterations, joined, set(TURN_S), result)
         return result
 
     # -- the phases of an update ---------------------------------------------------------------------------------------
@@ -458,21 +458,22 @@ class Window:
                 return strip
         return None
 
-    def _report(self, iterations: int, changed: list[Batch], look: bool, result: WindowUpdate) -> WindowReport:
+    def _report(self, iterations: int, changed: list[Batch], duties: set[str], result: WindowUpdate) -> WindowReport:
         """Judge the window as it is now, and count what is in it."""
         state, batches, quality = self.state, self.network.batches, self._quality
         fit = self._fit()
         flown = self.network.flown
         newest = flown[-1] if flown else None
         quality.integrity.note([b for b in changed if b in batches])  # what left at once is no more exposed
-        findings = quality.last
-        if look or findings is None or findings.strip != (newest.id if newest else ""):
-            solution = state.solution
+        findings, solution = quality.last, state.solution
+        look = WATCH in duties or findings is None or findings.strip != (newest.id if newest else "")
+        changed_sources = quality.watch_sources(self._now_s, look, SOURCES in duties)
+        if look or changed_sources or findings is None:
             noise = self._noise(newest) if newest else np.zeros((6, 6))
             findings = quality.look(self._now_s, self._length_s, fit, noise)
             self._block.drifts = self._sources.named()
-            if state.solution != solution:
-                self._orientation.forget()
+        if changed_sources or state.solution != solution:
+            self._orientation.forget()
         result.events += findings.events
         counts = batches.counts
         unknowns = len(state) + counts.determined

@@ -44,8 +44,6 @@ from .drifts import MOST_GROUPS, Cell, Compensation, Named, estimated
 JUDGED_S = 3.0
 #: Rays of batches taken in at one update, about; bounds the time of an update. Tuned.
 AT_ONCE = 240
-#: Time between tests, s. Tuned: a drift that matters takes longer to grow.
-TEST_EVERY_S = 1.0
 #: Unit of time of the drift unknowns, s, so that bias and drift are numbers of like size.
 DRIFT_S = 10.0
 #: Integral of the correlation of position noise over all lags, in units of the lag at which it is 1/e (see
@@ -74,7 +72,6 @@ class DriftMonitor:
     def __init__(self, network: LiveNetwork, follows: bool = True, alpha: float = FALSE_ALARM) -> None:
         self._network, self._follows, self._alpha = network, follows, alpha
         self._strip = -1
-        self._next_s = -np.inf
         self._named: deque[Named] = deque(maxlen=MOST_NAMED)
         self._restart(0.0)
 
@@ -111,8 +108,8 @@ class DriftMonitor:
         self._restart(self._mine(self._network.batches)[-1].oldest_s)
         return True
 
-    def update(self, now_s: float) -> None:
-        """Take in batches that have settled, and test when it is time; the state is solved."""
+    def take_in(self, now_s: float) -> None:
+        """Take in batches that have settled; the state is solved."""
         mine = self._mine(self._network.batches)
         # once there is an alarm, new batches come in at once, so that the drift is taken out of them, too
         settled = [b for b in mine if b.newest_s <= now_s - (0.0 if self.biased else JUDGED_S)]
@@ -127,9 +124,6 @@ class DriftMonitor:
             turn.append(batch)
             rays += len(batch.rays)
         self._take(turn)
-        if now_s >= self._next_s:
-            self._next_s = now_s + TEST_EVERY_S
-            self._test(now_s, mine)
 
     def _mine(self, batches: Iterable[Batch]) -> list[Batch]:
         return [b for b in batches if b.strips[-1] == self._strip]
@@ -233,9 +227,9 @@ class DriftMonitor:
         """Time since the strip began, in units of the drift's."""
         return (now_s - self._start_s) / DRIFT_S
 
-    def _test(self, now_s: float, batches: list[Batch]) -> None:
-        """Test with what is in the border, of all batches of the strip."""
-        self._tested_s = now_s
+    def test(self, now_s: float) -> None:
+        """Test with what is in the border, of all batches of the strip; the state is solved."""
+        self._tested_s, batches = now_s, self._mine(self._network.batches)
         cells = self._in_border(batches)
         border, found, factor = self._assembled(now_s, cells)
         scores = self._scores(now_s, batches, cells, border)

@@ -68,6 +68,18 @@ class QualityControl:
             functions = np.concatenate([A[0], ground.functions @ A[0]])
         return self.integrity.at(numbers, functions, self._network.state, renew)
 
+    def watch_sources(self, now_s: float, look: bool, test: bool) -> bool:
+        """Tie points that drift: take in what has settled where there is a look, test where it is time; whether others
+        drift than before."""
+        before = self._sources.biased
+        if look:
+            if self._sources.begin():
+                self._control.strip_began()
+            self._sources.take_in(now_s)
+        if test:
+            self._sources.test(now_s)
+        return self._sources.biased != before
+
     def look(self, now_s: float, length_s: float, fit: Fit, noise: Array) -> QualityFindings:
         """Findings of an update.
 
@@ -87,9 +99,6 @@ class QualityControl:
             if exposure is not None:
                 sigma = self._sigma(strip, time_s, exposure, noise)
                 protection = exposure.factor * sigma
-        if self._sources.begin():
-            self._control.strip_began()
-        self._sources.update(now_s)
         events: list[str] = []
         if self._parameters is not None:
             gsd_m = 1.0 if ground is None else ground.gsd_m

@@ -10,7 +10,7 @@ from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import OnlineResult, adjust_online, navigate
 from triline.solver.window.leaving import LEAVING_S
 from triline.solver.window.results import WindowOptions
-from triline.solver.window.window import LOOK_AFTER, QUESTION, RETEST, TURN_S, WATCH, Duties, Window
+from triline.solver.window.window import LOOK_AFTER, QUESTION, RETEST, SOURCES, TURN_S, WATCH, Duties, Window
 
 
 def turns(interval_s: float, seconds: float = 30.0, busy: float = 0.0) -> dict[str, list[float]]:
@@ -28,14 +28,19 @@ def turns(interval_s: float, seconds: float = 30.0, busy: float = 0.0) -> dict[s
 @pytest.mark.parametrize("interval_s", [0.012, 0.024, 0.05])
 def test_work_that_can_wait_is_done_as_often_whatever_the_batches(interval_s: float) -> None:
     done = turns(interval_s)
+    # 20 updates a second have no place for 25 turns: all parts are late by the same share
+    crowded = max(1.0, interval_s * sum(1.0 / every_s for every_s in TURN_S.values()))
+    assert crowded < 1.3
     for part, every_s in TURN_S.items():
         gaps = np.diff(done[part])
-        assert every_s - 1e-6 < gaps.min() and gaps.max() < every_s + max(3.0 * interval_s, 0.2 * every_s) + 1e-6
+        assert every_s - 1e-6 < gaps.min()
+        assert gaps.max() < crowded * every_s + max(3.0 * interval_s, 0.2 * every_s) + 1e-6
 
 
 def test_updates_that_do_not_hurry_do_all_that_is_due() -> None:
     done = turns(0.2)
-    assert {part: len(done[part]) for part in TURN_S} == {LOOK_AFTER: 150, RETEST: 150, QUESTION: 30, WATCH: 75}
+    often = {LOOK_AFTER: 150, RETEST: 150, QUESTION: 30, WATCH: 75, SOURCES: 30}
+    assert {part: len(done[part]) for part in TURN_S} == often
     assert np.diff(done[WATCH]) == pytest.approx(0.4)
     assert np.diff(done[QUESTION]) == pytest.approx(1.0)
 
