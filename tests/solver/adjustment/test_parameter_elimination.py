@@ -74,7 +74,7 @@ def test_what_only_the_pivot_tells_apart_or_lies_far_from_zero_is_adjusted_anew(
 
 
 def test_what_the_model_leaves_out_counts_once_however_many_parameters_go():
-    wander = SlowErrors((0.1, 0.1, 0.2), (1e-4,) * 3, (1e-4,) * 3, (0.1, 0.1, 0.2), (2e-4,) * 3, 20.0)
+    wander = SlowErrors((0.1, 0.1, 0.2), (1e-4,) * 3, (1e-4,) * 3, (0.1, 0.1, 0.2), (2e-4,) * 3, 80.0)
     model = WanderOptions(wander, left_out_m=0.05, left_out=1e-4)
     network = simulate(5, MODEL, points=80).network
     plain = pose_problem(network, model)
