@@ -188,16 +188,16 @@ class DaskRunner(_Counted):
             following += 1
         for job in arrived:
             place = running.pop(job)
-            if job.status != "finished":
-                error = job.exception()
-                if type(error).__name__ == "KilledWorker":
-                    tries[place] += 1
-                    if tries[place] > RETRIES:
-                        raise UserError(f"partition {keys[place]}: every worker that was given it died")
-                    submit(place)
-                    continue
-                raise error if error is not None else RuntimeError(f"partition {keys[place]}: {job.status}")
-            result, process, peak = job.result()
+            try:  # a result that was lost with the worker that held it is worked out anew, and waited for
+                result, process, peak = job.result()
+            except Exception as error:
+                if type(error).__name__ != "KilledWorker":
+                    raise
+                tries[place] += 1
+                if tries[place] > RETRIES:
+                    raise UserError(f"partition {keys[place]}: every worker that was given it died") from None
+                submit(place)
+                continue
             job.release()
             self._note(str(process), peak)
             if following < len(keys):
