@@ -61,7 +61,8 @@ HURRIED_S = 0.1
 #: Parts of the work that can wait: linearise what has moved, question the sigmas, test old batches again, judge the
 #: quality, test sources of tie points for drifts.
 LOOK_AFTER, QUESTION, RETEST, WATCH, SOURCES = "look after", "question", "retest", "watch", "sources"
-#: Time between two turns of each part, s; it is done in the first update after that.
+#: Time between two turns of each part, s; it is done in the first update after that. Tuned: a drift of tie
+#: points that matters takes more than a second to grow.
 TURN_S = {LOOK_AFTER: 0.1, QUESTION: 1.0, RETEST: 0.1, WATCH: 0.3, SOURCES: 1.0}
 #: Where an update comes late and what was found has changed sigmas, they are questioned again, as often as updates in
 #: quick succession would have done it, but no more than this.
