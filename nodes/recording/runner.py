@@ -122,7 +122,7 @@ def process(
     progress: Callable[[float], None] | None = None,
     apart: bool = False,
     instead: Mapping[str, bytes] | None = None,
-    copy: Callable[[Recorded], None] | None = None,
+    copy: Callable[[Sequence[Recorded]], None] | None = None,
 ) -> ProcessSummary:
     """Run nodes over a recording, as fast as it goes.
 
@@ -135,9 +135,9 @@ def process(
     apart : the nodes before the last may run in a process of their own, if they need nothing of it; what comes out is
         the same
     instead : payload in place of the recorded one, by topic
-    copy : takes inputs in place of ``write``, in the same order; most of them need no envelope
+    copy : takes inputs in place of ``write``, many at once, in the same order; most of them need no envelope
     """
-    copy = copy or (lambda recorded: write(_raw(recorded)))
+    copy = copy or (lambda messages: _each(write, messages))
     summary = ProcessSummary()
     held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
     recorded = {c.topic for c in reader.channels.values() if c.known and c.id in held}
@@ -154,24 +154,29 @@ def process(
             lambda: _handed_on(recording, numbers, drivers[:-1], drivers[-1:]), " and ".join(summary.nodes[:-1])
         )
         try:
+            done = 0
             for batch in ahead:
-                told.add(_take(batch, recording, line, summary))
+                before, done = done, _take(batch, recording, numbers, done, line, summary)
+                told.add(done - before)
         finally:
             ahead.close()
         summary.counters = {name: summary.counters.get(name, {}) for name in summary.nodes[:-1]} | summary.counters
     else:
         line = _Line(drivers, write, copy, summary)
-        for recorded in recording.messages(numbers):
-            line.take(recorded)
-            told.add(1)
+        for begin in range(0, len(numbers), TOGETHER):
+            part = numbers[begin : begin + TOGETHER]
+            line.take(recording.messages(part))
+            told.add(len(part))
     line.finish()
     return summary
 
 
+#: Messages of a recording that are taken together.
+TOGETHER = 256
 #: A message that a node has made, on its way from the other process: topic, stamp, source, number, payload.
 Flat = tuple[str, int, str, int, bytes]
-#: What is handed on from there: the number of a recorded message or what a node has made; None where the recording has
-#: ended; at last what the nodes there said.
+#: What is handed on from there: how many recorded messages are next (negative: are next, and are left out), or what a
+#: node has made; None where the recording has ended; at last what the nodes there said.
 Item = int | Flat | ProcessSummary | None
 
 
@@ -180,14 +185,14 @@ def _handed_on(
 ) -> Iterator[Item]:
     """The first nodes over the recording: what they hand on to the others, in order."""
     summary = ProcessSummary()
-    handed: list[Flat | None] = []
+    handed: list[Item] = []
     line = _Line(
-        drivers, lambda raw: handed.append(_flat(raw)), lambda recorded: handed.append(None), summary, others
+        drivers, lambda raw: handed.append(_flat(raw)), lambda messages: handed.append(len(messages)), summary, others,
+        leave_out=lambda: handed.append(-1),
     )  # fmt: skip
-    for number, recorded in zip(numbers.tolist(), recording.messages(numbers), strict=True):
-        line.take(recorded)
-        for one in handed:
-            yield number if one is None else one
+    for begin in range(0, len(numbers), TOGETHER):
+        line.take(recording.messages(numbers[begin : begin + TOGETHER]))
+        yield from handed
         handed.clear()
     line.settle()
     yield from handed
@@ -198,13 +203,16 @@ def _handed_on(
     yield summary
 
 
-def _take(batch: list[Item], recording: _Recorded, line: _Line, summary: ProcessSummary) -> int:
-    """The last node's part of a batch; returns how many recorded messages were in it."""
-    numbers = [item for item in batch if isinstance(item, int)]
-    recorded = recording.messages(np.array(numbers, dtype=np.int64))
+def _take(
+    batch: list[Item], recording: _Recorded, numbers: NDArray[np.int64], done: int, line: _Line, summary: ProcessSummary
+) -> int:
+    """The last node's part of a batch, in front of which some of the recording has been done; returns how much has
+    been then."""
     for item in batch:
         if isinstance(item, int):
-            line.take(next(recorded))
+            if item > 0:
+                line.take(recording.messages(numbers[done : done + item]))
+            done += abs(item)
         elif isinstance(item, tuple):
             topic, stamp_ns, source, sequence, data = item
             line.take_made(RawMessage(topic, Envelope(stamp_ns, source, sequence), data, stamp_ns))
@@ -212,7 +220,7 @@ def _take(batch: list[Item], recording: _Recorded, line: _Line, summary: Process
             line.settle()
         else:
             summary.add(item)
-    return len(numbers)
+    return done
 
 
 def _flat(raw: RawMessage) -> Flat:
@@ -273,45 +281,61 @@ class _Line:
     ----------
     drivers : of the nodes, those that make another's input before it
     write : takes what the nodes put out
-    copy : takes what is recorded, in the same order
+    copy : takes what is recorded, many at once, in the same order
     summary : where outputs and what nodes say are counted
     others : who is handed messages, and finds those of the recording checked
     checked : whether messages of the recording have been
+    leave_out : is called in the place of a recorded message that cannot be decoded
     """
 
     def __init__(
         self,
         drivers: Sequence[StepDriver],
         write: Callable[[RawMessage], None],
-        copy: Callable[[Recorded], None],
+        copy: Callable[[Sequence[Recorded]], None],
         summary: ProcessSummary,
         others: Sequence[StepDriver] = (),
         checked: bool = False,
+        leave_out: Callable[[], None] = lambda: None,
     ) -> None:
         self._drivers, self._write, self._copy, self._summary = drivers, write, copy, summary
+        self._leave_out = leave_out
+        self._passed: list[Recorded] = []  # messages of the recording that are to be copied
         self._listening, self._needed = _Listening(drivers), _Listening([*drivers, *others])
         self._decode = codec.parse if checked else codec.decode
         self._pending: list[tuple[Key, Message, RawMessage]] = []
 
-    def take(self, recorded: Recorded) -> None:
-        """The next message of the recording; what cannot be decoded, and a node would need, is left out and counted."""
-        channel, stamp_ns, sequence, data, _ = recorded
-        topic = channel.topic
-        body = None
-        if self._needed[topic]:
-            try:
-                body = self._decode(topic, data)
-            except ValueError as error:
-                self._summary.drop("malformed", f"{topic} {sequence} of {channel.source!r}: {error}")
-                return
-        self._summary.inputs[topic] += 1
-        if self._pending:
-            self._hand_on_pending(order_key(topic, Envelope(stamp_ns, channel.source, sequence, channel.start)))
-        self._copy(recorded)
-        if listening := self._listening[topic]:
-            message = Message(topic, stamp_ns, body, channel.source, sequence, channel.start)
-            for driver in listening:
-                self._queue(driver.step(message))
+    def take(self, messages: Iterable[Recorded]) -> None:
+        """The next messages of the recording; what cannot be decoded and a node would need is left out and counted."""
+        needed, listening, pending, passed = self._needed, self._listening, self._pending, self._passed
+        for recorded in messages:
+            channel, stamp_ns, sequence, data, _ = recorded
+            topic = channel.topic
+            body = None
+            if needed[topic]:
+                try:
+                    body = self._decode(topic, data)
+                except ValueError as error:
+                    self._summary.drop("malformed", f"{topic} {sequence} of {channel.source!r}: {error}")
+                    self._copy_passed()
+                    self._leave_out()
+                    continue
+            if pending:
+                self._hand_on_pending(order_key(topic, Envelope(stamp_ns, channel.source, sequence, channel.start)))
+            passed.append(recorded)
+            if drivers := listening[topic]:
+                message = Message(topic, stamp_ns, body, channel.source, sequence, channel.start)
+                for driver in drivers:
+                    if outputs := driver.step(message):
+                        self._queue(outputs)
+        self._copy_passed()
+
+    def _copy_passed(self) -> None:
+        """Copy the messages that have been taken since, before anything else is written."""
+        if self._passed:
+            self._summary.inputs.update(channel.topic for channel, *_ in self._passed)
+            self._copy(self._passed)
+            self._passed.clear()
 
     def take_made(self, raw: RawMessage) -> None:
         """The next message, of a node before these."""
@@ -346,6 +370,7 @@ class _Line:
             self._summary.outputs[output.topic] += 1
 
     def _hand_on(self, message: Message | None, raw: RawMessage) -> None:
+        self._copy_passed()
         self._write(raw)
         if message is not None:
             for driver in self._listening[raw.topic]:
@@ -359,6 +384,11 @@ class _Line:
 
 def _listens(driver: StepDriver, topic: str) -> bool:
     return any(topics.find(name).matches(topic) for name in (*driver.inputs, *driver.node.decisions))
+
+
+def _each(write: Callable[[RawMessage], None], messages: Iterable[Recorded]) -> None:
+    for recorded in messages:
+        write(_raw(recorded))
 
 
 def _raw(recorded: Recorded) -> RawMessage:

@@ -9,7 +9,7 @@ the source; so a recording explains itself and keeps both times apart.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
@@ -100,15 +100,16 @@ class RecordingWriter:
         else:
             self._writer.add_message(channel, receive_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
 
-    def write_recorded(self, recorded: Recorded) -> None:
-        """Add a message of another recording, received when it was stamped."""
-        of, stamp_ns, sequence, data, _ = recorded
-        channel = self._plain.get((of.topic, of.source, of.start))
-        if channel is None:
-            envelope = Envelope(stamp_ns, of.source, sequence, of.start)
-            self._write_first(RawMessage(of.topic, envelope, data, stamp_ns), None)
-        else:
-            self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
+    def write_recorded(self, messages: Iterable[Recorded]) -> None:
+        """Add messages of another recording, received when they were stamped."""
+        plain, add = self._plain, self._writer.add_message
+        for of, stamp_ns, sequence, data, _ in messages:
+            channel = plain.get((of.topic, of.source, of.start))
+            if channel is None:
+                envelope = Envelope(stamp_ns, of.source, sequence, of.start)
+                self._write_first(RawMessage(of.topic, envelope, data, stamp_ns), None)
+            else:
+                add(channel, stamp_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
 
     def _write_first(self, raw: RawMessage, platform: str | None) -> None:
         """Add a message of the configuration, or one that may be the first of its channel or platform."""

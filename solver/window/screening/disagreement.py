@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from statistics import median
 
 import numpy as np
 
@@ -57,7 +58,7 @@ class Disagreement:
                 self._of_two.append(square)
         self.enough, ratio = True, RIGHT
         if len(self._ratios) >= ENOUGH:
-            ratio = float(np.median(self._ratios))
+            ratio = median(self._ratios)  # NumPy's takes fifty times as long for so few
         elif len(self._of_two) >= ENOUGH:
             ratio = RIGHT * variance_of_most(np.array(self._of_two))
         else:

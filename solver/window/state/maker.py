@@ -191,9 +191,11 @@ class BatchMaker:
 
         All additional parameters and the shift of the surface count as touched.
         """
-        touched = np.unique(design.columns)
-        touched = touched[touched >= 0].astype(np.int64)
-        local = np.where(design.columns >= 0, np.searchsorted(touched, design.columns), -1)
+        place = np.full(int(design.columns.max()) + 2, -1)  # of each unknown; the last one is that of -1, none
+        place[design.columns] = 0
+        touched = np.flatnonzero(place[:-1] == 0)
+        place[touched], place[-1] = np.arange(len(touched)), -1
+        local = place[design.columns]
         node, component = np.nonzero((design.columns >= 0).any(axis=0))
         camera, of_camera, of_surface = None, self.network.camera_columns, self.network.surface.numbers
         if self.network.self_calibration is not None:
