@@ -143,7 +143,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scratch", type=Path, metavar="DIR",
         help="folder for the partitions, which all workers see (a temporary one)",
     )  # fmt: skip
-    group.add_argument("--partition-rays", type=int, default=RAYS, metavar="N", help=f"rays of a partition ({RAYS})")
+    group.add_argument("--partition-rays", type=int, metavar="N", help=f"rays of a partition ({RAYS})")
     parser.add_argument(
         "--per-line", action="store_true", help="refined orientation of every image line: orientation_lines.csv (-o)"
     )
@@ -158,8 +158,10 @@ def run(args: argparse.Namespace) -> int:
     dem = dem_settings(args)
     if not args.critical > 0:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
-    if args.iterations < 1:
-        raise UserError(f"--iterations {args.iterations}, wanted 1 at least")
+    for option in ("iterations", "segments", "fixes"):
+        number = getattr(args, option)
+        if number is not None and number < 1:
+            raise UserError(f"--{option} {number}, wanted 1 at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
     refuse_worker_options(args)
@@ -254,10 +256,11 @@ def refuse_worker_options(args: argparse.Namespace) -> None:
         raise UserError(f"--workers {args.workers}, wanted 1 at least")
     if args.workers is not None and args.scheduler:
         raise UserError("--workers and --scheduler: wanted one of them")
-    if args.partition_rays < LEAST_RAYS:
+    if args.partition_rays is not None and args.partition_rays < LEAST_RAYS:
         raise UserError(f"--partition-rays {args.partition_rays}, wanted {LEAST_RAYS} at least")
-    if args.scratch is not None and not (args.workers or args.scheduler):
-        raise UserError("--scratch goes with --workers or --scheduler")
+    for option, value in (("--scratch", args.scratch), ("--partition-rays", args.partition_rays)):
+        if value is not None and not (args.workers or args.scheduler):
+            raise UserError(f"{option} goes with --workers or --scheduler")
 
 
 @contextmanager
@@ -273,7 +276,7 @@ def partitions_of(args: argparse.Namespace) -> Iterator[Pose | None]:
         store = FolderStore(Path(folder).resolve() / "partitions")
         runner = DaskRunner(store, args.scheduler) if args.scheduler else ProcessRunner(store, args.workers)
         try:
-            yield Engine(runner, args.partition_rays).pose
+            yield Engine(runner, args.partition_rays or RAYS).pose
         finally:
             runner.close()
 

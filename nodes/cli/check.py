@@ -1,4 +1,4 @@
-"""``triline check``: whether a recording is whole, and what a flight folder lacks."""
+"""``triline check``: whether a recording is whole, and what a folder lacks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ EXAMPLE = """triline check flight.mcap
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "recording", type=Path, metavar="RECORDING_OR_FOLDER", help="flight.mcap, or a folder with flight.toml"
+        "recording",
+        type=Path,
+        metavar="RECORDING_OR_FOLDER",
+        help="flight.mcap, a folder with flight.toml, or a block folder",
     )
     parser.add_argument(
         "--authority", type=Path, metavar="FOLDER", help="of `triline keys`: who signed must be certified by it"
@@ -55,11 +58,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_folder(args: argparse.Namespace) -> int:
-    """Print what a flight folder lacks, a line each; 1 where something does."""
+    """Print what a folder lacks, a line each; 1 where something does."""
+    if args.authority is not None:
+        raise UserError("--authority goes with a recording")
     # the readers of everything that a flight can hold, which the check of a recording does not need
-    from ..formats.flight_folder import read_flight
+    from ..formats.block_folder import is_block_folder
+    from ..formats.flight_folder import FILE, read_flight
+    from ..formats.scene_block import is_scene_block
     from ..sensors.settings import read_sensors
 
+    is_flight = (args.recording / FILE).is_file()
+    if not is_flight and (is_scene_block(args.recording) or is_block_folder(args.recording)):
+        return _check_block(args)
     flight = read_flight(args.recording)
     programs = read_sensors(flight)
     problems, notes = flight.problems, [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
@@ -83,4 +93,35 @@ def _check_folder(args: argparse.Namespace) -> int:
             f"{len(flight.strips)} strip{'s' * (len(flight.strips) > 1)} with images" if flight.strips else "no images"
         )
         print(f"{args.recording}: complete; {strips}, ground at {flight.ground_height_m:g} m above the ellipsoid")
+    return 0
+
+
+def _check_block(args: argparse.Namespace) -> int:
+    """Print what is in a block folder, and remarks; the first value that cannot be read is told as by `adjust`."""
+    from ..formats.block_folder import read_block
+    from ..formats.scene_block import is_scene_block, read_scene_block
+
+    folder = args.recording
+    try:
+        if is_scene_block(folder):
+            scenes = read_scene_block(folder)
+            n, what, rays, ground, notes = len(scenes.images), "image", scenes.rays, scenes.ground, scenes.notes
+        else:
+            block = read_block(folder)
+            n, what, rays, ground, notes = len(block.strips), "strip", block.image, block.ground, block.notes
+    except UserError as error:
+        if not args.json:
+            raise
+        print(json.dumps({"folder": str(folder), "complete": False, "problems": [str(error)], "notes": []}))
+        return 1
+    if args.json:
+        print(json.dumps({"folder": str(folder), "complete": True, "problems": [], "notes": list(notes)}))
+        return 0
+    if not args.quiet:
+        for note in notes:
+            print(f"  note: {note}")
+        print(
+            f"{folder}: complete; {n} {what}{'s' * (n != 1)}, {len(rays)} image points, {len(ground)} ground points; "
+            f"`triline adjust {folder}` adjusts them"
+        )
     return 0

@@ -10,6 +10,7 @@ import pytest
 from places import BLOCKS, needs_blocks
 from small_block import FILES, simulated_block, write_files
 
+from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_writer import write_block
@@ -325,3 +326,17 @@ def test_a_large_file_is_read_whole(tmp_path):
     rows = (f"T{i // 4},S{1 + i // 2 % 2},{'FN'[i % 2]},{u[i]:.6f},{v[i]:.6f}\n" for i in range(n))
     (folder / "image_points.csv").write_text("point,strip,ccd,line,sample\n" + "".join(rows))
     assert len(read_block(folder).image) == n
+
+
+def test_a_folder_is_checked(tmp_path, capsys):
+    write_files(tmp_path)
+    assert main(["check", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "complete; 1 strip" in said and "image points" in said
+    points = tmp_path / "image_points.csv"
+    points.write_text(points.read_text() + "P9,S1,N,x,1\n")
+    assert main(["check", str(tmp_path)]) == 1
+    assert "image_points.csv:" in capsys.readouterr().err
+    assert main(["check", str(tmp_path), "--json"]) == 1
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["complete"] is False and "line: 'x'" in checked["problems"][0]
