@@ -167,8 +167,14 @@ def estimated_camera(recording: Recording, camera: LineCamera) -> tuple[LineCame
     return camera, 0
 
 
+def camera_of_table(table: Path) -> Path:
+    """File of the calibrated camera that goes with a table of orientation alone."""
+    return table.with_name(f"{table.stem}_camera.json")
+
+
 def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Path | None]:
-    """The calibrated camera that `triline adjust` wrote beside a table of orientation, which goes with it.
+    """The calibrated camera that stands beside a table of orientation and goes with it: that of the table, which
+    `triline export` writes, or that of the folder, which `triline adjust` does.
 
     Returns
     -------
@@ -179,10 +185,10 @@ def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Pat
     ------
     UserError : a camera that cannot be read, or with other CCD lines
     """
-    path = trajectory.parent / "camera.json"
-    if not path.exists():
-        return camera, None
-    return read_camera_instead(path, camera, f"stands beside {trajectory.name} and "), path
+    for path in (camera_of_table(trajectory), trajectory.parent / "camera.json"):
+        if path.exists():
+            return read_camera_instead(path, camera, f"stands beside {trajectory.name} and "), path
+    return camera, None
 
 
 def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines]]:

@@ -18,9 +18,17 @@ from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import matrix_from_quaternion
 from ...solver.geometry.trajectory import Trajectory
 from ..batch.point_table import write_points
-from ..batch.rectification import ORIENTATIONS, lines_of_recording, project_frame
+from ..batch.rectification import (
+    ORIENTATIONS,
+    REFINED,
+    camera_of_table,
+    estimated_camera,
+    lines_of_recording,
+    project_frame,
+)
 from ..convert import R_bc_of, local_frame, pose_sample
 from ..errors import UserError
+from ..formats.camera_json import write_camera
 from ..formats.features import features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
@@ -138,26 +146,42 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     if path.exists() and target.exists() and target.samefile(path):
         raise UserError(f"{target}: is the recording itself")
     result: dict[str, Any] = {"recording": str(path), "file": str(target)}
+    recording = Recording(path)
+    reader = recording.reader
+    name = ""
     with new_file(target) as part:
         if args.points:
-            reader = RecordingReader(path)
             project = reader.first("configuration/project")
             refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
             result["points"] = write_points(reader, part, covariance=args.covariance)
         else:
-            recording = Recording(path)
-            reader = recording.reader
             name, lines = lines_of_recording(recording, args.orientation)
             frame, project = project_frame(recording), recording.project()
             refuse_missing_grids(frame.crs, path)
             result |= {"orientation": name, "lines": _write_lines(args.format, part, lines, frame, R_bc_of(project))}
+    said = ", ".join(f"{v} {k}" for k, v in list(result.items())[2:])
+    if args.per_line:
+        result |= _write_camera(recording, name, target)
     if args.json:
         print(json.dumps(result, indent=2))
         return 0
     if not args.quiet:
-        print(f"{path} -> {target}: " + ", ".join(f"{v} {k}" for k, v in list(result.items())[2:]))
+        print(f"{path} -> {target}: {said}")
+        if args.per_line and result["camera"]:
+            print(f"  {result['camera']}: camera with {result['camera_parameters']} estimated parameters, goes with it")
     tell_damage("export", reader)
     return 0
+
+
+def _write_camera(recording: Recording, orientation: str, table: Path) -> dict[str, Any]:
+    """Write the camera whose parameters were estimated with an orientation beside the table of it."""
+    path, n = camera_of_table(table), 0
+    path.unlink(missing_ok=True)  # of an earlier table
+    if orientation in REFINED:
+        camera, n = estimated_camera(recording, recording.camera())
+        if n:
+            write_camera(path, camera)
+    return {"camera_parameters": n, "camera": str(path) if n else None}
 
 
 def _write_lines(

@@ -144,7 +144,8 @@ def _read_table(path: Path, keys: Keys, notes: list[str]) -> np.ndarray:
 
 
 def write_camera(path: Path, camera: LineCamera) -> None:
-    """Write ``camera.json``, and beside it one table of pixel centres a line; `read_camera` gives the same camera."""
+    """Write ``NAME.json``, and beside it ``NAME_LINE.csv`` with the pixel centres of each line; `read_camera` gives the
+    same camera."""
     path = Path(path)
     lenses = []
     for lens in camera.lenses:
@@ -158,7 +159,7 @@ def write_camera(path: Path, camera: LineCamera) -> None:
         lenses.append(entry)
     lines = []
     for line in camera.lines:
-        table = f"camera_{''.join(c if c.isalnum() or c in '-_' else '_' for c in line.id)}.csv"
+        table = f"{path.stem}_{''.join(c if c.isalnum() or c in '-_' else '_' for c in line.id)}.csv"
         write_table(
             path.parent / table,
             {"sample": range(line.pixels), "x_mm": line.xy_mm[:, 0], "y_mm": line.xy_mm[:, 1]},

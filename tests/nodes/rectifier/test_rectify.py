@@ -176,6 +176,27 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
     assert "stands beside orientation_lines.csv and has other lines, wanted F with" in capsys.readouterr().err
 
 
+def test_a_table_of_lines_comes_back_with_the_camera_of_its_orientation(flown, folder, capsys):
+    table = folder / "exported" / "lines.csv"
+    table.parent.mkdir()
+    assert main(["export", str(flown), "--per-line", str(table), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["camera"] == str(folder / "exported" / "lines_camera.json") and told["camera_parameters"] > 0
+    options = ["--gsd", 8, "--dem", folder / "dem.tif", "--dem-crs", "ellipsoid"]
+    images = {}
+    for name, words in {"plain": [], "table": ["--trajectory", table]}.items():
+        found = _rectify(capsys, flown, folder / "back.tif", *words, *options)
+        with rasterio.open(folder / "back.tif") as image:
+            images[name] = image.read(1).astype(float)
+    assert found["camera"] == told["camera"]
+    assert images["table"].shape == images["plain"].shape
+    assert (images["table"] != images["plain"]).mean() < 0.02
+    # an orientation that nobody has refined belongs to the camera as it was
+    assert main(["export", str(flown), "--per-line", str(table), "--orientation", "measured", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["camera"] is None
+    assert not (folder / "exported" / "lines_camera.json").exists()
+
+
 def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):
     names = {"dX": 0.1, "phi drift": 1e-6, "shift of the surface": 0.4, "clock": 1e-4, "xp_F": 0.01, "dc": 0.02}
     parameters = [m.ParameterEstimate(name=name, value=value) for name, value in names.items()]
