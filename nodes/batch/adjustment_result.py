@@ -254,7 +254,9 @@ def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent:
     """
     sure = ~np.isin(given.point, [d.point for d in result.doubtful])
     used = np.isfinite(given.sigma_m) & sure[:, None] & np.isfinite(sigma_m[given.point])
-    sign, scale = (1.0, 1.0) if independent else (-1.0, result.sigma0)  # sigmas of control scale with the others
+    found = next((c.factor for c in result.components if c.group == "control"), 1.0)
+    # sigmas of control scale with the others, and with the factor that was found for them
+    sign, scale = (1.0, 1.0) if independent else (-1.0, result.sigma0 * found)
     variance = np.where(used, (scale * given.sigma_m) ** 2 + sign * sigma_m[given.point] ** 2, 0.0)
     n = used.sum(axis=0)
     if not n.any():

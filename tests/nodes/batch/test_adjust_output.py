@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.quiver import Quiver
+from places import BLOCKS, needs_blocks
 from test_adjust_command import adjust, result_in, write_block
 
 from triline.nodes.cli import main
@@ -61,6 +62,16 @@ def test_control_takes_part_and_differs_by_less(folder, tmp_path):
         control = result_in(tmp_path / "out")["control"]
         ratios.append(np.divide(control["rmse_m"], control["expected_m"]))
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
+@needs_blocks
+def test_control_whose_sigma_was_estimated_differs_by_that(tmp_path):
+    assert adjust(BLOCKS / "selfcal", "--variance-components", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    found, control = result["variance_components"]["control"], result["control"]
+    assert found["estimated"] and found["sigma_factor"] > 1.1
+    ratio = np.divide(control["rmse_m"], control["expected_m"])
+    assert ((ratio > 0.7) & (ratio < 1.3)).all()  # 9 differences each
 
 
 def test_a_result_without_pictures_leaves_none_of_an_earlier_one(folder, tmp_path):
