@@ -202,7 +202,8 @@ class Voices:
         waiting = {key: refused for key, refused in self._held.items() if key[0] == topic}
         source = message.body.publisher or next((key[1] for key in reversed(waiting)), "")
         if not source:
-            return Heard(notes=(f"{topic}: nothing waits for a decision",))
+            known = any(key[0] == topic for key in self._voices)  # the others do not know what waits there
+            return Heard(notes=(f"{topic}: nothing waits for a decision",) if known else ())
         for key in [key for key in waiting if key[1] == source or message.body.accepted]:
             del self._held[key]
         if not message.body.accepted:

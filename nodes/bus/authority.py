@@ -107,7 +107,9 @@ class Authority:
             self._key = serialization.load_pem_private_key((folder / KEY).read_bytes(), None)
             self._certificate = x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
         except FileNotFoundError:
-            raise UserError(f"{folder}: no authority, `triline keys new {folder}` makes one") from None
+            raise UserError(
+                f"{folder}: no authority, wanted --authority FOLDER of one; `triline keys new FOLDER` makes the first"
+            ) from None
         except (ValueError, KeyError, TypeError, RecursionError):
             raise UserError(f"{folder}: the files of this authority are damaged") from None
 

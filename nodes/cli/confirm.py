@@ -79,20 +79,32 @@ def run(args: argparse.Namespace) -> int:
         if args.clock is not None:
             verdict.clock_s = args.clock
         heard.sent.set()
-        bus.publish(Message("observation/verdict", heard.stamp_ns + VERDICT_AHEAD_NS, verdict))
-        answered = _wait(lambda: heard.answer != "", ANSWER_S)
+        counts_ns = heard.stamp_ns + VERDICT_AHEAD_NS
+        bus.publish(Message("observation/verdict", counts_ns, verdict))
+        _wait(lambda: heard.answer != "" or heard.nothing != "", ANSWER_S)
+        answered = _wait(lambda: heard.answer != "", LISTEN_S if heard.nothing else 0.0)
     if args.json:
         result = {"point": args.point, "accepted": not args.reject, "answer": heard.answer, "looks": heard.looks}
         print(json.dumps(result, indent=2))
     elif answered:
         print(heard.answer + (f"; {heard.looks} looks that were held" if heard.looks else ""))
-    if not answered:
-        raise UserError(f"{args.point}: the verdict was sent, but no {'node' if topic else 'adjuster'} answers")
-    return 0
+    if answered:
+        return 0
+    if heard.nothing:
+        raise UserError(heard.nothing)
+    if heard.stamp_ns < counts_ns:
+        raise UserError(f"{args.point}: the verdict was sent, but no data come; it counts when they do")
+    raise UserError(f"{args.point}: the verdict was sent, but no {'node' if topic else 'adjuster'} answers")
 
 
 class _Heard:
-    """Messages about the point or by whom the topic is spoken on, and the newest platform time."""
+    """Messages about the point or by whom the topic is spoken on, and the newest platform time.
+
+    Attributes
+    ----------
+    answer : to the verdict
+    nothing : a node's word that nothing waits on the topic; another node may know of something
+    """
 
     def __init__(self, point: str) -> None:
         self._point = point
@@ -100,7 +112,7 @@ class _Heard:
         self.stamp_ns = 0
         self.points: set[str] = set()
         self.sources: set[str] = set()
-        self.answer = ""
+        self.answer = self.nothing = ""
         self.looks = 0
 
     def take_source(self, raw: RawMessage) -> None:
@@ -122,6 +134,8 @@ class _Heard:
             return
         elif raw.topic == "event/log" and body.message.startswith((f"{self._point} is ", f"{self._point} of ")):
             self.answer = body.message
+        elif raw.topic == "event/log" and body.message.startswith(f"{self._point}: nothing waits"):
+            self.nothing = body.message
         elif raw.topic == "observation/target" and body.point == self._point:
             self.looks += body.state in (body.CONFIRMED, body.REJECTED)
 

@@ -207,8 +207,9 @@ def watch(bus: Bus, stop: threading.Event, title: str, quiet: bool = False) -> F
             while not stop.wait(0.5):
                 live.update(screen(overview, title))
         return overview
-    begun = time.monotonic()
-    while not stop.wait(LINE_S):
+    begun, over = time.monotonic(), False
+    while not over:
+        over = stop.wait(LINE_S)  # a last line for those who watch for less than that
         if not quiet:
             sys.stdout.write(f"{time.monotonic() - begun:4.0f} s  {overview.line()}\n")
             sys.stdout.flush()

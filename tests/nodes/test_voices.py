@@ -84,7 +84,9 @@ def test_an_operator_chooses_the_source():
     assert rig.verdict(2.0, "sensor/gnss", accepted=False) == ["sensor/gnss of 'a' stays refused (Ann)"]
     rig.hear("sensor/gnss", 3.0, "a")
     assert rig.count("sensor/gnss", "a") == 1
-    assert rig.verdict(4.0, "sensor/attitude") == ["sensor/attitude: nothing waits for a decision"]
+    assert rig.verdict(4.0, "sensor/attitude") == []  # a node that does not hear the topic knows nothing of it
+    rig.hear("sensor/attitude", 5.0)
+    assert rig.verdict(6.0, "sensor/attitude") == ["sensor/attitude: nothing waits for a decision"]
 
 
 def test_a_program_that_was_started_again_takes_over_and_one_beside_it_does_not():

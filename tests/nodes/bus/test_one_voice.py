@@ -120,8 +120,13 @@ def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malfor
         done = triline("confirm", "configuration/camera", "--by", "Ann", "--port", port)
         assert done.returncode == 0, done.stderr
         assert done.stdout == "configuration/camera of 'test' is used from now on (Ann)\n"
+        again = triline("confirm", "configuration/camera", "--port", port)
+        assert again.returncode == 1
+        assert again.stderr == "triline confirm: configuration/camera: nothing waits for a decision\n"
         stop.set()
         flight.join()
+        late = triline("confirm", "configuration/camera", "--port", port)
+        assert late.returncode == 1 and "no data come; it counts when they do" in late.stderr
     cameras = [message.body for message in node.given if message.topic == "configuration/camera"]
     assert cameras == [camera, other] and not node.alarm
     assert triline("confirm", "sensor/nothing", "--source", "x").returncode == 1
