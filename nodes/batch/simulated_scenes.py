@@ -76,6 +76,8 @@ class SceneSimulation:
 def simulated_recording(what: SceneSimulation) -> tuple[list[Message], dict[str, Any]]:
     """The same as the messages of a flight, with the true points on ``truth/point``, and what they hold.
 
+    Of a recording with image lines only ground points are measured: a matcher finds the others.
+
     Raises
     ------
     UserError : as `write_simulated_scenes`
@@ -97,6 +99,8 @@ def simulated_recording(what: SceneSimulation) -> tuple[list[Message], dict[str,
     )
     messages = [*messages[:after], *points, *messages[after:]]
     if what.images:
+        known = set(block.ground.id)
+        messages = [m for m in messages if m.topic not in ("observation/tie", "truth/point") or m.body.point in known]
         lines = _image_lines(block, messages, sensors, what.seed)
         messages = list(merge(messages, lines, key=lambda message: (message.stamp_ns, rank(message.topic))))
     return messages, result

@@ -182,9 +182,10 @@ def _as_good(study: Study, best: Row, simplest: Row) -> Iterator[str]:
     if not same:
         yield f"the {n} common check points tell it from all others {level}"
     if len(same) > len(others):
+        more = len(same) - len(others)
         yield (
-            f"{len(same) - len(others)} of the others cannot be told from it by {n} common check points, but have "
-            f"larger predicted sigmas ({100 * (LARGER_SIGMA - 1):.0f} % or more)"
+            f"{more} of the others cannot be told from it by {n} common check points, but "
+            f"{'has' if more == 1 else 'have'} larger predicted sigmas ({100 * (LARGER_SIGMA - 1):.0f} % or more)"
         )
     if others:
         worst = max(row.rmse_3d_m for row in others) / best.rmse_3d_m - 1.0

@@ -78,9 +78,12 @@ def _copy(folder: Path, names: list[str]) -> str:
 
 
 def _table(members) -> str:
+    from ..bus.authority import ROUTER, SECURE_PORT
+
     lines = [f"{'name':<24} {'kind':<9} {'until':<11} {'state':<20} hosts, > calls"]
     for member in members:
         state = f"revoked {member.revoked}" if member.revoked else "valid"
-        where = ", ".join(member.hosts) + "".join(f" > {router}" for router in member.routers)
+        port = f":{member.port}" if member.hosts and member.kind == ROUTER and member.port != SECURE_PORT else ""
+        where = ", ".join(host + port for host in member.hosts) + "".join(f" > {router}" for router in member.routers)
         lines.append(f"{member.name:<24} {member.kind:<9} {member.until:<11} {state:<20} {where}")
     return "\n".join(lines)

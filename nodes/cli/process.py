@@ -207,9 +207,10 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
 
 def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, seconds: float) -> list[str]:
     flight_s = (summary.last_ns - summary.first_ns) / 1e9
+    times = flight_s / max(seconds, 1e-9)
     lines = [
         f"{output}: {' and '.join(summary.nodes)} over {flight_s:.1f} s of flight in {seconds:.1f} s"
-        f" ({flight_s / max(seconds, 1e-9):.0f} times real time)"
+        f" ({times:.{0 if times >= 9.95 else 1}f} times real time)"
     ]
     lines += [f"  {topic:<24} {n:>9} in" for topic, n in sorted(summary.inputs.items())]
     lines += [f"  {topic:<24} {n:>9} out" for topic, n in sorted(summary.outputs.items())]

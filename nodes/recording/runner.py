@@ -22,6 +22,7 @@ from ..voices import VERDICT
 from .index import Recorded
 from .reader import RecordingReader
 from .runner_apart import Ahead
+from .summary import time_span_ns
 
 
 @dataclass
@@ -37,7 +38,7 @@ class ProcessSummary:
     counters : per node, what it counted
     problems : per node, its last problem
     states : per node, what it said of itself at the end
-    first_ns, last_ns : platform time covered
+    first_ns, last_ns : platform time of what was measured and computed, 0 without any
     """
 
     nodes: list[str] = field(default_factory=list)
@@ -428,5 +429,5 @@ def _usable(reader: RecordingReader, made: set[str], summary: ProcessSummary) ->
         kept.append(np.array(accepted, dtype=np.int64))
     ordered = reader.sort(np.concatenate([*kept, np.empty(0, dtype=np.int64)]))
     if len(ordered):
-        summary.first_ns, summary.last_ns = (int(index.stamp_ns[n]) for n in (ordered[0], ordered[-1]))
+        summary.first_ns, summary.last_ns = time_span_ns(reader) or (0, 0)
     return ordered

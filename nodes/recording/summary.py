@@ -15,6 +15,10 @@ _NO_END = "the file has no end: it was cut off, or its writer was killed"
 _TIMED = (Family.SENSOR, Family.OBSERVATION, Family.RESULT, Family.TRUTH)
 
 
+#: Results of many moments, with the stamp at which they could be known: their stamps have no rate.
+IN_BURSTS = frozenset({"trajectory/smoothed", "orientation/final", "orientation/whole", "point/object"})
+
+
 @dataclass
 class TopicSummary:
     """One topic of a recording.
@@ -24,7 +28,7 @@ class TopicSummary:
     topic, type : names
     messages : how many
     first_ns, last_ns : stamps
-    rate_hz : mean rate between first and last stamp, 0 for fewer than two stamps
+    rate_hz : mean rate between first and last stamp; 0 for fewer than two stamps, and for what nodes put out in bursts
     sources : who published it
     gaps : messages missing by their numbers
     duplicates : messages whose number came before
@@ -71,7 +75,7 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
                 row.backwards += int((np.diff(stamps[np.argsort(sequences, kind="stable")]) < 0).sum())
     for row in by_topic.values():
         span_s = (row.last_ns - row.first_ns) / 1e9 if row.first_ns else 0.0  # 0: said before any time was known
-        row.rate_hz = (row.messages - 1) / span_s if span_s > 0 else 0.0
+        row.rate_hz = (row.messages - 1) / span_s if span_s > 0 and row.topic not in IN_BURSTS else 0.0
         row.sources.sort()
     return sorted(by_topic.values(), key=lambda row: (_place(row.topic), row.topic))
 

@@ -46,6 +46,10 @@ def read_isd(path: Path) -> SatelliteScene:
     UserError : naming file, key and what was wanted
     """
     file, notes = read_json(path), list[str]()
+    if file.has("exterior") and not file.has("name_model"):
+        raise UserError(
+            f"{path}: orientation of a frame camera, which `triline rectify --sensor` takes; wanted a scene"
+        )
     model = file.text("name_model")
     if model != _LINE_SCANNER:
         raise file.refuse("name_model", _LINE_SCANNER)
