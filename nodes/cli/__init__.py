@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..terminal import clean_streams, plain
+from .outputs import refuse_input_as_output
 
 #: Longest reason that is printed, characters.
 LONGEST_LINE = 1000
@@ -118,6 +119,7 @@ def _tell_fetched() -> None:
 def _run(argv: list[str], job: bool) -> int:
     args = parse(argv)
     try:
+        refuse_input_as_output(args)
         code = args.run(args)
         if job or getattr(args, "verbose", False):
             _tell_fetched()

@@ -164,6 +164,7 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"--{option} {number}, wanted 1 at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
+        refuse_folder_of_inputs(Path(args.output))
     refuse_worker_options(args)
     paths = [path_of(path) for path in args.input]
     args.input = args.input[0]
@@ -248,6 +249,12 @@ def read_input(path: Path) -> BlockData:
     reader = RecordingReader(path, by_ranges=True)
     block = block_from_messages(reader.messages(TOPICS), path.name)
     return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
+
+
+def refuse_folder_of_inputs(folder: Path) -> None:
+    """Raise UserError where a result would be written among the files of a block or of a flight, over its camera."""
+    if is_scene_block(folder) or is_block_folder(folder) or (folder / "flight.toml").is_file():
+        raise UserError(f"{folder}: has the files of a block or a flight, wanted another folder for the result")
 
 
 def refuse_worker_options(args: argparse.Namespace) -> None:
@@ -474,9 +481,10 @@ def write_result(
     """
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    # files of an earlier run, which do not belong to this result
-    for name in ("result.json", *TABLES, *PLOTS, CAMERA, PER_LINE):
-        (folder / name).unlink(missing_ok=True)
+    if any((folder / name).exists() for name in ("result.json", TABLES[0])):
+        # files of an earlier run, which do not belong to this result
+        for name in ("result.json", *TABLES, *PLOTS, CAMERA, PER_LINE):
+            (folder / name).unlink(missing_ok=True)
     (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
     used = adjustment.camera() or (None if camera is None else adjustment.block.camera)

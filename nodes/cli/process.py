@@ -152,8 +152,6 @@ def at_pace(tables: Tables, pace: str) -> Tables:
 
 def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
     refuse_unless_file(args.output)
-    if args.output.resolve() == args.recording.resolve():
-        raise UserError(f"{args.output}: the output would overwrite the recording")
     if not any(channel.known for channel in reader.channels.values()):
         raise UserError(f"{args.recording}: no topic of triline in it")
     if args.strict and (reader.damage or not reader.complete):

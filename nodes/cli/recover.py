@@ -23,8 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording, salvage=True)
-    if args.output.exists() and args.output.samefile(args.recording):
-        raise UserError(f"{args.output}: the output would overwrite the recording")
     refuse_unless_file(args.output)
     numbers = reader.select()
     if not len(numbers):

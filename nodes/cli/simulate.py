@@ -111,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--place, --points and --overpasses go with --satellite")
     flight = simulated_flight({name: _single(value) for name, value in given.items() if value is not None})
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or DEFAULT_EPOCH_NS
+    if args.dem is not None and Path(args.dem).resolve() == Path(args.output).resolve():
+        raise UserError("-o, --dem: wanted different files")
     simulator = Simulator(flight.simulation, flight.imager)
     with (
         new_file(Path(args.output)) as part,

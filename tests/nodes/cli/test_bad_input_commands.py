@@ -168,6 +168,41 @@ def test_no_command_takes_its_input_for_its_output_or_a_device_for_a_file(tmp_pa
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
 
 
+def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
+    path, other = tmp_path / "a.mcap", tmp_path / "other"
+    path.write_bytes(simulated_flight(12).read_bytes())
+    other.write_text("mine")
+    for arguments in (
+        ("process", path, "--camera", other, "-o", other),
+        ("process", path, "--config", other, "-o", other),
+        ("process", path, "--dem", other, "--dem-sigma", 1, "-o", other),
+        ("import", path, "--camera", other, "-o", other),
+        ("import", path, "--lines", f"F={path},N={other}@2", "-o", other),
+        ("rectify", path, "--trajectory", other, "-o", other),
+        ("locate", path, "--pixels", other, "-o", other),
+        ("simulate", "--motion", other, "-o", other),
+    ):
+        code, _, err = run_main(capsys, *arguments)
+        assert code == 1 and "the output would overwrite the" in err, (arguments, err)
+        assert other.read_text() == "mine"
+    code, _, err = run_main(capsys, "simulate", "--seconds", 2, "-o", tmp_path / "new", "--dem", tmp_path / "new")
+    assert code == 1 and "wanted different files" in err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other"]
+
+
+def test_a_result_is_not_written_among_the_files_of_a_block(tmp_path, capsys):
+    write_block(tmp_path / "block", simulated_block())
+    before = sorted(p.name for p in (tmp_path / "block").iterdir())
+    code, _, err = run_main(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "block")
+    assert code == 1 and "has the files of a block or a flight, wanted another folder for the result" in err
+    assert sorted(p.name for p in (tmp_path / "block").iterdir()) == before
+    # what lies in a folder that no adjustment made stays there
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "orientation_lines.csv").write_text("mine")
+    assert run_main(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "mine")[0] == 0
+    assert (tmp_path / "mine" / "orientation_lines.csv").read_text() == "mine"
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_an_example_and_the_common_options(command, capsys):
     code, out, err = run_main(capsys, command, "--help")

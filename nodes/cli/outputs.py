@@ -1,0 +1,32 @@
+"""What a command must not write over."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+
+
+def refuse_input_as_output(args: argparse.Namespace) -> None:
+    """Raise UserError where the file that a command is to write is one of those that it reads."""
+    output = getattr(args, "output", None)
+    if not output or not os.path.isfile(output):
+        return
+    for name, value in vars(args).items():
+        for word in _words(value) if name != "output" else ():
+            if os.path.isfile(word) and os.path.samefile(word, output):
+                raise UserError(f"{output}: the output would overwrite the {name.replace('_', ' ')}")
+
+
+def _words(value: Any) -> Iterator[str]:
+    """What may be the name of a file in the value of an option: itself, and the files in ``F=a.img@1,N=b.img``."""
+    for one in value if isinstance(value, (list, tuple)) else (value,):
+        if isinstance(one, (str, Path)):
+            text = os.fspath(one)
+            yield text
+            yield from (word.split("@")[0] for word in re.split("[=,]", text)[1:])
