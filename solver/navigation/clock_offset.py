@@ -42,6 +42,8 @@ SMALL_STEP_S = 0.25 * LEAST_S
 CERTAIN = 5.0
 #: Largest offset that is searched for, s: more is seen in the delays of messages (`clock_check`).
 LARGEST_S = 3.0
+#: Behind a longer gap in the samples, s, a stretch begins anew (tuned: attitudes may come once a second).
+LONGEST_GAP_S = 2.0
 #: Without roll, an offset has to turn the heading by more than an aircraft slips, rad (tuned).
 SLIP = np.radians(2.5)
 #: Turn, rad, and turn rate, rad/s, that a stretch must have for attitudes to show an offset (tuned).
@@ -258,6 +260,9 @@ class OffsetWatch:
     def sample(self, *values: float) -> None:
         """An inertial sample (time, interval, force, rate: 8 numbers) or an attitude (time, roll, pitch, heading)."""
         held = self._samples
+        if held and values[0] > held[-1][0] + LONGEST_GAP_S:  # nobody knows what the aircraft did in between
+            held.clear()
+            self._fixes.clear()
         self._stretch_s = INERTIAL_STRETCH_S if len(values) == 8 else ATTITUDE_STRETCH_S
         if held and (values[0] <= held[-1][0] or len(values) != len(held[-1])):
             if values[0] > held[-1][0] or values[0] < held[-1][0] - self._stretch_s:

@@ -194,6 +194,16 @@ def test_clocks_that_agree_are_not_accused(imu):
     assert "GNSS clock" not in node.state()  # the turn has shown it
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_strips_without_the_turns_between_them_accuse_no_clock(seed):
+    """Recorders that are switched off in turns: nobody knows how the aircraft came from one strip to the next."""
+    plan = FlightPlan(strips=2, cross_strips=1, strip_s=60.0, turns=False)
+    simulated = simulate(plan, seed, ErrorModel(attitude_rate_hz=50.0, gnss_rate_hz=2.0))
+    messages = [m for m in Simulator(simulated).messages(EPOCH) if m.topic in Navigator.inputs]
+    node, events, _ = heard(messages)
+    assert not any("clock" in text for text in events) and not node.counters["gnss of another clock"]
+
+
 @pytest.mark.parametrize(("offset_s", "imu"), [(0.1, True), (0.9, True), (0.9, False)])
 def test_tenths_of_a_second_are_named_after_a_turn_and_corrected_on_the_operators_word(offset_s, imu):
     messages = late_receiver(offset_s, imu)
