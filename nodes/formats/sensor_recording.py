@@ -59,7 +59,8 @@ def sensor_messages(
     )
     if folder.gnss is not None:
         project.origin_latitude = round(float(np.degrees(np.nanmedian(folder.gnss.lat))), 6)
-        project.origin_longitude = round(float(np.degrees(np.nanmedian(folder.gnss.lon))), 6)
+        lon = np.unwrap(folder.gnss.lon[np.isfinite(folder.gnss.lon)])
+        project.origin_longitude = round(float((np.degrees(np.median(lon)) + 180.0) % 360.0 - 180.0), 6)
     yield Message("configuration/project", messages[0].stamp_ns, project, source)
     yield from messages
 

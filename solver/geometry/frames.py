@@ -140,11 +140,15 @@ class LocalFrame:
         """Frame at the middle of points (n, 3) given in ``crs``, on the ellipsoid below them (height 0)."""
         if crs == "local":
             return cls(0.0, 0.0, 0.0)
-        middle = np.mean(np.atleast_2d(np.asarray(xyz, dtype=float)), axis=0)
-        lon, lat, _ = _transformer(_parse_crs(crs)).transform(*middle)
+        xyz, parsed = np.array(np.atleast_2d(xyz), dtype=float), _parse_crs(crs)
+        if parsed.is_geographic:
+            circle = 2.0 * np.pi / parsed.axis_info[0].unit_conversion_factor
+            if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
+                xyz[:, 0] %= circle
+        lon, lat, _ = _transformer(parsed).transform(*np.mean(xyz, axis=0))
         if not np.isfinite([lon, lat]).all():
             raise CrsError(f"coordinates outside the area of {crs!r}")
-        return cls(round(float(lat), 6), round(float(lon), 6), 0.0, crs)
+        return cls(round(float(lat), 6), round(float((lon + 180.0) % 360.0 - 180.0), 6), 0.0, crs)
 
 
 @dataclass(frozen=True)

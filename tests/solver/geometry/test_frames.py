@@ -75,6 +75,17 @@ def test_projected_crs_round_trip_and_convergence():
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
+def test_a_frame_across_the_date_line():
+    xyz = np.array([[179.99, 10.0, 0.0], [-179.97, 10.02, 3.0]])
+    frame = LocalFrame.around(xyz, "EPSG:4979")
+    assert (frame.lat_deg, frame.lon_deg) == (10.01, -179.99)
+    local = frame.from_crs(xyz)
+    assert np.abs(local).max() < 3000.0
+    np.testing.assert_allclose(frame.to_crs(local), xyz, atol=1e-9)
+    grad = LocalFrame.around([[199.9, 50.0, 0.0], [-199.9, 50.0, 0.0]], "EPSG:4807")  # Paris, in grad
+    assert abs(grad.lon_deg) == pytest.approx(177.66, abs=0.02)
+
+
 def test_unknown_crs_is_named():
     with pytest.raises(CrsError, match="EPSG:999999"):
         LocalFrame(0, 0, 0, "EPSG:999999").from_crs(np.zeros((1, 3)))
