@@ -37,7 +37,9 @@ SMOOTH_EVERY_S = 2.0
 RARE_S = 5.0
 #: Nodes whose results are as good at the pace for throughput.
 FAST = {"navigator", "matcher", "adjuster"}
-CAMERA, REPORT, ADJUSTER = "configuration/camera", "adjustment/report", "adjuster"
+CAMERA, REPORT, ADJUSTER, NAVIGATOR = "configuration/camera", "adjustment/report", "adjuster", "navigator"
+#: What an adjuster corrects, of a recording or of a navigator.
+POSES = ("trajectory/smoothed", "trajectory/filtered")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +75,8 @@ def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording)
     _check(reader, args)
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
+    if ADJUSTER in names and NAVIGATOR not in names and not len(reader.select(POSES)):
+        raise UserError(f"{args.recording}: no message on {' or '.join(POSES)}, wanted {NAVIGATOR} among --nodes, too")
     pace = args.pace or usual_pace(reader, names)
     tables = at_pace(load(args.config, registry.names()), pace)
     dem = dem_settings(args)

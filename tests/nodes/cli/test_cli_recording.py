@@ -172,6 +172,7 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         ((cut, "-o", out, "--strict"), "damaged: "),
         ((configured, "-o", out), "nothing to process for navigator,adjuster: it holds configuration/camera"),
         ((flight, "-o", out, "--nodes", "pilot"), "no node 'pilot'"),
+        ((flight, "-o", out, "--nodes", "adjuster"), "wanted navigator among --nodes, too"),
         ((flight, "-o", out, "--config", bad), "configuration [navigator]: wings is not known"),
         ((flight, "-o", tmp_path / "no" / "out.mcap"), "no such file or directory"),
     ):
