@@ -17,9 +17,10 @@ _SIGMAS = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 
 
 def write_points(reader: RecordingReader, path: Path, *, covariance: bool = False) -> int:
-    """Write ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,rays,role,status`` in the project's CRS.
+    """Write ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,rays,role,status,checked`` in the project's CRS.
 
-    A CRS in another unit has it in the names of the coordinates (``X_deg,Y_deg,Z_m``); sigmas are in metres.
+    A CRS in another unit has it in the names of the coordinates (``X_deg,Y_deg,Z_m``); sigmas are in metres. A point
+    half of whose rays were left out is checked as ``doubtful``: its sigma is of the rest, and says nothing of these.
 
     The best answer for a point is that of the whole strip, else the final one, else the first; of several of a kind the
     last. Returns the number of points.
@@ -53,7 +54,8 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
     flat = ".9f" if frame.is_geographic else ".4f"
     more = ("cov_XY_m2", "cov_XZ_m2", "cov_YZ_m2") if covariance else ()
     with open(path, "w", encoding="utf-8", newline="") as file:
-        file.write(",".join(("point", *place_columns(frame.units), *_SIGMAS, *more, "rays", "role", "status")) + "\n")
+        columns = ("point", *place_columns(frame.units), *_SIGMAS, *more, "rays", "role", "status", "checked")
+        file.write(",".join(columns) + "\n")
         for i, p in enumerate(best.values()):
             values = [format(v, f) for v, f in zip(place[i], (flat, flat, ".4f"), strict=True)]
             values += ["" if np.isnan(s) else f"{s:.4f}" for s in sigma[i]]
@@ -61,5 +63,5 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
                 values += ["" if np.isnan(c) else f"{c:.6e}" for c in C[i][[0, 0, 1], [1, 2, 2]]]
             name = f'"{p.point}"' if set(p.point) & set(',"\n') else p.point
             status = convert.enum_name(m.ObjectPoint.Status, p.status)
-            file.write(",".join([name, *values, str(p.rays), p.role, status]) + "\n")
+            file.write(",".join([name, *values, str(p.rays), p.role, status, p.checked]) + "\n")
     return len(best)

@@ -16,7 +16,10 @@ from triline.nodes.cli import main
 from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geotiff import Heights, write_heights
 from triline.nodes.formats.sbet import read_sbet
+from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
+from triline.nodes.recording.writer import RecordingWriter
+from triline.schemas import messages as m
 from triline.solver.geometry.rotation import matrix_from_angles
 
 ERRORS = {"dc": 0.05, "k1": 3e-6, "xp_F": 0.012, "yp_B": -0.01, "sy_F": 2e-4, "th_B": 2e-4}
@@ -305,3 +308,13 @@ def _lacks_egm96():
 def test_a_raster_of_ours_says_its_datum(placed):
     with rasterio.open(placed[0].parent / "dem.tif") as source:
         assert source.tags()["VERTICAL_DATUM"] == "ellipsoid"
+
+
+def test_points_say_what_checks_them(tmp_path):
+    path, table = tmp_path / "a.mcap", tmp_path / "points.csv"
+    with RecordingWriter(path) as writer:
+        for i, checked in enumerate(("all", "doubtful")):
+            point = m.ObjectPoint(point=f"T{i}", x=1.0, y=2.0, z=3.0, rays=3, role="tie", status=2, checked=checked)
+            writer.write(Message("point/object", 10**9, point, "adjuster"))
+    assert main(["export", str(path), "--points", str(table), "-q"]) == 0
+    assert pd.read_csv(table).set_index("point")["checked"].to_dict() == {"T0": "all", "T1": "doubtful"}
