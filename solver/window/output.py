@@ -127,6 +127,8 @@ class OrientationOutput:
             role = control[name].role if name in control else "tie"
             rays, single = int(batch.points_left[i]), int(earlier[i])  # single looks of earlier strips
             checked = checks(rays + single, len(residuals) + single, bool(known[i]))
+            if points[name].alone:
+                checked = "doubtful"
             out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
         return out
 

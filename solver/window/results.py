@@ -159,7 +159,8 @@ class AdjustedPoint(NamedTuple):
     whole : whether it has the information of whole strips, from the backward pass
     residuals : of all its looks
     checked : what a gross error in one of its rays would meet: "all" of them are checked by others; "across": two
-        rays, so that an error along the base goes into the height unseen; "doubtful": half of the rays are left out
+        rays, so that an error along the base goes into the height unseen; "doubtful": half of the rays are left out, or
+        strips contradict each other
     """
 
     name: str

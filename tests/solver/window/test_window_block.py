@@ -208,7 +208,8 @@ def test_a_point_taken_for_another_ties_nothing(flight, online):
     )
     result = adjust_online(mixed, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
     named = " ".join(text for text in result.events if "do not agree with earlier strips" in text)
-    assert str(simulation.points.id[one]) in named and str(simulation.points.id[other]) in named
+    for name in (str(simulation.points.id[one]), str(simulation.points.id[other])):
+        assert name in named and result.whole_points[name].checked == "doubtful"
     kept = [o for o in result.whole if o.strip == "S1"], [o for o in online.whole if o.strip == "S1"]
     assert far_apart(*kept)[0] < 1.5
 
