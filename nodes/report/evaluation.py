@@ -253,6 +253,7 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
     path = filtered.trajectory(flight.start_ns)
     default = (flight.project.image_sigma_px if flight.project is not None else 0.0) or _IMAGE_SIGMA_PX
     kept, rows, seen = [], [], set()
+    number = {id: i for i, id in enumerate(flight.strips)}
     for look in flight.looks:
         strip, ccd = flight.strips.get(look.strip), camera.line_index.get(look.ccd)
         if strip is None or not strip.line_rate_hz > 0 or ccd is None or look.key in bad or look.key in seen:
@@ -264,7 +265,7 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
         if inside and path.start_s <= time <= path.end_s and camera.lines[ccd].contains(look.sample):
             kept.append(look.point)
             sigmas = look.sigma_line or default, look.sigma_sample or default
-            rows.append((ccd, look.sample, time, 1.0 / strip.line_rate_hz, *sigmas))
+            rows.append((ccd, look.sample, time, 1.0 / strip.line_rate_hz, *sigmas, number[look.strip]))
     if not rows:
         return None
     ids, point = np.unique(kept, return_inverse=True)
@@ -277,6 +278,7 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
     return [str(i) for i in ids], ImageRays(
         point.astype(np.int64), table[:, 2], table[:, 3], pose.position_l, pose.angles, pose.velocity_l,
         pose.angle_rate, xy, pitch, camera.focal_length_mm[ccd], table[:, 4], table[:, 5], covariance,
+        table[:, 6].astype(np.int64),
     )  # fmt: skip
 
 

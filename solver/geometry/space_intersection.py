@@ -32,6 +32,7 @@ class ImageRays:
     focal_length_mm : (n,)
     sigma_line_px, sigma_sample_px : (n,)
     orientation_covariance : (n, 6, 6) X, Y, Z, omega, phi, kappa in m, rad; None if it is not known
+    strip : (n,) index of each ray's strip, whose orientation has errors of its own; None if all are of one
     """
 
     point: IntArray
@@ -47,6 +48,7 @@ class ImageRays:
     sigma_line_px: Array
     sigma_sample_px: Array
     orientation_covariance: Array | None = None
+    strip: IntArray | None = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,9 @@ def intersect(rays: ImageRays, n_points: int, correlation_time_s: float = np.inf
     """Weighted multi-ray forward intersection (Gauss-Newton on the collinearity equations).
 
     Rays are weighted by their image covariance ``Ju su^2 Ju^T + Jv sv^2 Jv^T``. Orientation errors of two looks at one
-    point are taken as correlated by ``exp(-|dt| / correlation_time_s)``: what a trajectory has wrong it has wrong for a
-    while, and errors common to all looks do not average out.
+    point from the same strip are taken as correlated by ``exp(-|dt| / correlation_time_s)``: what a trajectory has
+    wrong it has wrong for a while, and errors common to all looks do not average out. Those of different strips are
+    independent, as an adjustment takes them.
 
     Raises
     ------
@@ -110,7 +113,10 @@ def intersect(rays: ImageRays, n_points: int, correlation_time_s: float = np.inf
     covariance[known] = inverse
     if rays.orientation_covariance is not None:
         through = gain @ through_orientation  # (n, 3, 6): orientation error of a ray into the right-hand side
-        spread = _orientation_spread(through, rays.orientation_covariance[use], p, rays.time_s[use], correlation_time_s)
+        strip = None if rays.strip is None else rays.strip[use]
+        spread = _orientation_spread(
+            through, rays.orientation_covariance[use], p, rays.time_s[use], strip, correlation_time_s
+        )
         total = _sum_by_point(spread, p, n_points)
         covariance[known] += inverse @ total[known] @ inverse
     return Intersection(xyz, covariance, count, known)
@@ -129,7 +135,9 @@ def _sum_by_point(values: Array, point: IntArray, n_points: int) -> Array:
     return total
 
 
-def _orientation_spread(through: Array, covariance: Array, point: IntArray, time: Array, tau: float) -> Array:
+def _orientation_spread(
+    through: Array, covariance: Array, point: IntArray, time: Array, strip: IntArray | None, tau: float
+) -> Array:
     """(n, 3, 3) share of each ray in the covariance of its point's right-hand side, with its partners at that point."""
     root = through @ _root(covariance)
     spread = root @ np.swapaxes(root, 1, 2)
@@ -139,6 +147,8 @@ def _orientation_spread(through: Array, covariance: Array, point: IntArray, time
         pair = point[first] == point[second]
         first, second = first[pair], second[pair]
         correlation = np.exp(-np.abs(time[second] - time[first]) / tau)
+        if strip is not None:
+            correlation[strip[first] != strip[second]] = 0.0
         cross = correlation[:, None, None] * (root[first] @ np.swapaxes(root[second], 1, 2))
         spread[first] += cross + np.swapaxes(cross, 1, 2)  # no ray is first twice in one step
     return spread

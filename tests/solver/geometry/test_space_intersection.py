@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -105,11 +107,13 @@ def test_intersection_agrees_with_a_general_least_squares_solver():
         np.testing.assert_allclose(np.sqrt(np.diag(found.covariance[i])), sigma, rtol=0.05)
 
 
-@pytest.mark.parametrize("common", [True, False])
-def test_covariance_of_intersected_points_is_consistent(common):
+@pytest.mark.parametrize(("common", "by_strip"), [(True, False), (False, False), (False, True)])
+def test_covariance_of_intersected_points_is_consistent(common, by_strip):
+    """Errors common to all rays of a point, or of each ray its own: short-lived, or each ray of another strip."""
     root = np.diag([0.5, 0.4, 0.7, 1e-4, 1e-4, 2e-4]) @ np.tril(np.full((6, 6), 0.3) + 0.7 * np.eye(6))
     truth, rays = _rays(np.random.default_rng(2), 1500, 0.3, root, common)
-    found = intersect(rays, 1500, correlation_time_s=np.inf if common else 1e-3)
+    rays = replace(rays, strip=np.tile([0, 1, 2], 1500)) if by_strip else rays
+    found = intersect(rays, 1500, correlation_time_s=np.inf if common or by_strip else 1e-3)
     nees = accuracy(found.xyz_l - truth, found.covariance).nees
     low, high = nees_band(1500, 3, alpha=0.001)
     assert nees is not None and low < nees < high
