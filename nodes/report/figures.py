@@ -231,11 +231,12 @@ def progress(flight: Flight) -> Figure | None:
     top.axhline(1.0, color="black", lw=0.8)
     top.plot(t, sigma0, color=FINAL, label="σ₀ of the window")
     total = np.array([r.sigma0_total for r in reports])
-    if (total > 0).any():
-        top.plot(t, np.where(total > 0, total, np.nan), color=LIVE, label="σ₀ since the start")
-    largest = np.nanmax(np.abs(np.clip(sigma0, 0, 3) - 1)) if telling.any() else 0.0
+    total = np.where(telling & (total > 0), total, np.nan)
+    if np.isfinite(total).any():
+        top.plot(t, total, color=LIVE, label="σ₀ since the start")
+    largest = np.nanmax(np.abs(np.clip([sigma0, total], 0, 3) - 1)) if telling.any() else 0.0
     margin = max(0.15, 1.2 * float(largest))
-    top.set_ylim(max(0, 1 - margin), 1 + margin)
+    top.set_ylim(max(0, 1 - margin), 1 + 1.6 * margin)  # room for the legend
     top.set_title("σ₀ (1 expected)")
     top.legend(loc="upper right", ncols=3)
     new = np.array(updates_with_new_rays(reports))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from .. import convert
@@ -24,7 +25,7 @@ _COLORS = {"good": "#dff1e5", "weak": "#fdebc8", "failed": "#f9d2cd"}
 _SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 _MDEG = 1000.0 * float(np.degrees(1.0))
 _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
-_LONGEST_S = 6.0  # a report counts for no longer than this
+_LONGEST_S = 6.0  # a report counts for no longer than this, or than updates are apart
 _NEAR_S = 0.3  # largest distance in time between an error and the protection level it is compared with
 _NUMBER = re.compile(r"[+-]?\b\d+(\.\d+)?\b")
 
@@ -48,7 +49,8 @@ def integrity(flight: Flight) -> dict[str, Any] | None:
     lit = _lit(flight)
     if not lit:
         return None
-    lasting = _lasting([stamp for stamp, r in flight.reports if r.light], [stamp for stamp, _ in lit])
+    told = [stamp for stamp, r in flight.reports if r.light]
+    lasting = _lasting(told, [stamp for stamp, _ in lit], _longest_s(flight))
     total = sum(lasting)
     share = {light: 0.0 for light in LIGHTS}
     reasons: dict[tuple[str, str], dict[str, Any]] = {}
@@ -80,10 +82,15 @@ def _lit(flight: Flight) -> list[tuple[int, Any]]:
     return [row for row, on in zip(flight.reports, flying, strict=True) if on and row[1].light and row[1].strip]
 
 
-def _lasting(all_ns: list[int], lit_ns: list[int]) -> list[float]:
+def _lasting(all_ns: list[int], lit_ns: list[int], longest_s: float) -> list[float]:
     """Time until the next report, s, for each report with a light."""
     following = dict(pairwise(all_ns))
-    return [min((following.get(ns, ns) - ns) / convert.SECOND_NS, _LONGEST_S) for ns in lit_ns]
+    return [min((following.get(ns, ns) - ns) / convert.SECOND_NS, longest_s) for ns in lit_ns]
+
+
+def _longest_s(flight: Flight) -> float:
+    """How long a report counts at most, s: a little longer than updates are apart (10 s at the pace for throughput)."""
+    return max(_LONGEST_S, 1.2 * max((report.update_interval_s for _, report in flight.reports), default=0.0))
 
 
 def _levels(flight: Flight, result: dict[str, Any]) -> None:
@@ -151,14 +158,17 @@ def protection_figure(flight: Flight) -> Figure | None:
         curves.insert(0, ("error of the live orientation", np.abs(error), TRUTH, 0.7))
     for i, ax in enumerate(axes.T.ravel()):
         for name, values, color, width in curves:
-            x, y = axis.curve(t, _SCALE[i] * values[:, i : i + 1])
+            x, y = axis.curve(t, _SCALE[i] * values[:, i : i + 1], _longest_s(flight))
             ax.plot(x, y[:, 0], color=color, lw=width, label=name)
         ax.set_yscale("log")
         low, high = (_SCALE[i] * float(f(v[:, i])) for f, v in ((np.min, sigma), (np.max, protection)))
-        ax.set_ylim(0.2 * max(low, 1e-6 * high, 1e-9), 1.5 * max(high, 1e-9))
+        bottom, top = 0.2 * max(low, 1e-6 * high, 1e-9), 1.5 * max(high, 1e-9)
+        ax.set_ylim(bottom, top)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 300 * bottom else (1,)))
         ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
         ax.set_title(f"{_SYMBOLS[i]} [{'m' if i < 3 else 'mdeg'}]")
-        _shade(ax, axis, *lights)
+        _shade(ax, axis, *lights, _longest_s(flight))
     axis.dress(axes.ravel(), axes[-1])
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return fig
@@ -171,11 +181,11 @@ def _lights(flight: Flight) -> tuple[Array, Array]:
     return np.atleast_1d(flight.seconds(np.array([stamp for stamp, _ in lit], dtype=np.int64))), code
 
 
-def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array) -> None:
+def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array, longest_s: float) -> None:
     """The light as the colour of the background."""
     if not len(time_s):
         return
-    x, values = axis.curve(time_s, code[:, None])
+    x, values = axis.curve(time_s, code[:, None], longest_s)
     for k, light in enumerate(LIGHTS):
         burning = np.isfinite(x[1:] - x[:-1]) & (values[:-1, 0] == k)  # a light holds until the next report
         edges = np.flatnonzero(np.diff(burning, prepend=False, append=False))

@@ -33,8 +33,9 @@ class StripTime:
             place += end - start + gap
         self._gap = gap
 
-    def curve(self, time_s: Array, values: Array) -> tuple[Array, Array]:
-        """Places and values of a thinned-out curve; NaN where its data pause, so that no line crosses a pause."""
+    def curve(self, time_s: Array, values: Array, pause_s: float = _PAUSE_S) -> tuple[Array, Array]:
+        """Places and values of a thinned-out curve; NaN where its data pause for longer than ``pause_s``, so that no
+        line crosses a pause."""
         step = max(1, len(time_s) // _SAMPLES)
         t, v = np.asarray(time_s, dtype=float)[::step], np.asarray(values, dtype=float)[::step]
         if self.strips:
@@ -46,7 +47,7 @@ class StripTime:
             t, v, x = t[kept], v[kept], x[kept]
         else:
             x = t
-        pauses = np.flatnonzero(np.diff(t) > _PAUSE_S) + 1
+        pauses = np.flatnonzero(np.diff(t) > max(pause_s, _PAUSE_S)) + 1
         return np.insert(x, pauses, np.nan), np.insert(v, pauses, np.nan, axis=0)
 
     def dress(self, axes: Iterable[Axes], lowest: Iterable[Axes]) -> None:

@@ -12,11 +12,12 @@ from synthetic_flight import LIVE_SIGMA, START_NS, flight_messages
 
 from triline.nodes import convert
 from triline.nodes.cli import main
+from triline.nodes.node import Message
 from triline.nodes.recording.summary import Holdings
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import orientation_errors
 from triline.nodes.report.flight import Look, collect, rejected_key
-from triline.nodes.report.integrity import integrity, levels
+from triline.nodes.report.integrity import integrity, levels, protection_figure
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
 from triline.schemas import messages as m
@@ -95,6 +96,26 @@ def test_without_truth_levels_stand_alone_and_without_lights_nothing_is_said(mes
     said = integrity(collect([k for k in messages if not k.topic.startswith("truth/")]))
     assert said is not None and "protection_m" in said and "exceeded" not in said
     assert integrity(collect(flight_messages(seconds=12.0, points=20))) is None
+
+
+def test_reports_that_are_as_far_apart_as_the_pace_for_throughput_makes_them(messages):
+    """Updates each 10 s: each report counts until the next, and the figure joins what they say."""
+    kept, last_ns = [], 0
+    for message in messages:
+        if message.topic == "adjustment/report":
+            if message.stamp_ns - last_ns < 10 * convert.SECOND_NS:
+                continue
+            last_ns, body = message.stamp_ns, m.AdjustmentReport()
+            body.CopyFrom(message.body)
+            body.update_interval_s = 10.0
+            message = Message(message.topic, message.stamp_ns, body, message.source, message.sequence)
+        kept.append(message)
+    flight = collect(kept)
+    said, figure = integrity(flight), protection_figure(flight)
+    assert said is not None and figure is not None
+    assert len(flight.reports) == 3 and said["seconds"] == pytest.approx(20.0, abs=0.1)
+    drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines()}
+    assert np.isfinite(drawn["protection level"]).all() and len(drawn["protection level"]) == 3
 
 
 def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path):
