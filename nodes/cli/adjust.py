@@ -31,6 +31,7 @@ from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.refraction import Refraction
 from ...solver.models import MODELS
 from ...solver.models.base import ModelOptions
+from ...solver.models.lim import FEWEST_FIXES
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
@@ -158,10 +159,10 @@ def run(args: argparse.Namespace) -> int:
     dem = dem_settings(args)
     if not args.critical > 0:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
-    for option in ("iterations", "segments", "fixes"):
+    for option, least in (("iterations", 1), ("segments", 1), ("fixes", FEWEST_FIXES)):
         number = getattr(args, option)
-        if number is not None and number < 1:
-            raise UserError(f"--{option} {number}, wanted 1 at least")
+        if number is not None and number < least:
+            raise UserError(f"--{option} {number}, wanted {least} at least")
     if args.output:
         refuse_unless_folder(Path(args.output))
         refuse_folder_of_inputs(Path(args.output))

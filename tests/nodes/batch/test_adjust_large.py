@@ -90,7 +90,7 @@ def test_two_recordings_are_adjusted_as_one(folder, tmp_path, capsys):
         (["--scratch", "x"], "--scratch goes with --workers or --scheduler"),
         (["--partition-rays", "3000"], "--partition-rays goes with --workers or --scheduler"),
         (["--model", "ppm", "--segments", "0"], "--segments 0, wanted 1 at least"),
-        (["--model", "lim", "--fixes", "0"], "--fixes 0, wanted 1 at least"),
+        (["--model", "lim", "--fixes", "0"], "--fixes 0, wanted 4 at least"),
         (["--workers", "1", "--partition-rays", "3"], "--partition-rays 3, wanted 100 at least"),
         (["--workers", "1", "--then", "lim"], "adjusted without a second model (--then)"),
         (["--workers", "1", "--selfcal", "tls18"], "(--keep all goes)"),
