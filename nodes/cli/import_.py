@@ -15,22 +15,40 @@ from typing import Any
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
 from ..errors import UserError
-from ..formats.avirisc import LINE_RATE_HZ
+from ..formats.avirisc import LINE_RATE_HZ, avirisc_has_latitudes
 from ..formats.camera_json import read_camera, write_camera
 from ..formats.detect import KINDS, Imported, Options, kind_of_path, read_any
 from ..formats.envi_image import TYPES
 from ..formats.flight_folder import flight_messages
 from ..formats.geocal_xml import read_glas_camera, read_tie_points
-from ..formats.ground_height import NOT_GIVEN, GroundGiven
+from ..formats.gpx import has_attitudes
+from ..formats.ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from ..formats.image_lines import LinesGiven, files_of
 from ..formats.new_file import new_file
 from ..formats.tie_points import statistics, write_tie_points
-from ..formats.track import Accuracy, Mounting
+from ..formats.track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Mounting
+from ..formats.trajectory_csv import csv_has_latitudes
 from ..node import Message
 from ..recording.writer import RecordingWriter
 from ..terminal import drawing
 
 EXAMPLE = "triline import block_folder -o flight.mcap"
+
+_GROUND = ("ground_height", "above_ground", "dem", "dem_crs")
+_IMAGES = ("lines", "strip", "line_times", "first_time", "band", "raw", "samples", "grey_range")
+_SENSORS = ("date", "camera", "line_rate", *_GROUND, *_IMAGES)
+_POSES = ("lever_arm", "boresight", "position_sigma", "attitude_sigma", *_SENSORS)
+#: Kind of input -> options (as attributes) that have an effect on it.
+GO_WITH: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("flight", "block", "ties", "camera"), ()),
+    **dict.fromkeys(("sensors", "ros2"), _SENSORS),
+    **dict.fromkeys(("avirisng", "pos", "headwall", "resonon", "gpx"), _POSES),
+    **dict.fromkeys(("avirisc", "csv"), (*_POSES, "crs")),
+    "sbet": (*_POSES, "seconds_of_day"),
+    "scenes": _IMAGES,
+    "lines": ("date", "camera", "line_rate", *_IMAGES),
+}
+_OPTIONS = ("crs", "seconds_of_day", *_POSES)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE", help=f"camera.json, AVIRIS-NG camera XML, or a preset ({', '.join(PRESETS)})"
     )
     parser.add_argument(
-        "--lever-arm", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("FWD", "RIGHT", "DOWN"),
+        "--lever-arm", type=float, nargs=3, metavar=("FWD", "RIGHT", "DOWN"),
         help="from the point whose positions the file gives to the perspective centre, m",
     )  # fmt: skip
     parser.add_argument(
-        "--boresight", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("ROLL", "PITCH", "HEADING"),
+        "--boresight", type=float, nargs=3, metavar=("ROLL", "PITCH", "HEADING"),
         help="of the camera against the body whose attitude the file gives, degrees",
     )  # fmt: skip
     for name, what in (("position", "X Y Z, m (default 0.2 0.2 0.2)"), ("attitude", "deg (default 0.01 0.01 0.02)")):
@@ -72,11 +90,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ground.add_argument("--dem-crs", metavar="CRS", help="of the raster's heights: ellipsoid, EPSG:5773 ..")
     images = parser.add_argument_group("image lines")
     images.add_argument(
-        "--lines", action="append", default=[], metavar="VIEW=FILE,..",
+        "--lines", action="append", metavar="VIEW=FILE,..",
         help="images (ENVI, TIFF, raw) of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for "
         "a band of it; of a ROS 2 bag topics (N=/camera/nadir); of satellite scenes one a scene (scene/F=f.tif)",
     )  # fmt: skip
-    images.add_argument("--strip", default="", metavar="ID", help="of the images (default: name of the first file)")
+    images.add_argument("--strip", metavar="ID", help="of the images (default: name of the first file)")
     images.add_argument(
         "--line-times", type=Path, metavar="CSV", help="time of each line: line, and time, time_s or gps_s"
     )
@@ -100,19 +118,14 @@ def _day(text: str) -> date:
 
 def run(args: argparse.Namespace) -> int:
     source, output = Path(args.input), Path(args.output)
-    if args.line_rate is not None and not args.line_rate > 0:
-        raise UserError(f"--line-rate {args.line_rate:g}, wanted more than 0 Hz")
+    _check_numbers(args)
     kind = args.format or ("lines" if args.raw and not args.lines else kind_of_path(source))
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
-    if args.camera and kind in ("block", "scenes", "ties", "camera"):
-        raise UserError(f"--camera does not go with {KINDS[kind]}")
-    if args.date is not None and kind == "camera":
-        raise UserError(f"--date does not go with {KINDS[kind]}")
+    _refuse_options(args, kind, source)
     if output.exists() and source.exists() and output.samefile(source):
         raise UserError(f"{output}: is the input itself")
     if kind == "flight":
-        _refuse_options(args)
         imported, platform = flight_messages(source)
         result = _write(source, imported, output, platform, shown=not args.quiet and not args.json)
     elif kind == "camera":
@@ -124,13 +137,13 @@ def run(args: argparse.Namespace) -> int:
         options = Options(
             args.date,
             args.crs,
-            Mounting(tuple(args.lever_arm), tuple(args.boresight)),
+            Mounting(args.lever_arm or Mounting.lever_arm_m, args.boresight or Mounting.boresight_deg),
             args.line_rate or LINE_RATE_HZ,
-            read_camera_of(args.camera) if args.camera else None,
+            None if args.camera is None else read_camera_of(args.camera),
             args.seconds_of_day,
             _accuracy(args),
             _lines(args, kind),
-            _ground(args, kind),
+            _ground(args),
         )
         imported = read_any(source, kind, options)
         result = _write(source, imported, output, "demo", shown=not args.quiet and not args.json)
@@ -142,27 +155,41 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _ground(args: argparse.Namespace, kind: str) -> GroundGiven:
+def _check_numbers(args: argparse.Namespace) -> None:
+    """Raise UserError for a number that cannot be."""
+    if args.line_rate is not None and not 0 < args.line_rate < math.inf:
+        raise UserError(f"--line-rate {args.line_rate:g}, wanted a number above 0 (Hz)")
+    for name, most, wanted in (
+        ("lever_arm", MOST_LEVER_ARM_M, f"metres within {MOST_LEVER_ARM_M:g}; are they mm?"),
+        ("boresight", MOST_BORESIGHT_DEG, f"degrees within {MOST_BORESIGHT_DEG:g}"),
+    ):
+        values = getattr(args, name) or ()
+        if not all(abs(value) <= most for value in values):
+            raise UserError(f"{_flag(name)} {' '.join(f'{v:g}' for v in values)}: wanted {wanted}")
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _ground(args: argparse.Namespace) -> GroundGiven:
     """What the arguments say about the height of the ground.
 
     Raises
     ------
-    UserError : arguments that do not go together, or with the kind of input
+    UserError : arguments that do not go together
     """
     given = [name for name in ("ground_height", "above_ground", "dem") if getattr(args, name) is not None]
     if not given:
         if args.dem_crs is not None:
             raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
         return NOT_GIVEN
-    shown = [f"--{name.replace('_', '-')}" for name in given]
     if len(given) > 1:
-        raise UserError(f"{' and '.join(shown)}: wanted one of them")
-    if kind in ("block", "ties", "camera", "lines"):
-        raise UserError(f"{shown[0]} does not go with {KINDS[kind]}, wanted poses or sensors")
+        raise UserError(f"{' and '.join(_flag(name) for name in given)}: wanted one of them")
     if args.above_ground is not None and not 0 < args.above_ground < math.inf:
         raise UserError(f"--above-ground {args.above_ground:g}, wanted more than 0 m")
-    if args.ground_height is not None and not -500 < args.ground_height < 9000:
-        raise UserError(f"--ground-height {args.ground_height:g}, wanted metres from -500 to 9000")
+    if args.ground_height is not None and not LOWEST_M < args.ground_height < HIGHEST_M:
+        raise UserError(f"--ground-height {args.ground_height:g}, wanted metres from {LOWEST_M:g} to {HIGHEST_M:g}")
     return GroundGiven(args.ground_height, args.dem, args.dem_crs, args.above_ground)
 
 
@@ -175,26 +202,26 @@ def _lines(args: argparse.Namespace, kind: str) -> LinesGiven | None:
     """
     if args.samples is not None and (args.raw is None or args.samples < 1):
         raise UserError(f"--samples {args.samples}: wanted the pixels of a line, with --raw TYPE")
-    raw = None if args.raw is None else (args.raw, args.samples or 0)
+    raw, strip = None if args.raw is None else (args.raw, args.samples or 0), args.strip or ""
     if not args.lines and kind != "lines":
-        of_topics = ("strip",) if kind == "ros2" else ()
-        for name in ("strip", "line_times", "first_time", "band", "grey_range", "raw"):
-            if getattr(args, name) and name not in of_topics:
-                raise UserError(f"--{name.replace('_', '-')} is of images, wanted --lines VIEW=FILE with it")
-        return LinesGiven((), args.strip, rate_hz=args.line_rate) if kind == "ros2" else None
-    first = None
+        alone = {"ros2": ("strip", "line_rate"), "avirisc": ("line_rate",)}.get(kind, ())
+        for name in (*_IMAGES, "line_rate"):
+            if getattr(args, name) is not None and name not in alone:
+                raise UserError(f"{_flag(name)} is of images, wanted --lines VIEW=FILE with it")
+        return LinesGiven((), strip, rate_hz=args.line_rate) if kind == "ros2" else None
+    if kind == "lines" and args.date is not None and args.line_times is None:
+        raise UserError("--date goes with --line-times: a first time has its day")
+    files, first = files_of(args.lines or ()), None
     if args.first_time is not None:
         if args.line_rate is None:
             raise UserError("--first-time without --line-rate, wanted both")
         first = (args.first_time, args.line_rate)
-    elif args.line_rate is not None and kind not in ("avirisc", "ros2"):
+    elif args.line_rate is not None and kind != "avirisc" and LinesGiven(files).topics is None:
         raise UserError("--line-rate without --first-time, wanted both")
     span = None if args.grey_range is None else (args.grey_range[0], args.grey_range[1])
     if span is not None and not -math.inf < span[0] < span[1] < math.inf:
         raise UserError(f"--grey-range {span[0]:g} {span[1]:g}, wanted two numbers, the lower one first")
-    return LinesGiven(
-        files_of(args.lines), args.strip, args.line_times, first, args.band, span, args.date, raw, args.line_rate
-    )
+    return LinesGiven(files, strip, args.line_times, first, args.band, span, args.date, raw, args.line_rate)
 
 
 def _accuracy(args: argparse.Namespace) -> Accuracy:
@@ -232,15 +259,20 @@ def _import_camera(source: Path, output: Path) -> dict[str, Any]:
     return {"lines": {line.id: line.pixels for line in camera.lines}, "notes": notes}
 
 
-def _refuse_options(args: argparse.Namespace) -> None:
-    """Raise UserError for an option that says what flight.toml says."""
-    names = ("date", "crs", "camera", "position_sigma", "attitude_sigma", "line_rate", "seconds_of_day", "lines")
-    names = (*names, "strip", "line_times", "first_time", "band", "grey_range", "raw", "samples")
-    names = (*names, "ground_height", "above_ground", "dem", "dem_crs")
-    given = [name for name in names if getattr(args, name)]
-    given += [name for name in ("lever_arm", "boresight") if any(getattr(args, name))]
-    if given:
-        raise UserError(f"--{given[0].replace('_', '-')} does not go with a flight folder: it stands in flight.toml")
+def _refuse_options(args: argparse.Namespace, kind: str, source: Path) -> None:
+    """Raise UserError for an option that has no effect on what is imported."""
+    given = [name for name in _OPTIONS if getattr(args, name) is not None]
+    for name in given:
+        if name not in GO_WITH[kind]:
+            what = "a flight folder: it stands in flight.toml" if kind == "flight" else KINDS[kind]
+            raise UserError(f"{_flag(name)} does not go with {what}")
+    if "crs" in given and (avirisc_has_latitudes if kind == "avirisc" else csv_has_latitudes)(source):
+        raise UserError(f"--crs {args.crs}: does not go with {source}, whose positions are latitude and longitude")
+    of_attitudes = [name for name in ("lever_arm", "boresight", "attitude_sigma") if name in given]
+    if kind == "gpx" and of_attitudes and not has_attitudes(source):
+        raise UserError(f"{_flag(of_attitudes[0])} does not go with {source}, whose positions have no attitudes")
+    if args.seconds_of_day and args.date is None:
+        raise UserError("--seconds-of-day goes with --date: of which day?")
 
 
 def _write(source: Path, imported: Imported, output: Path, platform: str, *, shown: bool) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...solver.geometry.frames import CrsError
 from ..errors import UserError
@@ -23,6 +24,17 @@ _NAME = re.compile(r"^(f(\d{2})(\d{2})(\d{2})t\d{2}p\d{2}r\d{2}).*_eph$")
 def is_avirisc(path: Path) -> bool:
     """Whether a file name is that of an AVIRIS-C ephemeris file."""
     return bool(_NAME.match(path.name))
+
+
+def avirisc_has_latitudes(path: Path) -> bool:
+    """Whether an AVIRIS-C ephemeris file has longitude and latitude, and not UTM coordinates.
+
+    Raises
+    ------
+    UserError : from `read_records`
+    """
+    values = read_records(path, BANDS, [])[1]
+    return values.shape[1] == len(BANDS) and _are_degrees(values)
 
 
 def read_avirisc(
@@ -43,7 +55,7 @@ def read_avirisc(
         raise UserError(f"{path}: {values.shape[1]} values a record, wanted 6: {', '.join(BANDS)}")
     x, y, height = values[:, 0], values[:, 1], values[:, 2]
     heading = np.radians(values[:, 5])
-    if np.abs(x).max() <= 360 and np.abs(y).max() <= 90:
+    if _are_degrees(values):
         lon, lat = x, y
     else:
         crs = crs or _zone_of_twin(path)
@@ -73,6 +85,11 @@ def read_avirisc(
         notes=tuple(notes),
     )
     return checked(track, path)
+
+
+def _are_degrees(values: NDArray[np.floating]) -> bool:
+    """Whether the first two of the values (n, 6) are longitudes and latitudes."""
+    return bool(np.abs(values[:, 0]).max() <= 360 and np.abs(values[:, 1]).max() <= 90)
 
 
 def _zone_of_twin(path: Path) -> str:

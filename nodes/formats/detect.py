@@ -197,10 +197,6 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     """
     kind = kind_of_path(path) if kind is None else kind
     options = Options() if options is None else options
-    if options.day is not None and kind in ("block", "scenes", "ties"):
-        raise UserError(f"{path}: --date does not go with a {KINDS[kind]}: its times stand for themselves")
-    if options.lines is not None and kind in ("block", "ties"):
-        raise UserError(f"{path}: --lines do not go with a {KINDS[kind]}, wanted poses or sensors of the flight")
     if kind in ("block", "scenes"):
         block = read_block(path) if kind == "block" else local_block(read_scene_block(path))
         notes, messages = [*block.notes, *not_carried(block)], block_messages(block)

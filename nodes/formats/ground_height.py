@@ -16,6 +16,8 @@ Array = NDArray[np.floating]
 
 #: A raster of heights is asked at so many places of the flight.
 _PLACES = 200
+#: Ground of the Earth lies between these heights above the ellipsoid, m.
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
 
 
 @dataclass(frozen=True)

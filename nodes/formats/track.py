@@ -32,6 +32,8 @@ Array = NDArray[np.floating]
 
 #: More than aircraft that carry cameras do, m/s^2.
 MOST_ACCELERATION = 50.0
+#: Components of a lever arm, m, and angles of a boresight, degrees, are not larger than these.
+MOST_LEVER_ARM_M, MOST_BORESIGHT_DEG = 50.0, 360.0
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,12 @@ def is_trajectory_csv(path: Path) -> bool:
     return _is_photogrammetric(names) or {"lat", "lon", "roll"} <= {_quantity(name)[0] for name in names}
 
 
+def csv_has_latitudes(path: Path) -> bool:
+    """Whether the header of a CSV file has latitude and longitude, and not coordinates in a CRS."""
+    names = _header(path)
+    return not _is_photogrammetric(names) and {"lat", "lon"} <= {_quantity(name)[0] for name in names}
+
+
 def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = None) -> NavigationTrack:
     """Poses with a time that `time_columns` knows; ``time_s`` from another start than 1970 is taken as it is.
 

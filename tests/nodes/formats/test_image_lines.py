@@ -238,6 +238,9 @@ def test_an_image_alone_with_first_time_and_rate(tmp_path, capsys):
     other = write_image(tmp_path / "other.img", cube_of("u2", bands=1))
     assert main(["import", str(path), "-o", str(out), "--lines", f"B={other}", *camera]) == 1
     assert "nadir.bil: an image that --lines does not name" in capsys.readouterr().err
+    day = ["--date", "2020-06-01"]
+    assert main(["import", str(path), "-o", str(out), *camera, "--lines", f"B={path}", *day]) == 1
+    assert "--date goes with --line-times" in capsys.readouterr().err
     assert main(["import", str(path), "-o", str(out)]) == 1
     assert "nadir.bil: times of its lines are missing, wanted --line-times CSV" in capsys.readouterr().err
 

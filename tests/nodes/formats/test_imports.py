@@ -13,13 +13,14 @@ from small_block import simulated_block, write_files
 from tracks import ns, straight_track
 
 from triline.nodes.cli import main
+from triline.nodes.cli.import_ import GO_WITH
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried, strip_shifts
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.block_writer import write_block
-from triline.nodes.formats.detect import Options, read_any
+from triline.nodes.formats.detect import KINDS, Options, read_any
 from triline.nodes.formats.geocal_xml import read_tie_points
 from triline.nodes.formats.gps_time import gps_from_utc_ns
 from triline.nodes.formats.sbet import write_sbet
@@ -343,6 +344,76 @@ def test_usage_errors(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["import", "x", "-o", "y", "--date", "yesterday"])
     assert stop.value.code == 2 and "wanted YYYY-MM-DD" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options, wanted",
+    [
+        (["--lever-arm", "nan", "0", "0"], "--lever-arm nan 0 0: wanted metres within 50; are they mm?"),
+        (["--lever-arm", "0", "inf", "0"], "--lever-arm 0 inf 0: wanted metres within 50"),
+        (["--lever-arm", "0", "0", "-1500"], "--lever-arm 0 0 -1500: wanted metres within 50"),
+        (["--boresight", "nan", "0", "0"], "--boresight nan 0 0: wanted degrees within 360"),
+        (["--boresight", "0", "0", "1e9"], "--boresight 0 0 1e+09: wanted degrees within 360"),
+        (["--position-sigma", "1", "nan", "1"], "--position-sigma 1 nan 1: wanted three numbers above 0"),
+        (["--line-rate", "nan"], "--line-rate nan, wanted a number above 0 (Hz)"),
+        (["--line-rate", "inf"], "--line-rate inf, wanted a number above 0 (Hz)"),
+        (["--above-ground", "nan"], "--above-ground nan, wanted more than 0 m"),
+        (["--ground-height", "nan"], "--ground-height nan, wanted metres from -500 to 9000"),
+        (["--camera", ""], "no such file, and no preset of that name"),
+        (["--seconds-of-day"], "--seconds-of-day goes with --date"),
+    ],
+)
+def test_numbers_and_names_that_cannot_be(tmp_path, capsys, options, wanted):
+    out = tmp_path / "out.mcap"
+    assert wanted in _refused(capsys, str(write_sbet_file(tmp_path)), "-o", str(out), *options)
+    assert not out.exists()
+
+
+VALUES = {
+    "date": ["2020-06-01"], "crs": ["EPSG:32632"], "camera": ["ads40"], "lever_arm": ["0", "0", "1"],
+    "boresight": ["0", "0", "1"], "position_sigma": ["1", "1", "1"], "attitude_sigma": ["1", "1", "1"],
+    "line_rate": ["50"], "seconds_of_day": [], "ground_height": ["100"], "lines": ["N=n.img"], "strip": ["S1"],
+}  # fmt: skip
+
+
+def test_every_kind_says_which_options_go_with_it():
+    assert GO_WITH.keys() == KINDS.keys()
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "flight"])
+def test_options_without_effect_are_refused(tmp_path, capsys, kind):
+    path = tmp_path / "input"
+    path.write_text("content")
+    for name in VALUES.keys() - set(GO_WITH[kind]):
+        flag = f"--{name.replace('_', '-')}"
+        err = _refused(capsys, str(path), "-o", str(tmp_path / "out.mcap"), "--format", kind, flag, *VALUES[name])
+        assert f"{flag} does not go with {KINDS[kind]}" in err
+
+
+GPX = """<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+<trkpt lat="48" lon="11"><ele>900</ele><time>2020-06-01T12:00:00Z</time></trkpt>
+<trkpt lat="48.001" lon="11"><ele>900</ele><time>2020-06-01T12:00:02Z</time></trkpt></trkseg></trk></gpx>"""
+
+
+@pytest.mark.parametrize(
+    "name, option, wanted",
+    [
+        ("poses.csv", "crs", "poses.csv, whose positions are latitude and longitude"),
+        ("poses.csv", "line_rate", "--line-rate is of images, wanted --lines VIEW=FILE with it"),
+        ("track.gpx", "lever_arm", "--lever-arm does not go with"),
+        ("track.gpx", "attitude_sigma", "track.gpx, whose positions have no attitudes"),
+        ("f090625t01p00r05_lonlat_eph", "crs", "whose positions are latitude and longitude"),
+    ],
+)
+def test_what_a_file_holds_decides_which_options_go_with_it(tmp_path, capsys, name, option, wanted):
+    rows = "".join(f"{1591012800 + i},48.00{i},11,900,0,0,0\n" for i in range(3))
+    (tmp_path / "poses.csv").write_text("time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + rows)
+    (tmp_path / "track.gpx").write_text(GPX)
+    np.array([[11.0, 48.0, 900.0, 0.0, 0.0, 0.0]] * 3).astype("<f8").tofile(tmp_path / "f090625t01p00r05_lonlat_eph")
+    out = tmp_path / "out.mcap"
+    more = [f"--{option.replace('_', '-')}", *VALUES[option]]
+    assert wanted in _refused(capsys, str(tmp_path / name), "-o", str(out), *more)
+    assert main(["import", str(tmp_path / name), "-o", str(out), "--camera", "ads40", "--position-sigma", *"123"]) == 0
 
 
 def test_options_reach_the_reader(tmp_path):

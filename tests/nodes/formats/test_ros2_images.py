@@ -131,6 +131,7 @@ def test_what_cannot_be_image_lines_is_told(tmp_path, capsys):
             ["--lines", f"N={n}", "--band", "1"],
             "--band, --grey-range, --line-times and --first-time are of image files",
         ),
+        (["--lines", "N=nadir.img", "--line-rate", "50"], "--line-rate without --first-time, wanted both"),
     ):
         assert main(["import", str(bag), "-o", str(out), *arguments]) == 1, arguments
         err = capsys.readouterr().err

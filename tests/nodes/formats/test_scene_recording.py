@@ -154,7 +154,7 @@ def test_bad_input(tmp_path, capsys):
     out = str(tmp_path / "x.mcap")
     for arguments, match in (
         ([str(affine)], "model affine, wanted the rigorous one: a recording holds orbit and attitude"),
-        ([str(folder), "--date", "2020-01-01"], "--date does not go with a block of satellite scenes"),
+        ([str(folder), "--date", "2020-01-01"], "--date does not go with block of satellite scenes"),
         ([str(folder), "--camera", "si-100"], "--camera does not go with block of satellite scenes"),
     ):
         capsys.readouterr()
