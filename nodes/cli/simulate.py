@@ -26,6 +26,7 @@ from ..simulator.flight_settings import (
     OPTIONS,
     Option,
     SimulatedFlight,
+    checked,
     shown_default,
     simulated_flight,
 )
@@ -55,7 +56,7 @@ _GROUPS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="recording to write, or folder")
     parser.add_argument("--epoch", metavar="UTC", help=f"when it begins (default {DEFAULT_EPOCH}, or as --motion says)")
-    parser.add_argument("--compression", choices=sorted(COMPRESSIONS), default="none", help="of the recording")
+    parser.add_argument("--compression", choices=sorted(COMPRESSIONS), help="of the recording (default none)")
     parser.add_argument("--dem", metavar="FILE", help="also write the true relief, a GeoTIFF in UTM, for `rectify`")
     satellite = parser.add_argument_group(
         "satellite scenes",
@@ -116,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     simulator = Simulator(flight.simulation, flight.imager)
     with (
         new_file(Path(args.output)) as part,
-        RecordingWriter(part, args.compression) as writer,
+        RecordingWriter(part, args.compression or "none") as writer,
         progress("writing", quiet=args.quiet or args.json) as tell,
     ):
         for i, message in enumerate(simulator.messages(epoch_ns)):
@@ -141,11 +142,15 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
     other += [name for name in ("epoch", "dem") if getattr(args, name) is not None]
     if other:
         raise UserError(f"--{other[0].replace('_', '-')} does not go with --satellite")
+    checked({name: _single(value) for name, value in given.items() if value is not None})
+    if args.place is not None and not (abs(args.place[0]) <= 90 and abs(args.place[1]) <= 360):
+        raise UserError(f"--place {args.place[0]:g} {args.place[1]:g}: wanted latitude and longitude, degrees")
     output = Path(args.output)
     recording = output.suffix.lower() == ".mcap"
     if not recording:
-        if given["images"]:
-            raise UserError(f"{output}: --images goes with a recording, wanted a name that ends with .mcap")
+        for name in ("images", "compression"):
+            if getattr(args, name) is not None:
+                raise UserError(f"{output}: --{name} goes with a recording, wanted a name that ends with .mcap")
         refuse_unless_folder(output)
     keys = {"seed": "seed", "control": "control", "check": "check", "image_sigma": "image_sigma_px",
             "control_sigma": "control_sigma_m", "outliers": "outliers", "images": "images"}  # fmt: skip
@@ -159,7 +164,7 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
     if recording:
         messages, result = simulated_recording(what)
         result |= {"folder": args.output}
-        with new_file(output) as part, RecordingWriter(part, args.compression) as writer:
+        with new_file(output) as part, RecordingWriter(part, args.compression or "none") as writer:
             for message in messages:
                 writer.write(message)
     else:

@@ -122,6 +122,14 @@ OPTIONS: tuple[Option, ...] = (
     Option("true", str, "an error that the flight has and nothing states; may be repeated", "world", count=0),
 )
 BY_NAME = {option.name: option for option in OPTIONS}
+#: Setting -> the one without which it has no effect.
+_GOES_WITH = {
+    **dict.fromkeys(("image_noise", "cars", "clouds"), "images"),
+    "imu_rate": "imu",
+    "outlier_px": "outliers",
+}
+#: Setting -> those that have no effect beside it: an inertial unit measures no attitude, a real motion has its times.
+_GOES_NOT_WITH = {"imu": ("attitude_rate", "noise_attitude"), "motion": ("gnss_rate", "attitude_rate")}
 _DEFAULTS = {
     "plan": FlightPlan(),
     "observations": ObservationPlan(),
@@ -152,7 +160,7 @@ def simulated_flight(settings: Mapping[str, Any]) -> SimulatedFlight:
     ------
     UserError : a setting that is not known or cannot be
     """
-    values = {name: _checked(name, value) for name, value in settings.items()}
+    values = checked(settings)
     try:
         if values.get("images"):
             values.setdefault("ties", 0.0)
@@ -160,6 +168,37 @@ def simulated_flight(settings: Mapping[str, Any]) -> SimulatedFlight:
         return replace(flight, imager=_imager(flight.simulation, values)) if values.get("images") else flight
     except ValueError as error:
         raise UserError(str(error)) from None
+
+
+def checked(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of the kinds that the settings have.
+
+    Raises
+    ------
+    UserError : a setting that is not known, a value of another kind
+    """
+    return {name: _checked(name, value) for name, value in settings.items()}
+
+
+def _refuse_without_effect(values: Mapping[str, Any]) -> None:
+    """Raise UserError for a setting that changes nothing, given the others."""
+    given = {name for name, value in values.items() if value is not False}
+    for name, other in _GOES_WITH.items():
+        if name in given and not values.get(other):
+            raise UserError(f"simulation: {_flag(name)} goes with {_flag(other)}")
+    for other, names in _GOES_NOT_WITH.items():
+        for name in names:
+            if name in given and values.get(other):
+                raise UserError(f"simulation: {_flag(name)} does not go with {_flag(other)}")
+    strips, cross = values.get("strips", 1), values.get("cross", 0)
+    if "sidelap" in given and strips == 1:
+        raise UserError("simulation: --sidelap goes with --strips, of at least 2")
+    if "no_turns" in given and strips + cross == 1:
+        raise UserError("simulation: --no-turns goes with --strips or --cross: a strip alone has no turns")
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _checked(name: str, value: Any) -> Any:
@@ -180,6 +219,8 @@ def _checked(name: str, value: Any) -> Any:
         numbers = tuple(option.kind(part) for part in parts)
     except (TypeError, ValueError):
         raise UserError(f"simulation: {name} is {value!r}, wanted {_wanted(option)}") from None
+    if option.kind is float and not np.isfinite(numbers).all():
+        raise UserError(f"simulation: {name} is {value!r}, wanted {_wanted(option)}")
     if len(numbers) != option.count:
         raise UserError(f"simulation: {name} has {len(numbers)} values, wanted {option.count}")
     return numbers if option.count > 1 else numbers[0]
@@ -218,6 +259,7 @@ def _planned(values: Mapping[str, Any]) -> SimulatedFlight:
     for name, value in values.items():
         if BY_NAME[name].group == "motion" and name != "motion" and value is not False:
             raise UserError(f"simulation: {name.replace('_', '-')} belongs to a real motion, wanted motion as well")
+    _refuse_without_effect(values)
     plan = _fields(values, "plan")
     for name, field in (("seconds", "strip_s"), ("relief", "relief_m")):
         if name in values:
@@ -244,6 +286,7 @@ def _real(values: Mapping[str, Any]) -> SimulatedFlight:
     for name in values:
         if BY_NAME[name].group == "plan" and values[name] is not False:
             raise UserError(f"simulation: {name.replace('_', '-')} belongs to a planned flight, not to a real motion")
+    _refuse_without_effect(values)
     if "pixels" in values and "sensor" not in values:
         raise UserError("simulation: pixels of a real motion's camera wants a sensor as well")
     start, duration = values.get("from", 0.0), values.get("seconds")

@@ -62,6 +62,7 @@ def test_orthoimages_of_two_lenses_coincide(processed, tmp_path):
     ("arguments", "match"),
     [
         (["-o", "folder", "--satellite", "spot5-hrs-small", "--images"], "--images goes with a recording"),
+        (["-o", "folder", "--satellite", "misr", "--compression", "none"], "--compression goes with a recording"),
         (["-o", "x.mcap", "--satellite", "spot5-hrs", "--images"], "lines of 12000 pixels, wanted at most 2000"),
         (["-o", "x.mcap", "--satellite", "eros-a1", "--overpasses", "0"], "0 overpasses, wanted 1 to 9"),
         (["-o", "x.mcap", "--satellite", "sputnik"], "satellite 'sputnik', wanted one of alos-prism"),

@@ -247,10 +247,17 @@ def test_recording_holds_the_flight(tmp_path, capsys):
         (["--epoch", "2026-01-01T00:00:00"], "time zone"),
         (["--offset", "1", "1", "-1"], "offset_sigma_m"),
         (["--outliers", "1.5"], "outlier_share"),
-        (["--height", "inf"], "height_m"),
+        (["--height", "inf"], "height is inf, wanted a number"),
         (["--imu", "mems", "--strips", "2", "--no-turns"], "without interruptions"),
         (["--motion", "absent_file"], "no such file"),
         (["--motion", "absent_file", "--strips", "2"], "belongs to a planned flight"),
+        (["--motion", "absent_file", "--no-turns"], "belongs to a planned flight"),
+        (["--motion", "absent_file", "--ground", "nan"], "ground is nan, wanted a number"),
+        (["--heading", "nan"], "heading is nan, wanted a number"),
+        (["--relief", "nan"], "relief is nan, wanted a number"),
+        (["--offset", "1", "nan", "1"], "wanted 3 numbers"),
+        (["--satellite", "spot5-hrs", "--control-sigma", "inf"], "control_sigma is inf, wanted 3 numbers"),
+        (["--satellite", "spot5-hrs", "--place", "nan", "0"], "--place nan 0: wanted latitude and longitude, degrees"),
     ],
 )
 def test_bad_options_get_one_line(tmp_path, capsys, options, words):
@@ -258,6 +265,36 @@ def test_bad_options_get_one_line(tmp_path, capsys, options, words):
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1 and error.startswith("triline simulate: ")
     assert not (tmp_path / "x.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--image-noise", "3"], "--image-noise goes with --images"),
+        (["--cars", "0"], "--cars goes with --images"),
+        (["--clouds", "0.1"], "--clouds goes with --images"),
+        (["--imu-rate", "100"], "--imu-rate goes with --imu"),
+        (["--outlier-px", "5", "9"], "--outlier-px goes with --outliers"),
+        (["--outliers", "0", "--outlier-px", "5", "9"], "--outlier-px goes with --outliers"),
+        (["--sidelap", "0.2"], "--sidelap goes with --strips, of at least 2"),
+        (["--sidelap", "0.2", "--cross", "1"], "--sidelap goes with --strips, of at least 2"),
+        (["--no-turns"], "--no-turns goes with --strips or --cross"),
+        (["--imu", "mems", "--attitude-rate", "100"], "--attitude-rate does not go with --imu"),
+        (["--imu", "mems", "--noise-attitude", "1", "1", "1"], "--noise-attitude does not go with --imu"),
+        (["--motion", "absent_file", "--gnss-rate", "2"], "--gnss-rate does not go with --motion"),
+        (["--motion", "absent_file", "--as-sensors", "--attitude-rate", "2"], "--attitude-rate does not go with"),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, capsys, options, words):
+    assert main([*QUICK[:1], "-o", str(tmp_path / "x.mcap"), *options]) == 1
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_options_that_go_together_are_taken():
+    plan = {"seconds": 4, "ties": 2, "lead_in": 1, "control": 0, "check": 0}
+    assert len(simulated_flight({**plan, "no_turns": True, "cross": 1}).simulation.flight.strips) == 2
+    assert simulated_flight({**plan, "no_turns": False, "outliers": 0.1, "outlier_px": [5, 9]}).motion is None
 
 
 @pytest.mark.parametrize(
