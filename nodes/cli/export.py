@@ -51,6 +51,14 @@ EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientat
 #: Messages turned into rows at a time.
 BATCH = 20_000
 _LINE_FORMATS = ("csv", "patb", "sbet")
+#: Option (as attribute) -> targets that it goes with, for those that do not go with all.
+_GO_WITH = {
+    "format": ("per_line",),
+    "covariance": ("points",),
+    "orientation": ("per_line",),
+    "rows": ("csv", "parquet"),
+    "every": ("csv", "parquet", "geojson", "gpkg", "sbet"),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format", choices=_LINE_FORMATS,
         help="with --per-line: CSV with sigmas (default), PATB-like rows of position and rotation matrix, or SBET",
     )  # fmt: skip
-    parser.add_argument("--covariance", action="store_true", help="of the points, with --points")
+    parser.add_argument("--covariance", action="store_true", default=None, help="of the points, with --points")
     parser.add_argument(
         "--orientation", choices=tuple(ORIENTATIONS), help="with --per-line (default: the best there is, in this order)"
     )
@@ -87,20 +95,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rows", metavar="FIELD",
         help="one table, with a row for each element of this repeated sub-message ('none': a row for each message)",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th message (default 1)")
+    parser.add_argument("--every", type=int, metavar="N", help="take every N-th message (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.every < 1:
+    if args.every is not None and args.every < 1:
         raise UserError(f"--every {args.every}, wanted at least 1")
+    kind = next(name for name in (*_WRITERS, "points", "per_line") if getattr(args, name) is not None)
+    for name, kinds in _GO_WITH.items():
+        if getattr(args, name) is not None and kind not in kinds:
+            *flags, last = (f"--{other.replace('_', '-')}" for other in kinds)
+            raise UserError(f"--{name}: wanted with {', '.join(flags)}{' and ' * bool(flags)}{last} only")
     path = Path(args.recording)
-    if args.points or args.per_line:
+    if kind in ("points", "per_line"):
         return _run_table(path, args)
     if args.topic is None:
         raise UserError("--topic: wanted with --csv, --parquet, --geojson, --gpkg and --sbet")
-    for name in ("covariance", "orientation", "format"):
-        if getattr(args, name):
-            raise UserError(f"--{name}: wanted with --{'points' if name == 'covariance' else 'per-line'} only")
     reader = RecordingReader(path)
     try:
         row = topics.find(args.topic)
@@ -111,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     if not len(reader.select([args.topic])):
         held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
         raise UserError(f"{path}: no message on {args.topic}; it holds {', '.join(held) or 'no known topic'}")
-    kind, target = next((name, Path(getattr(args, name))) for name in _WRITERS if getattr(args, name))
+    target = Path(getattr(args, kind))
     if target.exists() and target.samefile(path):
         raise UserError(f"{target}: is the recording itself")
     with new_file(target) as part:
@@ -140,9 +150,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     """Points, or the orientation of all lines: tables that are no topic."""
     if args.topic is not None:
         raise UserError(f"--topic {args.topic}: does not go with --points and --per-line")
-    if args.points and args.format:
-        raise UserError("--format: wanted with --per-line only")
-    target = Path(args.points or args.per_line)
+    target = Path(args.per_line if args.points is None else args.points)
     if path.exists() and target.exists() and target.samefile(path):
         raise UserError(f"{target}: is the recording itself")
     result: dict[str, Any] = {"recording": str(path), "file": str(target)}
@@ -150,10 +158,10 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     reader = recording.reader
     name = ""
     with new_file(target) as part:
-        if args.points:
+        if args.points is not None:
             project = reader.first("configuration/project")
             refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
-            result["points"] = write_points(reader, part, covariance=args.covariance)
+            result["points"] = write_points(reader, part, covariance=bool(args.covariance))
         else:
             name, lines = lines_of_recording(recording, args.orientation)
             frame, project = project_frame(recording), recording.project()

@@ -161,7 +161,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--resampling {args.resampling}: goes with --sensor, wanted one of {', '.join(TAPS)}")
     rectify_mosaic.refuse_options(args)
     for name in rectify_image.OPTIONS:
-        if name not in _OF_BOTH and getattr(args, name) not in (None, False):
+        if name not in _OF_BOTH and rectify_image.is_given(args, name):
             raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
 
 

@@ -44,8 +44,9 @@ _CONTROL = (
 MOST_SIDE = 2_000_000_000
 #: Options (as attributes) that a recording does not take.
 OPTIONS = (
-    "model", "first_pixel", "refraction", "control", "dem_crs", "dem_datum", "bounds", "nodata", "direct", "occlusions",
-    "mask", "sigma", "compress", "plain", "position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma", "workers",
+    "model", "first_pixel", "refraction", "control", "correction", "dem_crs", "dem_datum", "bounds", "nodata", "direct",
+    "occlusions", "mask", "sigma", "compress", "plain", "position_sigma", "attitude_sigma", "pixel_sigma",
+    "height_sigma", "workers",
 )  # fmt: skip
 #: Rasters that are looked for in a folder of heights.
 _DEM_NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
@@ -68,7 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--correction",
         choices=("shift", "affine", "camera"),
-        default="affine",
         help="by control: of the image, or of the parameters of a frame camera (default: affine)",
     )
     group.add_argument("--dem-crs", metavar="CRS", help="of the heights; of a recording: ellipsoid, EPSG:5773 ..")
@@ -98,6 +98,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--workers", type=int, metavar="N", help="threads, of a mosaic processes (default: as many as cores)"
     )
+
+
+def is_given(args: argparse.Namespace, name: str) -> bool:
+    """Whether the command line has an option (as attribute), be it 0."""
+    return getattr(args, name) is not None and getattr(args, name) is not False
 
 
 @dataclass(frozen=True)
@@ -196,6 +201,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--height {args.height}: wanted a number")
     if args.dem and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
+    if args.correction is not None and args.control is None:
+        raise UserError(f"--correction {args.correction}: goes with --control CSV, whose points it is found by")
     if args.direct and (args.sigma or args.occlusions):
         raise UserError("--direct: sees nothing hidden and makes no sigmas, wanted without --occlusions and --sigma")
     if args.bounds is not None:
@@ -324,7 +331,7 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
             u,
             v,
             sigma,
-            affine=args.correction == "affine",
+            affine=args.correction != "shift",
         )
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
@@ -526,7 +533,7 @@ def _tell(
         used = ~fit.rejected
         result["control"] = {
             "points": len(used), "rejected": int(fit.rejected.sum()), "sigma0": fit.sigma0,
-            "redundancy": fit.redundancy, "correction": args.correction,
+            "redundancy": fit.redundancy, "correction": args.correction or "affine",
             "shift_px": fit.bias.coefficients[:, 0].tolist(),
             "rms_px": np.sqrt(np.mean(fit.residual_px[used] ** 2, axis=0)).tolist(),
         }  # fmt: skip

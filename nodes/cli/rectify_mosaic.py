@@ -50,7 +50,7 @@ OPTIONS = ("tile", "balance", "seams", "feather", "source", "seam_lines", "input
 #: Ends of the names of recordings; everything else is an image.
 _RECORDINGS = (".mcap",)
 #: Options of images and recordings that a mosaic of several does not take.
-_NOT_OF_MOSAIC = ("trajectory", "control", "first_pixel", "mask", "bounds", "direct", "plain")
+_NOT_OF_MOSAIC = ("trajectory", "control", "correction", "first_pixel", "mask", "bounds", "direct", "plain")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def refuse_options(args: argparse.Namespace) -> None:
     """Refuse options of a mosaic without --mosaic."""
     for name in OPTIONS:
-        if getattr(args, name) not in (None, False):
+        if rectify_image.is_given(args, name):
             raise UserError(f"--{name.replace('_', '-')}: goes with --mosaic")
 
 
@@ -138,12 +138,12 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
     if len({str(p.resolve()) for p in named}) < len(named):
         raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
     for name in _NOT_OF_MOSAIC:
-        if getattr(args, name) not in (None, False):
+        if rectify_image.is_given(args, name):
             raise UserError(
                 f"--{name.replace('_', '-')}: is of one image or recording; wanted orthoimages made with it, then "
                 "--mosaic of these"
             )
-    tile = args.tile or TILE
+    tile = TILE if args.tile is None else args.tile
     if args.tile is not None and (tile < LEAST_TILE or tile & (tile - 1)):
         raise UserError(f"--tile {args.tile}: wanted a power of two of at least {LEAST_TILE}")
     if args.feather is not None and not 0 <= args.feather <= tile // 4:

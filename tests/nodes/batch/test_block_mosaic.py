@@ -129,6 +129,8 @@ def test_virtual_mosaic_of_tiles(block, made, tmp_path):
         (["--gsd", "3"], "cells of 2 x 2, wanted 3"),
         (["--crs", "EPSG:32633"], "is not in EPSG:32633"),
         (["--control", "c.csv"], "--control: is of one image"),
+        (["--correction", "shift"], "--correction: is of one image"),
+        (["--tile", "0"], "--tile 0: wanted a power of two of at least 128"),
         (["--sensor", "one.geom"], "--sensor: 1 for 3 images"),
         (["--sigma", "s.tif"], "wanted the sigmas of each orthoimage"),
     ],

@@ -324,6 +324,16 @@ def test_sbet_comes_back_as_the_track_it_was(tmp_path):
         (["--topic", "sensor/gnss", "--sbet", "o"], "--sbet: sensor/gnss has no poses"),
         (["--topic", "sensor/gnss", "--csv", "no/o"], "no folder"),
         (["--topic", "sensor/gnss", "--csv", "o", "--every", "0"], "--every 0, wanted at least 1"),
+        (["--points", "o", "--every", "1"], "--every: wanted with --csv, --parquet, --geojson, --gpkg and --sbet only"),
+        (["--points", "o", "--orientation", "final"], "--orientation: wanted with --per-line only"),
+        (["--points", "o", "--rows", "none"], "--rows: wanted with --csv and --parquet only"),
+        (["--points", "o", "--format", "csv"], "--format: wanted with --per-line only"),
+        (["--per-line", "o", "--every", "2"], "--every: wanted with --csv, "),
+        (["--per-line", "o", "--covariance"], "--covariance: wanted with --points only"),
+        (["--per-line", "o", "--rows", "x"], "--rows: wanted with --csv and --parquet only"),
+        (["--topic", "sensor/gnss", "--csv", "o", "--format", "csv"], "--format: wanted with --per-line only"),
+        (["--topic", "sensor/gnss", "--sbet", "o", "--rows", "none"], "--rows: wanted with --csv and --parquet only"),
+        (["--topic", "sensor/gnss", "--csv", ""], "."),
     ],
 )
 def test_refusals_are_one_line_and_leave_no_file(recording, tmp_path, capsys, monkeypatch, args, wanted):
