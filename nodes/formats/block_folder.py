@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import CrsError, Frame, LocalFrame
 from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ...solver.geometry.trajectory import Trajectory
-from ...solver.models import WANDER_TIMES, setting_names
+from ...solver.models import WANDER_SIGMAS, WANDER_TIMES, setting_names
 from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
@@ -178,8 +179,9 @@ def _settings(table: Keys) -> dict[str, object]:
         if key == "then":
             continue
         if "_sigma" in key:  # one number stands for all three components
+            how: dict[str, Any] = {"low": 0.0} if key in WANDER_SIGMAS else {"positive": True}  # a wander may be none
             many = isinstance(value, list)
-            settings[key] = table.numbers(key, 3, positive=True) if many else (table.number(key, positive=True),) * 3
+            settings[key] = table.numbers(key, 3, **how) if many else (table.number(key, **how),) * 3
         elif key in _WHOLE:
             settings[key] = table.integer(key)
         elif key in WANDER_TIMES:

@@ -19,7 +19,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
 from ...solver.geometry.earth import ecef_from_geodetic
 from ...solver.geometry.frames import CrsError, LocalFrame
-from ...solver.models import WANDER_TIMES
+from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
 from ..convert import camera_message, ground_point_message
@@ -32,14 +32,14 @@ from .dem import read_dem
 from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track, within
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
-from .ground_height import NOT_GIVEN, GroundGiven
+from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
 from .projection import missing_grids
 from .sensor_folder import read_grade
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
-from .track import Accuracy, Mounting, NavigationTrack
+from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Mounting, NavigationTrack
 
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
@@ -317,8 +317,7 @@ def _general(flight: Flight, keys: Keys) -> None:
     flight.platform = keys.text("platform", "aircraft")
     if not flight.platform.replace("_", "").replace("-", "").isalnum():
         flight.problems.append(str(keys.refuse("platform", "a word of letters, digits, _ and -")))
-    height = flight.attempt(lambda: keys.number("ground_height_m", 0.0))
-    flight.ground_height_m = height or 0.0
+    flight.ground_height_m = flight.attempt(lambda: _ground_height(keys)) or 0.0
     if keys.has("origin_deg"):
         flight.attempt(lambda: _origin(flight, keys))
     crs = flight.attempt(lambda: keys.text("crs"))
@@ -340,6 +339,13 @@ def _general(flight: Flight, keys: Keys) -> None:
     if grids:
         what = f"PROJ lacks the grid {', '.join(grids[:3])} for {whole!r}: heights would be off by the geoid"
         flight.problems.append(f"{keys.path}: flight.vertical_datum: {what} (`projsync --file {grids[0]}` fetches it)")
+
+
+def _ground_height(keys: Keys) -> float:
+    height = keys.number("ground_height_m", 0.0)
+    if not LOWEST_M < height < HIGHEST_M:
+        raise keys.refuse("ground_height_m", f"metres from {LOWEST_M:g} to {HIGHEST_M:g}")
+    return height
 
 
 def _origin(flight: Flight, keys: Keys) -> None:
@@ -395,9 +401,14 @@ def _mounting(flight: Flight, keys: Keys) -> None:
         a, b, c = keys.numbers(key, 3, _ZERO)
         return a, b, c
 
-    for key, most in (("lever_arm_m", 50.0), ("camera_lever_arm_m", 50.0)):
+    metres = f"metres within {MOST_LEVER_ARM_M:g}; are they mm?"
+    for key, most, wanted in (
+        ("lever_arm_m", MOST_LEVER_ARM_M, metres),
+        ("camera_lever_arm_m", MOST_LEVER_ARM_M, metres),
+        ("boresight_deg", MOST_BORESIGHT_DEG, f"degrees within {MOST_BORESIGHT_DEG:g}"),
+    ):
         if keys.has(key) and np.abs(keys.numbers(key, 3)).max() > most:
-            raise keys.refuse(key, f"metres within {most:g}; are they mm?")
+            raise keys.refuse(key, wanted)
     flight.lever_arm_m = three("lever_arm_m")
     flight.mounting = Mounting(three("camera_lever_arm_m"), three("boresight_deg"))
 
@@ -420,6 +431,9 @@ def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
         raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
     if kind == "ros2":
         _image_topics(flight, keys)
+    else:
+        of_bag = [keys.name(key) for key in ("images", "line_rate_hz") if keys.has(key)]
+        flight.problems.extend(f"{keys.path}: {key}: goes with a ROS 2 bag, not with {KINDS[kind]}" for key in of_bag)
     options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
     if kind in ("sensors", "ros2"):
         next(iter(read_any(path, kind, options).messages), None)
@@ -459,7 +473,9 @@ def _errors(flight: Flight, navigation: Keys, trajectory: Keys, imu: Keys) -> No
         "offset_sigma_m": offset, "shift_sigma_deg": shift, "drift_sigma_deg": drift,
         "wander_sigma_m": wander_m, "wander_sigma_deg": wander_deg,
     }  # fmt: skip
-    flight.sigmas = {key: trajectory.numbers(key, 3, value, positive=True) for key, value in defaults.items()}
+    for key, value in defaults.items():  # a wander may be none
+        how: dict[str, Any] = {"low": 0.0} if key in WANDER_SIGMAS else {"positive": True}
+        flight.sigmas[key] = trajectory.numbers(key, 3, value, **how)
     flight.sigmas["wander_time_s"] = trajectory.number("wander_time_s", time_s, positive=True)
     if trajectory.has("attitude_wander_time_s"):
         flight.sigmas["attitude_wander_time_s"] = trajectory.number("attitude_wander_time_s", 0.0, positive=True)
@@ -478,7 +494,13 @@ def _ground(flight: Flight, keys: Keys, general: Keys) -> None:
         flight.ground = GroundGiven(dem=path, dem_crs=keys.text("crs") if keys.has("crs") else None)
     if general.has("above_ground_m"):
         above = general.number("above_ground_m", positive=True)
-        flight.ground = flight.ground if flight.ground.stated else GroundGiven(above_m=above)
+        for said, other in (
+            (general.has("ground_height_m"), "flight.ground_height_m"),
+            (flight.ground.stated, "[dem]"),
+        ):
+            if said:
+                raise UserError(f"{general.path}: flight.above_ground_m and {other}: wanted one of them")
+        flight.ground = GroundGiven(above_m=above)
     if general.has("ground_height_m"):
         flight.ground = GroundGiven(flight.ground_height_m)
     elif flight.track is not None:

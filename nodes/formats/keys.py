@@ -50,10 +50,14 @@ class Keys:
             raise self.refuse(key, "a text")
         return value
 
-    def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
+    def number(
+        self, key: str, default: float | None = None, *, positive: bool = False, low: float | None = None
+    ) -> float:
         value = self._get(key, default)
         if not _is_number(value) or (positive and not value > 0):
             raise self.refuse(key, "a number above 0" if positive else "a number")
+        if low is not None and value < low:
+            raise self.refuse(key, f"a number of at least {low:g}")
         return float(value)
 
     def integer(self, key: str, default: int | None = None, *, low: int = 0, high: int = LARGEST) -> int:
@@ -64,12 +68,20 @@ class Keys:
         return value
 
     def numbers(
-        self, key: str, count: int, default: tuple[float, ...] | None = None, *, positive: bool = False
+        self,
+        key: str,
+        count: int,
+        default: tuple[float, ...] | None = None,
+        *,
+        positive: bool = False,
+        low: float | None = None,
     ) -> tuple[float, ...]:
         value = self._get(key, default)
         good = isinstance(value, list | tuple) and len(value) == count and all(_is_number(v) for v in value)
         if not good or (positive and not all(v > 0 for v in value)):
             raise self.refuse(key, f"{count} {'positive ' if positive else ''}numbers")
+        if low is not None and min(value) < low:
+            raise self.refuse(key, f"{count} numbers of at least {low:g}")
         return tuple(float(v) for v in value)
 
     def tables(self, key: str) -> list[Keys]:

@@ -10,6 +10,8 @@ from .base import COMPONENTS, CorrectionModel, Design, Extent, ModelOptions, Pse
 __all__ = ["COMPONENTS", "MODELS", "CorrectionModel", "Design", "Extent", "ModelOptions", "PseudoObservations",
            "setting_names"]  # fmt: skip
 
+#: Sigmas of the wander that a project may state; zeros say that there is none.
+WANDER_SIGMAS = ("wander_sigma_m", "wander_sigma_deg")
 #: Correlation times of the wander that a project may state.
 WANDER_TIMES = ("wander_time_s", "attitude_wander_time_s")
 
@@ -30,7 +32,7 @@ def setting_names() -> frozenset[str]:
     """Keys of the settings that the models know, of all of them."""
     own = {name for options in __getattr__("MODELS").values() for name in vars(options)["__dataclass_fields__"]}
     own -= {"slow", "left_out_m", "left_out"}  # made of the others
-    return frozenset(own | {"drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg", *WANDER_TIMES})
+    return frozenset(own | {"drift_sigma_deg", *WANDER_SIGMAS, *WANDER_TIMES})
 
 
 def __getattr__(name: str) -> dict[str, type[ModelOptions]]:

@@ -232,8 +232,10 @@ def same(value: float) -> tuple[float, float, float]:
     return (value, value, value)
 
 
-def three(settings: Mapping[str, object], key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three positive numbers from settings; one number stands for all three.
+def three(
+    settings: Mapping[str, object], key: str, default: tuple[float, float, float], *, zeros: bool = False
+) -> tuple[float, float, float]:
+    """Three numbers from settings, positive or with ``zeros`` not negative; one number stands for all three.
 
     Raises
     ------
@@ -244,6 +246,8 @@ def three(settings: Mapping[str, object], key: str, default: tuple[float, float,
         numbers = np.broadcast_to(np.asarray(value, dtype=float), (3,))
     except (TypeError, ValueError):
         raise ValueError(f"{key}: wanted three numbers, got {value!r}") from None
-    if not (numbers > 0).all():
-        raise ValueError(f"{key}: wanted three positive numbers, got {value!r}")
+    if not ((numbers >= 0) if zeros else (numbers > 0)).all():
+        raise ValueError(
+            f"{key}: wanted three {'numbers of at least 0' if zeros else 'positive numbers'}, got {value!r}"
+        )
     return (float(numbers[0]), float(numbers[1]), float(numbers[2]))

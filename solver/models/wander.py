@@ -74,16 +74,16 @@ class WanderOptions(ModelOptions):
     def from_settings(cls, settings: Mapping[str, object]) -> Self:
         degree = float(np.pi / 180)
 
-        def angles(key: str, default: float) -> tuple[float, float, float]:
-            a, b, c = three(settings, key, (default, default, default))
+        def angles(key: str, default: float, *, zeros: bool = False) -> tuple[float, float, float]:
+            a, b, c = three(settings, key, (default, default, default), zeros=zeros)
             return (a * degree, b * degree, c * degree)
 
         slow = SlowErrors(
             three(settings, "offset_sigma_m", (0.2, 0.2, 0.2)),
             angles("shift_sigma_deg", 0.01),
             angles("drift_sigma_deg", 0.01),
-            three(settings, "wander_sigma_m", (0.1, 0.1, 0.1)),
-            angles("wander_sigma_deg", 0.005),
+            three(settings, "wander_sigma_m", (0.1, 0.1, 0.1), zeros=True),
+            angles("wander_sigma_deg", 0.005, zeros=True),
             float(str(settings.get("wander_time_s", 30.0))),
             float(str(settings.get("attitude_wander_time_s", 0.0))),
         )

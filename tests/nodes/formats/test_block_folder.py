@@ -13,9 +13,12 @@ from small_block import FILES, simulated_block, write_files
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
+from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.formats.block_writer import write_block
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
+from triline.solver.models.lim import LimOptions
+from triline.solver.models.wander import WanderOptions
 
 
 def test_values_of_a_hand_written_folder(tmp_path):
@@ -137,6 +140,18 @@ BAD = {
         {"project": "[trajectory]\nshift_sigma_deg = [1, 2]\n"},
         "project.toml: trajectory.shift_sigma_deg: [1, 2], wanted 3 positive numbers",
     ),
+    "sigma of zero": (
+        {"project": "[trajectory]\nfirst_sigma_m = 0\n"},
+        "project.toml: trajectory.first_sigma_m: 0, wanted a number above 0",
+    ),
+    "wander below zero": (
+        {"project": "[trajectory]\nwander_sigma_m = [0, 0, -1]\n"},
+        "project.toml: trajectory.wander_sigma_m: [0, 0, -1], wanted 3 numbers of at least 0",
+    ),
+    "wander below zero, one number": (
+        {"project": "[trajectory]\nwander_sigma_deg = -1\n"},
+        "project.toml: trajectory.wander_sigma_deg: -1, wanted a number of at least 0",
+    ),
     "correlation time of no length": (
         {"project": "[trajectory]\nwander_time_s = -1\n"},
         "project.toml: trajectory.wander_time_s: -1, wanted a number above 0",
@@ -156,6 +171,18 @@ def test_bad_input_is_named_with_its_place(tmp_path, case):
         read_block(write_files(tmp_path, **changed))
     assert wanted in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_zeros_say_that_nothing_wanders(tmp_path):
+    """And a recording of the block says so, too: what it does not state the adjuster would take to be a little."""
+    project = "[trajectory]\nwander_sigma_m = 0\nwander_sigma_deg = [0, 0, 0]\n"
+    block = read_block(write_files(tmp_path, project=project))
+    stated = block.apriori.trajectory
+    slow = WanderOptions.from_settings(stated).slow
+    assert not any((*slow.wander_m, *slow.wander)) and any(slow.offset_m)
+    assert LimOptions.from_settings(stated).slow is None
+    body = next(m.body for m in block_messages(block) if m.topic == "configuration/project")
+    assert list(body.wander_sigma_m) == list(body.wander_sigma_deg) == [0.0, 0.0, 0.0]
 
 
 def test_the_number_of_problems_is_told(tmp_path):

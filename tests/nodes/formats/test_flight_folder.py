@@ -276,6 +276,28 @@ WRONG = {
         "[200, 0, -1500]",
         "mounting.lever_arm_m: [200, 0, -1500], wanted metres within",
     ),
+    "boresight of many turns": (
+        "[0.0, 0.1, 0.0]",
+        "[0, 0, 1e9]",
+        "mounting.boresight_deg: [0, 0, 1000000000.0], wanted",
+    ),
+    "ground in space": (
+        '"ellipsoid"\n',
+        '"ellipsoid"\nground_height_m = 1e9\n',
+        "flight.ground_height_m: 1000000000.0, wanted metres from -500 to 9000",
+    ),
+    "two grounds": (
+        '"ellipsoid"\n',
+        '"ellipsoid"\nground_height_m = 600\nabove_ground_m = 1400\n',
+        "flight.above_ground_m and flight.ground_height_m: wanted one of them",
+    ),
+    "rate of a bag": ('"RTK"', '"RTK"\nline_rate_hz = 50', "navigation.line_rate_hz: goes with a ROS 2 bag, not with"),
+    "topics of a bag": ('"RTK"', '"RTK"\nimages = {N = "/n"}', "navigation.images: goes with a ROS 2 bag, not with"),
+    "wander below zero": (
+        "attitude_wander_time_s = 20",
+        "wander_sigma_m = [0, 0, -1]",
+        "trajectory.wander_sigma_m: [0, 0, -1], wanted 3 numbers of at least 0",
+    ),
     "two numbers": ("[0.0, 0.1, 0.0]", "[0.0, 0.1]", "mounting.boresight_deg: [0.0, 0.1], wanted 3 numbers"),
     "another day": (
         "2020-06-01\ngnss",
@@ -309,6 +331,12 @@ def test_what_is_wrong_is_said_once_and_nothing_else(folder, what):
     assert len(problems) == n and wanted in problems[0] and "\n" not in problems[0], problems
 
 
+def test_zeros_say_that_nothing_wanders(folder):
+    (folder / "flight.toml").write_text(TOML.replace("[trajectory]", "[trajectory]\nwander_sigma_m = [0, 0, 0]"))
+    flight = read_flight(folder)
+    assert not flight.problems and flight.sigmas["wander_sigma_m"] == (0.0, 0.0, 0.0)
+
+
 def test_an_elevation_model_without_datum_is_asked_for_it(folder):
     write_heights(folder / "dem.tif", Heights("EPSG:4326", np.zeros((4, 4)), LON - 0.15, LAT + 0.15, 0.1, -0.1))
     table = '[dem]\nfile = "dem.tif"\nsigma_m = 0.5\n'
@@ -327,6 +355,9 @@ def test_an_elevation_model_without_datum_is_asked_for_it(folder):
     }  # fmt: skip
     (folder / "flight.toml").write_text(TOML + '[dem]\nfile = "dem.tif"\ncrs = "ellipsoid"\n')  # for other things
     assert not read_flight(folder).problems and "adjuster" not in load(folder / "flight.toml")
+    above = TOML.replace('"ellipsoid"\n', '"ellipsoid"\nabove_ground_m = 1400\n') + table + 'crs = "ellipsoid"\n'
+    (folder / "flight.toml").write_text(above)
+    assert "flight.above_ground_m and [dem]: wanted one of them" in read_flight(folder).problems[0]
     (folder / "dem.tif").unlink()
     assert "dem.file: no dem.tif in the folder" in read_flight(folder).problems[0]
 
