@@ -16,6 +16,7 @@ from ...solver.adjustment.refined_orientation import design_at
 from ...solver.adjustment.reliability import reliability
 from ...solver.geometry.rotation import angles_from_matrix, corrected_angles, matrix_from_angles
 from ..formats.line_orientation import OrientedLines
+from ..formats.new_file import new_file
 from .adjustment_result import TABLES, Adjustment, set_name
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
     paths = []
     for name, table in zip(TABLES, (points_table, residuals_table, trajectory_table), strict=True):
         path = folder / name
-        table(adjustment).to_csv(path, index=False)
+        with new_file(path) as part:
+            table(adjustment).to_csv(part, index=False)
         paths.append(path)
     return paths
 

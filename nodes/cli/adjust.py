@@ -48,7 +48,7 @@ from ..formats.camera_json import read_camera_instead, write_camera
 from ..formats.dem import surface_control
 from ..formats.importable import refuse_importable
 from ..formats.line_orientation import write_oriented_lines
-from ..formats.new_file import refuse_unless_folder
+from ..formats.new_file import new_file, refuse_unless_folder
 from ..formats.scene_block import is_scene_block
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
@@ -476,9 +476,10 @@ def write_result(
     adjustment: Adjustment, content: Mapping[str, Any], folder: Path, *, plots: bool = False, per_line: bool = False,
     camera: Path | None = None,
 ) -> None:  # fmt: skip
-    """Write ``result.json``, the tables and the calibrated camera; pictures and the table of lines on request.
+    """Write the tables, the calibrated camera and ``result.json``; pictures and the table of lines on request.
 
-    A ``camera`` that the user gave goes with the tables, calibrated anew or as it is.
+    A ``camera`` that the user gave goes with the tables, calibrated anew or as it is. ``result.json`` comes last: where
+    it is, all is there.
     """
     refuse_unless_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -486,17 +487,19 @@ def write_result(
         # files of an earlier run, which do not belong to this result
         for name in ("result.json", *TABLES, *PLOTS, CAMERA, PER_LINE):
             (folder / name).unlink(missing_ok=True)
-    (folder / "result.json").write_text(json.dumps(content, indent=2) + "\n")
     write_tables(adjustment, folder)
     used = adjustment.camera() or (None if camera is None else adjustment.block.camera)
     if used is not None:
         write_camera(folder / CAMERA, used)
     if per_line:
-        write_oriented_lines(folder / PER_LINE, oriented_lines(adjustment), adjustment.block.frame)
+        with new_file(folder / PER_LINE) as part:
+            write_oriented_lines(part, oriented_lines(adjustment), adjustment.block.frame)
     if plots:
         from ..report.adjustment_plots import write_plots
 
         write_plots(adjustment, folder)
+    with new_file(folder / "result.json") as part:
+        part.write_text(json.dumps(content, indent=2) + "\n")
 
 
 class _ProgressLines:

@@ -22,6 +22,7 @@ from ..batch.scene_adjustment import (
 )
 from ..batch.two_steps import OWNERS, UNUSED
 from ..errors import UserError
+from ..formats.new_file import new_file
 from ..formats.scene_block import SceneBlockData, read_scene_block
 from .locate import refraction_of
 
@@ -101,13 +102,14 @@ def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
 
 
 def write_scene_result(adjustment: SceneAdjustment, content: dict[str, object], folder: Path) -> list[str]:
-    """Write ``result.json``, the tables and ``rpc/``; returns notes."""
+    """Write the tables, ``rpc/`` and, last, ``result.json``; returns notes."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in [folder / name for name in ("result.json", *TABLES)] + list(folder.glob("rpc/*.RPB")):
         old.unlink(missing_ok=True)
     notes = write_scene_tables(adjustment, folder)
     with_notes = content | {"notes": [*_texts(content["notes"]), *notes]}
-    (folder / "result.json").write_text(json.dumps(with_notes, indent=2) + "\n")
+    with new_file(folder / "result.json") as part:
+        part.write_text(json.dumps(with_notes, indent=2) + "\n")
     return notes
 
 

@@ -12,6 +12,7 @@ from ...solver.camera.line_camera import CcdLine, Lens, LineCamera
 from ...solver.camera.sensors import line_from_parameters
 from ..errors import UserError
 from .keys import Keys, is_there, read_json
+from .new_file import new_file
 from .table import Column, read_table, write_table
 
 #: The most pixels of a CCD line, ten times those of the longest lines that are built.
@@ -170,4 +171,5 @@ def write_camera(path: Path, camera: LineCamera) -> None:
             entry["chips"] = list(line.chips)
         lines.append(entry)
     text = json.dumps({"name": camera.name, "lenses": lenses, "lines": lines}, indent=1)
-    path.write_text(text + "\n", encoding="utf-8")
+    with new_file(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import sqlite3
 import struct
@@ -13,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UserError
 from .features import Features
 
 APPLICATION_ID = 0x47504B47  # "GPKG"
@@ -47,12 +47,13 @@ def write_geopackage(path: Path, name: str, features: Features) -> int:
 
     Raises
     ------
-    UserError : the file cannot be written
+    OSError : the file cannot be written
     """
     table = re.sub(r"\W", "_", name)
     try:
         path.unlink(missing_ok=True)
         with closing(sqlite3.connect(path)) as database, database:
+            database.execute("PRAGMA journal_mode = MEMORY")  # a file of its own would stay where a disk is full
             database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             database.execute(f"PRAGMA user_version = {VERSION}")
             database.executescript(_SCHEMA)
@@ -65,7 +66,7 @@ def write_geopackage(path: Path, name: str, features: Features) -> int:
                 _add_table(database, f"{table}_lines", "LINESTRING", lines, names, features.lon_lat_height)
             return len(points) + len(lines)
     except sqlite3.Error as error:
-        raise UserError(f"{path}: cannot be written ({error})") from None
+        raise OSError(errno.EIO, str(error), str(path)) from None
 
 
 def _reference_systems() -> list[tuple[Any, ...]]:

@@ -105,6 +105,7 @@ def write_heights(path: Path, heights: Heights) -> None:
     transform = rasterio.Affine(heights.dx, 0.0, corner[0], 0.0, heights.dy, corner[1])
     with (
         new_file(path) as part,
+        _told(path),
         rasterio.open(
             part, "w", driver="GTiff", width=columns, height=rows, count=1, dtype="float32", crs=heights.crs,
             transform=transform, nodata=np.nan, compress="deflate", predictor=3, tiled=True,

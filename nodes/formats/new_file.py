@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import UserError
+
+#: What only writing meets, which names no file: a full disk, a quota, a file as large as may be.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def refuse_unless_file(target: Path) -> None:
@@ -46,7 +50,8 @@ def new_file(target: Path) -> Iterator[Path]:
         yield part
         os.replace(part, target)
     except OSError as error:
-        if error.filename is None or Path(error.filename) != part:
+        of_part = error.errno in _FULL if error.filename is None else error.filename == os.fspath(part)
+        if not of_part:
             raise
         raise UserError(f"{target}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     finally:

@@ -89,7 +89,7 @@ def write_sbet(
     values[:, 3] = geodetic[:, 2]
     values[:, 4:7] = velocity_ned
     values[:, 7:10] = rpy
-    values.tofile(path)
+    path.write_bytes(values.tobytes())
 
 
 def write_sbet_poses(

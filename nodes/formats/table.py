@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import UserError
+from .new_file import new_file
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 #: The search for problems of a file ends after so many.
@@ -202,12 +203,15 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]], formats: Mapping[str, str]) -> None:
-    """Write columns as CSV; ``formats`` gives the format (``".6f"``) of number columns, ``""`` keeps all digits."""
+    """Write columns as CSV; ``formats`` gives the format (``".6f"``) of number columns, ``""`` keeps all digits.
+
+    The file gets its name when it is whole.
+    """
     cells = []
     for name, values in columns.items():
         spec = formats.get(name)
         cells.append([str(v) if spec is None else "" if v != v else format(v, spec) for v in values])
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with new_file(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*cells, strict=True))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..batch.adjustment_result import PLOTS, Adjustment, set_name
 from ..batch.adjustment_tables import correction_functions
+from ..formats.new_file import new_file
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -31,7 +32,8 @@ def write_plots(adjustment: Adjustment, folder: Path) -> list[Path]:
         for name, draw in zip(PLOTS, (draw_residuals, draw_points, draw_corrections), strict=True):
             figure = draw(adjustment)
             path = folder / name
-            figure.savefig(path)
+            with new_file(path) as part:
+                figure.savefig(part, format=path.suffix[1:])
             plt.close(figure)
             paths.append(path)
     return paths

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from full_disk import files_of_at_most
 from matplotlib.quiver import Quiver
 from places import BLOCKS, needs_blocks
 from test_adjust_command import adjust, result_in, write_block
@@ -81,6 +82,19 @@ def test_a_result_without_pictures_leaves_none_of_an_earlier_one(folder, tmp_pat
     assert adjust(folder, "-o", tmp_path) == 0
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"notes.txt", "result.json", "points.csv", "residuals.csv", "trajectory_refined.csv"}
+
+
+def test_a_full_disk_leaves_whole_tables_and_no_result(folder, tmp_path, capsys):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert adjust(folder, "--per-line", "-o", whole) == 0
+    sizes = {path.name: path.stat().st_size for path in whole.iterdir()}
+    for name in ("trajectory_refined.csv", "orientation_lines.csv"):
+        with files_of_at_most(sizes[name] - 1):
+            code, _, err = adjust(folder, "--per-line", "-o", cut, capsys=capsys)
+        assert code == 1 and err.splitlines()[-1] == f"triline adjust: {cut / name}: cannot be written: file too large"
+        left = {path.name: path.stat().st_size for path in cut.iterdir()}
+        assert "points.csv" in left and not {name, "result.json"} & set(left)
+        assert all(sizes[name] == size for name, size in left.items())
 
 
 def test_residuals_are_thinned_and_say_so(tmp_path):

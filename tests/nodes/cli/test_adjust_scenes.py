@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from full_disk import files_of_at_most
 from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
 
 from triline.nodes.cli import main
@@ -77,6 +78,16 @@ def test_result_and_tables(block, tmp_path, capsys):
     residuals = rows(out / "residuals.csv")
     assert sum(int(row["rejected"]) for row in residuals) == len(result["rejected"])
     assert {row["ccd"] for row in residuals} == {"F", "B"}
+
+
+def test_a_full_disk_leaves_whole_tables_and_no_result(block, tmp_path, capsys):
+    out, table = tmp_path / "result", tmp_path / "result" / "residuals.csv"
+    assert main(["adjust", str(block), "-q", "-o", str(out)]) == 0
+    capsys.readouterr()
+    with files_of_at_most(table.stat().st_size - 1):
+        assert main(["adjust", str(block), "-q", "-o", str(out)]) == 1
+    assert capsys.readouterr().err == f"triline adjust: {table}: cannot be written: file too large\n"
+    assert [path.name for path in out.iterdir() if path.is_file()] == ["points.csv"]
 
 
 def test_refined_orientation_and_rpc_locate_the_adjusted_points(block, tmp_path):

@@ -216,8 +216,12 @@ def test_what_a_command_cannot_help_is_one_line(tmp_path, capsys, monkeypatch):
     """A full disk, no memory, a fault of our own: one line, exit code 1, and what was begun is taken away."""
     import triline.nodes.cli.simulate as module
 
+    path = tmp_path / "a.mcap"
     for error, text in (
-        (OSError(28, "No space left on device"), "triline simulate: no space left on device"),
+        (
+            OSError(28, "No space left on device"),
+            f"triline simulate: {path}: cannot be written: no space left on device",
+        ),
         (MemoryError("Unable to allocate 2 TiB"), "triline simulate: not enough memory: Unable to allocate 2 TiB"),
         (ZeroDivisionError("two\nlines"), "triline simulate: fault in triline"),
     ):
@@ -227,7 +231,7 @@ def test_what_a_command_cannot_help_is_one_line(tmp_path, capsys, monkeypatch):
                 raise error
 
         monkeypatch.setattr(module, "RecordingWriter", Failing)
-        code = main(["simulate", "-o", str(tmp_path / "a.mcap"), "--seconds", "2"])
+        code = main(["simulate", "-o", str(path), "--seconds", "2"])
         out, err = capsys.readouterr()
         assert code == 1 and out == "" and len(err.splitlines()) == 1 and err.startswith(text)
         assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from datetime import date
 import numpy as np
 import pandas as pd
 import pytest
+from full_disk import files_of_at_most
 from recording_file import write_recording
 from small_block import simulated_block
 
@@ -102,6 +103,16 @@ def test_one_row_a_message_with_columns_named_as_the_fields(recording, tmp_path)
     np.testing.assert_allclose(table.filter(like="correction_").iloc[1], np.arange(6))
     assert table["strip"].tolist() == ["S1"] * 12 + ["S2"] * 8
     assert table["velocity.x_m_s"].isna().all()  # a sub-message that was not sent
+
+
+@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "sbet"])
+def test_a_full_disk_is_told_with_the_file_and_leaves_nothing(recording, tmp_path, capsys, kind):
+    target = tmp_path / f"o.{kind}"
+    with files_of_at_most(1000):
+        assert main(["export", str(recording), "--topic", "orientation/final", f"--{kind}", str(target)]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"triline export: {target}: cannot be written: ") and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_elements_of_a_repeated_message_go_to_a_file_of_their_own(recording, tmp_path, capsys):
