@@ -26,6 +26,8 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 RECORD_HEAD = struct.Struct("<BQ")
 #: What a message begins with behind that: channel, sequence number, log time, publish time.
 MESSAGE_HEAD = struct.Struct("<HIQQ")
+#: Bytes of a footer: one flipped bit makes a chunk look like one, behind which nothing would be read.
+FOOTER_SIZE = RECORD_HEAD.size + 20
 #: No writer of recordings makes larger records; a larger length is damage.
 MAX_RECORD = 1 << 32
 #: A record outside chunks that is larger is looked into: its length may be damaged, and skipping it skip whole chunks.
@@ -132,7 +134,7 @@ def payload_at(buffer: memoryview, place: int) -> memoryview:
 
 
 def records(buffer: memoryview) -> Iterator[Record | WholeChunk | Damage]:
-    """The records of a file up to its footer, and the damaged stretches between them.
+    """The records of a file up to its footer, and the damaged stretches between them and behind.
 
     After something that makes no sense the walk goes on at the next chunk that does, so that every chunk that is whole
     is found, whatever stands around it.
@@ -150,8 +152,20 @@ def records(buffer: memoryview) -> Iterator[Record | WholeChunk | Damage]:
             found, following = Damage(position, at - position, reason), at
         yield found
         if isinstance(found, Record) and found.opcode == Opcode.FOOTER:
+            yield from _behind(buffer, found.end)
             return
         position = following
+
+
+def _behind(buffer: memoryview, end: int) -> Iterator[Damage]:
+    """What stands behind the footer, which ends there, and the magic bytes that close a file, or a part of them."""
+    end += len(MAGIC)
+    if end < len(buffer):
+        follows = buffer[end : end + len(MAGIC)] == MAGIC
+        reason = (
+            "a second recording behind the end of the first" if follows else "bytes behind the end of the recording"
+        )
+        yield Damage(end, len(buffer) - end, reason)
 
 
 def _examine(buffer: memoryview, position: int) -> tuple[Record | WholeChunk | Damage, int | None]:
@@ -185,6 +199,8 @@ def _plausible(buffer: memoryview, position: int) -> bool:
     if position + RECORD_HEAD.size > len(buffer):
         return True
     opcode, length = RECORD_HEAD.unpack_from(buffer, position)
+    if opcode == Opcode.FOOTER:
+        return length == FOOTER_SIZE - RECORD_HEAD.size
     return Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= MAX_RECORD
 
 

@@ -21,7 +21,6 @@ from .remote import RemoteFile
 
 #: Of the end so much is fetched at once, bytes; most indices are smaller.
 _END = 1 << 16
-_FOOTER_SIZE = scan.RECORD_HEAD.size + 20
 _INDEX_HEAD = struct.Struct("<HI")
 _ENTRY = np.dtype([("time", "<u8"), ("place", "<u8")])
 #: Sequence number of a message whose head was not fetched yet.
@@ -128,13 +127,13 @@ def open_ranged(file: RemoteFile) -> Ranged:
     size, buffer = file.size, file.buffer
     file.fetch([0, max(size - _END, 0)], [scan.RECORD_HEAD.size * 2, size])
     end = size - len(scan.MAGIC)
-    if buffer[end:] != scan.MAGIC or end < _FOOTER_SIZE + len(scan.MAGIC):
+    if buffer[end:] != scan.MAGIC or end < scan.FOOTER_SIZE + len(scan.MAGIC):
         raise NoIndexError("no end")
-    footer = _parse(buffer[end - _FOOTER_SIZE : end])
+    footer = _parse(buffer[end - scan.FOOTER_SIZE : end])
     if not isinstance(footer, Footer) or not len(scan.MAGIC) <= footer.summary_start < end:
         raise NoIndexError("no summary")
     file.fetch(footer.summary_start, size)
-    summary = list(_records(buffer[footer.summary_start : end - _FOOTER_SIZE]))
+    summary = list(_records(buffer[footer.summary_start : end - scan.FOOTER_SIZE]))
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]
     chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
     counted = [record.message_count for record in summary if isinstance(record, Statistics)]

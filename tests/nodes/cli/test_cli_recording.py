@@ -72,6 +72,11 @@ def test_check(capsys, flight, tmp_path):
     cases = {
         "cut.mcap": (data[: len(data) * 2 // 3], "the file ends inside a record"),
         "flipped.mcap": (bytes(broken), "a chunk with a wrong checksum"),
+        "twice.mcap": (
+            data * 2,
+            f"a second recording behind the end of the first at byte {len(data)} ({len(data)} bytes)",
+        ),
+        "longer.mcap": (data + bytes(700), f"bytes behind the end of the recording at byte {len(data)} (700 bytes)"),
         "foreign.mcap": (b"GIF89a" + bytes(50), "not an MCAP recording"),
         "empty.mcap": (b"", "empty"),
     }
@@ -107,6 +112,10 @@ def test_recover(capsys, flight, tmp_path):
     assert len(kept.index) == len(before.index) > 100
     np.testing.assert_array_equal(kept.index.stamp_ns, before.index.stamp_ns)
     np.testing.assert_array_equal(kept.index.sequence, before.index.sequence)
+    path.write_bytes(data + data)
+    code, out, _ = run(capsys, "recover", path, "-o", out_path)
+    assert code == 0 and f"lost {len(data)} bytes in 1 places; the first: a second recording behind the end" in out
+    assert len(RecordingReader(out_path).index) == len(RecordingReader(tmp_path / "small.mcap").index)
     code, _, err = run(capsys, "recover", path, "-o", path)
     assert code == 1 and "would overwrite" in err
     (tmp_path / "junk").write_bytes(b"junk" * 100)
@@ -163,6 +172,8 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         writer.finish()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[:-100])
+    longer = tmp_path / "longer.mcap"
+    longer.write_bytes(flight.read_bytes() + bytes(700))
     configured = write_recording(tmp_path / "configured.mcap", [sample.message("configuration/camera")])
     bad = tmp_path / "bad.toml"
     bad.write_text("[navigator]\nwings = 2\n")
@@ -170,6 +181,7 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         ((flight, "-o", flight), "would overwrite the recording"),
         ((ros, "-o", out), "no topic of triline in it"),
         ((cut, "-o", out, "--strict"), "damaged: "),
+        ((longer, "-o", out, "--strict"), "damaged: bytes behind the end of the recording"),
         ((configured, "-o", out), "nothing to process for navigator,adjuster: it holds configuration/camera"),
         ((flight, "-o", out, "--nodes", "pilot"), "no node 'pilot'"),
         ((flight, "-o", out, "--nodes", "adjuster"), "wanted navigator among --nodes, too"),

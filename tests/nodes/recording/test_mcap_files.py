@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import sample_messages as sample
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set, register_schema
@@ -125,6 +126,15 @@ def test_views_of_a_file_are_not_copies(tmp_path):
     reader = RecordingReader(path)
     data = reader.raw(0).data
     assert isinstance(data, memoryview) and data.obj is reader._buffer.obj
+
+
+def test_a_chunk_that_damage_turns_into_a_footer_does_not_end_the_recording(tmp_path):
+    path = write_recording(tmp_path / "a.mcap", sample.flight(2.0), chunk_size=8192)
+    data, spans = bytearray(path.read_bytes()), chunk_spans(path)
+    data[spans[2][0]] = Opcode.FOOTER  # one bit of the opcode of a chunk
+    path.write_bytes(data)
+    reader = RecordingReader(path)
+    assert reader.n_chunks == len(spans) - 1 and reader.complete and reader.damage
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
