@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
-from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation
+from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation, known_crs
 from ...solver.geometry.rotation import quaternion_from_matrix
 from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
@@ -320,6 +320,13 @@ class Rectification:
         mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
     ) -> None:  # fmt: skip
         self._mosaic = mosaic
+        line = camera.lines[ccd]
+        if line.pixels // factor < 2 <= line.pixels:
+            most = grid.gsd / factor * (line.pixels // 2)
+            raise UserError(
+                f"--gsd {grid.gsd:g}: leaves less than two cells for the {line.pixels} pixels of CCD line {line.id!r}, "
+                f"wanted {most:.3g} at most"
+            )
         self.rays = rays_of(camera, ccd, factor=factor)
         self.surface, self.grid, self.resampling = surface, grid, resampling
         self.orientation, self.reference_ns, self.factor, self.errors = orientation, reference_ns, factor, errors
@@ -435,12 +442,13 @@ def frame_for(frame: LocalFrame, crs: str) -> LocalFrame:
 
     Raises
     ------
-    UserError : PROJ does not know the CRS, or it is geographic
+    UserError : PROJ does not know the CRS, or it is not projected
     """
     other = LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
     if crs == "local":
         return other
     try:
+        known_crs(crs, geocentric=False)
         other.to_crs(np.zeros((1, 3)))
         geographic = other.is_geographic
     except ValueError as error:

@@ -18,7 +18,7 @@ from ...solver.arrays import Array
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
 from ...solver.geometry.earth import ecef_from_geodetic
-from ...solver.geometry.frames import CrsError, LocalFrame
+from ...solver.geometry.frames import CrsError, LocalFrame, known_crs
 from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
@@ -330,6 +330,7 @@ def _general(flight: Flight, keys: Keys) -> None:
     if "+" in crs and not crs.strip().startswith("+"):
         raise keys.refuse("crs", "the horizontal part alone, the vertical one in vertical_datum")
     try:
+        known_crs(crs)
         LocalFrame.around(np.zeros((1, 3)), whole)
     except CrsError as error:
         if "outside" not in str(error):  # the origin of the coordinates may lie there

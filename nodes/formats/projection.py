@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...solver.geometry.frames import CrsError
+from ...solver.geometry.frames import CrsError, known_crs
 from ..errors import UserError
 
 
@@ -21,13 +21,7 @@ class Projection:
     """
 
     def __init__(self, crs: str):
-        import pyproj
-        import pyproj.exceptions
-
-        try:
-            self._crs = pyproj.CRS.from_user_input(crs)
-        except pyproj.exceptions.CRSError as error:
-            raise CrsError(f"PROJ does not know the CRS {crs!r}: {str(error).splitlines()[0]}") from None
+        self._crs = known_crs(crs)
         if not self._crs.is_projected:
             raise CrsError(f"{crs!r} is not a projected CRS, wanted one with easting and northing")
 
@@ -53,11 +47,15 @@ class Projection:
 
 
 def missing_grids(crs: str) -> list[str]:
-    """Names of the grids (geoids, datum shifts) that PROJ's best path from a CRS to WGS 84 needs and cannot find."""
-    import pyproj
+    """Names of the grids (geoids, datum shifts) that PROJ's best path from a CRS to WGS 84 needs and cannot find.
+
+    Raises
+    ------
+    CrsError : as of `known_crs`
+    """
     from pyproj.transformer import TransformerGroup
 
-    known = pyproj.CRS.from_user_input(crs)
+    known = known_crs(crs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         group = TransformerGroup(known if len(known.axis_info) == 3 else known.to_3d(), "EPSG:4979", always_xy=True)
@@ -67,12 +65,15 @@ def missing_grids(crs: str) -> list[str]:
 
 
 def refuse_missing_grids(crs: str, where: object) -> None:
-    """Raise UserError where PROJ would take heights in a CRS for ellipsoidal ones, because it lacks the geoid."""
-    grids = [] if crs == "local" else missing_grids(crs)
+    """Raise UserError where PROJ would take heights in a CRS for ellipsoidal ones, because it lacks the geoid, or where
+    it has no place for a point.
+    """
+    try:
+        grids = [] if crs == "local" else missing_grids(crs)
+    except CrsError as error:
+        raise UserError(f"{where}: {error}") from None
     if grids:
-        import pyproj
-
-        name = pyproj.CRS.from_user_input(crs).name
+        name = known_crs(crs).name
         raise UserError(
             f"{where}: PROJ lacks the grid {', '.join(grids[:3])} for {name!r}: heights would be off by the geoid "
             f"(`projsync --file {grids[0]}` fetches it)"

@@ -23,6 +23,8 @@ Array = NDArray[np.floating]
 
 #: Coordinates that need no PROJ, see `BodyFrame`.
 GEOGRAPHIC = "geographic"
+#: No point lies deeper, m: coordinates of a map, taken for geocentric ones, lie about the centre of the Earth.
+DEEPEST_M = -1e5
 _UNITS = {"metre": "m", "degree": "deg", "grad": "grad", "foot": "ft", "US survey foot": "ft_us"}
 
 
@@ -87,7 +89,7 @@ class LocalFrame:
             return xyz.copy()
         lon, lat, h = self._to_wgs84.transform(xyz[..., 0], xyz[..., 1], xyz[..., 2])
         out = self.from_geodetic(lat, lon, h)
-        if not np.isfinite(out).all() or np.any(np.abs(lat) > 90.0):
+        if not np.isfinite(out).all() or np.any(np.abs(lat) > 90.0) or np.any(h < DEEPEST_M):
             raise CrsError(f"coordinates outside the area of {self.crs!r}")
         return out
 
@@ -129,7 +131,7 @@ class LocalFrame:
 
     @cached_property
     def _crs(self):
-        return _parse_crs(self.crs)
+        return known_crs(self.crs)
 
     @cached_property
     def _to_wgs84(self):
@@ -140,7 +142,7 @@ class LocalFrame:
         """Frame at the middle of points (n, 3) given in ``crs``, on the ellipsoid below them (height 0)."""
         if crs == "local":
             return cls(0.0, 0.0, 0.0)
-        xyz, parsed = np.array(np.atleast_2d(xyz), dtype=float), _parse_crs(crs)
+        xyz, parsed = np.array(np.atleast_2d(xyz), dtype=float), known_crs(crs)
         if parsed.is_geographic:
             circle = 2.0 * np.pi / parsed.axis_info[0].unit_conversion_factor
             if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
@@ -200,13 +202,27 @@ class BodyFrame:
 Frame = LocalFrame | BodyFrame
 
 
-def _parse_crs(crs: str):
+def known_crs(crs: str, *, geocentric: bool = True):
+    """The CRS of pyproj, which gives a place: not heights alone.
+
+    Parameters
+    ----------
+    geocentric : whether it may be geocentric, in which points have coordinates, but maps have none
+
+    Raises
+    ------
+    CrsError : PROJ does not know it, or it is of another kind
+    """
     import pyproj.exceptions
 
     try:
-        return pyproj.CRS.from_user_input(crs)
+        known = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
         raise CrsError(f"PROJ does not know the CRS {crs!r}: {str(error).splitlines()[0]}") from None
+    if known.is_projected or known.is_geographic or (geocentric and known.is_geocentric):
+        return known
+    kind = "a geocentric" if known.is_geocentric else "a vertical" if known.is_vertical else "another"
+    raise CrsError(f"crs {crs!r}: {kind} system, wanted a projected or geographic one (with heights)")
 
 
 def _transformer(crs):

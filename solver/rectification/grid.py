@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.ellipsoid import WGS84, Ellipsoid
+from ..geometry.frames import known_crs
 
 Array = NDArray[np.floating]
 
@@ -85,16 +86,11 @@ def transformer_to(crs: str, ellipsoid: Ellipsoid = WGS84) -> Any:
     ValueError : PROJ does not know the CRS, it has no horizontal part, or it is of another planet
     """
     import pyproj
-    from pyproj.exceptions import CRSError, ProjError
+    from pyproj.exceptions import ProjError
 
-    try:
-        flat = pyproj.CRS.from_user_input(crs)
-    except CRSError as error:
-        raise ValueError(f"PROJ does not know the CRS {crs!r}: {str(error).splitlines()[0]}") from None
+    flat = known_crs(crs, geocentric=False)
     if flat.is_compound:
         flat = flat.sub_crs_list[0]
-    if flat.is_vertical or flat.is_geocentric or flat.ellipsoid is None:
-        raise ValueError(f"{crs!r} is not a map: wanted a projected or geographic CRS")
     if len(flat.axis_info) > 2:
         flat = flat.to_2d()
     axis = 0.0 if flat.ellipsoid is None else flat.ellipsoid.semi_major_metre

@@ -131,6 +131,14 @@ BAD = {
         {"project": '[project]\ncrs = "EPSG:999999"\n'},
         "project.toml: project.crs: PROJ does not know the CRS",
     ),
+    "vertical CRS": (
+        {"project": '[project]\ncrs = "EPSG:5773"\n'},
+        "project.toml: project.crs: crs 'EPSG:5773': a vertical system, wanted a projected or geographic one (with",
+    ),
+    "geocentric CRS": (
+        {"project": '[project]\ncrs = "EPSG:4978"\n'},
+        "trajectory.csv:2: X_m: [0.0, 1.5, 1000.0] lies outside the area of 'EPSG:4978'",
+    ),
     "TOML": ({"project": "[project\n"}, "project.toml: not valid TOML"),
     "TOML type": (
         {"project": "[apriori]\nimage_sigma_px = 'x'\n"},

@@ -268,6 +268,11 @@ WRONG = {
         "flight.vertical_datum: 'EPSG:32632', wanted a vertical",
     ),
     "CRS unknown": ('"EPSG:32632"', '"EPSG:9"', "flight.crs: PROJ does not know the CRS 'EPSG:9"),
+    "CRS vertical": (
+        '"EPSG:32632"',
+        '"EPSG:5773"',
+        "flight.crs: crs 'EPSG:5773': a vertical system, wanted a projected",
+    ),
     "CRS local": ('"EPSG:32632"', '"local"', "flight.crs: 'local', wanted one that PROJ understands"),
     "camera and preset": ('"camera.json"', '"camera.json"\npreset = "ads40"', "camera: wanted either file"),
     "no such preset": ('file = "camera.json"', 'preset = "x"', "camera.preset: 'x', wanted one of"),
