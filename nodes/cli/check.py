@@ -10,6 +10,7 @@ from pathlib import Path
 from ..bus.authority import CERTIFICATE
 from ..errors import UserError
 from ..recording.reader import RecordingReader
+from ..recording.remote import RemotePath, path_of
 from ..recording.seal import verify
 from ..recording.seal_place import seal_of
 from ..recording.summary import findings
@@ -21,9 +22,9 @@ EXAMPLE = """triline check flight.mcap
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording",
-        type=Path,
+        type=path_of,
         metavar="RECORDING_OR_FOLDER",
-        help="flight.mcap, a folder with flight.toml, or a block folder",
+        help="flight.mcap, or its URL, a folder with flight.toml, or a block folder",
     )
     parser.add_argument(
         "--authority", type=Path, metavar="FOLDER", help="of `triline keys`: who signed must be certified by it"
@@ -33,10 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.recording.is_dir():
         return _check_folder(args)
+    if isinstance(args.recording, RemotePath) and args.authority is not None:
+        raise UserError(
+            f"{args.recording}: seals of recordings elsewhere are not looked at, wanted a file for --authority"
+        )
     reader = RecordingReader(args.recording)
     found = findings(reader)
     authority = args.authority / CERTIFICATE if args.authority and args.authority.is_dir() else args.authority
-    seal = verify(args.recording, authority)
+    seal = None if reader.remote is not None else verify(args.recording, authority)
     if seal is None and authority is not None:
         raise UserError(f"{args.recording}: not signed, {seal_of(args.recording).name} is not there")
     if seal is not None:

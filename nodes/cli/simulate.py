@@ -30,7 +30,7 @@ from ..simulator.flight_settings import (
     shown_default,
     simulated_flight,
 )
-from ..simulator.simulator import Simulator
+from ..simulator.simulator import BEFORE_NS, Simulator
 from ..simulator.world_settings import HELP, world_terms
 from .progress import progress
 
@@ -191,7 +191,12 @@ def _utc_ns(text: str) -> int:
     if moment.tzinfo is None:
         raise UserError(f"--epoch {text!r} has no time zone: wanted a time such as {DEFAULT_EPOCH}")
     whole = moment.replace(microsecond=0)
-    return int(whole.timestamp()) * convert.SECOND_NS + moment.microsecond * 1000
+    epoch_ns = int(whole.timestamp()) * convert.SECOND_NS + moment.microsecond * 1000
+    if epoch_ns + BEFORE_NS < 0:  # what is known before the flight is stamped with that time
+        raise UserError(f"--epoch {text!r}: begins before 1970, wanted UTC since then")
+    if epoch_ns > convert.LATEST_S * convert.SECOND_NS:
+        raise UserError(f"--epoch {text!r}: wanted a time before 2261")
+    return epoch_ns
 
 
 def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, counts: dict[str, int]) -> dict[str, Any]:

@@ -65,6 +65,7 @@ def times_of(table: Table, columns: list[Column], day: date | None, notes: list[
         seconds = table[name]
         bad = ~(np.abs(seconds) < LATEST_S)
         table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, wanted seconds since 1970-01-01 UTC")
+        table.refuse(seconds < 0, name, lambda i: f"{seconds[i]:.6g} is before 1970, wanted UTC seconds since then")
         time_ns = _ns(seconds)
     elif name in GPS:
         time_ns, given = _from_gps(table, columns, day, notes)
@@ -97,7 +98,10 @@ def instant_ns(text: str, what: str) -> int:
     read = pd.to_datetime(pd.Series([text]), format="ISO8601", utc=True, errors="coerce")
     if read.isna().any():
         raise UserError(f"{what}: {text!r}, wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z")
-    return int(_datetime_ns(read)[0])
+    time_ns = int(_datetime_ns(read)[0])
+    if time_ns < 0:
+        raise UserError(f"{what}: {text!r} is before 1970, wanted UTC since then")
+    return time_ns
 
 
 def _ns(seconds: Array) -> NDArray[np.int64]:
@@ -122,7 +126,9 @@ def _from_words(table: Table, columns: list[Column]) -> NDArray[np.int64]:
     read = pd.to_datetime(pd.Series(words, dtype=object), format="ISO8601", utc=True, errors="coerce")
     wanted = "wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z"
     table.refuse(read.isna().to_numpy(), name, lambda i: f"{str(words[i])!r}, {wanted}")
-    return _datetime_ns(read)
+    time_ns = _datetime_ns(read)
+    table.refuse(time_ns < 0, name, lambda i: f"{str(words[i])!r} is before 1970, wanted UTC since then")
+    return time_ns
 
 
 def _from_gps(

@@ -124,6 +124,10 @@ def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
             more = f" (and {len(bad) - 1} more like it)" if len(bad) > 1 else ""
             what = f"{values[bad[0]]:.6g}, wanted {low:g} to {high:g} {unit}"
             raise UserError(f"{path}: record {bad[0] + 1}: {name}: {what}{more}")
+    old = np.flatnonzero(track.time_ns < 0)
+    if len(old):
+        when = np.datetime64(int(track.time_ns[old[0]]), "ns").astype("datetime64[s]")
+        raise UserError(f"{path}: record {old[0] + 1}: time: {when} is before 1970, wanted UTC since then")
     newest = np.maximum.accumulate(track.time_ns)
     rising = np.concatenate([[True], track.time_ns[1:] > newest[:-1]])
     if rising.sum() < 2:

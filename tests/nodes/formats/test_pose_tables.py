@@ -124,6 +124,14 @@ BAD = {
         None,
         f"p.csv:{N + 1}: time_s: 1e+19, wanted seconds since 1970-01-01 UTC",
     ),
+    "before 1970": (
+        "time_s",
+        ["-3.5", *UNIX[1:]],
+        COLUMNS,
+        TAIL,
+        None,
+        "p.csv:2: time_s: -3.5 is before 1970, wanted UTC seconds since then",
+    ),
     "no time": ("when", UNIX, COLUMNS, TAIL, None, "p.csv:1: time_s: column missing, wanted time_s (UTC, since 1970)"),
     "a word": (
         "time",

@@ -11,6 +11,7 @@ import pytest
 from places import ROOT
 from recording_file import chunk_spans, write_recording
 
+from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
@@ -148,6 +149,17 @@ def test_what_is_no_recording_is_one_line(tmp_path, name):
         Recording(url_of(tmp_path / name))
     assert url_of(tmp_path) in str(told.value)
     assert "\n" not in str(told.value)
+
+
+def test_check_takes_a_url(flown, tmp_path, capsys):
+    assert main(["check", url_of(flown)]) == 0
+    assert capsys.readouterr().out.startswith(f"{url_of(flown)}: whole, ")
+    longer = tmp_path / "longer.mcap"
+    longer.write_bytes(flown.read_bytes() + b"more")
+    assert main(["check", url_of(longer)]) == 1
+    assert f"{url_of(longer)}: bytes behind the end of the recording" in capsys.readouterr().err
+    assert main(["check", url_of(flown), "--authority", str(tmp_path)]) == 1
+    assert "seals of recordings elsewhere are not looked at" in capsys.readouterr().err
 
 
 def test_a_store_that_nothing_is_installed_for_is_one_line():

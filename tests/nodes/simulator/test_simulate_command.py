@@ -245,6 +245,8 @@ def test_recording_holds_the_flight(tmp_path, capsys):
         (["--seed", "-1"], "seed must not be negative"),
         (["--epoch", "yesterday"], "wanted a time such as"),
         (["--epoch", "2026-01-01T00:00:00"], "time zone"),
+        (["--epoch", "1960-01-01T00:00:00Z"], "before 1970, wanted UTC since then"),
+        (["--epoch", "9999-01-01T00:00:00Z"], "wanted a time before 2261"),
         (["--offset", "1", "1", "-1"], "offset_sigma_m"),
         (["--outliers", "1.5"], "outlier_share"),
         (["--height", "inf"], "height is inf, wanted a number"),
