@@ -7,6 +7,7 @@ beneath, and cleans with `plain` what it draws.
 
 from __future__ import annotations
 
+import io
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -72,12 +73,29 @@ def drawing(stream: Any) -> TextIO:
     return stream.stream if isinstance(stream, CleanStream) else stream
 
 
+class _Closed(io.TextIOBase):
+    """In the place of a stream that was closed before the program began (``>&-``).
+
+    Parameters
+    ----------
+    wanted : whether what is written is a result, which then goes nowhere as with a closed pipe
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self._wanted = wanted
+
+    def write(self, text: str, /) -> int:
+        if self._wanted:
+            raise BrokenPipeError
+        return len(text)
+
+
 @contextmanager
 def clean_streams() -> Iterator[None]:
     """Standard output and standard error take no control characters in this block."""
     out, err = sys.stdout, sys.stderr
-    sys.stdout = cast(TextIO, CleanStream(drawing(out)))
-    sys.stderr = cast(TextIO, CleanStream(drawing(err)))
+    sys.stdout = cast(TextIO, CleanStream(drawing(out) or cast(TextIO, _Closed(wanted=True))))
+    sys.stderr = cast(TextIO, CleanStream(drawing(err) or cast(TextIO, _Closed(wanted=False))))
     try:
         yield
     finally:

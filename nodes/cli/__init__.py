@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
+from contextlib import nullcontext
 from typing import Any
 
 from ..errors import UserError
 from ..terminal import clean_streams, plain
-from .outputs import refuse_input_as_output
+from .ending import EndedBySignal, ended_by_signals
+from .outputs import refuse_empty_words, refuse_input_as_output
 
 #: Longest reason that is printed, characters.
 LONGEST_LINE = 1000
@@ -45,12 +48,16 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 def parse(argv: list[str]) -> argparse.Namespace:
     """Parse the words behind ``triline``; an unknown option is reported with the usage of its command."""
-    command = next((word for word in argv if not word.startswith("-")), None)
+    command = _command(argv)
     parser, subparser = _parser(command if command in COMMANDS else None)
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         (subparser or parser).error(f"unrecognized arguments: {' '.join(unknown)}")
     return args
+
+
+def _command(argv: list[str]) -> str:
+    return next((word for word in argv if not word.startswith("-")), "")
 
 
 def _parser(command: str | None) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser | None]:
@@ -97,7 +104,7 @@ def _version() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; returns 0, 1 (work failed: one line on standard error) or 2 (usage)."""
+    """Run a command; returns 0, 1 (work failed: one line on standard error), 2 (usage) or 128 + a signal."""
     # One thread a process, before NumPy is loaded: sums come out the same in all nodes, and matrices are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     job = bool(os.environ.pop("TRILINE_JOB", ""))
@@ -105,7 +112,7 @@ def main(argv: list[str] | None = None) -> int:
         from ..jobs.work import end_with_parent
 
         end_with_parent()
-    with clean_streams():
+    with clean_streams(), nullcontext() if job else ended_by_signals():  # of a job its worker cleans up
         return _run(sys.argv[1:] if argv is None else argv, job)
 
 
@@ -117,34 +124,40 @@ def _tell_fetched() -> None:
 
 
 def _run(argv: list[str], job: bool) -> int:
-    args = parse(argv)
+    name, verbose = f"triline {_command(argv)}", False
     try:
+        args = parse(argv)
+        verbose = getattr(args, "verbose", False)
+        refuse_empty_words(argv)
         refuse_input_as_output(args)
         code = args.run(args)
-        if job or getattr(args, "verbose", False):
+        if job or verbose:
             _tell_fetched()
         return code
     except UserError as error:
-        print(f"triline {args.command}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
+        print(f"{name}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
     except FileNotFoundError as error:
-        print(f"triline {args.command}: {error.filename}: no such file or folder", file=sys.stderr)
+        print(f"{name}: {error.filename}: no such file or folder", file=sys.stderr)
     except IsADirectoryError as error:
-        print(f"triline {args.command}: {error.filename}: is a folder, wanted a file", file=sys.stderr)
+        print(f"{name}: {error.filename}: is a folder, wanted a file", file=sys.stderr)
     except (PermissionError, NotADirectoryError) as error:
-        print(f"triline {args.command}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
+        print(f"{name}: {error.filename}: {(error.strerror or '').lower()}", file=sys.stderr)
     except MemoryError as error:
-        print(f"triline {args.command}: not enough memory: {str(error) or 'out of memory'}", file=sys.stderr)
+        print(f"{name}: not enough memory: {str(error) or 'out of memory'}", file=sys.stderr)
     except BrokenPipeError:  # the program that reads our output has ended, as in `triline info F | head`
         sys.stderr.close()
+    except EndedBySignal as ended:
+        print(f"{name}: ended by {signal.Signals(ended.number).name}", file=sys.stderr)
+        return 128 + ended.number
     except KeyboardInterrupt:
-        print(f"triline {args.command}: interrupted", file=sys.stderr)
+        print(f"{name}: interrupted", file=sys.stderr)
     except OSError as error:  # a full disk, most often
         where = f"{error.filename}: " if error.filename else ""
-        print(f"triline {args.command}: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
+        print(f"{name}: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
     except Exception as error:  # a fault of the program; -v shows where
-        if getattr(args, "verbose", False):
+        if verbose:
             raise
         what = " ".join(f"{type(error).__name__}: {error}".split())
         told = f"fault in triline, please report it (-v shows where): {plain(what, 300)}"
-        print(f"triline {args.command}: {told}", file=sys.stderr)
+        print(f"{name}: {told}", file=sys.stderr)
     return 1

@@ -1,4 +1,4 @@
-"""What a command must not write over."""
+"""What a command must not write to, or over."""
 
 from __future__ import annotations
 
@@ -6,10 +6,21 @@ import argparse
 import os
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+
+
+def refuse_empty_words(argv: list[str]) -> None:
+    """Raise UserError where a name is empty: as a path it would stand for the folder in which the command runs."""
+    for before, word in pairwise(["", *argv]):
+        option, equals, value = word.partition("=")
+        if not word:
+            raise UserError(f"{before} '': wanted a name" if before.startswith("-") else "'': wanted a name")
+        if option.startswith("-") and equals and not value:
+            raise UserError(f"{option} '': wanted a name")
 
 
 def refuse_input_as_output(args: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ What it gives comes in batches, in its order, so nothing depends on which proces
 from __future__ import annotations
 
 import multiprocessing
+import os
 import queue
 import signal
 import threading
@@ -74,6 +75,7 @@ class Ahead(Generic[T]):
 def _work(connection: Connection, other: Connection, make: Callable[[], Iterable[T]]) -> None:
     """The process ahead: makes batches, which a thread of it sends, so that making does not wait for sending."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     other.close()
     made: queue.Queue[list[T] | UserError | None] = queue.Queue(WAITING)
     sender = threading.Thread(target=_send, args=(connection, made), daemon=True)
@@ -97,6 +99,5 @@ def _send(connection: Connection, made: queue.Queue[list[T] | UserError | None])
             connection.send(batch)
             if batch is None:
                 return
-    except (BrokenPipeError, OSError):
-        while made.get() is not None:  # nobody listens any more; this process is about to be ended
-            pass
+    except OSError:  # nobody listens any more: the first process has ended, or is about to end this one
+        os._exit(1)

@@ -190,6 +190,24 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other"]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("export", "a.mcap", "--topic", "orientation/final", "--csv", ""),
+        ("export", "a.mcap", "--topic", "orientation/final", "--geojson="),
+        ("adjust", "block", "-o", ""),
+        ("simulate", "--satellite", "spot5-hrs", "-o", ""),
+        ("new", "flight", ""),
+    ],
+    ids=lambda words: words[0],
+)
+def test_an_output_without_a_name_is_refused(arguments, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    option = "" if arguments[0] == "new" else next(w for w in reversed(arguments) if w).rstrip("=") + " "
+    assert run_main(capsys, *arguments) == (1, "", f"triline {arguments[0]}: {option}'': wanted a name\n")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_result_is_not_written_among_the_files_of_a_block(tmp_path, capsys):
     write_block(tmp_path / "block", simulated_block())
     before = sorted(p.name for p in (tmp_path / "block").iterdir())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 
 import pytest
+from bus_rig import simulated_flight, wait_for
 from places import ROOT
 
 #: Packages that take 0.1 s and more to import each.
@@ -70,3 +73,60 @@ def test_a_heavy_package_would_be_seen(tmp_path):
 def test_a_look_into_a_recording_imports_hardly_anything():
     assert imported("info", "recordings/strip.mcap", packages=NOT_FOR_INFO) == set()
     assert "cryptography" in imported("check", "none", packages=NOT_FOR_INFO)
+
+
+def ended(tmp_path, number: int, module: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """A command to which a signal comes as it imports a module."""
+    code = (
+        "import os, sys\nfrom triline.nodes.cli import main\n"
+        "class Watch:\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == {module!r}:\n            os.kill(os.getpid(), {number})\n"
+        f"sys.meta_path.insert(0, Watch())\nsys.exit(main({list(words)!r}))"
+    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (signal.SIGINT, 1, "interrupted"),
+        (signal.SIGTERM, 143, "ended by SIGTERM"),
+        (signal.SIGHUP, 129, "ended by SIGHUP"),
+    ],
+)
+def test_a_signal_while_a_command_is_loaded_ends_it_in_one_line(tmp_path, number, code, words):
+    run = ended(tmp_path, number, "numpy", "process", "none.mcap", "-o", "out.mcap")
+    assert (run.returncode, run.stdout, run.stderr) == (code, "", f"triline process: {words}\n")
+
+
+def test_a_command_that_is_told_to_end_leaves_nothing(tmp_path):
+    """The module is imported with the table half written."""
+    words = ("export", str(ROOT / "recordings/strip.mcap"), "--topic", "sensor/gnss", "--csv", "gnss.csv")
+    run = ended(tmp_path, signal.SIGTERM, "pandas", *words)
+    assert (run.returncode, run.stdout, run.stderr) == (143, "", "triline export: ended by SIGTERM\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_process_that_is_told_to_end_takes_its_second_process_along(tmp_path):
+    flight = simulated_flight(60)
+    command = [sys.executable, "-m", "triline.nodes.cli", "process", str(flight), "-o", "out.mcap", "--processes", "2"]
+    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for(lambda: len(list(tmp_path.glob("*.part"))) == 1, 20, "the beginning of the output")
+    program.send_signal(signal.SIGTERM)
+    _, err = program.communicate(timeout=20)
+    assert program.returncode == 143 and err.splitlines()[-1] == "triline process: ended by SIGTERM"
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ProcessLookupError):
+        os.killpg(program.pid, 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "closed", "code"),
+    [("info FILE", ">&-", 1), ("info FILE --json", ">&-", 1), ("info FILE", "2>&-", 0), ("info none", "2>&-", 1)],
+)
+def test_streams_that_the_shell_has_closed(words, closed, code):
+    command = words.replace("FILE", "recordings/strip.mcap")
+    line = f"{sys.executable} -m triline.nodes.cli {command} {closed}"
+    run = subprocess.run(["sh", "-c", line], capture_output=True, text=True, cwd=ROOT)
+    assert (run.returncode, run.stderr) == (code, "") and bool(run.stdout) == (code == 0)

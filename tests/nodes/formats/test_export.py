@@ -344,7 +344,7 @@ def test_sbet_comes_back_as_the_track_it_was(tmp_path):
         (["--per-line", "o", "--rows", "x"], "--rows: wanted with --csv and --parquet only"),
         (["--topic", "sensor/gnss", "--csv", "o", "--format", "csv"], "--format: wanted with --per-line only"),
         (["--topic", "sensor/gnss", "--sbet", "o", "--rows", "none"], "--rows: wanted with --csv and --parquet only"),
-        (["--topic", "sensor/gnss", "--csv", ""], "."),
+        (["--topic", "sensor/gnss", "--csv", ""], "--csv '': wanted a name"),
     ],
 )
 def test_refusals_are_one_line_and_leave_no_file(recording, tmp_path, capsys, monkeypatch, args, wanted):
