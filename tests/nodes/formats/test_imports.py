@@ -359,7 +359,7 @@ def test_usage_errors(capsys):
         (["--line-rate", "inf"], "--line-rate inf, wanted a number above 0 (Hz)"),
         (["--above-ground", "nan"], "--above-ground nan, wanted more than 0 m"),
         (["--ground-height", "nan"], "--ground-height nan, wanted metres from -500 to 9000"),
-        (["--camera", ""], "no such file, and no preset of that name"),
+        (["--camera", ""], "--camera '': wanted a name"),
         (["--seconds-of-day"], "--seconds-of-day goes with --date"),
     ],
 )
