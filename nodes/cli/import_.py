@@ -123,8 +123,6 @@ def run(args: argparse.Namespace) -> int:
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
     _refuse_options(args, kind, source)
-    if output.exists() and source.exists() and output.samefile(source):
-        raise UserError(f"{output}: is the input itself")
     if kind == "flight":
         imported, platform = flight_messages(source)
         result = _write(source, imported, output, platform, shown=not args.quiet and not args.json)

@@ -12,6 +12,7 @@ from triline.nodes.cli import main
 from triline.nodes.cli.navigate import COLUMNS
 from triline.nodes.errors import UserError
 from triline.nodes.formats.sensor_folder import read_sensor_folder
+from triline.nodes.formats.sensor_recording import sensor_messages
 from triline.nodes.recording.reader import RecordingReader
 from triline.solver.geometry.frames import LocalFrame
 
@@ -259,3 +260,15 @@ def test_platform_keys_are_read(tmp_path):
     assert p.initial is not None and np.degrees(p.initial.sigma) == pytest.approx([20.0, 20.0, 3.0])
     assert np.allclose(p.mount.rotation, [[0, 1, 0], [1, 0, 0], [0, 0, -1]], atol=1e-12)
     assert any("unknown" in n for n in read.notes)
+
+
+def test_a_flight_across_the_date_line_has_its_origin_there(tmp_path):
+    folder = write(tmp_path / "sensors")
+    table = np.loadtxt(folder / "gnss.csv", delimiter=",", skiprows=1)
+    table = table[len(table) % 2 :]  # as many on one side as on the other
+    table[:, 2] += 180.0 - np.median(table[:, 2])
+    table[:, 2] = (table[:, 2] + 180.0) % 360.0 - 180.0
+    assert np.ptp(table[:, 2]) > 359.0
+    np.savetxt(folder / "gnss.csv", table, "%.14g", ",", header=GNSS, comments="")
+    project = next(sensor_messages(folder, [])).body
+    assert abs(project.origin_longitude) > 179.9
