@@ -10,14 +10,14 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ..bus.folder_lock import locked
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_folder
-from ..jobs.driver import Progress, drive, progress_of
+from ..jobs.driver import Progress, add_recorded, drive, progress_of
 from ..jobs.inputs import sources
 from ..jobs.plan import Plan, plans
 from ..jobs.pools import LocalPool, Pool
@@ -91,21 +91,21 @@ def _work(planned: Sequence[Plan], progress: Progress, workers: int, args: argpa
         pool = DaskPool(args.scheduler)
     else:
         pool = LocalPool(min(workers, progress.total))
+    lost = None
     try:
         with _interruptible(), _told(progress, pool, args) as told:
             drive(planned, pool, args.retries, progress, told)
     except KeyboardInterrupt:
-        with suppress(UserError):  # of a scheduler that is lost
-            for outcome in pool.ended(0.0):
-                if outcome.good:  # it was finished, and had not been looked at
-                    progress.outcomes.setdefault((outcome.flight, outcome.step), outcome)
-        return f"interrupted; {_finished(progress)}, the same command goes on from there"
+        lost = "interrupted"
     except UserError as error:
-        return str(error)
+        lost = str(error)
     finally:
         pool.close()
         remove_working_folders(Path(job.folder) for plan in planned for job in plan.jobs.values())
-    return None
+    if lost is None:
+        return None
+    add_recorded(planned, progress)
+    return f"{lost}; {_finished(progress)}, the same command goes on from there"
 
 
 def _steps(text: str) -> list[str]:

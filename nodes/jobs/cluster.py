@@ -83,9 +83,7 @@ class DaskPool:
             raise self._lost()
 
     def _lost(self) -> UserError:
-        return UserError(
-            f"--scheduler {self._address}: the scheduler is gone; what is finished is kept, the same command goes on"
-        )
+        return UserError(f"--scheduler {self._address}: the scheduler is gone")
 
     def _outcome(self, future: Any, result: Any) -> Outcome:
         job, _ = self._given.pop(future.key)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from .plan import Job, Plan
 from .pools import Pool
+from .records import is_finished
 from .steps import STEPS
 from .work import Outcome
 
@@ -46,6 +48,15 @@ def progress_of(plans: Sequence[Plan]) -> Progress:
     """How far the jobs are before any is given out."""
     jobs, finished = sum(len(plan.jobs) for plan in plans), sum(len(plan.finished) for plan in plans)
     return Progress(jobs - finished, finished)
+
+
+def add_recorded(plans: Sequence[Plan], progress: Progress) -> None:
+    """Count the jobs that were finished, and not looked at before `drive` was left, by their records."""
+    for plan in plans:
+        for step, job in plan.jobs.items():
+            known = step in plan.finished or job.key in progress.outcomes
+            if not known and is_finished(Path(job.folder), step, job.made_of):
+                progress.outcomes[job.key] = Outcome(*job.key, good=True)
 
 
 def drive(

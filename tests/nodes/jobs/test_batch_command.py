@@ -222,15 +222,22 @@ def test_an_interrupted_batch_leaves_what_is_finished_and_nothing_else(season, h
     assert not list(Path("out").rglob(".job-*"))
 
 
-def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_finished(season, monkeypatch, capsys):
+@pytest.mark.parametrize("taken", [False, True])
+def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_finished(
+    season, taken, monkeypatch, capsys
+):
+    """Also where the interruption comes between taking a job that has ended and counting it."""
+
     def interrupted(plans, pool, *_):
         pool.submit(plans[0].jobs["adjust"], 1, 0)
         until(lambda: not pool._ended.empty(), "nothing was finished")
+        if taken:
+            assert pool.ended(0.0)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(batch, "drive", interrupted)
     assert main(["batch", "season/day1", "-o", "out", *ADJUST]) == 1
-    assert "interrupted; 1 " in capsys.readouterr().err
+    assert "interrupted; 1 of 2 jobs are finished and kept" in capsys.readouterr().err
     assert [row["state"] for row in summary()["flights"]] == ["finished", "unfinished"]
 
 
