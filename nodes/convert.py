@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +59,24 @@ class PoseSample:
     valid: bool
     strip: str = ""
     correction: Array | None = None
+    noise_time_s: float = 0.0
+
+
+class PlainPose(NamedTuple):
+    """A pose message as plain numbers; of many, arrays are made at once.
+
+    Attributes
+    ----------
+    time_ns, valid, noise_time_s : as in `PoseSample`
+    position_l, quaternion : 3 and 4 numbers
+    covariance : 36 numbers, row by row; None if the message has none
+    """
+
+    time_ns: int
+    position_l: list[float]
+    quaternion: list[float]
+    covariance: list[float] | None
+    valid: bool
     noise_time_s: float = 0.0
 
 
@@ -134,34 +152,45 @@ def check_strip(body: Any, stamp_ns: int) -> None:
         raise ValueError(f"strip {body.id!r} that begins {away_s:.0f} s after its message")
 
 
-def pose_sample(message: Any) -> PoseSample:
-    """The arrays of a PoseInFrame.
+def plain_pose(message: Any) -> PlainPose:
+    """The numbers of a PoseInFrame, checked.
 
     Raises
     ------
     ValueError : a value that is not finite, a quaternion that is not a rotation, a covariance of the wrong size
     """
     p, q = message.pose.position, message.pose.orientation
-    x, y, z, w = q.x, q.y, q.z, q.w
-    position = np.array([p.x, p.y, p.z])
-    if not math.isfinite(p.x + p.y + p.z + x + y + z + w):
+    px, py, pz, x, y, z, w = p.x, p.y, p.z, q.x, q.y, q.z, q.w
+    if not math.isfinite(px + py + pz + x + y + z + w):
         raise ValueError("pose is not finite")
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if abs(norm - 1.0) > 1e-3:
         raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
-    if not 0.0 <= message.noise_time_s < math.inf:
-        raise ValueError(f"noise_time_s of {message.noise_time_s:g} s, wanted 0 or more")
+    noise_time_s = message.noise_time_s
+    if not 0.0 <= noise_time_s < math.inf:
+        raise ValueError(f"noise_time_s of {noise_time_s:g} s, wanted 0 or more")
     covariance = _square(message.covariance, 6, "covariance")
-    correction = np.array(message.correction) if message.correction else None
+    quaternion = [x / norm, y / norm, z / norm, w / norm]
+    return PlainPose(time_ns(message.timestamp), [px, py, pz], quaternion, covariance, message.valid, noise_time_s)
+
+
+def pose_sample(message: Any) -> PoseSample:
+    """The arrays of a PoseInFrame.
+
+    Raises
+    ------
+    ValueError : as `plain_pose`
+    """
+    stamp_ns, position, quaternion, covariance, valid, noise_time_s = plain_pose(message)
     return PoseSample(
-        time_ns(message.timestamp),
-        position,
-        np.array([x / norm, y / norm, z / norm, w / norm]),
-        covariance,
-        message.valid,
+        stamp_ns,
+        np.array(position),
+        np.array(quaternion),
+        None if covariance is None else np.array(covariance).reshape(6, 6),
+        valid,
         message.strip,
-        correction,
-        message.noise_time_s,
+        np.array(message.correction) if message.correction else None,
+        noise_time_s,
     )
 
 
@@ -170,17 +199,17 @@ def angles_of(quaternion: ArrayLike) -> Array:
     return angles_from_matrix(matrix_from_quaternion(quaternion))
 
 
-def _square(values: Any, n: int, name: str) -> Array | None:
-    """A flattened (n, n) matrix of a message, None if absent."""
+def _square(values: Any, n: int, name: str) -> list[float] | None:
+    """The numbers of a flattened (n, n) matrix of a message, None if absent."""
     if len(values) == 0:
         return None
     if len(values) != n * n:
         raise ValueError(f"{name} has {len(values)} values, wanted {n * n}")
     numbers = list(values)
-    matrix = np.array(numbers).reshape(n, n)
-    if not (math.isfinite(sum(numbers)) or np.isfinite(matrix).all()) or min(numbers[:: n + 1]) < 0:
+    # a sum of large numbers may be infinite where none of them is
+    if not (math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))) or min(numbers[:: n + 1]) < 0:
         raise ValueError(f"{name} is not finite or has a negative variance")
-    return matrix
+    return numbers
 
 
 def camera_message(camera: LineCamera) -> Any:

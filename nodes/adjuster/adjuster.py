@@ -386,14 +386,12 @@ class Adjuster(Node):
         if self._window is None:
             self.problem("before configuration", "a pose came before configuration/project and camera")
             return []
-        sample = convert.pose_sample(body)
-        if sample.covariance is None:
-            raise ValueError("pose without covariance")
-        ahead_s = (sample.time_ns - stamp_ns) * 1e-9
+        pose = convert.plain_pose(body)
+        ahead_s = (pose.time_ns - stamp_ns) * 1e-9
         if ahead_s > POSE_AHEAD_S:  # a window that long would not be solved in a day
             raise ValueError(f"pose of a time {ahead_s:g} s after the stamp of its message")
-        time_s = self._seconds(sample.time_ns)
-        self._poses.add(time_s, sample, smoothed, body.reason)
+        time_s = self._seconds(pose.time_ns)
+        self._poses.add(time_s, pose, smoothed, body.reason)
         if self._strips.any_held:
             self._begin_held()
         if not (smoothed and self._poses.filtered_seen):

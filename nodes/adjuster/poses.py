@@ -96,12 +96,12 @@ class PoseBuffer:
 
     def __init__(self, known_only: bool = False, smoothed_only: bool = False) -> None:
         self._known_only, self._smoothed_only = known_only, smoothed_only
-        self._latest: dict[bool, tuple[float, Array]] = {}
+        self._latest: dict[bool, tuple[float, list[float]]] = {}
         self._attitude_lost = False
         self._left_out = (0.0, 0.0)
         self.filtered_seen = False
         self.first_known_s = np.inf
-        self._waiting: dict[bool, list[tuple[float, convert.PoseSample]]] = {False: [], True: []}
+        self._waiting: dict[bool, list[tuple[float, convert.PlainPose]]] = {False: [], True: []}
         self._seen: dict[bool, tuple[list[float], list[str | None]]] = {False: ([], []), True: ([], [])}
         self._invalid: dict[bool, list[tuple[float, float, str]]] = {False: [], True: []}
 
@@ -112,22 +112,30 @@ class PoseBuffer:
         self._latest.clear()
         self.first_known_s = np.inf
 
-    def add(self, time_s: float, sample: convert.PoseSample, smoothed: bool, reason: str) -> None:
+    def add(self, time_s: float, pose: convert.PlainPose, smoothed: bool, reason: str) -> None:
+        """Take a pose; ``reason`` why it is not valid.
+
+        Raises
+        ------
+        ValueError : a pose without covariance
+        """
+        covariance = pose.covariance
+        if covariance is None:
+            raise ValueError("pose without covariance")
         self.filtered_seen |= not smoothed
-        assert sample.covariance is not None
-        known = max(sample.covariance[i, i] for i in (3, 4, 5)) < KNOWN_ATTITUDE_RAD**2
+        known = max(covariance[21], covariance[28], covariance[35]) < KNOWN_ATTITUDE_RAD**2
         if not smoothed and self._latest:
             self._attitude_lost |= not known
         if known:
             self.first_known_s = min(self.first_known_s, time_s)
         if known or not self._known_only:
-            self._waiting[smoothed].append((time_s, sample))
+            self._waiting[smoothed].append((time_s, pose))
         if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):
-            self._latest[smoothed] = time_s, sample.covariance
+            self._latest[smoothed] = time_s, covariance
         times, reasons = self._seen[smoothed]
         place = bisect_left(times, time_s)
         times.insert(place, time_s)
-        reasons.insert(place, None if sample.valid else reason)
+        reasons.insert(place, None if pose.valid else reason)
         old = bisect_left(times, times[-1] - REMEMBERED_S)
         if old > MOST_OLD:
             self._invalid[smoothed] += _stretches(times[: old + 1], reasons[: old + 1])
@@ -138,20 +146,21 @@ class PoseBuffer:
         if not self._latest:
             return None
         newest_s, covariance = max(self._latest.values(), key=lambda latest: latest[0])
-        return covariance if newest_s >= time_s else None
+        return _matrix(covariance) if newest_s >= time_s else None
 
     @property
     def learning(self) -> bool:
         """Whether the newest smoothed pose is clearly more certain than the newest filtered one."""
         if len(self._latest) < 2:
             return False
-        smoothed, filtered = (np.diagonal(self._latest[key][1]) for key in (True, False))
+        smoothed, filtered = (np.array(self._latest[key][1][::7]) for key in (True, False))
         return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
 
     @property
     def leading(self) -> tuple[float, Array] | None:
         """Time and covariance (6, 6) of the newest pose with a known attitude: filtered ones where there are any."""
-        return self._latest.get(not self.filtered_seen)
+        latest = self._latest.get(not self.filtered_seen)
+        return None if latest is None else (latest[0], _matrix(latest[1]))
 
     def started_anew(self) -> bool:
         """Whether attitude is known again after it was not: the filter has started anew. True once."""
@@ -175,14 +184,15 @@ class PoseBuffer:
             waiting = [w for w in self._waiting[smoothed] if not begin_s < w[0] < end_s]
             self._waiting[smoothed] = []
             if waiting:
-                samples = [sample for _, sample in waiting]
+                times, poses = map(list, zip(*waiting, strict=True))
+                covariance = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
                 yield (
-                    [time for time, _ in waiting],
-                    np.array([s.position_l for s in samples]),
-                    np.array([s.quaternion for s in samples]),
-                    slow.without([time for time, _ in waiting], np.array([s.covariance for s in samples])),
+                    times,
+                    np.array([pose.position_l for pose in poses]),
+                    np.array([pose.quaternion for pose in poses]),
+                    slow.without(times, covariance),
                     smoothed,
-                    samples[-1].noise_time_s,
+                    poses[-1].noise_time_s,
                 )
 
     def _smoothed_follow(self) -> bool:
@@ -209,6 +219,10 @@ class PoseBuffer:
             low, high = max(low - 1, 0), high + 1
         reason = next((r for r in reasons[low:high] if r is not None), None)
         return reason is None, reason or ""
+
+
+def _matrix(covariance: list[float]) -> Array:
+    return np.array(covariance).reshape(6, 6)
 
 
 def _stretches(times: list[float], reasons: list[str | None]) -> list[tuple[float, float, str]]:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from triline.nodes.adjuster.poses import PoseBuffer
-from triline.nodes.convert import PoseSample
+from triline.nodes.convert import PlainPose
 from triline.solver.geometry.measured_trajectory import MeasuredTrajectory
 
 
 def sample(valid):
-    return PoseSample(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6) * 1e-6, valid, "", None)
+    return PlainPose(0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], (np.eye(6) * 1e-6).ravel().tolist(), valid)
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_what_was_invalid_long_ago_is_still_known(buffer):
 
 def test_known_again_is_a_new_filter_once():
     buffer = PoseBuffer(known_only=True)
-    unknown = PoseSample(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), False, "", None)
+    unknown = PlainPose(0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], np.eye(6).ravel().tolist(), False)
     buffer.add(9.0, unknown, False, "aligning")
     buffer.add(10.0, sample(True), False, "")
     assert not buffer.started_anew()  # the first one is none

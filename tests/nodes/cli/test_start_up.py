@@ -78,7 +78,10 @@ def test_a_look_into_a_recording_imports_hardly_anything():
 def ended(tmp_path, number: int, module: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A command to which a signal comes as it imports a module."""
     code = (
-        "import os, sys\nfrom triline.nodes.cli import main\n"
+        "import os, signal, sys\nfrom triline.nodes.cli import main\n"
+        # where the tests run in the background of a shell, signals are ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_DFL)\nsignal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "class Watch:\n"
         "    def find_spec(self, name, *_):\n"
         f"        if name == {module!r}:\n            os.kill(os.getpid(), {number})\n"
