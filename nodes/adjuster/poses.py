@@ -133,11 +133,12 @@ class PoseBuffer:
         if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):
             self._latest[smoothed] = time_s, covariance
         times, reasons = self._seen[smoothed]
-        place = bisect_left(times, time_s)
+        place = bisect_left(times, time_s) if times and time_s <= times[-1] else len(times)
         times.insert(place, time_s)
         reasons.insert(place, None if pose.valid else reason)
-        old = bisect_left(times, times[-1] - REMEMBERED_S)
-        if old > MOST_OLD:
+        forgotten_s = times[-1] - REMEMBERED_S
+        if len(times) > MOST_OLD and times[MOST_OLD] < forgotten_s:
+            old = bisect_left(times, forgotten_s)
             self._invalid[smoothed] += _stretches(times[: old + 1], reasons[: old + 1])
             del times[:old], reasons[:old]
 

@@ -115,19 +115,21 @@ class OrientationOutput:
             xyz_l, covariance = xyz_l + drift[0], covariance + drift[1]
         v_line, v_sample = statistics.v_px.T.tolist()
         w, rejected = statistics.largest_w.tolist(), (batch.weight == 0.0).tolist()
-        source, first = batch.rays.source.tolist(), batch.first_ray.tolist()
+        source, first, left = batch.rays.source.tolist(), batch.first_ray.tolist(), batch.points_left.tolist()
         known, earlier = np.all(batch.control.weight > 0, axis=1), np.zeros(batch.n_points, dtype=np.int64)
         if batch.ties is not None:
             known, earlier = known | batch.ties.placed, earlier + (batch.ties.active & batch.ties.single)
+        is_known, of_earlier = known.tolist(), earlier.tolist()
         out = []
         for i in np.flatnonzero(batch.normals.rank == 3).tolist():
             name, mine = batch.names[i], slice(first[i], first[i + 1])
-            seen = [points[name].looks[k] for k in source[mine]]
+            point = points[name]
+            seen = map(point.looks.__getitem__, source[mine])
             residuals = tuple(map(RayResidual, seen, v_line[mine], v_sample[mine], w[mine], rejected[mine]))
             role = control[name].role if name in control else "tie"
-            rays, single = int(batch.points_left[i]), int(earlier[i])  # single looks of earlier strips
-            checked = checks(rays + single, len(residuals) + single, bool(known[i]))
-            if points[name].alone:
+            rays, single = left[i], of_earlier[i]  # single looks of earlier strips
+            checked = checks(rays + single, len(residuals) + single, is_known[i])
+            if point.alone:
                 checked = "doubtful"
             out.append(AdjustedPoint(name, role, xyz_l[i], covariance[i], rays, final, residuals, checked))
         return out

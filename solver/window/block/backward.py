@@ -94,7 +94,10 @@ class LeftPoints:
     def refined(self, solution: BlockSolution) -> list[AdjustedPoint]:
         """The points as a solution of whole strips gives them."""
         xyz_l, covariance = self.functions.at(*solution.of(self.functions.columns))
-        return [p._replace(xyz_l=xyz_l[i], covariance=covariance[i], whole=True) for i, p in enumerate(self.points)]
+        return [
+            AdjustedPoint(p.name, p.role, xyz, C, p.rays, p.final, p.residuals, p.checked, whole=True)
+            for p, xyz, C in zip(self.points, xyz_l, covariance, strict=True)
+        ]
 
 
 @dataclass(frozen=True)

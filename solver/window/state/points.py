@@ -138,7 +138,7 @@ class Intake:
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""
         strip = self._strips.get(look.strip)
-        return float("nan") if strip is None else float(strip.time_of(look.line))
+        return float("nan") if strip is None else strip.first_line_time_s + look.line / strip.line_rate_hz
 
     def _judge(self, look: Look) -> str:
         if not all(map(isfinite, (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px))):
