@@ -145,6 +145,8 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
     checked({name: _single(value) for name, value in given.items() if value is not None})
     if args.place is not None and not (abs(args.place[0]) <= 90 and abs(args.place[1]) <= 360):
         raise UserError(f"--place {args.place[0]:g} {args.place[1]:g}: wanted latitude and longitude, degrees")
+    if given["images"] and given["outliers"] is not None:
+        raise UserError("--outliers does not go with --satellite and --images: no tie points are simulated then")
     output = Path(args.output)
     recording = output.suffix.lower() == ".mcap"
     if not recording:

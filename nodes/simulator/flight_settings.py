@@ -190,6 +190,8 @@ def _refuse_without_effect(values: Mapping[str, Any]) -> None:
         for name in names:
             if name in given and values.get(other):
                 raise UserError(f"simulation: {_flag(name)} does not go with {_flag(other)}")
+    if "outliers" in given and not values.get("ties", default(BY_NAME["ties"])):
+        raise UserError("simulation: --outliers goes with --ties above 0: blunders are those of simulated tie points")
     strips, cross = values.get("strips", 1), values.get("cross", 0)
     if "sidelap" in given and strips == 1:
         raise UserError("simulation: --sidelap goes with --strips, of at least 2")

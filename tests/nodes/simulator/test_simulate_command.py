@@ -278,6 +278,9 @@ def test_bad_options_get_one_line(tmp_path, capsys, options, words):
         (["--imu-rate", "100"], "--imu-rate goes with --imu"),
         (["--outlier-px", "5", "9"], "--outlier-px goes with --outliers"),
         (["--outliers", "0", "--outlier-px", "5", "9"], "--outlier-px goes with --outliers"),
+        (["--images", "--outliers", "0.1"], "--outliers goes with --ties above 0"),
+        (["--ties", "0", "--outliers", "0.1"], "--outliers goes with --ties above 0"),
+        (["--satellite", "aster-vnir", "--images", "--outliers", "0.1"], "--outliers does not go with --satellite and"),
         (["--sidelap", "0.2"], "--sidelap goes with --strips, of at least 2"),
         (["--sidelap", "0.2", "--cross", "1"], "--sidelap goes with --strips, of at least 2"),
         (["--no-turns"], "--no-turns goes with --strips or --cross"),
@@ -297,6 +300,7 @@ def test_options_that_go_together_are_taken():
     plan = {"seconds": 4, "ties": 2, "lead_in": 1, "control": 0, "check": 0}
     assert len(simulated_flight({**plan, "no_turns": True, "cross": 1}).simulation.flight.strips) == 2
     assert simulated_flight({**plan, "no_turns": False, "outliers": 0.1, "outlier_px": [5, 9]}).motion is None
+    assert simulated_flight({**plan, "images": True, "outliers": 0.1}).imager is not None
 
 
 @pytest.mark.parametrize(
