@@ -36,10 +36,10 @@ from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
 from .projection import missing_grids
-from .sensor_folder import read_grade
+from .sensor_folder import read_grade, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
-from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Mounting, NavigationTrack
+from .track import Accuracy, Mounting, NavigationTrack
 
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
@@ -402,14 +402,7 @@ def _mounting(flight: Flight, keys: Keys) -> None:
         a, b, c = keys.numbers(key, 3, _ZERO)
         return a, b, c
 
-    metres = f"metres within {MOST_LEVER_ARM_M:g}; are they mm?"
-    for key, most, wanted in (
-        ("lever_arm_m", MOST_LEVER_ARM_M, metres),
-        ("camera_lever_arm_m", MOST_LEVER_ARM_M, metres),
-        ("boresight_deg", MOST_BORESIGHT_DEG, f"degrees within {MOST_BORESIGHT_DEG:g}"),
-    ):
-        if keys.has(key) and np.abs(keys.numbers(key, 3)).max() > most:
-            raise keys.refuse(key, wanted)
+    refuse_mounting(keys)
     flight.lever_arm_m = three("lever_arm_m")
     flight.mounting = Mounting(three("camera_lever_arm_m"), three("boresight_deg"))
 

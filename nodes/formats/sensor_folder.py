@@ -18,6 +18,7 @@ from ..convert import LATEST_S
 from ..errors import UserError
 from .keys import Keys, read_toml
 from .table import Column, Table, read_table
+from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M
 
 Array = NDArray[np.floating]
 
@@ -280,14 +281,22 @@ def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:
 
 
 def read_platform(path: Path, notes: list[str]) -> Platform:
-    """Read platform.toml; keys that it lacks have defaults, with a note where the default matters."""
+    """Read platform.toml; keys that it lacks have defaults, with a note where the default matters.
+
+    Raises
+    ------
+    UserError : not TOML, a value that no platform has
+    """
     if not path.is_file():
         notes.append(f"{path.name} is absent: a lever arm of zero and a MEMS unit are assumed")
         return Platform()
     keys = read_toml(path)
     zero = (0.0, 0.0, 0.0)
+    refuse_mounting(keys)
     arms = [keys.numbers(name, 3, zero) for name in ("lever_arm_m", "camera_lever_arm_m", "boresight_deg")]
-    sigma = keys.number("lever_arm_sigma_m", 0.0)
+    sigma = keys.number("lever_arm_sigma_m", 0.0, low=0.0)
+    if sigma > MOST_LEVER_ARM_M:
+        raise keys.refuse("lever_arm_sigma_m", f"metres up to {MOST_LEVER_ARM_M:g}; are they mm?")
     imu, initial, gnss = keys.table("imu"), keys.table("initial"), keys.table("gnss")
     wander = gnss.numbers("wander_sigma_m", 3, zero)
     wander_time_s = gnss.number("wander_time_s", 60.0, positive=True)
@@ -299,6 +308,18 @@ def read_platform(path: Path, notes: list[str]) -> Platform:
         notes.extend(f"{path.name}: key {name!r} is not known and was ignored" for name in table.unread())
     a, b, c, w = ((float(x), float(y), float(z)) for x, y, z in (*arms, wander))
     return Platform(a, b, c, sigma, grade, prior, w, wander_time_s)
+
+
+def refuse_mounting(keys: Keys) -> None:
+    """Raise UserError for a lever arm or a boresight in a table that no platform has."""
+    metres = f"metres within {MOST_LEVER_ARM_M:g}; are they mm?"
+    for key, most, wanted in (
+        ("lever_arm_m", MOST_LEVER_ARM_M, metres),
+        ("camera_lever_arm_m", MOST_LEVER_ARM_M, metres),
+        ("boresight_deg", MOST_BORESIGHT_DEG, f"degrees within {MOST_BORESIGHT_DEG:g}"),
+    ):
+        if keys.has(key) and np.abs(keys.numbers(key, 3)).max() > most:
+            raise keys.refuse(key, wanted)
 
 
 def read_grade(imu: Keys, notes: list[str], file: str, default_grade: InertialGrade | None = None) -> InertialGrade:

@@ -11,7 +11,7 @@ import pytest
 from triline.nodes.cli import main
 from triline.nodes.cli.navigate import COLUMNS
 from triline.nodes.errors import UserError
-from triline.nodes.formats.sensor_folder import read_sensor_folder
+from triline.nodes.formats.sensor_folder import read_platform, read_sensor_folder
 from triline.nodes.formats.sensor_recording import sensor_messages
 from triline.nodes.recording.reader import RecordingReader
 from triline.solver.geometry.frames import LocalFrame
@@ -170,6 +170,24 @@ def test_malformed_files_name_file_line_and_column(tmp_path):
         read_sensor_folder(folder)
     with pytest.raises(UserError, match="not a folder"):
         read_sensor_folder(folder / "imu.csv")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("lever_arm_m = [1e6, 0, 0]", r"lever_arm_m: \[1000000\.0, 0, 0\], wanted metres within 50; are they mm\?"),
+        ("camera_lever_arm_m = [0, -51, 0]", r"camera_lever_arm_m: \[0, -51, 0\], wanted metres within 50"),
+        ("boresight_deg = [0, 0, 1e4]", r"boresight_deg: \[0, 0, 10000\.0\], wanted degrees within 360"),
+        ("lever_arm_m = [nan, 0, 0]", r"lever_arm_m: \[nan, 0, 0\], wanted 3 numbers"),
+        ("boresight_deg = [0, inf, 0]", r"boresight_deg: \[0, inf, 0\], wanted 3 numbers"),
+        ("lever_arm_sigma_m = -1", r"lever_arm_sigma_m: -1, wanted a number of at least 0"),
+        ("lever_arm_sigma_m = 200", r"lever_arm_sigma_m: 200, wanted metres up to 50"),
+    ],
+)
+def test_mountings_that_no_platform_has_are_refused(tmp_path, line, words):
+    (tmp_path / "platform.toml").write_text(line + "\n")
+    with pytest.raises(UserError, match=rf"platform\.toml: {words}"):
+        read_platform(tmp_path / "platform.toml", [])
 
 
 def test_sigmas_of_zero_or_nan_are_named(tmp_path, capsys):
