@@ -17,7 +17,7 @@ from ..batch.rectification import true_relief
 from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
 from ..errors import UserError
 from ..formats.geotiff import write_heights
-from ..formats.new_file import new_file, refuse_unless_folder
+from ..formats.new_file import new_file, refuse_unless_free
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from ..simulator.flight_settings import (
     DEFAULT_EPOCH,
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--image-sigma, --control-sigma, --outliers and --images (of a recording) go with it",
     )
     satellite.add_argument(
-        "--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a folder, or NAME.mcap"
+        "--satellite", metavar="NAME", help=f"one of {', '.join(ORBITAL_SENSORS)}; -o is a new folder, or NAME.mcap"
     )
     satellite.add_argument(
         "--place",
@@ -153,7 +153,7 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
         for name in ("images", "compression"):
             if getattr(args, name) is not None:
                 raise UserError(f"{output}: --{name} goes with a recording, wanted a name that ends with .mcap")
-        refuse_unless_folder(output)
+        refuse_unless_free(output)
     keys = {"seed": "seed", "control": "control", "check": "check", "image_sigma": "image_sigma_px",
             "control_sigma": "control_sigma_m", "outliers": "outliers", "images": "images"}  # fmt: skip
     stated = {keys[name]: _single(given[name]) for name in goes if given[name] is not None}

@@ -34,6 +34,13 @@ def refuse_unless_folder(target: Path) -> None:
         raise UserError(f"{target}: cannot be written: no permission in {place}")
 
 
+def refuse_unless_free(target: Path) -> None:
+    """Raise UserError as `refuse_unless_folder`, and where the folder is there and has something in it."""
+    refuse_unless_folder(target)
+    if target.is_dir() and any(target.iterdir()):
+        raise UserError(f"{target}: is there already and is not empty, wanted a new folder")
+
+
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
     """A path to write to, which is renamed to ``target`` at the end, or deleted if something fails before.

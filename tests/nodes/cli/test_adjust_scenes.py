@@ -395,3 +395,16 @@ def test_options_that_do_not_go(options, match, made, capsys):
 def test_simulations_that_do_not_go(options, match, tmp_path, capsys):
     assert main(["simulate", "-o", str(tmp_path / "x"), *options]) == 1
     assert match in capsys.readouterr().err
+
+
+def test_a_simulation_does_not_write_over_what_is_in_a_folder(block, tmp_path, capsys):
+    before = {path: path.read_bytes() for path in block.rglob("*") if path.is_file()}
+    assert main(["simulate", "-q", "-o", str(block), "--satellite", "spot5-hrs", "--seed", "4"]) == 1
+    assert capsys.readouterr().err == (
+        f"triline simulate: {block}: is there already and is not empty, wanted a new folder\n"
+    )
+    assert {path: path.read_bytes() for path in block.rglob("*") if path.is_file()} == before
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert main(["simulate", "-q", "-o", str(empty), "--satellite", "spot5-hrs", "--points", "40"]) == 0
+    assert (empty / "project.toml").is_file()
