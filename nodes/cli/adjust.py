@@ -57,6 +57,7 @@ from ..terminal import drawing, plain
 from .adjust_scenes import run_scenes
 from .dem_options import add_dem_options, dem_settings
 from .locate import refraction_of
+from .outputs import refuse_folder_of_inputs
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --model dgr --then lim --fixes 12 --plots -o result
@@ -250,12 +251,6 @@ def read_input(path: Path) -> BlockData:
     reader = RecordingReader(path, by_ranges=True)
     block = block_from_messages(reader.messages(TOPICS), path.name)
     return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
-
-
-def refuse_folder_of_inputs(folder: Path) -> None:
-    """Raise UserError where a result would be written among the files of a block or of a flight, over its camera."""
-    if is_scene_block(folder) or is_block_folder(folder) or (folder / "flight.toml").is_file():
-        raise UserError(f"{folder}: has the files of a block or a flight, wanted another folder for the result")
 
 
 def refuse_worker_options(args: argparse.Namespace) -> None:

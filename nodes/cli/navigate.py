@@ -24,13 +24,17 @@ from ...solver.navigation.post_processing import (
     zero_velocities,
 )
 from ..errors import UserError
-from ..formats.new_file import refuse_unless_folder
+from ..formats.new_file import new_file, refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
 from ..formats.sensor_folder import SensorFolder, read_sensor_folder
 from ..recording.remote import RemotePath, path_of
+from .outputs import refuse_folder_of_inputs
 
 HELP = "GNSS/inertial filter and smoother over a recording or a sensor folder"
 EXAMPLE = "triline navigate flight_sensors/ -o navigation"
+
+#: What a run writes; those of an earlier run, which do not belong to it, are deleted before.
+TRAJECTORY, PAGE, RESULT = FILES = ("trajectory.csv", "navigation.html", "result.json")
 
 _VALUES = ("lat_deg", "lon_deg", "height_m", "vn_m_s", "ve_m_s", "vd_m_s", "roll_deg", "pitch_deg", "heading_deg")
 _SIGMAS = ("n_m", "e_m", "d_m", "vn_m_s", "ve_m_s", "vd_m_s", "roll_deg", "pitch_deg", "heading_deg")
@@ -67,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"{source}: results of a recording elsewhere need a folder here: -o DIR")
     out = Path(args.output) if args.output else default
     refuse_unless_folder(out)
+    refuse_folder_of_inputs(out)
     if source.is_dir():
         folder = read_sensor_folder(source, platform)
     else:
@@ -96,16 +101,21 @@ def run(args: argparse.Namespace) -> int:
     for note in notes:
         _say(quiet, f"note: {note}")
     out.mkdir(parents=True, exist_ok=True)
-    rows = write_trajectory(out / "trajectory.csv", stretches, inertial, folder, args.rate)
+    for name in FILES:  # of an earlier run
+        (out / name).unlink(missing_ok=True)
+    with new_file(out / TRAJECTORY) as part:
+        rows = write_trajectory(part, stretches, inertial, folder, args.rate)
     result = _result(folder, stretches, inertial, gnss, notes, held_out)
     result["rows"] = rows
     if not args.no_page:
         from ..report.navigation_page import write_page
 
-        write_page(out / "navigation.html", stretches, gnss, result)
+        with new_file(out / PAGE) as part:
+            write_page(part, stretches, gnss, result)
     result["seconds"] = round(time.perf_counter() - began, 3)
     text = json.dumps(result, indent=2)
-    (out / "result.json").write_text(text + "\n", encoding="utf-8")
+    with new_file(out / RESULT) as part:  # the last: where it is, all is there
+        part.write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
     else:
@@ -250,7 +260,7 @@ def _summary(result: dict[str, Any], out: Path) -> None:
         if "held_out" in s:
             h = s["held_out"]
             print(f"  held out: {h['n']} fixes, rms {_joined(h['rms_m'], 1.0, '.3f')} m")
-    print(f"{result['rows']} rows in {out / 'trajectory.csv'} ({result['seconds']:.1f} s)")
+    print(f"{result['rows']} rows in {out / TRAJECTORY} ({result['seconds']:.1f} s)")
 
 
 def _joined(values: list[float], factor: float, form: str) -> str:

@@ -34,6 +34,16 @@ def refuse_input_as_output(args: argparse.Namespace) -> None:
                 raise UserError(f"{output}: the output would overwrite the {name.replace('_', ' ')}")
 
 
+def refuse_folder_of_inputs(folder: Path) -> None:
+    """Raise UserError where a result would be written among the files of a block or of a flight, over some of them."""
+    # readers that only commands with folders of results need
+    from ..formats.block_folder import is_block_folder
+    from ..formats.scene_block import is_scene_block
+
+    if is_scene_block(folder) or is_block_folder(folder) or (folder / "flight.toml").is_file():
+        raise UserError(f"{folder}: has the files of a block or a flight, wanted another folder for the result")
+
+
 def _words(value: Any) -> Iterator[str]:
     """What may be the name of a file in the value of an option: itself, and the files in ``F=a.img@1,N=b.img``."""
     for one in value if isinstance(value, (list, tuple)) else (value,):

@@ -7,6 +7,7 @@ from pathlib import Path
 import inertial_flights as sim
 import numpy as np
 import pytest
+from full_disk import files_of_at_most
 
 from triline.nodes.cli import main
 from triline.nodes.cli.navigate import COLUMNS
@@ -95,6 +96,28 @@ def test_no_smooth_json_rate_and_hold_out(tmp_path, capsys):
     assert len(rows) == result["rows"] and np.allclose(np.diff(rows[:, 0]), 0.2)
     held = result["stretches"][0]["held_out"]
     assert held["n"] == 19 and max(held["rms_over_sigma"]) < 2.0
+
+
+def test_a_full_disk_leaves_no_half_file_and_none_of_an_earlier_run(tmp_path, capsys):
+    folder, out = write(tmp_path / "flight"), tmp_path / "out"
+    out.mkdir()
+    for name in ("notes.txt", "trajectory.csv", "navigation.html", "result.json"):
+        (out / name).write_text("earlier")
+    with files_of_at_most(1000):
+        assert main(["navigate", str(folder), "-o", str(out), "--no-smooth", "--no-page", "--no-checks"]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error == f"triline navigate: {out / 'trajectory.csv'}: cannot be written: file too large"
+    assert [path.name for path in out.iterdir()] == ["notes.txt"]
+
+
+def test_results_do_not_go_into_the_folder_of_a_block(tmp_path, capsys):
+    folder, block = write(tmp_path / "flight"), tmp_path / "block"
+    block.mkdir()
+    (block / "strips.csv").write_text("strip,first_line_time_s,line_rate_hz,lines\n")
+    (block / "trajectory.csv").write_text("of the block")
+    assert main(["navigate", str(folder), "-o", str(block)]) == 1
+    assert "has the files of a block or a flight, wanted another folder for the result" in capsys.readouterr().err
+    assert (block / "trajectory.csv").read_text() == "of the block"
 
 
 def test_gaps_are_filled_and_named(tmp_path, capsys):
