@@ -134,7 +134,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--refraction", nargs="*", type=float, metavar="VALUE", help="take the bending of rays in the air off: as in "
         "'triline locate'; behind the input",
     )  # fmt: skip
-    group.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
+    group.add_argument(
+        "--iterations", type=int, metavar="N",
+        help="steps of an adjustment, at most (30, and where they do not do as many again); the result counts those of "
+        "all: a second model, data snooping and sigmas that are estimated adjust anew",
+    )  # fmt: skip
     group = parser.add_argument_group("large blocks")
     group.add_argument(
         "--workers", type=int, metavar="N",

@@ -97,7 +97,7 @@ def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
             raise UserError(f"--{option} {value}, wanted 1 to {MOST_PIECES}")
     return SceneJob(
         model, args.then, given, args.selfcal, args.free, args.sets or "lens", args.snoop, args.critical,
-        args.iterations,
+        args.iterations or SceneJob.iterations,
     )  # fmt: skip
 
 

@@ -135,10 +135,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Settings:
-    """Of all runs: data snooping, and iterations at most."""
+    """Of all runs: data snooping, and iterations at most (None: as many as are usual)."""
 
     snoop: bool = False
-    iterations: int = 30
+    iterations: int | None = None
 
 
 class Block(Protocol):
@@ -295,7 +295,7 @@ class SceneBlock(_OfData[SceneBlockData]):
             data = replace(data, rpc={**data.rpc, "correction": c.correction})
         job = SceneJob(
             c.model or "dgr", c.then, _given(c), c.selfcal, sets=c.sets or "lens", snoop=settings.snoop,
-            iterations=settings.iterations,
+            iterations=settings.iterations or SceneJob.iterations,
         )  # fmt: skip
         a = run_scene_job(data, job)
         points, d = differences(a, "check")

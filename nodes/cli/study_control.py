@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--correction", nargs="+", choices=("shift", "affine"), help="satellites: of scenes with RPC (both)"
     )
     parser.add_argument("--snoop", action="store_true", help="data snooping in every run")
-    parser.add_argument("--iterations", type=int, default=30, metavar="N", help="at most (30)")
+    parser.add_argument("--iterations", type=int, metavar="N", help="of an adjustment, at most (30)")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes (one a core)")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one row a run")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture (PNG, SVG, PDF)")

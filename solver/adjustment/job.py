@@ -82,7 +82,9 @@ class Job:
     robust : weight function; with `snoop` it gives the start of the search only
     reweight : re-estimate the image sigma
     components : estimate the sigmas of image, control, position and attitude, and question those of constants
-    weights, max_iterations : see `AdjustmentOptions`
+    weights : see `AdjustmentOptions`
+    max_iterations : of each adjustment, and one that takes them all is not gone on with; None for as many as are usual,
+        which only guard against what does not converge
     platform : constant errors of the platform that are unknowns
     """
 
@@ -97,7 +99,7 @@ class Job:
     reweight: bool = False
     components: bool = False
     weights: str = "motion"
-    max_iterations: int = 30
+    max_iterations: int | None = None
     platform: PlatformErrors = NO_PLATFORM_ERRORS
 
     @property
@@ -108,7 +110,8 @@ class Job:
 
     @property
     def options(self) -> AdjustmentOptions:
-        return AdjustmentOptions(self.weights, self.max_iterations)
+        most = AdjustmentOptions.max_iterations if self.max_iterations is None else self.max_iterations
+        return AdjustmentOptions(self.weights, most)
 
     @property
     def on_the_way(self) -> AdjustmentOptions:
@@ -307,7 +310,7 @@ class _Stage:
             start = solve(problem, points, weight, replace(job.options, robust=Huber()), tell)
         self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
         self._read_surface()
-        if not before:
+        if not before and not self._cut_short:  # far from the solution residuals tell nothing of noise
             self._state_noise(network, model)
         if self.scales.factor["image"] != 1.0:
             self._keep(scaled(self.solution, {"image": self.scales.factor["image"]}, job.options))
@@ -333,7 +336,7 @@ class _Stage:
 
     def work(self, last: bool) -> None:
         """All steps after the first adjustment; elimination and variance components in the last stage only."""
-        job = self.job
+        job, first = self.job, self.solution
         if job.snoop:
             self._snoop_with_start()
         if job.reweight:
@@ -347,8 +350,16 @@ class _Stage:
                 self._snoop()
         if last and job.components:
             self._estimate_components()
+        if self.solution is first and self._cut_short:  # more steps would be more than were asked for
+            return
         self._keep(solve(self.solution.problem, self.solution, self.solution.ray_weight, job.options))
         self._read_surface()
+
+    @property
+    def _cut_short(self) -> bool:
+        """Whether a limit of steps that was asked for has ended the last adjustment before it arrived."""
+        most = self.job.max_iterations
+        return most is not None and not self.solution.converged and len(self.solution.history) >= most
 
     def _estimate_components(self) -> None:
         """Variance components; with data snooping in turn, until that of the image stays: what is left out depends on

@@ -146,6 +146,13 @@ def test_self_calibration_brings_sigma0_to_one_and_points_to_truth(tmp_path):
     assert len(parameters) == 18 and all(p["reason"] and p["value"] == 0 for p in gone)
 
 
+def test_no_more_steps_than_asked_for(folder, tmp_path):
+    assert adjust(folder, "--iterations", 1, "-q", "-o", tmp_path) == 0
+    result = result_in(tmp_path)
+    assert result["iterations"] == 1 and not result["converged"]
+    assert "not converged: the figures are those of the last step" in result["notes"]
+
+
 def test_result_files_have_what_the_interface_says(folder, tmp_path):
     assert adjust(folder, "--snoop", "--selfcal", "tls18", "-q", "-o", tmp_path) == 0
     result = result_in(tmp_path)
