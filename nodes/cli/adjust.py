@@ -116,9 +116,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--keep",
         choices=("significant", "all", "determinable"),
-        default="significant",
-        help="what the determinability tests do: keep a parameter that is significant though correlated (significant), "
-        "remove whatever fails a test (determinable), remove nothing (all)",
+        help="what the determinability tests of --selfcal do: keep a parameter that is significant though correlated "
+        "(significant, the default), remove whatever fails a test (determinable), remove nothing (all)",
     )
     group = parser.add_argument_group("observations")
     group.add_argument("--snoop", action="store_true", help="data snooping: test and leave out outliers")
@@ -182,6 +181,8 @@ def run(args: argparse.Namespace) -> int:
             raise UserError("--lever-arm-sigma does not go with satellite scenes")
         if args.camera is not None:
             raise UserError("--camera does not go with satellite scenes")
+        if args.keep is not None:
+            raise UserError("--keep does not go with satellite scenes: their parameters are not tested")
         if len(paths) > 1:
             raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
         if args.workers or args.scheduler:
@@ -196,6 +197,9 @@ def run(args: argparse.Namespace) -> int:
     args.selfcal = args.selfcal or (LEFT if questions else "none")
     if args.free and args.selfcal == "none":
         raise UserError("--free goes with additional parameters, wanted --selfcal")
+    if args.keep is not None and args.selfcal in ("none", LEFT):
+        tested = ", ".join(name for name in SELF_CALIBRATIONS if name != LEFT)
+        raise UserError(f"--keep goes with additional parameters that are tested, wanted --selfcal, one of {tested}")
     if args.clock_sigma is None:
         args.clock_sigma = USUAL_PLATFORM.clock_sigma_s if questions and len(paths) == 1 else 0.0
     recordings = [read_input(path) for path in paths]
@@ -344,7 +348,7 @@ def job_of(args: argparse.Namespace, block: BlockData) -> Job:
     """The job that the options ask for."""
     model = args.model or ("wander" if wanders(block.apriori.trajectory) else "dgr")
     first, second = models_of(block, model, args.then, {option: getattr(args, option) for option in OWNERS})
-    limits = Limits(keep_significant=args.keep == "significant")
+    limits = Limits(keep_significant=args.keep in (None, "significant"))
     robust = WEIGHT_FUNCTIONS[args.robust]() if args.robust else None
     return Job(
         first,

@@ -420,6 +420,15 @@ def refusal(capsys, *words):
     return lines[0]
 
 
+@pytest.mark.parametrize(
+    "options", [(), ("--selfcal", "none"), ("--selfcal", "calibrated"), ("--variance-components",)]
+)
+@pytest.mark.parametrize("keep", ["all", "significant"])
+def test_keep_is_refused_where_no_parameter_is_tested(folder, capsys, options, keep):
+    words = "--keep goes with additional parameters that are tested, wanted --selfcal, one of tls18, "
+    assert words in refusal(capsys, folder, "--keep", keep, *options)
+
+
 def test_refraction_is_taken_off(folder, tmp_path):
     """Seen through air, ground beside the flight line looks further away than it is; heights follow from that."""
     heights = []

@@ -373,6 +373,7 @@ def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys)
         (["--model", "wander"], "model wander: does not go with satellite scenes, wanted dgr, ppm, lim"),
         (["--segments", "3"], "--segments is for the model ppm; asked for is dgr"),
         (["--model", "ppm", "--segments", "500"], "--segments 500, wanted 1 to 60"),
+        (["--selfcal", "lens", "--keep", "all"], "--keep does not go with satellite scenes: their parameters are not"),
         (["--reweight"], "--reweight does not go with a block of satellite scenes"),
         (["--dem", "d.tif", "--dem-sigma", "1"], "--dem does not go with a block of satellite scenes"),
     ],
