@@ -48,7 +48,7 @@ def block_messages(block: BlockData, source: str = "import") -> Iterator[Message
 
 
 def not_carried(block: BlockData) -> list[str]:
-    """The parts of a block that messages cannot hold, a line each."""
+    """The parts of a block that messages cannot hold, and what they hold instead, a line each."""
     notes = []
     keys = [key for key in block.apriori.trajectory if key not in (*SIGMAS, *WANDER_TIMES)]
     keys += [f"then.{key}" for key in block.apriori.then]
@@ -60,7 +60,19 @@ def not_carried(block: BlockData) -> list[str]:
             rate = strip.line_rate_hz
             off = float(np.abs((strip.line_time_s - strip.line_time_s[0]) * rate - u).max())
             notes.append(f"strip {strip.id}: line times become a constant rate, off by {off:.2f} lines at most")
+        if not strip.lines:
+            notes.append(
+                f"strip {strip.id}: number of lines not known, taken as the {lines_of(strip)} under its trajectory"
+            )
     return notes
+
+
+def lines_of(strip: Strip) -> int:
+    """Number of lines of a strip; where it is not known, that of the lines that its trajectory goes on over."""
+    if strip.lines:
+        return strip.lines
+    last = (strip.trajectory.end_s - strip.first_line_time_s) * strip.line_rate_hz
+    return max(int(np.floor(last + 1e-6)) + 1, 0)  # the end may be the time of a line
 
 
 def strip_shifts(block: BlockData) -> NDArray[np.float64]:
@@ -175,7 +187,7 @@ def _pass_messages(block: BlockData, times: _Times, i: int, source: str) -> Iter
             id=strip.id,
             first_line_time_ns=first_line,
             line_rate_hz=strip.line_rate_hz,
-            lines=strip.lines,
+            lines=lines_of(strip),
             ended=ended,
         )
         yield Message("configuration/strip", stamp, body, source)

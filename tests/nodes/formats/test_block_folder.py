@@ -13,7 +13,7 @@ from small_block import FILES, simulated_block, write_files
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
-from triline.nodes.formats.block_messages import block_messages
+from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.formats.block_writer import write_block
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
@@ -241,6 +241,17 @@ def _lens_folder(tmp_path, own_orientation: bool):
         both = [row + ",L1" for row in rows[1:]] + [row.replace("1000.0", "1001.0") + ",L2" for row in rows[1:]]
         trajectory = "\n".join([rows[0] + ",lens", *both]) + "\n"
     return write_files(tmp_path, camera=json.dumps(camera), strips=strips, trajectory=trajectory)
+
+
+@pytest.mark.parametrize("lines", ["0", ""])
+def test_a_number_of_lines_that_is_not_known_is_that_under_the_trajectory(tmp_path, lines):
+    """An on-line adjustment took such a strip for one of ten minutes, and did not tie others to it."""
+    strips = FILES["strips.csv"].replace("2001", lines)
+    block = read_block(write_files(tmp_path, strips=strips))
+    assert block.strips[0].lines == 0
+    bodies = [m.body for m in block_messages(block) if m.topic == "configuration/strip"]
+    assert [body.lines for body in bodies] == [2201, 2201]  # 100 to 111 s, 200 a second
+    assert not_carried(block) == ["strip S1: number of lines not known, taken as the 2201 under its trajectory"]
 
 
 @pytest.mark.parametrize("own_orientation", [False, True])
