@@ -44,6 +44,8 @@ from .track import Accuracy, Mounting, NavigationTrack
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
 FAR_M = 50e3
+#: Images of a strip that are named where they are missing.
+MISSING_SHOWN = 3
 #: What `navigation.file` may be.
 NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
 #: Slow errors of positions by kind of GNSS solution, m: constant in a strip, and wandering (east, north, up), and the
@@ -558,9 +560,15 @@ def _strip(flight: Flight, keys: Keys) -> None:
     files = []
     for view in images.values:
         name, band = images.text(view), None
-        if "@" in name and not (flight.folder / name).exists():
+        if "@" in name and not is_there(flight.folder / name):
             name, _, band = name.rpartition("@")
-        files.append((view, _beside(flight, images, view, name), band))
+        files.append((view, name, band))
+    missing = [name for name in dict.fromkeys(name for _, name, _ in files) if not is_there(flight.folder / name)]
+    if len(missing) > 1:
+        shown = ", ".join(name[:200] for name in missing[:MISSING_SHOWN])
+        more = f" and {len(missing) - MISSING_SHOWN} more" if len(missing) > MISSING_SHOWN else ""
+        raise UserError(f"{keys.path}: {images.where}: {len(missing)} files are not in the folder: {shown}{more}")
+    files = [(view, _beside(flight, images, view, name), band) for view, name, band in files]
     times = _beside(flight, keys, "line_times", keys.text("line_times")) if keys.has("line_times") else None
     first = None
     if keys.has("first_time") or keys.has("line_rate_hz"):

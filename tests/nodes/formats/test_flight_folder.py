@@ -336,6 +336,19 @@ def test_what_is_wrong_is_said_once_and_nothing_else(folder, what):
     assert len(problems) == n and wanted in problems[0] and "\n" not in problems[0], problems
 
 
+def test_images_of_a_strip_that_are_missing_are_counted(folder):
+    for images, wanted in (
+        ("F = 'f.img', N = 'nadir.img', B = 'b.img'", "2 files are not in the folder: f.img, b.img"),
+        ("F = 'x.img@1', N = 'x.img@2', B = 'b.img'", "2 files are not in the folder: x.img, b.img"),
+        (
+            "F = '1.img', N = '2.img', B = '3.img', C = '4.img'",
+            "4 files are not in the folder: 1.img, 2.img, 3.img and 1 more",
+        ),
+    ):
+        (folder / "flight.toml").write_text(TOML.replace('N = "nadir.img"', images))
+        assert read_flight(folder).problems == [f"{folder / 'flight.toml'}: strips[1].images: {wanted}"]
+
+
 def test_zeros_say_that_nothing_wanders(folder):
     (folder / "flight.toml").write_text(TOML.replace("[trajectory]", "[trajectory]\nwander_sigma_m = [0, 0, 0]"))
     flight = read_flight(folder)
