@@ -37,8 +37,6 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     from ..report.page import page
     from ..report.source import read
 
-    if output.exists() and recording.samefile(output):
-        raise UserError(f"{output}: is the recording itself")
     try:
         with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work begins
             flight, held = read(recording)

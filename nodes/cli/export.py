@@ -42,6 +42,7 @@ from ..recording.access import Recording
 from ..recording.reader import RecordingReader
 from ..recording.summary import damage_lines
 from .damage import tell_damage
+from .outputs import refuse_input_as_output
 
 EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientation.csv
   triline export flight.mcap --points points.csv
@@ -106,6 +107,7 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) is not None and kind not in kinds:
             *flags, last = (f"--{other.replace('_', '-')}" for other in kinds)
             raise UserError(f"--{name}: wanted with {', '.join(flags)}{' and ' * bool(flags)}{last} only")
+    refuse_input_as_output(args, kind)
     path = Path(args.recording)
     if kind in ("points", "per_line"):
         return _run_table(path, args)
@@ -122,8 +124,6 @@ def run(args: argparse.Namespace) -> int:
         held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
         raise UserError(f"{path}: no message on {args.topic}; it holds {', '.join(held) or 'no known topic'}")
     target = Path(getattr(args, kind))
-    if target.exists() and target.samefile(path):
-        raise UserError(f"{target}: is the recording itself")
     with new_file(target) as part:
         count: dict[str, Any] = {**_WRITERS[kind](reader, args, part)}
     # read anew: what this reader skipped is counted once
@@ -151,8 +151,6 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     if args.topic is not None:
         raise UserError(f"--topic {args.topic}: does not go with --points and --per-line")
     target = Path(args.per_line if args.points is None else args.points)
-    if path.exists() and target.exists() and target.samefile(path):
-        raise UserError(f"{target}: is the recording itself")
     result: dict[str, Any] = {"recording": str(path), "file": str(target)}
     recording = Recording(path)
     reader = recording.reader
@@ -227,8 +225,7 @@ def _element_tables(reader: RecordingReader, args: argparse.Namespace, kind: str
     for field in () if args.rows else repeated_messages(topics.find(args.topic).type_name):
         if any(len(getattr(message.body, field)) for message in _messages(reader, args)):
             beside = target.with_name(f"{target.stem}_{field}{target.suffix}")
-            if beside.exists() and beside.samefile(reader.path):
-                raise UserError(f"{beside}: is the recording itself")
+            refuse_input_as_output(args, kind, beside)
             with new_file(beside) as part:
                 found[str(beside)] = _TABLES[kind](reader, args, part, ElementLayout(args.topic, field))["rows"]
     return found

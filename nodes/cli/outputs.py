@@ -23,13 +23,19 @@ def refuse_empty_words(argv: list[str]) -> None:
             raise UserError(f"{option} '': wanted a name")
 
 
-def refuse_input_as_output(args: argparse.Namespace) -> None:
-    """Raise UserError where the file that a command is to write is one of those that it reads."""
-    output = getattr(args, "output", None)
+def refuse_input_as_output(args: argparse.Namespace, option: str = "output", file: Path | None = None) -> None:
+    """Raise UserError where the file that a command is to write is one of those that it reads.
+
+    Parameters
+    ----------
+    option : that names what is written, as an attribute; the others may name what is read
+    file : that is written where it is not the one that the option names, but beside it
+    """
+    output = file or getattr(args, option, None)
     if not output or not os.path.isfile(output):
         return
     for name, value in vars(args).items():
-        for word in _words(value) if name != "output" else ():
+        for word in _words(value) if name != option else ():
             if os.path.isfile(word) and os.path.samefile(word, output):
                 raise UserError(f"{output}: the output would overwrite the {name.replace('_', ' ')}")
 

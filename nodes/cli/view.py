@@ -13,6 +13,7 @@ from pathlib import Path
 from ..errors import UserError
 from .bus_options import add_bus_arguments, bus_of, reporter
 from .damage import tell_damage
+from .outputs import refuse_input_as_output
 
 EXAMPLE = """triline view flight.mcap --web
   triline view --fleet --secure survey/ann      # all aircraft in the air: docs/fleet.md"""
@@ -37,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
         return _fleet(args)
     if len(args.recording) != 1:
         raise UserError(f"{len(args.recording)} recordings, wanted one (--fleet shows several)")
+    mode = _mode(args)
     args.recording = args.recording[0]
     from ..recording.reader import RecordingReader
 
@@ -45,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
     from ..viewer.scene import TOPICS, TRUTH_TOPICS
 
     messages = reader.sorted_messages((*TOPICS, *TRUTH_TOPICS))
-    mode = _mode(args, [args.recording])
     signal.signal(signal.SIGTERM, _stop)
     canvas = open_canvas(mode)
     process = canvas.process if isinstance(canvas, RerunCanvas) else None
@@ -65,15 +66,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mode(args: argparse.Namespace, recordings: list[Path]) -> str:
+def _mode(args: argparse.Namespace) -> str:
     """Mode of the canvas.
 
     Raises
     ------
     UserError : the file to write is one of the recordings
     """
-    if args.rrd is not None and args.rrd.exists() and any(args.rrd.samefile(path) for path in recordings):
-        raise UserError(f"{args.rrd}: is the recording itself")
+    refuse_input_as_output(args, "rrd")
     return f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"
 
 
@@ -81,7 +81,7 @@ def _fleet(args: argparse.Namespace) -> int:
     """All aircraft of some recordings, or of those in the air until interrupted."""
     if args.platform is not None:
         raise UserError("--fleet and --platform: wanted one of them")
-    mode = _mode(args, args.recording)
+    mode = _mode(args)
     from ..bus.program import stop_on_signals
     from ..viewer import fleet_live
     from ..viewer.rerun_canvas import RerunCanvas, open_canvas

@@ -181,6 +181,11 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
         ("rectify", path, "--trajectory", other, "-o", other),
         ("locate", path, "--pixels", other, "-o", other),
         ("simulate", "--motion", other, "-o", other),
+        ("analyze", other, "-o", other),
+        ("export", other, "--topic", "sensor/gnss", "--csv", other),
+        ("export", other, "--points", other),
+        ("view", other, "--rrd", other),
+        ("view", path, other, "--fleet", "--rrd", other),
     ):
         code, _, err = run_main(capsys, *arguments)
         assert code == 1 and "the output would overwrite the" in err, (arguments, err)

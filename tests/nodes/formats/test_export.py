@@ -115,6 +115,14 @@ def test_a_full_disk_is_told_with_the_file_and_leaves_nothing(recording, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+def test_a_table_beside_the_target_does_not_go_over_the_recording(recording, tmp_path, capsys):
+    flight = tmp_path / "o_residuals.csv"  # any name may be that of a recording
+    flight.write_bytes(recording.read_bytes())
+    assert main(["export", str(flight), "--topic", "point/object", "--csv", str(tmp_path / "o.csv")]) == 1
+    assert f"{flight}: the output would overwrite the recording" in capsys.readouterr().err
+    assert flight.read_bytes() == recording.read_bytes()
+
+
 def test_elements_of_a_repeated_message_go_to_a_file_of_their_own(recording, tmp_path, capsys):
     table = _csv(recording, tmp_path, "point/object")
     assert table["point"].tolist() == ["P1", "P1", "P2"] and table["residuals.count"].tolist() == [2, 2, 0]
