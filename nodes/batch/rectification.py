@@ -96,7 +96,7 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
         missing = ORIENTATIONS[name].rstrip("/") if measured or name == "measured" else "trajectory"
         raise UserError(f"{path}: no {name} orientation ({missing}): {has}; 'triline process' makes it")
     if name == "truth":
-        base = _sorted(recording.poses("truth/trajectory"))
+        base = recording.poses("truth/trajectory").one_a_time()
     else:
         base = _measured(recording, held, smoothed=name != "live")
     reference_ns = int(base.time_ns[0])
@@ -104,7 +104,8 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
     orientation = LineOrientation((base.time_ns - reference_ns) * 1e-9, base.position_l, base.quaternion, gap_s)
     stated = base
     if name in REFINED:
-        refined = recording.poses(ORIENTATIONS[name])
+        # whole strips come again when the block is refined with later ones; live is the first answer
+        refined = recording.poses(ORIENTATIONS[name]).one_a_time(keep_first=name == "live")
         if name == "whole" and "orientation/final" in held:  # of a strip whose backward pass is missing
             refined = _with_final(recording, refined)
         try:
@@ -124,10 +125,10 @@ def _measured(recording: Recording, held: set[str], smoothed: bool) -> PoseTable
     best = "trajectory/smoothed" if smoothed else "trajectory/filtered"
     other = "trajectory/filtered" if smoothed else "trajectory/smoothed"
     if best not in held:
-        return _sorted(recording.poses(other))
-    poses = _sorted(recording.poses(best))
+        return recording.poses(other).one_a_time()
+    poses = recording.poses(best).one_a_time()
     if smoothed and other in held:
-        more = _sorted(recording.poses(other))
+        more = recording.poses(other).one_a_time()
         poses = _joined(poses, more, (more.time_ns < poses.time_ns[0]) | (more.time_ns > poses.time_ns[-1]))
     return poses
 
@@ -135,17 +136,12 @@ def _measured(recording: Recording, held: set[str], smoothed: bool) -> PoseTable
 def _with_final(recording: Recording, whole: PoseTable) -> PoseTable:
     """Poses of whole strips, and the final ones of strips that have none."""
     final = recording.poses("orientation/final")
-    return _joined(_sorted(whole), final, ~np.isin(final.strip, whole.strip))
-
-
-def _sorted(poses: PoseTable) -> PoseTable:
-    _, first = np.unique(poses.time_ns, return_index=True)
-    return PoseTable(*(values[first] for values in vars(poses).values()))
+    return _joined(whole, final, ~np.isin(final.strip, whole.strip))
 
 
 def _joined(one: PoseTable, other: PoseTable, which: NDArray[np.bool_]) -> PoseTable:
     pairs = zip(vars(one).values(), vars(other).values(), strict=True)
-    return _sorted(PoseTable(*(np.concatenate([a, b[which]]) for a, b in pairs)))
+    return PoseTable(*(np.concatenate([a, b[which]]) for a, b in pairs)).one_a_time()
 
 
 def estimated_camera(recording: Recording, camera: LineCamera) -> tuple[LineCamera, int]:
@@ -202,8 +198,7 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
     strips = recording.last_strips()
     if not strips:
         raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
-    topic = ORIENTATIONS[name]
-    poses = None if topic.endswith("/") else _sorted(recording.poses(topic))
+    stated = name in REFINED and orientation.has_covariance
 
     def parts() -> Iterator[OrientedLines]:
         for strip in strips.values():
@@ -214,10 +209,8 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
                 continue
             position, R = orientation.at(time_s[known])
             sigma = np.full((len(known), 6), np.nan)
-            if poses is not None:
-                stated = np.sqrt(np.einsum("nii->ni", poses.covariance))
-                nearest = np.clip(np.searchsorted(poses.time_ns, stamps[known]), 0, len(stated) - 1)
-                sigma = stated[nearest]
+            if stated:
+                sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance_at(time_s[known])))
             yield OrientedLines(strip.id, known, stamps[known], position, R, sigma)
 
     return name, parts()

@@ -29,7 +29,7 @@ from ..batch.rectification import (
 from ..convert import R_bc_of, local_frame, pose_sample
 from ..errors import UserError
 from ..formats.camera_json import write_camera
-from ..formats.features import features_of
+from ..formats.features import answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
 from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
@@ -96,7 +96,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rows", metavar="FIELD",
         help="one table, with a row for each element of this repeated sub-message ('none': a row for each message)",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, metavar="N", help="take every N-th message (default 1)")
+    parser.add_argument(
+        "--every",
+        type=int,
+        metavar="N",
+        help="take every N-th message, on maps and as SBET every N-th time or point (default 1)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -203,6 +208,11 @@ def _messages(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Mes
     return islice(reader.sorted_messages([args.topic]), 0, None, args.every)
 
 
+def _answers(reader: RecordingReader, args: argparse.Namespace) -> list[Message]:
+    """Every N-th of the messages that no other one about the same time or point replaces."""
+    return answers(args.topic, reader.sorted_messages([args.topic]))[:: args.every]
+
+
 def _layout(args: argparse.Namespace) -> RowLayout:
     try:
         return RowLayout(args.topic, None if args.rows in (None, "none") else args.rows)
@@ -269,12 +279,12 @@ def _project_and_frame(reader: RecordingReader) -> tuple[Any, LocalFrame | None]
 
 
 def _write_geojson(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    features = features_of(args.topic, _messages(reader, args), _project_and_frame(reader)[1])
+    features = features_of(args.topic, _answers(reader, args), _project_and_frame(reader)[1])
     return {"features": write_geojson(target, features)}
 
 
 def _write_gpkg(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    features = features_of(args.topic, _messages(reader, args), _project_and_frame(reader)[1])
+    features = features_of(args.topic, _answers(reader, args), _project_and_frame(reader)[1])
     return {"features": write_geopackage(target, args.topic, features)}
 
 
@@ -289,17 +299,17 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
             f"{reader.path}: no message on configuration/project: the place of the local frame is not known"
         )
     samples = []
-    for message in _messages(reader, args):
+    for message in _answers(reader, args):
         try:
             samples.append(pose_sample(message.body))
         except ValueError as error:
             reader.problems["malformed"] += 1
             reader.last_problem = str(error)
-    time_ns, first = np.unique(np.array([sample.time_ns for sample in samples], dtype=np.int64), return_index=True)
-    if len(time_ns) < 2:
-        raise UserError(f"{reader.path}: {len(time_ns)} poses on {args.topic}, wanted at least 2")
-    position = np.array([samples[i].position_l for i in first])
-    quaternion = np.array([samples[i].quaternion for i in first])
+    if len(samples) < 2:
+        raise UserError(f"{reader.path}: {len(samples)} poses on {args.topic}, wanted at least 2")
+    time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    position = np.array([sample.position_l for sample in samples])
+    quaternion = np.array([sample.quaternion for sample in samples])
     seconds = (time_ns - time_ns[0]) * 1e-9
     velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
     write_sbet_poses(target, time_ns, position, matrix_from_quaternion(quaternion), velocity_l, frame, R_bc_of(project))

@@ -38,10 +38,11 @@ class Features:
 def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | None) -> Features:
     """Features of a topic with places: poses, object points, ground points, GNSS fixes.
 
-    Of several messages about one point the last counts. Poses are joined to one line a strip.
+    Poses are joined to one line a strip.
 
     Parameters
     ----------
+    messages : of which none replaces another one, see `answers`
     frame : of the project; GNSS fixes do without
 
     Raises
@@ -56,6 +57,27 @@ def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | Non
     if frame is None:
         raise UserError("no message on configuration/project: the place of the local frame is not known")
     return _poses(topic, messages, frame) if kind == "foxglove.PoseInFrame" else _points(topic, messages, frame)
+
+
+def answers(topic: str, messages: Iterable[Message]) -> list[Message]:
+    """Poses in order of time, and points, each as the last message about it has it; other messages as they are.
+
+    Of live orientation the first one about a time counts, which is the answer that was given at once.
+    """
+    kind = topics.find(topic).type_name
+    found: dict[int | str, Message] = {}
+    if kind == "foxglove.PoseInFrame":
+        for message in messages:
+            time = message.body.timestamp
+            time_ns = time.seconds * SECOND_NS + time.nanos
+            if topic != "orientation/live" or time_ns not in found:
+                found[time_ns] = message
+        return [found[time_ns] for time_ns in sorted(found)]
+    if kind in ("triline.ObjectPoint", "triline.GroundPoint"):
+        for message in messages:
+            found[message.body.point] = message
+        return list(found.values())
+    return list(messages)
 
 
 def topics_with_places() -> tuple[str, ...]:
@@ -87,7 +109,6 @@ def _sigmas(covariances: list[Any], size: int, names: tuple[str, ...]) -> dict[s
 def _poses(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Features:
     bodies = [message.body for message in messages]
     _needed(topic, bodies)
-    bodies.sort(key=lambda body: (body.timestamp.seconds, body.timestamp.nanos))
     place = [body.pose.position for body in bodies]
     properties: dict[str, list[Any]] = {
         "time_ns": [body.timestamp.seconds * SECOND_NS + body.timestamp.nanos for body in bodies],
@@ -109,10 +130,7 @@ def _poses(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Featur
 
 
 def _points(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Features:
-    newest: dict[str, Any] = {}
-    for message in messages:
-        newest[message.body.point] = message.body
-    bodies = list(newest.values())
+    bodies = [message.body for message in messages]
     _needed(topic, bodies)
     properties: dict[str, list[Any]] = {"point": [body.point for body in bodies]}
     if bodies[0].DESCRIPTOR.full_name == "triline.ObjectPoint":

@@ -54,6 +54,13 @@ class PoseTable:
     valid: NDArray[np.bool_]
     strip: NDArray[Any]
 
+    def one_a_time(self, keep_first: bool = False) -> PoseTable:
+        """Rows in order of time: of several about one time the last, which replaces the others, or the first."""
+        time = self.time_ns if keep_first else self.time_ns[::-1]
+        rows = np.unique(time, return_index=True)[1]
+        rows = rows if keep_first else len(time) - 1 - rows
+        return PoseTable(*(values[rows] for values in vars(self).values()))
+
 
 class Recording:
     """A recording, opened for reading.

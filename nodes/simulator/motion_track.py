@@ -68,9 +68,8 @@ def _of_recording(recording: Recording, held: set[str]) -> NavigationTrack:
     project = recording.reader.first("configuration/project")
     assert project is not None
     frame = convert.local_frame(project)
-    poses = recording.poses(topic)
-    _, rows = np.unique(poses.time_ns, return_index=True)
-    rows = rows[poses.valid[rows]]
+    poses = recording.poses(topic).one_a_time()
+    rows = np.flatnonzero(poses.valid)
     if len(rows) < 2:
         raise UserError(f"{path}: {len(rows)} valid poses on {topic}, wanted at least 2")
     position = poses.position_l[rows]

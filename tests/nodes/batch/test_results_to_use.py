@@ -163,6 +163,37 @@ def oriented(tmp_path_factory):
     return folder / "oriented.mcap", pd.read_csv(folder / "lines.csv")
 
 
+def test_lines_have_the_last_whole_orientation(oriented, tmp_path):
+    """The first strip is refined again with the second one."""
+    path, lines = oriented
+    recording = Recording(path)
+    topic = "orientation/whole"
+    poses = recording.poses(topic)
+    count = len(poses.time_ns)
+    last = poses.one_a_time()
+    assert len(last.time_ns) * 2 == count and (np.diff(last.time_ns) > 0).all()
+    assert np.abs(last.position_l - poses.one_a_time(keep_first=True).position_l).max() > 0.01
+    for strip in ("S1", "S2"):
+        own = lines[lines.strip == strip]
+        known = last.strip == strip
+        found = np.interp(last.time_ns[known] * 1e-9 - 1.7e9, own.time_s - 1.7e9, own.Z_m)
+        assert found == pytest.approx(last.position_l[known, 2], abs=2e-3)
+
+
+def test_lines_of_a_strip_without_whole_orientation_have_the_sigmas_of_the_final_one(oriented, tmp_path):
+    path, _ = oriented
+    cut, out = tmp_path / "cut.mcap", tmp_path / "lines.csv"
+    with RecordingWriter(cut) as writer:
+        for message in Recording(path).messages():
+            if message.topic != "orientation/whole" or message.body.strip != "S2":
+                writer.write(message)
+    assert main(["export", str(cut), "--per-line", str(out), "-q"]) == 0
+    lines, final = pd.read_csv(out), Recording(path).poses("orientation/final")
+    own, known = lines[lines.strip == "S2"], final.strip == "S2"
+    found = np.interp(final.time_ns[known] * 1e-9 - 1.7e9, own.time_s - 1.7e9, own.sigma_Z_m)
+    assert found == pytest.approx(np.sqrt(final.covariance[known, 2, 2]), rel=0.01)
+
+
 def test_lines_as_patb_are_those_of_the_csv(oriented, tmp_path, capsys):
     recording, lines = oriented
     out = tmp_path / "lines.ori"

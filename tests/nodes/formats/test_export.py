@@ -265,6 +265,35 @@ def test_object_points_count_once_with_their_last_state(recording, tmp_path):
     assert features[0]["geometry"]["coordinates"][2] == pytest.approx(wanted[2], abs=1e-3)
 
 
+@pytest.fixture(scope="module")
+def refined_twice(tmp_path_factory):
+    """Strip S1, and strip S1 again, a metre higher, with S2."""
+    messages = [_project()]
+    for k, (strip, z) in enumerate((("S1", 1000.0), ("S1", 1001.0), ("S2", 1001.0))):
+        for i in range(5):
+            t = START + (i + 10 * (strip == "S2")) * 10**8
+            stamp = START + 10**10 * (1 + (k > 0)) + 10 * k + i
+            pose = pose_message(t, [10.0 * i, 5.0, z], [0.0, 0.0, 0.0], np.eye(6), strip=strip)
+            messages.append(Message("orientation/whole", stamp, pose, "adjuster"))
+    return write_recording(tmp_path_factory.mktemp("twice") / "flight.mcap", messages)
+
+
+def test_what_is_refined_again_takes_the_place_of_what_was_said_before(refined_twice, tmp_path, capsys):
+    target = tmp_path / "o.geojson"
+    words = ["export", str(refined_twice), "--topic", "orientation/whole"]
+    assert main([*words, "--geojson", str(target)]) == 0
+    assert "12 features" in capsys.readouterr().out
+    features = json.loads(target.read_text())["features"]
+    lines = [f for f in features if f["geometry"]["type"] == "LineString"]
+    assert {f["properties"]["line"]: len(f["geometry"]["coordinates"]) for f in lines} == {"S1": 5, "S2": 5}
+    heights = [place[2] for f in lines for place in f["geometry"]["coordinates"]]
+    assert heights == pytest.approx([1001.0] * 10, abs=0.01)
+    assert main([*words, "--sbet", str(tmp_path / "o.sbet"), "--every", "2"]) == 0
+    records = np.fromfile(tmp_path / "o.sbet", "<f8").reshape(-1, 17)
+    assert records[:, 3] == pytest.approx([1001.0] * 5, abs=0.01)
+    assert np.diff(records[:, 0]) == pytest.approx([0.2, 0.2, 0.7, 0.2], abs=1e-6)
+
+
 def _geometry(blob: bytes) -> tuple[int, np.ndarray]:
     """WKB type and coordinates of a GeoPackage geometry."""
     magic, version, flags, srs = struct.unpack_from("<2sBBi", blob)
