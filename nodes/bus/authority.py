@@ -32,7 +32,7 @@ AIRCRAFT, DESK, ROUTER = "aircraft", "desk", "router"
 #: Port on which a secure platform meets.
 SECURE_PORT = 7447
 #: How long certificates hold: of the authority, and of others unless another time is asked for, days.
-AUTHORITY_DAYS, DAYS = 3650, 730
+AUTHORITY_DAYS, DAYS, LONGEST_DAYS = 3650, 730, 36500
 #: Files of a bundle and of an authority.
 KEY, CERTIFICATE, AUTHORITY, CONFIGURATION, FACTS = (
     "key.pem", "certificate.pem", "authority.pem", "zenoh.json5", "bundle.json",
@@ -168,9 +168,16 @@ class Authority:
 
         Raises
         ------
-        UserError : a name that is taken or cannot be one, a router without an address, or hosts and routers of a desk
+        UserError : a name that is taken or cannot be one, a router without an address, hosts and routers of a desk,
+            or a host, port or time that cannot be
         """
         _named(name)
+        for host in hosts:
+            _check_host(host)
+        if not 0 < port < 65536:
+            raise UserError(f"--port {port}: wanted 1 to 65535")
+        if not 1 <= days <= LONGEST_DAYS:
+            raise UserError(f"--days {days}: wanted 1 to {LONGEST_DAYS}")
         called = [_host_and_port(router) for router in routers or []]
         if kind == ROUTER and not hosts:
             raise UserError(f"{name}: wanted --host, the address at which the router listens")
@@ -436,6 +443,15 @@ def _alternative(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
+
+
+def _check_host(host: str) -> None:
+    """Raise UserError for what is neither an address nor a host name."""
+    if not re.fullmatch(r"[A-Za-z0-9._-]+", host):
+        try:
+            ipaddress.ip_address(host)
+        except ValueError:
+            raise UserError(f"--host {host!r}: wanted an address or the name of a host, without a port") from None
 
 
 def _host_and_port(router: str) -> str:

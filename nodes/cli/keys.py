@@ -58,10 +58,6 @@ def run(args: argparse.Namespace) -> int:
             result = {"revoked": args.name, "copy": [str(authority.folder / member.name) for member in others]}
             text = f"{args.name} is revoked" + _copy(authority.folder, [member.name for member in others])
         else:
-            if args.days < 1:
-                from ..errors import UserError
-
-                raise UserError(f"--days {args.days}: wanted 1 or more")
             bundle = authority.certify(args.name, args.action, args.host, args.port, args.days, routers=args.router)
             others = [member.name for member in authority.valid if member.name != args.name]
             result = {"bundle": str(bundle), "copy": [str(authority.folder / name) for name in others]}

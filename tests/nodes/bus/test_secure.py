@@ -54,6 +54,11 @@ def test_keys_makes_bundles_lists_and_revokes(tmp_path, capsys):
         (("new", folder), "is an authority already"),
         (("aircraft", "aircraft1", "--authority", folder), "this name is taken"),
         (("aircraft", "a/b", "--authority", folder), "wanted a name"),
+        (("aircraft", "a2", "--authority", folder, "--host", "not a host"), "--host 'not a host': wanted an address"),
+        (("router", "r2", "--authority", folder, "--host", "10.77.0.1:7450"), "wanted an address"),
+        (("aircraft", "a2", "--authority", folder, "--port", "99999"), "--port 99999: wanted 1 to 65535"),
+        (("aircraft", "a2", "--authority", folder, "--days", "0"), "--days 0: wanted 1 to 36500"),
+        (("aircraft", "a2", "--authority", folder, "--days", "99999999"), "wanted 1 to 36500"),
         (("revoke", "bob", "--authority", folder), "is not certified"),
         (("list", "--authority", tmp_path), "no authority"),
     ):
