@@ -11,6 +11,7 @@ from bus_rig import free_port, triline, wait_for
 
 from triline.nodes.bus.live import BusRunner, in_thread
 from triline.nodes.bus.session import Bus
+from triline.nodes.cli import confirm, main
 from triline.nodes.monitor.monitor import Monitor
 from triline.nodes.node import Message, Node
 from triline.schemas.envelope import Envelope, RawMessage
@@ -93,6 +94,28 @@ def test_a_source_that_nobody_heard_is_not_chosen():
         flight.join()
     assert done.returncode == 1
     assert "--source reciever: does not speak on sensor/attitude; heard receiver" in done.stderr
+
+
+def test_a_verdict_beside_a_recorder_says_that_no_data_come(monkeypatch, capsys):
+    monkeypatch.setattr(confirm, "ANSWER_S", 0.5)
+    monkeypatch.setattr(confirm, "LISTEN_S", 0.2)
+    port, stop = free_port(), threading.Event()
+    newest = [sample.EPOCH_NS]
+    with Bus(port=port, source="recorder") as bus:
+        bus.subscribe("observation/verdict", lambda raw: newest.append(raw.envelope.stamp_ns))
+
+        def report() -> None:
+            while not stop.wait(0.05):
+                status = sample.message("status/recorder")
+                bus.publish(Message(status.topic, max(newest), status.body, "recorder"))
+
+        reporting = threading.Thread(target=report, daemon=True)
+        reporting.start()
+        code = main(["confirm", "GCP1", "--port", str(port)])
+        stop.set()
+        reporting.join()
+    assert len(newest) == 2 and code == 1
+    assert "GCP1: the verdict was sent, but no data come; it counts when they do" in capsys.readouterr().err
 
 
 def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
