@@ -49,8 +49,7 @@ def integrity(flight: Flight) -> dict[str, Any] | None:
     lit = _lit(flight)
     if not lit:
         return None
-    told = [stamp for stamp, r in flight.reports if r.light]
-    lasting = _lasting(told, [stamp for stamp, _ in lit], _longest_s(flight))
+    lasting = _lasting(flight, lit)
     total = sum(lasting)
     share = {light: 0.0 for light in LIGHTS}
     reasons: dict[tuple[str, str], dict[str, Any]] = {}
@@ -82,10 +81,12 @@ def _lit(flight: Flight) -> list[tuple[int, Any]]:
     return [row for row, on in zip(flight.reports, flying, strict=True) if on and row[1].light and row[1].strip]
 
 
-def _lasting(all_ns: list[int], lit_ns: list[int], longest_s: float) -> list[float]:
-    """Time until the next report, s, for each report with a light."""
-    following = dict(pairwise(all_ns))
-    return [min((following.get(ns, ns) - ns) / convert.SECOND_NS, longest_s) for ns in lit_ns]
+def _lasting(flight: Flight, lit: list[tuple[int, Any]]) -> list[float]:
+    """Time until the next report or the end of the strip, s, for each report with a light."""
+    following, longest_s = dict(pairwise(stamp for stamp, r in flight.reports if r.light)), _longest_s(flight)
+    ends = {id: span[1] for id in flight.strips if (span := flight.strip_times(id)) is not None}
+    until = [min(following.get(ns, ns), max(ends.get(r.strip, ns), ns)) for ns, r in lit]
+    return [min((end - ns) / convert.SECOND_NS, longest_s) for (ns, _), end in zip(lit, until, strict=True)]
 
 
 def _longest_s(flight: Flight) -> float:
@@ -175,10 +176,15 @@ def protection_figure(flight: Flight) -> Figure | None:
 
 
 def _lights(flight: Flight) -> tuple[Array, Array]:
-    """Time (n,) s and the light (n,), place in LIGHTS or -1, of reports on strips."""
+    """Time (n,) s and the light (n,) from then on, place in LIGHTS or -1 for none: reports on strips, and where the
+    last of several ceases to count."""
     lit = _lit(flight)
     code = np.array([LIGHTS.index(r.light) if r.light in LIGHTS else -1 for _, r in lit], dtype=float)
-    return np.atleast_1d(flight.seconds(np.array([stamp for stamp, _ in lit], dtype=np.int64))), code
+    time_s = np.atleast_1d(flight.seconds(np.array([stamp for stamp, _ in lit], dtype=np.int64)))
+    ends = time_s + _lasting(flight, lit)
+    last = np.append(time_s[1:] > ends[:-1] + 1e-6, True)
+    places = np.flatnonzero(last) + 1
+    return np.insert(time_s, places, ends[last]), np.insert(code, places, -1.0)
 
 
 def _shade(ax: Axes, axis: StripTime, time_s: Array, code: Array, longest_s: float) -> None:

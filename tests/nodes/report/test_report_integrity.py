@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from types import SimpleNamespace
 
@@ -116,6 +117,15 @@ def test_reports_that_are_as_far_apart_as_the_pace_for_throughput_makes_them(mes
     assert len(flight.reports) == 3 and said["seconds"] == pytest.approx(20.0, abs=0.1)
     drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines()}
     assert np.isfinite(drawn["protection level"]).all() and len(drawn["protection level"]) == 3
+    # the table and the background end with the strip, not with the last report on it or the next one
+    start = (min(stamp for stamp, _ in flight.reports) - flight.start_ns) / convert.SECOND_NS
+    flight.strips["S1"] = copy.deepcopy(flight.strips["S1"])
+    flight.strips["S1"].lines = int(flight.strips["S1"].line_rate_hz * (start + 17.0 - 2.0)) + 1
+    said, figure = integrity(flight), protection_figure(flight)
+    assert said is not None and figure is not None and said["seconds"] == pytest.approx(17.0, abs=0.1)
+    shades = [patch.get_extents() for kind in figure.axes[0].collections for patch in kind.get_paths()]
+    assert min(box.x0 for box in shades) == pytest.approx(start, abs=0.1)
+    assert max(box.x1 for box in shades) == pytest.approx(start + 17.0, abs=0.1)
 
 
 def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path):
