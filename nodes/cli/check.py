@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 
@@ -127,6 +128,6 @@ def _check_block(args: argparse.Namespace) -> int:
             print(f"  note: {note}")
         print(
             f"{folder}: complete; {n} {what}{'s' * (n != 1)}, {len(rays)} image points, {len(ground)} ground points; "
-            f"`triline adjust {folder}` adjusts them"
+            f"`triline adjust {shlex.quote(str(folder))}` adjusts them"
         )
     return 0

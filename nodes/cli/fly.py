@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import threading
 import time
 from datetime import UTC, datetime
@@ -250,7 +251,7 @@ class Fly(LiveFlight):
         return lines + [f"never seen: {name}" for name in result["never_seen"]]
 
     def settings_again(self) -> str:
-        return f" --config {self.flight.folder / FILE}"
+        return f" --config {shlex.quote(str(self.flight.folder / FILE))}"
 
 
 def _nodes(text: str) -> tuple[str, ...]:

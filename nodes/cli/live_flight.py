@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import signal
 import socket
 import sys
@@ -197,6 +198,8 @@ class LiveFlight:
                     del group.processes["viewer"]
                     continue
                 self.restarts += 1
+                if self.watch is not None:
+                    self.watch.tell(f"{dead.name} has ended, and is started again")
                 recorder = dead.name == "recorder"
                 group.start(
                     dead.name, *(("-o", str(self._next_recording())) if recorder else self.node_arguments(dead.name))
@@ -315,16 +318,17 @@ class LiveFlight:
             lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
         if self.restarts:
             lines.append(f"{self.restarts} nodes were started again")
+        if others := [path for path in result["recordings"] if path != str(self.recording)]:
+            lines.append(f"this page is of the largest recording alone; the flight goes on in {', '.join(others)}")
         lines += ["", f"recording  {self.recording}"]
         lines += [f"report     {result['report']}"] if "report" in result else []
+        recording, processed = shlex.quote(str(self.recording)), shlex.quote(str(self.folder / "processed.mcap"))
         if self.viewer_mode.startswith("rrd:"):
-            lines.append(
-                f"scene      {self.viewer_mode[4:]}   (no display: open it with `triline view {self.recording}`)"
-            )
+            lines.append(f"scene      {self.viewer_mode[4:]}   (no display: open it with `triline view {recording}`)")
         lines += [
-            f"replay it  triline replay {self.recording}",
-            f"again      triline process {self.recording} -o {self.folder / 'processed.mcap'} "
-            f"--nodes {','.join(self.estimators)}{self.settings_again()}",
+            f"replay it  triline replay {recording}",
+            f"again      triline process {recording} -o {processed} --nodes {','.join(self.estimators)}"
+            f"{self.settings_again()}",
         ]
         return "\n".join(lines)
 

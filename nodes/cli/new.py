@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 from pathlib import Path
 
 from ..errors import UserError
@@ -33,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
     elif args.metadata:
         raise UserError(f"{args.metadata[0]}: metadata go with `triline new scenes`")
     else:
-        path, todo = write_template(args.folder), f"fill it in; `triline check {args.folder}` says what is missing"
+        command = f"triline check {shlex.quote(str(args.folder))}"
+        path, todo = write_template(args.folder), f"fill it in; `{command}` says what is missing"
     if args.json:
         print(json.dumps({"file": str(path)}, indent=2))
     elif not args.quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import signal
 import sys
 import threading
@@ -121,7 +122,7 @@ def _fleet(args: argparse.Namespace) -> int:
         if process is not None:
             process.close()
     if args.rrd is not None and not args.quiet:
-        print(f"{args.rrd}: {used} messages; open it with 'rerun {args.rrd}'", flush=True)
+        print(f"{args.rrd}: {used} messages; open it with `rerun {shlex.quote(str(args.rrd))}`", flush=True)
     return 0
 
 
@@ -155,7 +156,7 @@ def _say(args: argparse.Namespace, mode: str, counts: Counter[str], url: str | N
     elif mode == "web":
         print(f"{url}\nCtrl-C stops the viewer", flush=True)
     elif args.rrd is not None and not args.quiet:
-        print(f"{args.rrd}: {counts.total()} messages; open it with 'rerun {args.rrd}'", flush=True)
+        print(f"{args.rrd}: {counts.total()} messages; open it with `rerun {shlex.quote(str(args.rrd))}`", flush=True)
 
 
 def _stop(*_: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -211,7 +212,8 @@ def refuse_problems(flight: Flight) -> None:
     """Raise UserError with the first problem of a folder and the number of the others, if there is any."""
     if flight.problems:
         more = len(flight.problems) - 1
-        others = f" (and {more} more: `triline check {flight.folder}` names them)" if more else ""
+        command = f"triline check {shlex.quote(str(flight.folder))}"
+        others = f" (and {more} more: `{command}` names them)" if more else ""
         raise UserError(f"{flight.problems[0]}{others}")
 
 

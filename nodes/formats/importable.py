@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from ..errors import UserError
@@ -22,7 +23,8 @@ def refuse_importable(path: Path) -> None:
     except UserError:
         return
     target = "camera.json" if kind == "camera" else f"{path.stem}.mcap"
-    raise UserError(f"{path}: is a {KINDS[kind]}, wanted a recording: `triline import {path} -o {target}` makes one")
+    command = f"triline import {shlex.quote(str(path))} -o {shlex.quote(target)}"
+    raise UserError(f"{path}: is a {KINDS[kind]}, wanted a recording: `{command}` makes one")
 
 
 def _is_mcap(path: Path) -> bool:

@@ -1,0 +1,34 @@
+"""What a live flight says at its end."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+
+from triline.nodes.cli.demo import Demo
+
+RESULT = {"lost": {}, "waited_s": 0.0}
+
+
+def demo(folder: Path) -> Demo:
+    options = {"no_images": False, "seed": 1, "secure": None, "web": False, "headless": True}
+    return Demo(argparse.Namespace(output=folder, quiet=True, json=False, **options))
+
+
+def test_commands_at_the_end_of_a_flight_can_be_pasted(tmp_path):
+    folder = tmp_path / "two words"
+    said = demo(folder).summary({**RESULT, "recordings": [str(folder / "flight.mcap")]}).splitlines()
+    (again,) = (line for line in said if line.startswith("again"))
+    words = shlex.split(again.removeprefix("again"))
+    assert words[:5] == ["triline", "process", f"{folder}/flight.mcap", "-o", f"{folder}/processed.mcap"]
+    (replay,) = (line for line in said if line.startswith("replay it"))
+    assert shlex.split(replay.removeprefix("replay it"))[-1] == f"{folder}/flight.mcap"
+    assert not any("largest" in line for line in said)
+
+
+def test_a_flight_in_several_recordings_names_those_that_its_page_leaves_out(tmp_path):
+    """The recorder was killed and started again, and wrote a file of its own from then on."""
+    recordings = [str(tmp_path / name) for name in ("flight.mcap", "flight-2.mcap")]
+    said = demo(tmp_path).summary({**RESULT, "recordings": recordings})
+    assert f"of the largest recording alone; the flight goes on in {recordings[1]}\n" in said
