@@ -9,9 +9,12 @@ import signal
 import sys
 import threading
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import UserError
+from ..formats.new_file import new_file
 from .bus_options import add_bus_arguments, bus_of, reporter
 from .damage import tell_damage
 from .outputs import refuse_input_as_output
@@ -39,7 +42,6 @@ def run(args: argparse.Namespace) -> int:
         return _fleet(args)
     if len(args.recording) != 1:
         raise UserError(f"{len(args.recording)} recordings, wanted one (--fleet shows several)")
-    mode = _mode(args)
     args.recording = args.recording[0]
     from ..recording.reader import RecordingReader
 
@@ -49,12 +51,15 @@ def run(args: argparse.Namespace) -> int:
 
     messages = reader.sorted_messages((*TOPICS, *TRUTH_TOPICS))
     signal.signal(signal.SIGTERM, _stop)
-    canvas = open_canvas(mode)
-    process = canvas.process if isinstance(canvas, RerunCanvas) else None
+    process = None
     try:
-        counts = show(messages, canvas, truth=not args.no_truth)
-        if not counts.total():
-            raise UserError(f"{args.recording}: nothing in it that can be shown")
+        with _mode(args, [args.recording]) as mode:
+            canvas = open_canvas(mode)
+            process = canvas.process if isinstance(canvas, RerunCanvas) else None
+            counts = show(messages, canvas, truth=not args.no_truth)
+            if not counts.total():
+                raise UserError(f"{args.recording}: nothing in it that can be shown")
+        mode = f"rrd:{args.rrd}" if args.rrd is not None else mode
         _say(args, mode, counts, None if process is None else process.web_url)
         tell_damage("view", reader)
         if process is not None:
@@ -67,22 +72,29 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mode(args: argparse.Namespace) -> str:
-    """Mode of the canvas.
+@contextmanager
+def _mode(args: argparse.Namespace, recordings: list[Path]) -> Iterator[str]:
+    """Mode of the canvas; a file has its name when the canvas is closed, and the one before stays where that fails.
 
     Raises
     ------
-    UserError : the file to write is one of the recordings
+    UserError : the file to write is one of the recordings, or cannot be written
     """
+    if args.rrd is None:
+        yield "web" if args.web else "native"
+        return
     refuse_input_as_output(args, "rrd")
-    return f"rrd:{args.rrd}" if args.rrd is not None else "web" if args.web else "native"
+    if not recordings:  # of aircraft in the air: what has been seen stays, whatever happens
+        yield f"rrd:{args.rrd}"
+        return
+    with new_file(args.rrd) as part:
+        yield f"rrd:{part}"
 
 
 def _fleet(args: argparse.Namespace) -> int:
     """All aircraft of some recordings, or of those in the air until interrupted."""
     if args.platform is not None:
         raise UserError("--fleet and --platform: wanted one of them")
-    mode = _mode(args)
     from ..bus.program import stop_on_signals
     from ..viewer import fleet_live
     from ..viewer.rerun_canvas import RerunCanvas, open_canvas
@@ -103,25 +115,30 @@ def _fleet(args: argparse.Namespace) -> int:
         bus = Bus(source="viewer", file=args.bus, **where)
         if alone := bus.why_alone():
             reporter(args.quiet)(alone)
-    canvas = open_canvas(mode)
-    process = canvas.process if isinstance(canvas, RerunCanvas) else None
+    process = None
     try:
-        if mode == "web" and process is not None:
-            print(f"{process.web_url}\nCtrl-C stops the viewer", flush=True)
-        if bus is None:
-            used = fleet_live.show_recordings(readers, canvas)
-            if not used:
-                raise UserError(f"{args.recording[0]}: nothing in it that can be shown")
-            if process is not None:
-                process.wait()
-        else:
-            used = fleet_live.show_live(bus, canvas, stop)
+        with _mode(args, args.recording) as mode:
+            canvas = open_canvas(mode)
+            process = canvas.process if isinstance(canvas, RerunCanvas) else None
+            if mode == "web" and process is not None:
+                print(f"{process.web_url}\nCtrl-C stops the viewer", flush=True)
+            if bus is None:
+                used = fleet_live.show_recordings(readers, canvas)
+                if not used:
+                    raise UserError(f"{args.recording[0]}: nothing in it that can be shown")
+            else:
+                used = fleet_live.show_live(bus, canvas, stop)
+        if bus is None and process is not None:
+            process.wait()
     finally:
         if bus is not None:
             bus.close()
         if process is not None:
             process.close()
-    if args.rrd is not None and not args.quiet:
+    if args.rrd is not None and args.json:
+        shown = {"recordings": [str(path) for path in args.recording], "mode": f"rrd:{args.rrd}", "messages": used}
+        print(json.dumps(shown, indent=2))
+    elif args.rrd is not None and not args.quiet:
         print(f"{args.rrd}: {used} messages; open it with `rerun {shlex.quote(str(args.rrd))}`", flush=True)
     return 0
 

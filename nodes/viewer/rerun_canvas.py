@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,11 +36,15 @@ _MAP_POINTS = 300.0  # height and width of the map, about
 
 
 class RerunCanvas:
-    """Draws into a Rerun recording stream; `process` is the viewer it belongs to, if we started one."""
+    """Draws into a Rerun recording stream; `process` is the viewer it belongs to, if we started one, `file` where it is
+    written to, if it is."""
 
-    def __init__(self, stream: rr.RecordingStream, process: ViewerProcess | None = None) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, process: ViewerProcess | None = None, file: Path | None = None
+    ) -> None:
         self.stream = stream
         self.process = process
+        self.file = file
         self._named: set[str] = set()
         stream.log("flight", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -131,8 +136,20 @@ class RerunCanvas:
         self.stream.send_blueprint(made)
 
     def close(self) -> None:
-        self.stream.flush(timeout_sec=_FLUSH_S)
-        self.stream.disconnect()
+        """Write what still waits.
+
+        Raises
+        ------
+        OSError : the file cannot be written
+        """
+        try:
+            self.stream.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError:  # the library does not say why
+            if self.file is None:
+                raise
+            raise OSError(errno.EIO, "its writer has given up, as on a full disk", str(self.file)) from None
+        finally:
+            self.stream.disconnect()
 
 
 def open_canvas(mode: str) -> Canvas:
@@ -153,7 +170,7 @@ def open_canvas(mode: str) -> Canvas:
         if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
             raise UserError(f"{path}: cannot be written there")
         stream.save(path)
-        return RerunCanvas(stream)
+        return RerunCanvas(stream, file=path)
     process = ViewerProcess(web=mode == "web")
     stream.connect_grpc(process.grpc_url)
     return RerunCanvas(stream, process)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_rig import wait_for
+from full_disk import files_of_at_most
 from notebook import Notebook
 from recording_file import write_recording
 from synthetic_flight import START_NS, flight_messages, spoilt_copy
@@ -292,10 +293,25 @@ def test_view_command_writes_a_file(recording, messages, tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["messages"]["orientation/final"] == sum(m.topic == "orientation/final" for m in messages)
     assert _rerun("rrd", "verify", str(target)).returncode == 0
+    assert printed["mode"] == f"rrd:{target}"
     assert main(["view", str(tmp_path / "none.mcap"), "--rrd", str(target)]) == 1
     assert main(["view", str(recording), "--rrd", str(tmp_path / "no" / "x.rrd")]) == 1
     err = capsys.readouterr().err
-    assert "no such file" in err and "cannot be written" in err and "Traceback" not in err
+    assert "no such file" in err and f"{tmp_path / 'no' / 'x.rrd'}: no folder" in err and "Traceback" not in err
+    assert main(["view", "--fleet", str(recording), "--rrd", str(tmp_path / "fleet.rrd"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["messages"] > 0
+
+
+def test_a_scene_stays_where_there_is_none_to_take_its_place(recording, tmp_path, capsys):
+    target, empty = tmp_path / "view.rrd", write_recording(tmp_path / "empty.mcap", [])
+    target.write_text("the one before")
+    assert main(["view", str(empty), "--rrd", str(target)]) == 1
+    assert "nothing in it that can be shown" in capsys.readouterr().err
+    with files_of_at_most(20_000):
+        assert main(["view", str(recording), "--rrd", str(target)]) == 1
+    err = capsys.readouterr().err
+    assert f"triline view: {target}: cannot be written: its writer has given up, as on a full disk" in err
+    assert target.read_text() == "the one before" and len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.parametrize("seed", range(3))
