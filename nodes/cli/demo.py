@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(result, indent=2))
     else:
         print(demo.summary(result))
-    return 0
+    return 1 if "no_report" in result else 0
 
 
 class Demo(LiveFlight):

@@ -282,7 +282,12 @@ class LiveFlight:
         if not recordings:
             raise UserError(f"no recording in {self.folder}; see {self.folder / 'log' / 'recorder.log'}")
         self.recording = max(recordings, key=lambda path: path.stat().st_size)
-        result = {} if getattr(self.args, "no_report", False) else self._report()
+        result: dict[str, Any] = {}
+        if not getattr(self.args, "no_report", False):
+            try:
+                result = self._report()
+            except UserError as error:  # on a full disk, for one: what was recorded is said all the same
+                result = {"no_report": str(error)}
         result.update(
             recordings=[str(path) for path in recordings], restarts=self.restarts,
             landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost,
@@ -313,6 +318,7 @@ class LiveFlight:
         lines = ["", *(accuracy_lines(result) if "report" in result else [])]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
         lines += [f"damaged recording: {text}" for text in result.get("damage", [])]
+        lines += [f"no report: {result['no_report']}"] if "no_report" in result else []
         lines += self.remarks(result)
         if result["lost"]:
             lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))

@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 from triline.nodes.cli.demo import Demo
+from triline.nodes.cli.live_flight import LiveFlight
 
 RESULT = {"lost": {}, "waited_s": 0.0}
 
@@ -32,3 +33,13 @@ def test_a_flight_in_several_recordings_names_those_that_its_page_leaves_out(tmp
     recordings = [str(tmp_path / name) for name in ("flight.mcap", "flight-2.mcap")]
     said = demo(tmp_path).summary({**RESULT, "recordings": recordings})
     assert f"of the largest recording alone; the flight goes on in {recordings[1]}\n" in said
+
+
+def test_a_flight_whose_report_cannot_be_made_says_what_was_recorded(tmp_path):
+    flight = demo(tmp_path)
+    (tmp_path / "flight.mcap").write_text("no recording")
+    result = LiveFlight._evaluate(flight)
+    assert result["no_report"] == f"{tmp_path}/flight.mcap: not an MCAP recording"
+    said = flight.summary({**result, "waited_s": 0.0})
+    assert f"no report: {result['no_report']}\n" in said and f"recording  {tmp_path}/flight.mcap\n" in said
+    assert "report     " not in said
