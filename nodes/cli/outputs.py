@@ -23,21 +23,48 @@ def refuse_empty_words(argv: list[str]) -> None:
             raise UserError(f"{option} '': wanted a name")
 
 
-def refuse_input_as_output(args: argparse.Namespace, option: str = "output", file: Path | None = None) -> None:
-    """Raise UserError where the file that a command is to write is one of those that it reads.
+#: Options that name a file which a command writes.
+_WRITTEN = (
+    *("output", "csv", "map_csv", "plot", "page", "mask", "sigma", "source", "seam_lines", "stac"),
+    *("parquet", "geojson", "gpkg", "sbet", "points", "per_line", "rrd"),
+)
+#: Files of a block, a flight, a sensor folder or scenes that no other file of the folder names.
+_OF_FOLDERS = {
+    *("project.toml", "flight.toml", "platform.toml", "camera.json", "expected.json"),
+    *("strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv", "imu.csv", "gnss.csv", "attitude.csv"),
+}
+_LONGEST_TEXT = 1_000_000
+
+
+def refuse_input_as_output(args: argparse.Namespace, option: str = "", file: Path | None = None) -> None:
+    """Raise UserError where a file that a command is to write is one of those that it reads.
 
     Parameters
     ----------
-    option : that names what is written, as an attribute; the others may name what is read
+    option : that names what is written, as an attribute; without it all that do
     file : that is written where it is not the one that the option names, but beside it
     """
-    output = file or getattr(args, option, None)
-    if not output or not os.path.isfile(output):
-        return
-    for name, value in vars(args).items():
-        for word in _words(value) if name != option else ():
-            if os.path.isfile(word) and os.path.samefile(word, output):
-                raise UserError(f"{output}: the output would overwrite the {name.replace('_', ' ')}")
+    for written in (option,) if option else _WRITTEN:
+        output = file or getattr(args, written, None)
+        if not isinstance(output, (str, Path)) or not output or not os.path.isfile(output):
+            continue
+        for name, value in vars(args).items():
+            for word in _words(value) if name not in _WRITTEN else ():
+                if os.path.isfile(word) and os.path.samefile(word, output):
+                    raise UserError(f"{output}: the output would overwrite the {name.replace('_', ' ')}")
+                if os.path.isdir(word) and _is_read_of(Path(word), Path(output)):
+                    raise UserError(f"{output}: the output would overwrite a file of {word}")
+
+
+def _is_read_of(folder: Path, file: Path) -> bool:
+    """Whether a file belongs to what is read of a folder: by its name, or because another file there names it."""
+    if file.resolve().parent != folder.resolve():
+        return False
+    if file.name in _OF_FOLDERS:
+        return True
+    texts = [path for kind in ("*.toml", "*.json") for path in folder.glob(kind) if path.name != file.name]
+    small = [path for path in texts if path.is_file() and path.stat().st_size <= _LONGEST_TEXT]
+    return any(file.name in path.read_text(encoding="utf-8", errors="replace") for path in small)
 
 
 def refuse_folder_of_inputs(folder: Path) -> None:

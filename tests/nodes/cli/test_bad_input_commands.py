@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -190,6 +191,30 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
         code, _, err = run_main(capsys, *arguments)
         assert code == 1 and "the output would overwrite the" in err, (arguments, err)
         assert other.read_text() == "mine"
+    block = tmp_path / "block"
+    write_block(block, simulated_block())
+    (block / "project.toml").write_text("# line times of S1: times.csv\n")
+    times, trajectory = block / "times.csv", block / "trajectory.csv"
+    times.write_text("mine")
+    flown = trajectory.read_bytes()
+    for arguments, said in (
+        (
+            ("study", "control", block, "--csv", trajectory),
+            f"{trajectory}: the output would overwrite a file of {block}",
+        ),
+        (("study", "control", block, "--page", times), f"{times}: the output would overwrite a file of {block}"),
+        (
+            ("study", "misspecified", "--motion", trajectory, "--csv", trajectory),
+            "the output would overwrite the motion",
+        ),
+        (("export", path, "--points", path), "the output would overwrite the recording"),
+        (("rectify", other, "--sensor", path, "-o", "x.tif", "--mask", path), "the output would overwrite the sensor"),
+        (("import", block, "-o", trajectory), f"the output would overwrite a file of {block}"),
+    ):
+        code, _, err = run_main(capsys, *arguments)
+        assert code == 1 and said in err and len(err.splitlines()) == 1, (arguments, err)
+    assert times.read_text() == "mine" and trajectory.read_bytes() == flown
+    shutil.rmtree(block)
     code, _, err = run_main(capsys, "simulate", "--seconds", 2, "-o", tmp_path / "new", "--dem", tmp_path / "new")
     assert code == 1 and "wanted different files" in err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other"]
