@@ -161,6 +161,8 @@ def protection_figure(flight: Flight) -> Figure | None:
         for name, values, color, width in curves:
             x, y = axis.curve(t, _SCALE[i] * values[:, i : i + 1], _longest_s(flight))
             ax.plot(x, y[:, 0], color=color, lw=width, label=name)
+            lone = _lone(y[:, 0])
+            ax.plot(x[lone], y[lone, 0], color=color, ls="", marker=".", ms=3.0 + 2.0 * width)
         ax.set_yscale("log")
         low, high = (_SCALE[i] * float(f(v[:, i])) for f, v in ((np.min, sigma), (np.max, protection)))
         bottom, top = 0.2 * max(low, 1e-6 * high, 1e-9), 1.5 * max(high, 1e-9)
@@ -173,6 +175,12 @@ def protection_figure(flight: Flight) -> Figure | None:
     axis.dress(axes.ravel(), axes[-1])
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return fig
+
+
+def _lone(values: Array) -> NDArray[np.bool_]:
+    """Which values no line shows, because those before and after them are missing."""
+    known = np.concatenate([[False], np.isfinite(values), [False]])
+    return known[1:-1] & ~known[:-2] & ~known[2:]
 
 
 def _lights(flight: Flight) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from triline.nodes.report.flight import Look, collect, rejected_key
 from triline.nodes.report.integrity import integrity, levels, protection_figure
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
+from triline.nodes.report.style import FINAL, LIVE
 from triline.schemas import messages as m
 
 WEAK_S = 10.0  # of 26 s on the strip
@@ -117,6 +118,13 @@ def test_reports_that_are_as_far_apart_as_the_pace_for_throughput_makes_them(mes
     assert len(flight.reports) == 3 and said["seconds"] == pytest.approx(20.0, abs=0.1)
     drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines()}
     assert np.isfinite(drawn["protection level"]).all() and len(drawn["protection level"]) == 3
+    dots = [line for line in figure.axes[0].get_lines() if line.get_marker() == "."]
+    assert not any(len(line.get_xdata()) for line in dots)
+    lone = collect([k for k in kept if k.topic != "adjustment/report" or k.stamp_ns == last_ns])
+    figure = protection_figure(lone)
+    assert figure is not None
+    dots = [line for line in figure.axes[0].get_lines() if line.get_marker() == "." and len(line.get_xdata())]
+    assert {line.get_color() for line in dots} >= {LIVE, FINAL}, "a single report is seen"
     # the table and the background end with the strip, not with the last report on it or the next one
     start = (min(stamp for stamp, _ in flight.reports) - flight.start_ns) / convert.SECOND_NS
     flight.strips["S1"] = copy.deepcopy(flight.strips["S1"])
