@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.loop:
         report("looping: later rounds have shifted stamps and times, and new names of strips and points (S1~2)")
     with Bus(source="player", file=args.bus, **bus_of(args)) as bus:
-        nobody = bus.why_alone() or _nobody(bus)
+        nobody = bus.why_alone() or _nobody(bus, args.wait_for)
         bus.announce("player")
         bus.prepare({channel.topic for channel in reader.channels.values() if channel.known})
         brake = Brake(bus, args.wait_for, stop, args.rate)
@@ -90,12 +90,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _nobody(bus: Bus, patience_s: float = 0.5) -> str:
-    """A line which says that no node is there, or ""; waits a little for nodes that have just been started."""
+def _nobody(bus: Bus, awaited: str = "", patience_s: float = 0.5) -> str:
+    """A line which says that no node is there, or not one that is to be waited for, or ""; waits a little for nodes
+    that have just been started."""
+    names = {name.strip() for name in awaited.split(",") if name.strip()}
     until = time.monotonic() + patience_s
-    while not bus.alive():
+    while not (alive := bus.alive()) or not alive >= names:
         if time.monotonic() > until:
-            return f"no node lives on platform {bus.platform} yet; who comes later gets the last minute"
+            if not alive:
+                return f"no node lives on platform {bus.platform} yet; who comes later gets the last minute"
+            missing, there = ", ".join(sorted(names - alive)), ", ".join(sorted(alive))
+            return f"--wait-for {missing}: not on platform {bus.platform} yet, so not waited for; there: {there}"
         time.sleep(0.05)
     return ""
 

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from recording_file import write_recording
 import triline
 from triline.nodes.bus.session import Bus
 from triline.nodes.cli import main
+from triline.nodes.cli.replay import _nobody
 from triline.nodes.convert import iso
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message, Node
@@ -327,6 +329,15 @@ def test_replay_command(tmp_path, flight):
         result = json.loads(done.stdout)
     assert result["messages"]["sensor/attitude"] == got["sensor/attitude"] == 600
     assert got["sensor/lines/F"] == result["messages"]["sensor/lines/F"] and got["configuration/camera"] == 1
+
+
+def test_replay_names_who_is_to_be_waited_for_and_is_not_there():
+    bus = SimpleNamespace(platform="demo", alive=lambda: {"navigator", "recorder"})
+    said = _nobody(bus, "navigtor, recorder", 0.0)
+    assert said == "--wait-for navigtor: not on platform demo yet, so not waited for; there: navigator, recorder"
+    assert _nobody(bus, "navigator", 0.0) == _nobody(bus, patience_s=0.0) == ""
+    bus.alive = set
+    assert "no node lives on platform demo yet" in _nobody(bus, "navigator", 0.0)
 
 
 @pytest.mark.study
