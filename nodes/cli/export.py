@@ -29,7 +29,7 @@ from ..batch.rectification import (
 from ..convert import R_bc_of, local_frame, pose_sample
 from ..errors import UserError
 from ..formats.camera_json import write_camera
-from ..formats.features import answers, features_of
+from ..formats.features import Features, answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
 from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
@@ -278,14 +278,19 @@ def _project_and_frame(reader: RecordingReader) -> tuple[Any, LocalFrame | None]
     return project, None if project is None else local_frame(project)
 
 
+def _features(reader: RecordingReader, args: argparse.Namespace) -> Features:
+    try:
+        return features_of(args.topic, _answers(reader, args), _project_and_frame(reader)[1])
+    except UserError as error:
+        raise UserError(f"{reader.path}: {error}") from None
+
+
 def _write_geojson(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    features = features_of(args.topic, _answers(reader, args), _project_and_frame(reader)[1])
-    return {"features": write_geojson(target, features)}
+    return {"features": write_geojson(target, _features(reader, args))}
 
 
 def _write_gpkg(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    features = features_of(args.topic, _answers(reader, args), _project_and_frame(reader)[1])
-    return {"features": write_geopackage(target, args.topic, features)}
+    return {"features": write_geopackage(target, args.topic, _features(reader, args))}
 
 
 def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:

@@ -414,7 +414,7 @@ def test_no_project_no_map(tmp_path, capsys):
         writer.write(Message("orientation/final", START, pose_message(START, [0, 0, 0], [0, 0, 0]), "x"))
     for option in ("--geojson", "--sbet"):
         assert main(["export", str(path), "--topic", "orientation/final", option, str(tmp_path / "o")]) == 1
-        assert "no message on configuration/project" in capsys.readouterr().err
+        assert f"{path}: no message on configuration/project" in capsys.readouterr().err
 
 
 def test_machine_readable_result(recording, tmp_path, capsys):
