@@ -22,6 +22,7 @@ from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
 from ..bus.program import end_by_signal
 from ..errors import UserError
+from ..formats.new_file import refuse_unless_folder
 from ..monitor.monitor import ENDING, display
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class LiveFlight:
 
     def fly(self) -> dict[str, Any]:
         """Run the flight; returns the evaluation of its recording. Nobody else writes into its folder meanwhile."""
+        refuse_unless_folder(self.folder)
         with locked(self.folder):
             return self._fly()
 

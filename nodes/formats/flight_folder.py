@@ -175,7 +175,9 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
     """
     path = folder / FILE
     if not path.is_file():
-        raise UserError(f"{folder}: no {FILE}; `triline new flight {folder}` writes one")
+        if folder.is_file():
+            raise UserError(f"{folder}: is a file, wanted a folder with {FILE}")
+        raise UserError(f"{folder}: no {FILE}; `triline new flight {shlex.quote(str(folder))}` writes one")
     file = read_toml(path)
     flight = Flight(folder)
     tables = {}

@@ -6,6 +6,7 @@ import argparse
 import shlex
 from pathlib import Path
 
+from triline.nodes.cli import main
 from triline.nodes.cli.demo import Demo
 from triline.nodes.cli.live_flight import LiveFlight
 
@@ -43,3 +44,16 @@ def test_a_flight_whose_report_cannot_be_made_says_what_was_recorded(tmp_path):
     said = flight.summary({**result, "waited_s": 0.0})
     assert f"no report: {result['no_report']}\n" in said and f"recording  {tmp_path}/flight.mcap\n" in said
     assert "report     " not in said
+
+
+def test_a_file_is_neither_a_flight_nor_a_folder_of_results(tmp_path, capsys):
+    file = tmp_path / "flight.mcap"
+    file.write_text("mine")
+    for words, said in (
+        (["fly", str(file)], f"triline fly: {file}: is a file, wanted a folder with flight.toml\n"),
+        (["fly", str(tmp_path / "a b")], f"no flight.toml; `triline new flight '{tmp_path}/a b'` writes one\n"),
+        (["demo", "--headless", "-o", str(file)], f"triline demo: {file}: is a file, wanted a folder for the result\n"),
+    ):
+        assert main(words) == 1
+        assert said in capsys.readouterr().err
+    assert file.read_text() == "mine"
