@@ -37,6 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     revoke.add_argument("name", metavar="NAME")
     actions.add_parser("list", help="who is certified")
     for action, sub in actions.choices.items():
+        # after the action, too; what stands before it stays
+        for words, text in (
+            (("--json",), "print a machine-readable result"),
+            (("-q", "--quiet"), "print only the result and errors"),
+            (("-v", "--verbose"), "print details"),
+        ):
+            sub.add_argument(*words, action="store_true", default=argparse.SUPPRESS, help=text)
         if action != "new":
             sub.add_argument("--authority", type=Path, default=Path(), metavar="DIR", help="its folder (default: here)")
 

@@ -48,6 +48,9 @@ def test_keys_makes_bundles_lists_and_revokes(tmp_path, capsys):
     assert code == 0 and f"copy again {folder / 'aircraft1'}" in out
     code, out, _ = keys(capsys, "list", "--authority", folder)
     assert [line.split()[:2] for line in out.splitlines()[1:]] == [["aircraft1", "aircraft"], ["ann", "desk"]]
+    listed = json.loads(keys(capsys, "list", "--authority", folder, "--json")[1])
+    assert [member["name"] for member in listed["members"]] == ["aircraft1", "ann"]
+    assert json.loads(keys(capsys, "--json", "list", "--authority", folder)[1]) == listed
     assert keys(capsys, "revoke", "ann", "--authority", folder)[0] == 0
     assert "revoked" in keys(capsys, "list", "--authority", folder)[1]
     for arguments, wanted in (
