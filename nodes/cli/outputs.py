@@ -64,7 +64,8 @@ def _is_read_of(folder: Path, file: Path) -> bool:
         return True
     texts = [path for kind in ("*.toml", "*.json") for path in folder.glob(kind) if path.name != file.name]
     small = [path for path in texts if path.is_file() and path.stat().st_size <= _LONGEST_TEXT]
-    return any(file.name in path.read_text(encoding="utf-8", errors="replace") for path in small)
+    named = re.compile(rf"(?<![\w.-]){re.escape(file.name)}(?![\w.-])")  # not as a part of another name
+    return any(named.search(path.read_text(encoding="utf-8", errors="replace")) for path in small)
 
 
 def refuse_folder_of_inputs(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -16,6 +17,7 @@ from recording_file import chunk_spans
 from small_block import simulated_block
 
 from triline.nodes.cli import COMMANDS, main
+from triline.nodes.cli.outputs import refuse_input_as_output
 from triline.nodes.formats.block_writer import write_block
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.writer import RecordingWriter
@@ -214,6 +216,8 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
         code, _, err = run_main(capsys, *arguments)
         assert code == 1 and said in err and len(err.splitlines()) == 1, (arguments, err)
     assert times.read_text() == "mine" and trajectory.read_bytes() == flown
+    (block / "mes.csv").write_text("a result")  # the end of a name that stands there
+    refuse_input_as_output(argparse.Namespace(block=block, csv=block / "mes.csv"))
     shutil.rmtree(block)
     code, _, err = run_main(capsys, "simulate", "--seconds", 2, "-o", tmp_path / "new", "--dem", tmp_path / "new")
     assert code == 1 and "wanted different files" in err
