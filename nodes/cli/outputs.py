@@ -14,13 +14,22 @@ from ..errors import UserError
 
 
 def refuse_empty_words(argv: list[str]) -> None:
-    """Raise UserError where a name is empty: as a path it would stand for the folder in which the command runs."""
+    """Raise UserError where a name is empty or ``-``.
+
+    As a path the empty one would stand for the folder in which the command runs, and ``-`` for a file of that name: no
+    command reads standard input or writes a file to standard output.
+    """
     for before, word in pairwise(["", *argv]):
         option, equals, value = word.partition("=")
-        if not word:
-            raise UserError(f"{before} '': wanted a name" if before.startswith("-") else "'': wanted a name")
-        if option.startswith("-") and equals and not value:
-            raise UserError(f"{option} '': wanted a name")
+        if len(word) == 3 and word[0] == word[2] == "-" and word[1].isalpha():  # -o-
+            option, equals, value = word[:2], "=", "-"
+        if not option.startswith("-") or not equals:
+            option, value = before if before.startswith("-") else "", word
+        where = f"{option} " if option else ""
+        if not value:
+            raise UserError(f"{where}'': wanted a name")
+        if value == "-":
+            raise UserError(f"{where}-: wanted the name of a file, not standard input or output")
 
 
 #: Options that name a file which a command writes.

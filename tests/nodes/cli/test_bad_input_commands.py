@@ -242,6 +242,23 @@ def test_an_output_without_a_name_is_refused(arguments, tmp_path, capsys, monkey
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("export", "a.mcap", "--topic", "orientation/final", "--csv", "-"), "--csv -"),
+        (("export", "a.mcap", "--topic", "orientation/final", "--geojson=-"), "--geojson -"),
+        (("simulate", "--seconds", 2, "-o-"), "-o -"),
+        (("import", "-", "-o", "a.mcap"), "-"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_standard_output_is_no_file(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = f"triline {arguments[0]}: {said}: wanted the name of a file, not standard input or output\n"
+    assert run_main(capsys, *arguments) == (1, "", told)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_result_is_not_written_among_the_files_of_a_block(tmp_path, capsys):
     write_block(tmp_path / "block", simulated_block())
     before = sorted(p.name for p in (tmp_path / "block").iterdir())
