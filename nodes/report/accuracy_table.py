@@ -21,6 +21,8 @@ _POINTS = {
 }
 _INTERSECTED = {"direct_georeferencing": "direct georeferencing", "final": "intersected, final pose"}
 _HEAD = f"{'n':>6}       X       Y       Z  "
+#: How the line begins that says in ``missing`` of an evaluation that nothing was measured in images.
+NO_TIES = "observation/tie"
 _NOTE = "sigma: root mean of the stated variances; NEES: squared errors over stated variances, 1 expected"
 
 
@@ -62,7 +64,10 @@ def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
     if gain:
         lines.append(f"{'  improvement, final':<34}" + "".join(f"{v:7.1f}x" if v else "       -" for v in gain))
     elif not points:
-        lines.append("  none: the flight was too short, or no point got two looks")
+        why = "the flight was too short, or no point got two looks"
+        if any(line.startswith(NO_TIES) for line in result["missing"]):
+            why = "there is no tie point in it"
+        lines.append(f"  none: {why}")
     lines.append(_NOTE)
     if "sigma0" in result:
         lines.append(

@@ -14,6 +14,7 @@ from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_
 from ...solver.geometry.space_intersection import ImageRays, Intersection, intersect
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
+from .accuracy_table import NO_TIES
 from .flight import Flight, PoseSeries, collect, in_gap, rejected_key
 
 Array = NDArray[np.floating]
@@ -141,6 +142,7 @@ def missing(flight: Flight) -> list[str]:
     wanted = [
         (flight.project is not None, "configuration/project"),
         (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
+        (bool(flight.looks), f"{NO_TIES}: no object points"),
         (bool(flight.measured), "trajectory/filtered or trajectory/smoothed: no direct georeferencing"),
         ("final" in flight.poses, f"orientation/final: {why}"),
         ("truth" in flight.poses, "truth/trajectory: no error of the orientation (truth is known in simulations only)"),

@@ -75,6 +75,14 @@ def test_sensors_alone_give_what_is_missing_instead_of_an_empty_line(messages, t
     assert all(lines) and any(line.startswith("not in this recording: orientation/final") for line in lines)
 
 
+@pytest.mark.parametrize(("dropped", "why"), [("", "too short, or no"), ("observation/tie", "no tie point in it")])
+def test_a_flight_without_a_tie_point_says_so(messages, dropped, why):
+    gone = ("point/", "configuration/camera", dropped) if dropped else ("point/", "configuration/camera")
+    result = evaluate_flight(collect([x for x in messages if not x.topic.startswith(gone)]))
+    assert [why in line for line in accuracy_lines(result) if line.startswith("  none: ")] == [True]
+    assert bool(dropped) == any(line == "observation/tie: no object points" for line in result["missing"])
+
+
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(recording, tmp_path, capsys, monkeypatch):
     worked = []
     monkeypatch.setattr("triline.nodes.report.source.read", lambda path: worked.append(path))
