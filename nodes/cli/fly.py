@@ -33,6 +33,8 @@ TIMED = ("sensor/gnss", "sensor/imu", "sensor/attitude")
 APART_NS, LOOKED_AT_S = 1_000_000_000, 10.0
 #: Where sensors go on at the end: for so long the nodes may catch up, s.
 CATCH_UP_S = 2.5
+#: Who is on a port that is taken answers within so long; nodes of a flight that was killed have ended after so long, s.
+MEET_S, ENDED_S = 2.0, 5.0
 SOURCE = "flight"
 FILE = "flight.toml"
 
@@ -142,9 +144,30 @@ class Fly(LiveFlight):
         self._tell_phase()
 
     def port(self) -> int:
-        from ..bus.session import default_port
+        from ..bus.session import default_port, port_is_held
 
-        return self.args.port or (default_port() if self.secure is None else self.secure.port)
+        port = self.args.port or (default_port() if self.secure is None else self.secure.port)
+        if self.args.bus is None and port_is_held(port):
+            self._refuse_flown(port)
+        return port
+
+    def _refuse_flown(self, port: int) -> None:
+        """Raise UserError where nodes that this flight would start run on its platform, and go on running."""
+        from ..bus.session import Bus
+
+        own, begun = {"recorder", *self.estimators, *self.programs}, time.monotonic()
+        with Bus(self.platform, source=SOURCE, port=port, secure=self.secure) as bus:
+            while not (there := own & bus.alive()) and time.monotonic() < begun + MEET_S:
+                time.sleep(0.1)
+            while there and time.monotonic() < begun + ENDED_S:
+                time.sleep(0.1)
+                there = own & bus.alive()
+        if there:
+            one = "runs" if len(there) == 1 else "run"
+            raise UserError(
+                f"platform {self.platform!r} flies already: {', '.join(sorted(there))} {one} on port {port}, "
+                "wanted them stopped, or another --port"
+            )
 
     def clear(self) -> None:
         if any(self.folder.glob("flight*.mcap")):

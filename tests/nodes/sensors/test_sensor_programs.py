@@ -13,7 +13,7 @@ from envi_files import write_camera
 
 from triline.nodes.bus.program import ProgramOptions
 from triline.nodes.bus.session import Bus
-from triline.nodes.cli import main
+from triline.nodes.cli import fly, main, parse
 from triline.nodes.cli.fly import FirstData
 from triline.nodes.cli.node import _value
 from triline.nodes.convert import gnss_message
@@ -145,6 +145,32 @@ def test_a_flight_is_not_written_over(folder, capsys):
     assert "holds a flight already, wanted another folder" in capsys.readouterr().err
     assert main(["fly", str(folder / "nowhere")]) == 1
     assert "no flight.toml" in capsys.readouterr().err
+
+
+def test_a_platform_that_flies_already_is_not_flown_again(folder, capsys, monkeypatch):
+    monkeypatch.setattr(fly, "ENDED_S", 0.0)
+    port = free_port()
+    words = ["fly", str(folder), "-o", str(folder / "out"), "--no-viewer", "--port", str(port), "--seconds", "1"]
+    with Bus("live1", source="adjuster", port=port) as bus:
+        bus.announce("adjuster")
+        assert main(words) == 1
+    told = f"platform 'live1' flies already: adjuster runs on port {port}, wanted them stopped, or another --port"
+    assert capsys.readouterr().err == f"triline fly: {told}\n"
+
+
+def test_nodes_of_others_on_the_port_and_those_that_end_hinder_no_flight(folder, monkeypatch):
+    monkeypatch.setattr(fly, "MEET_S", 0.3)
+    words = ["fly", str(folder), "-o", str(folder / "out"), "--no-viewer", "--port", str(port := free_port())]
+    args = parse([*words, "--nodes", "navigator"])
+    flight = fly.Fly(args, read_flight(folder, live=True), [])
+    with Bus("live1", source="adjuster", port=port) as bus, Bus("live2", source="navigator", port=port) as other:
+        bus.announce("adjuster")
+        other.announce("navigator")
+        assert flight.port() == port
+        ending = Bus("live1", source="navigator", port=port)
+        ending.announce("navigator")
+        threading.Timer(0.5, ending.close).start()
+        assert flight.port() == port
 
 
 def connected(port: int) -> socket.socket:
