@@ -7,7 +7,9 @@ import getpass
 import json
 import threading
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from google.protobuf.message import DecodeError
 
 from ...schemas import codec
 from ...schemas import messages as m
@@ -17,6 +19,9 @@ from ..errors import UserError
 from ..node import Message
 from ..voices import is_voiced
 from .bus_options import add_bus_arguments, bus_of
+
+if TYPE_CHECKING:
+    from ..bus.session import Bus
 
 EXAMPLE = """triline confirm GCP3 --port 17447
   triline confirm GCP3 --reject
@@ -71,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
             _wait(lambda: bool(heard.sources), NOBODY_S)
         if not topic and heard.points and args.point not in heard.points:
             raise UserError(f"{args.point} is no ground point of this flight, there are {_few(heard.points)}")
-        if args.source and heard.sources and args.source not in heard.sources and not args.reject:
-            raise UserError(f"--source {args.source}: does not speak on {topic}; heard {_few(heard.sources)}")
+        if args.source and not args.reject and args.source not in heard.sources:
+            _refuse_unheard(args.source, topic, heard, bus)
         verdict = m.Verdict(point=args.point, accepted=not args.reject, by=args.by)
         if topic:
             verdict = m.Verdict(topic=topic, publisher=args.source, accepted=not args.reject, by=args.by)
@@ -97,11 +102,41 @@ def run(args: argparse.Namespace) -> int:
     raise UserError(f"{args.point}: the verdict was sent, but no {'node' if topic else 'adjuster'} answers")
 
 
+def _refuse_unheard(source: str, topic: str, heard: _Heard, bus: Bus) -> None:
+    """Raise UserError where a source has not spoken on a topic, as far as that can be told.
+
+    On the ground not every topic is heard, and one that is silent now may have been spoken on before: then the recorder
+    knows by whom, and nodes whether at all.
+    """
+    if heard.sources:
+        raise UserError(f"--source {source}: does not speak on {topic}; heard {_few(heard.sources)}")
+    recorded = _recorded_sources(topic, bus)
+    if source in recorded:
+        return
+    if recorded:
+        raise UserError(f"--source {source}: has not spoken on {topic}; recorded {_few(recorded)}")
+    if topic not in heard.received:
+        raise UserError(f"--source {source}: nobody has spoken on {topic}")
+
+
+def _recorded_sources(topic: str, bus: Bus) -> set[str]:
+    """Who has spoken on a topic, by the recorder; nobody where none answers."""
+    from ..bus.downlink import INVENTORY
+
+    try:
+        answers = [raw for raw in bus.ask("inventory", NOBODY_S) if raw.topic == INVENTORY]
+        streams = [stream for raw in answers for stream in m.Inventory.FromString(bytes(raw.data)).streams]
+    except (ValueError, DecodeError):  # it has no disk, or is gone
+        return set()
+    return {stream.source for stream in streams if stream.topic == topic}
+
+
 class _Heard:
     """Messages about the point or by whom the topic is spoken on, and the newest platform time.
 
     Attributes
     ----------
+    sources, received : who speaks on the topic, and topics of which nodes have received something
     answer : to the verdict
     nothing : a node's word that nothing waits on the topic; another node may know of something
     """
@@ -112,6 +147,7 @@ class _Heard:
         self.stamp_ns = 0
         self.points: set[str] = set()
         self.sources: set[str] = set()
+        self.received: set[str] = set()
         self.answer = self.nothing = ""
         self.looks = 0
 
@@ -122,13 +158,15 @@ class _Heard:
     def take(self, raw: RawMessage) -> None:
         if find(raw.topic).family is not Family.OBSERVATION:
             self.stamp_ns = max(self.stamp_ns, raw.envelope.stamp_ns)
-        if raw.topic.startswith(("status/", "trajectory/")):
+        if raw.topic.startswith("trajectory/"):
             return
         try:
             body: Any = codec.decode(raw.topic, raw.data)
         except ValueError:
             return
-        if raw.topic == "observation/control":
+        if raw.topic.startswith("status/"):
+            self.received.update(counts.topic for counts in body.topics if counts.received)
+        elif raw.topic == "observation/control":
             self.points.add(body.point)
         elif not self.sent.is_set():
             return

@@ -6,6 +6,7 @@ import copy
 import json
 import threading
 
+import pytest
 import sample_messages as sample
 from bus_rig import free_port, triline, wait_for
 
@@ -14,6 +15,7 @@ from triline.nodes.bus.session import Bus
 from triline.nodes.cli import confirm, main
 from triline.nodes.monitor.monitor import Monitor
 from triline.nodes.node import Message, Node
+from triline.schemas import messages as m
 from triline.schemas.envelope import Envelope, RawMessage
 
 
@@ -94,6 +96,45 @@ def test_a_source_that_nobody_heard_is_not_chosen():
         flight.join()
     assert done.returncode == 1
     assert "--source reciever: does not speak on sensor/attitude; heard receiver" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("received", "recorded", "said"),
+    [
+        ((), (), "--source foo: nobody has spoken on sensor/gnss"),
+        (("sensor/attitude",), ("sensor/attitude",), "--source foo: nobody has spoken on sensor/gnss"),
+        (("sensor/gnss",), ("sensor/gnss",), "--source foo: has not spoken on sensor/gnss; recorded receiver"),
+        (("sensor/gnss",), (), "the verdict was sent"),  # it may have been foo
+    ],
+)
+def test_a_source_of_a_silent_topic_is_not_chosen_either(received, recorded, said, monkeypatch, capsys):
+    for name, seconds in (("ANSWER_S", 0.1), ("LISTEN_S", 0.2), ("NOBODY_S", 0.2)):
+        monkeypatch.setattr(confirm, name, seconds)
+    inventory, stop, port = m.Inventory(), threading.Event(), free_port()
+    for topic in recorded:
+        inventory.streams.add(topic=topic, source="receiver")
+    answer = RawMessage("query/inventory", Envelope(0, "recorder", 0), inventory.SerializeToString())
+    with Bus(port=port, source="recorder") as bus:
+        bus.answer_messages("inventory", lambda _: [answer] if recorded else [])
+
+        def report() -> None:
+            while not stop.wait(0.02):
+                status = sample.message("status/recorder")
+                del status.body.topics[:]
+                for topic in received:
+                    status.body.topics.add(topic=topic, received=7)
+                bus.publish(Message(status.topic, sample.EPOCH_NS, status.body, "recorder"))
+
+        reporting = threading.Thread(target=report, daemon=True)
+        reporting.start()
+        assert main(["confirm", "sensor/gnss", "--source", "foo", "--port", str(port)]) == 1
+        assert said in capsys.readouterr().err
+        if recorded:  # who has spoken before may be chosen, and anybody be rejected
+            for words in (["--source", "receiver"], ["--source", "foo", "--reject"]):
+                assert main(["confirm", recorded[0], *words, "--port", str(port)]) == 1
+                assert "the verdict was sent" in capsys.readouterr().err
+        stop.set()
+        reporting.join()
 
 
 def test_a_verdict_beside_a_recorder_says_that_no_data_come(monkeypatch, capsys):
