@@ -152,6 +152,30 @@ def check_strip(body: Any, stamp_ns: int) -> None:
         raise ValueError(f"strip {body.id!r} that begins {away_s:.0f} s after its message")
 
 
+def check_place(latitude: float, longitude: float, height: float) -> None:
+    """Whether a position can be one, degrees and m; raises ValueError with its values."""
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and math.isfinite(height)):
+        raise ValueError(f"position {[latitude, longitude, height]} is no latitude, longitude, height")
+
+
+def check_angles(roll: float, pitch: float, heading: float) -> None:
+    """Whether an attitude can be one of an aircraft, rad; raises ValueError with its values."""
+    if not math.isfinite(roll + pitch + heading):
+        raise ValueError("roll, pitch or heading is not finite")
+    if max(abs(roll), abs(pitch)) > 2.0 or abs(heading) > 7.0:
+        raise ValueError(f"roll, pitch, heading {(roll, pitch, heading)} are not radians of an aircraft")
+
+
+def check_inertial(interval_ns: int, force: tuple[float, ...], rate: tuple[float, ...]) -> None:
+    """Whether an inertial sample can be one of an aircraft, ns, m/s^2 and rad/s; raises ValueError with what cannot."""
+    if not math.isfinite(sum(force) + sum(rate)):
+        raise ValueError("specific force or angular rate is not finite")
+    if max(force) > 500.0 or min(force) < -500.0 or max(rate) > 50.0 or min(rate) < -50.0:
+        raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
+    if not 0 < interval_ns <= SECOND_NS:
+        raise ValueError(f"interval {interval_ns} ns, wanted more than 0 and at most a second")
+
+
 def plain_pose(message: Any) -> PlainPose:
     """The numbers of a PoseInFrame, checked.
 

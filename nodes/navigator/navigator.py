@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -231,13 +230,8 @@ class Navigator(Node):
             return []
         self._note_time(body.time_ns, "inertial")
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
-        if not math.isfinite(sum(force) + sum(rate)):
-            raise ValueError("specific force or angular rate is not finite")
-        if max(force) > 500.0 or min(force) < -500.0 or max(rate) > 50.0 or min(rate) < -50.0:
-            raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
         interval_ns = body.interval_ns
-        if not 0 < interval_ns <= convert.SECOND_NS:
-            raise ValueError(f"interval {interval_ns} ns, wanted more than 0 and at most a second")
+        convert.check_inertial(interval_ns, force, rate)
         if not isinstance(self._engine, InertialNavigator):
             self._engine = inertial_engine(
                 self._configuration, body, filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s
@@ -261,10 +255,7 @@ class Navigator(Node):
             return []
         self._note_time(body.time_ns, "attitude")
         rpy = (body.roll, body.pitch, body.heading)
-        if not np.isfinite(rpy).all():
-            raise ValueError("roll, pitch or heading is not finite")
-        if max(abs(rpy[0]), abs(rpy[1])) > 2.0 or abs(rpy[2]) > 7.0:
-            raise ValueError(f"roll, pitch, heading {rpy} are not radians of an aircraft")
+        convert.check_angles(*rpy)
         if self._is_frozen(body.time_ns, rpy):
             return []
         self._offset.sample(self._seconds(body.time_ns), *rpy)
@@ -301,9 +292,8 @@ class Navigator(Node):
         if self._engine is None:
             self.problem("before configuration", "sensor/gnss came before configuration/project")
             return []
+        convert.check_place(body.latitude, body.longitude, body.altitude)
         geodetic = np.array([body.latitude, body.longitude, body.altitude])
-        if not np.isfinite(geodetic).all() or abs(geodetic[0]) > 90 or abs(geodetic[1]) > 360:
-            raise ValueError(f"position {geodetic.tolist()} is no latitude, longitude, height")
         covariance = np.array(body.position_covariance)
         if covariance.shape != (9,) or not np.isfinite(covariance).all() or covariance[::4].min() <= 0:
             raise ValueError("position covariance: wanted 9 values with a positive diagonal")

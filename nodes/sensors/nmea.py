@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pynmeagps import GET, VALCKSUM, NMEAReader
 
-from ..convert import SECOND_NS, attitude_message, gnss_message
+from ..convert import SECOND_NS, attitude_message, check_place, gnss_message
 from ..formats.keys import Keys
 from ..node import Message
 from .bytes_in import check_address, read_bytes
@@ -181,6 +181,7 @@ class NmeaParser:
             level = self._settings.velocity_sigma_m_s
             velocity = (*self._motion[1], 0.0), (level, level, UNKNOWN_CLIMB_M_S)
         place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
+        check_place(*place)
         body = gnss_message(utc_ns, place, sigma, *velocity)
         return [Message("sensor/gnss", self._settings.clock.stamp(utc_ns), body)]
 

@@ -17,7 +17,15 @@ import numpy as np
 
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
-from ..convert import LATEST_S, SECOND_NS, attitude_message, gnss_message
+from ..convert import (
+    LATEST_S,
+    SECOND_NS,
+    attitude_message,
+    check_angles,
+    check_inertial,
+    check_place,
+    gnss_message,
+)
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..node import Message
@@ -142,11 +150,16 @@ class StreamParser:
         if not np.isfinite(values).all() or not 0 <= time_ns <= LATEST_NS:
             raise ValueError("wanted finite values, and a time from 1970 to 2261")
         stamp = self._clock.stamp(time_ns)
+        if kind != b"IMU" and not min(values[3:6]) > 0:
+            raise ValueError("wanted sigmas above 0")
         if kind == b"GNSS":
+            check_place(*values[:3])
             return [Message("sensor/gnss", stamp, gnss_message(time_ns, values[:3], values[3:6]))]
         if kind == b"ATTITUDE":
+            check_angles(*values[:3])
             return [Message("sensor/attitude", stamp, attitude_message(time_ns, values[:3], values[3:6]))]
-        interval_ns, f, w = int(words[1]), values[1:4], values[4:7]
+        interval_ns, f, w = int(words[1]), tuple(values[1:4]), tuple(values[4:7])
+        check_inertial(interval_ns, f, w)
         body = m.Imu(
             time_ns=time_ns, interval_ns=interval_ns, force_x=f[0], force_y=f[1], force_z=f[2],
             rate_x=w[0], rate_y=w[1], rate_z=w[2],

@@ -112,6 +112,7 @@ def test_heading_and_velocity_where_they_are_wanted(tmp_path):
         (gga("092750.20", quality=0), "no fix"),
         (gga("092750.20", sep=""), "no geoid separation"),
         (gga("092750.20", lat=""), "field missing"),
+        (gga("092750.20", lat="9521.680200"), "field missing"),
         (gga("092750.20") * 2, "time does not go on"),
     ],
 )

@@ -71,6 +71,11 @@ def test_the_clock_of_a_driver():
         (b"GNSS 1 2 3\n", "not readable"),
         (b"IMU x 5000000 0 0 0 0 0 0\n", "not readable"),
         (b"GNSS %d 47.9 nan 1500 1 1 1\n" % T, "not readable"),
+        (b"GNSS %d 95 11.1 1500 1 1 1\n" % T, "not readable"),
+        (b"GNSS %d 47.9 11.1 1500 1 0 1\n" % T, "not readable"),
+        (b"IMU %d -5000000000 0 0 0 0 0 0\n" % T, "not readable"),
+        (b"IMU %d 5000000 0 0 -9806 0 0 0\n" % T, "not readable"),
+        (b"ATTITUDE %d 0.01 0.02 150 1 1 1\n" % T, "not readable"),
         (b"LINES N S1 0 %d 5000000 3 4 12\n" % T, "not readable"),
         (b"LINES N S1 0 %d 5000000 0 4 16\n" % T, "not readable"),
     ],
@@ -78,6 +83,14 @@ def test_the_clock_of_a_driver():
 def test_what_cannot_be_read_is_counted_and_the_next_record_comes(bad, kind):
     messages, counts = parse(bad + ALL)
     assert len(messages) == 4 and counts == {kind: 1}
+
+
+def test_what_no_aircraft_measures_is_said_with_its_record():
+    said: list[str] = []
+    parser = StreamParser(Clock(), lambda kind, text: said.append(text))
+    assert not parser.feed(b"GNSS %d 95 11.1 1500 1 1 1\nIMU %d -5000000000 0 0 0 0 0 0\n" % (T, T))
+    assert said[0] == f"GNSS {T} 95 11.1 1500 1 1 1: position [95.0, 11.1, 1500.0] is no latitude, longitude, height"
+    assert said[1].endswith("interval -5000000000 ns, wanted more than 0 and at most a second")
 
 
 def test_address():
