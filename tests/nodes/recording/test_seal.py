@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import sample_messages as sample
+from places import ROOT
 
 from triline.nodes import cli
 from triline.nodes.bus.authority import Authority
@@ -68,6 +69,17 @@ def recorded(path: Path, bundle: Path, close: bool = True) -> Path:
     if close:
         recorder.close()
     return path
+
+
+def test_a_revocation_does_not_touch_seals_as_the_page_says(tmp_path, authority, capsys):
+    page = " ".join((ROOT / "docs" / "security.md").read_text(encoding="utf-8").split())
+    assert "revocations and the last day of a certificate do not count" in page
+    bundle = authority.certify("lost", "aircraft", ["10.0.0.3"])
+    before = recorded(tmp_path / "before.mcap", bundle)
+    authority.revoke("lost")
+    for signed in (before, recorded(tmp_path / "after.mcap", bundle)):
+        assert run_main("check", signed, "--authority", authority.folder) == 0
+        assert "signed by 'lost' of 'survey'" in capsys.readouterr().out
 
 
 def test_a_signed_recording_is_whole_and_says_by_whom(recording, authority, capsys):
