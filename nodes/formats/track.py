@@ -177,6 +177,7 @@ def times_from_gps(
         notes.append(f"{path.name}: the day of the flight is not known (--date); times count from 1980-01-06")
         return utc_ns_from_gps(0, seconds)
     week, weekday = gps_week(day)
+    seconds = seconds - seconds[0] // WEEK_S * WEEK_S  # of a flight over the end of a week that was cut behind it
     if of_day:
         return utc_ns_from_gps(week, seconds + weekday * DAY_S)
     said = int(seconds[0] // DAY_S) % 7

@@ -318,6 +318,11 @@ def test_sbet_over_the_end_of_a_week(tmp_path):
     assert track.time_ns[0] == ns("2020-06-06T23:59:41")
     # the same flight, named after its second day
     np.testing.assert_array_equal(read_sbet(path, date(2020, 6, 7)).time_ns, track.time_ns)
+    # its part behind the end of the week, whose seconds go on
+    values[:, 0] = [604800.0, 604800.5, 604801.0]
+    values.tofile(path)
+    for day in (6, 7):
+        assert read_sbet(path, date(2020, 6, day)).time_ns[0] == track.time_ns[2]
 
 
 def test_sbet_damaged(tmp_path):
