@@ -45,7 +45,7 @@ def read_dem(path: Path, dem_crs: str | None = None) -> Heights:
         raise UserError(f"{path}: {own.name!r} does not say what its heights count from, {_WANTED}")
     flat = own.sub_crs_list[0] if own.is_compound else own
     if dem_crs == ELLIPSOID:
-        return replace(heights, crs=flat.to_wkt(), above_ellipsoid=True)
+        return _checked(path, replace(heights, crs=flat.to_wkt(), above_ellipsoid=True))
     try:
         given = pyproj.CRS.from_user_input(dem_crs)
         if given.is_vertical and not given.is_compound:
@@ -58,6 +58,11 @@ def read_dem(path: Path, dem_crs: str | None = None) -> Heights:
 
 
 def _checked(path: Path, heights: Heights) -> Heights:
+    import pyproj
+
+    axes = pyproj.CRS.from_user_input(heights.crs).axis_info
+    if heights.unit and (len(axes) < 3 or axes[2].unit_conversion_factor == 1.0):  # PROJ knows that of the CRS alone
+        raise UserError(f"{path}: heights in {heights.unit}, wanted metres, or a vertical CRS with that unit")
     refuse_missing_grids(heights.crs, path)
     return heights
 

@@ -20,7 +20,7 @@ from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
 from .keys import is_there
 from .new_file import new_file
-from .raster_open import open_raster
+from .raster_open import as_stated, open_raster, unit_of_heights
 
 Array = NDArray[np.floating]
 
@@ -47,6 +47,7 @@ class Heights:
     x0, y0 : CRS coordinates of the first value
     dx, dy : from column to column, from row to row
     above_ellipsoid : the file says that they count from the ellipsoid
+    unit : of the values as the file states it, "" for metres
     """
 
     crs: str
@@ -56,6 +57,7 @@ class Heights:
     dx: float
     dy: float
     above_ellipsoid: bool = False
+    unit: str = ""
 
 
 def read_heights(path: Path) -> Heights:
@@ -82,13 +84,14 @@ def read_heights(path: Path) -> Heights:
             band = source.read(1, masked=True)
             crs = source.crs.to_wkt()
             ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
+            unit = unit_of_heights(source)
+            with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
+                z = as_stated(source, np.ma.filled(band.astype(float), np.nan))
     except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
-    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
-        z = np.ma.filled(band.astype(float), np.nan)
     if not np.isfinite(z).any():
         raise UserError(f"{path}: holds no height")
-    return Heights(crs, z, t.c + 0.5 * t.a, t.f + 0.5 * t.e, t.a, t.e, ellipsoidal)
+    return Heights(crs, z, t.c + 0.5 * t.a, t.f + 0.5 * t.e, t.a, t.e, ellipsoidal, unit)
 
 
 def write_heights(path: Path, heights: Heights) -> None:

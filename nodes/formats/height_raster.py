@@ -13,7 +13,7 @@ from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.rectification.terrain import bilinear
 from ..errors import UserError
 from .keys import is_there
-from .raster_open import open_raster
+from .raster_open import as_stated, open_raster, unit_of_heights
 
 Array = NDArray[np.floating]
 
@@ -23,8 +23,6 @@ DATUMS = "ellipsoid, a vertical CRS (EPSG:5773), a raster of geoid heights, or t
 SAME_PLANET = 1e-3
 #: The range of heights is looked up in at most so many values a side; then it is widened by so much, metres. Tuned.
 MOST_SIDE, THIN_SLACK_M = 3000, 100.0
-#: Units of heights that count as metres.
-_METRES = ("", "m", "metre", "meter", "metres", "meters")
 
 
 class RasterFile:
@@ -120,8 +118,8 @@ class HeightRaster:
         t, path = file.transform, file.path
         if t.b or t.d:
             raise UserError(f"{path}: is turned, wanted a raster along its axes")
-        unit = (file.source.units[0] or "").strip().lower()
-        if unit not in _METRES:
+        unit = unit_of_heights(file.source)
+        if unit:
             raise UserError(f"{path}: heights in {unit}, wanted metres")
         if file.rows < 2 or file.columns < 2:
             raise UserError(f"{path}: {file.rows} x {file.columns} heights, wanted at least 2 x 2")
@@ -263,9 +261,7 @@ def _window(file: RasterFile, row: int, column: int, rows: int, columns: int, th
         raise UserError(f"{file.path}: heights of {place} cannot be read: {' '.join(str(error).split())}") from None
     with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
         z = np.ma.filled(band.astype(np.float32), np.nan)
-    if source.scales[0] != 1.0 or source.offsets[0] != 0.0:
-        z = z * np.float32(source.scales[0]) + np.float32(source.offsets[0])
-    return z
+    return as_stated(source, z)
 
 
 class _GeoidRaster:

@@ -10,6 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
+#: Units of heights that count as metres.
+_METRES = ("", "m", "metre", "meter", "metres", "meters")
+
 _alone = threading.Lock()
 
 
@@ -26,6 +31,18 @@ def open_raster(path: Path) -> Any:
     with warnings.catch_warnings(), _without_undecodable_messages():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(path)
+
+
+def unit_of_heights(source: Any) -> str:
+    """The unit of the first band of a dataset; "" for metres, and where it states none."""
+    unit = (source.units[0] or "").strip().lower()
+    return "" if unit in _METRES else unit
+
+
+def as_stated(source: Any, values: NDArray[Any]) -> NDArray[Any]:
+    """Values of the first band of a dataset, times the scale and plus the offset that it states."""
+    scale, offset = source.scales[0], source.offsets[0]
+    return values if scale == 1.0 and offset == 0.0 else values * values.dtype.type(scale) + values.dtype.type(offset)
 
 
 @contextmanager

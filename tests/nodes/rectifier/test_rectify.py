@@ -14,7 +14,10 @@ from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.formats.dem import read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
+from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
@@ -361,6 +364,25 @@ def test_heights_that_cannot_be_used(folder, flown, capsys):
     assert "holds no height" in capsys.readouterr().err
     back = read_heights(folder / "far.tif")
     assert (back.x0, back.y0, back.dx, back.dy) == (4e5, 6.2e6, 10.0, -10.0)
+
+
+def test_heights_are_those_that_the_raster_states(tmp_path):
+    """Whole decimetres with scale and offset; feet are refused where the CRS does not say so."""
+    path = tmp_path / "dm.tif"
+    place = rasterio.Affine(10.0, 0.0, 5e5, 0.0, -10.0, 5.3e6)
+    shape = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "int16"}
+    with rasterio.open(path, "w", crs="EPSG:32632", transform=place, nodata=-1, **shape) as target:
+        target.write(np.array([[[4000] * 4] * 3 + [[-1] * 4]], dtype=np.int16))
+        target.scales, target.offsets = (0.1,), (50.0,)
+    z = read_dem(path, "ellipsoid").z_m
+    assert z[:3] == pytest.approx(450.0) and np.isnan(z[3]).all()
+    assert HeightRaster([path], None, "ellipsoid").heights(0, 0, 3, 4) == pytest.approx(450.0)
+    with rasterio.open(path, "r+") as target:
+        target.units = ("ft",)
+    for read in (lambda: read_dem(path, "ellipsoid"), lambda: HeightRaster([path], None, "ellipsoid")):
+        with pytest.raises(UserError, match="heights in ft, wanted metres"):
+            read()
+    assert read_dem(path, "+proj=utm +zone=32 +datum=WGS84 +vunits=ft +type=crs").unit == "ft"
 
 
 # ---- the node
