@@ -14,8 +14,8 @@ from ...solver.adjustment.adjustment import Solution
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.refined_orientation import design_at
 from ...solver.adjustment.reliability import reliability
-from ...solver.geometry.rotation import angles_from_matrix, corrected_angles, matrix_from_angles
-from ..formats.line_orientation import OrientedLines
+from ...solver.geometry.rotation import corrected_angles, matrix_from_angles
+from ..formats.line_orientation import OrientedLines, poses_in_crs
 from ..formats.new_file import new_file
 from .adjustment_result import TABLES, Adjustment, set_name
 
@@ -109,13 +109,8 @@ def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
     parts = []
     for item in adjustment.result.solution.layout.sets:
         time = adjustment.block.strips[item.strip].trajectory.time_s
-        position, angles, sigma = _refined(adjustment, item, time)
-        places = frame.to_crs(position)
-        if frame.crs != "local":
-            R = np.swapaxes(frame.R_l_crs(places), 1, 2) @ matrix_from_angles(*angles.T)
-            angles = angles_from_matrix(R)
+        places, angles, sigma = poses_in_crs(*_refined(adjustment, item, time), frame)
         angles = np.degrees(angles)
-        angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
         decimals = 9 if frame.is_geographic else 5
         columns: dict[str, object] = {"strip": set_name(adjustment, item), "time_s": _seconds(time, reference)}
         columns |= {
@@ -137,12 +132,12 @@ def _seconds(time_s: Array, reference_ns: int) -> Array | list[str]:
 
 
 def _refined(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array, Array]:
-    """Position (n, 3) and angles (n, 3) in the local frame, and the sigmas (n, 6) of their corrections."""
+    """Position (n, 3) and rotation (n, 3, 3) to the local frame, and the covariance (n, 6, 6) of their corrections."""
     poses = adjustment.block.strips[item.strip].trajectory.at(time_s)
-    correction, sigma = correction_functions(adjustment, item, time_s)
+    correction, covariance = correction_functions(adjustment, item, time_s)
     turn = correction[:, 3:]
     angles = corrected_angles(poses.angles, turn) if adjustment.block.heading else poses.angles + turn
-    return poses.position_l + correction[:, :3], angles, sigma
+    return poses.position_l + correction[:, :3], matrix_from_angles(*angles.T), covariance
 
 
 def oriented_lines(adjustment: Adjustment) -> Iterator[OrientedLines]:
@@ -157,33 +152,32 @@ def oriented_lines(adjustment: Adjustment) -> Iterator[OrientedLines]:
         line, time = line[path.covers(time)], time[path.covers(time)]
         if not len(line):
             continue
-        position, angles, sigma = _refined(adjustment, item, time)
         stamps = reference + np.rint(time * 1e9).astype(np.int64)
-        yield OrientedLines(set_name(adjustment, item), line, stamps, position, matrix_from_angles(*angles.T), sigma)
+        yield OrientedLines(set_name(adjustment, item), line, stamps, *_refined(adjustment, item, time))
 
 
 def correction_functions(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array]:
-    """Corrections (n, 6) of all stages together, and their a-posteriori sigmas (n, 6); metres and radians.
+    """Corrections (n, 6) of all stages together, and their a-posteriori covariance (n, 6, 6); metres and radians.
 
-    The sigmas are those of the last stage, which estimates what the stages before it left.
+    The covariance is that of the last stage, which estimates what the stages before it left.
     """
     result = adjustment.result
     total = np.zeros((len(time_s), 6))
     for stage in result.stages:
         mine = next(s for s in stage.layout.sets if (s.strip, s.lens) == (item.strip, item.lens))
         total += design_at(stage, mine, time_s).evaluate(stage.state.theta)
-    return total, result.sigma0 * correction_sigma(result.solution, item, time_s)
+    return total, result.sigma0**2 * correction_cofactors(result.solution, item, time_s)
 
 
-def correction_sigma(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
-    """Sigmas (n, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
+def correction_cofactors(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
+    """Covariance (n, 6, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
     design = design_at(solution, item, time_s)
     numbers = design.unknowns()
     Q = np.pad(solution.factor.cofactors(numbers), ((0, 1), (0, 1)))  # the last column reads zeros
     columns = np.where(design.columns >= 0, np.searchsorted(numbers, design.columns), -1)
-    variance = np.zeros((len(time_s), 6))
+    found = np.zeros((len(time_s), 6, 6))
     for a in range(design.columns.shape[1]):
         for b in range(design.columns.shape[1]):
             weight = design.coefficients[:, a] * design.coefficients[:, b]
-            variance += weight[:, None] * Q[columns[:, a], columns[:, b]]
-    return np.sqrt(np.maximum(variance, 0.0))
+            found += weight[:, None, None] * Q[columns[:, a, :, None], columns[:, b, None, :]]
+    return found

@@ -208,10 +208,10 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
             if not len(known):
                 continue
             position, R = orientation.at(time_s[known])
-            sigma = np.full((len(known), 6), np.nan)
+            covariance = np.full((len(known), 6, 6), np.nan)
             if stated:
-                sigma = np.sqrt(np.einsum("nii->ni", orientation.covariance_at(time_s[known])))
-            yield OrientedLines(strip.id, known, stamps[known], position, R, sigma)
+                covariance = orientation.covariance_at(time_s[known])
+            yield OrientedLines(strip.id, known, stamps[known], position, R, covariance)
 
     return name, parts()
 

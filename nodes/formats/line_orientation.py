@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...schemas.units import place_columns
 from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
-from ...solver.geometry.rotation import R_BC_NOMINAL, angles_from_matrix
+from ...solver.geometry.rotation import R_BC_NOMINAL, angles_from_matrix, angles_jacobian
 from ..errors import UserError
 from .sbet import write_sbet_poses
 
@@ -36,7 +36,7 @@ class OrientedLines:
     time_ns : (n,) UTC, or the project's own count
     position_l : (n, 3) perspective centre, local frame, m
     R_lc : (n, 3, 3) image to local
-    sigma : (n, 6) of X, Y, Z, omega, phi, kappa, m and rad; NaN where it is not known
+    covariance : (n, 6, 6) of X, Y, Z, omega, phi, kappa in the local frame, m and rad; NaN where it is not known
     """
 
     strip: str
@@ -44,7 +44,7 @@ class OrientedLines:
     time_ns: NDArray[np.int64]
     position_l: Array
     R_lc: Array
-    sigma: Array
+    covariance: Array
 
 
 def write_oriented_lines(
@@ -137,12 +137,37 @@ def _in_crs(position_l: Array, R_lc: Array, frame: LocalFrame) -> tuple[Array, A
     return place, np.swapaxes(frame.R_l_crs(place), 1, 2) @ R_lc
 
 
+def poses_in_crs(position_l: Array, R_lc: Array, covariance: Array, frame: LocalFrame) -> tuple[Array, Array, Array]:
+    """Poses in the CRS and along its axes.
+
+    Parameters
+    ----------
+    position_l, R_lc : (n, 3) m and (n, 3, 3), local frame
+    covariance : (n, 6, 6) of X, Y, Z, omega, phi, kappa in the local frame, m and rad
+
+    Returns
+    -------
+    place : (n, 3), units of the CRS
+    angles : (n, 3) omega, phi, kappa, rad; kappa within half a turn
+    sigma : (n, 6) of X, Y, Z, omega, phi, kappa, m and rad
+    """
+    place, R = _in_crs(position_l, R_lc, frame)
+    angles = angles_from_matrix(R)
+    C = covariance
+    if frame.crs != "local":
+        turn = R @ np.swapaxes(R_lc, 1, 2)  # local axes to those of the CRS
+        T = np.zeros((len(place), 6, 6))
+        T[:, :3, :3] = turn
+        T[:, 3:, 3:] = angles_jacobian(angles) @ turn @ np.linalg.inv(angles_jacobian(angles_from_matrix(R_lc)))
+        C = T @ C @ np.swapaxes(T, 1, 2)
+    angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return place, angles, np.sqrt(np.maximum(np.einsum("nii->ni", C), 0.0))
+
+
 def _rows(file: TextIO, part: OrientedLines, rows: slice, frame: LocalFrame, R_bc: Array, placed: bool) -> None:
     position, R = part.position_l[rows], part.R_lc[rows]
-    place, R_crs = _in_crs(position, R, frame)
-    angles = np.degrees(angles_from_matrix(R_crs))
-    angles[:, 2] = (angles[:, 2] + 180.0) % 360.0 - 180.0
-    sigma = part.sigma[rows] * np.repeat([1.0, 180.0 / np.pi], 3)
+    place, angles, sigma = poses_in_crs(position, R, part.covariance[rows], frame)
+    angles, sigma = np.degrees(angles), sigma * np.repeat([1.0, 180.0 / np.pi], 3)
     flat = "%.9f" if frame.is_geographic else "%.4f"
     formats = [flat, flat, "%.4f", *["%.7f"] * 3, *["%.4f"] * 3, *["%.7f"] * 3]
     columns = [place, angles, sigma]

@@ -143,8 +143,8 @@ def draw_corrections(adjustment: Adjustment) -> Any:
     for n, item in enumerate(layout.sets):
         extent = item.model.extent
         time = np.linspace(extent.start_s, extent.end_s, 400)
-        value, sigma = correction_functions(adjustment, item, time)
-        value, sigma = value * unit, sigma * unit
+        value, covariance = correction_functions(adjustment, item, time)
+        value, sigma = value * unit, np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0)) * unit
         share = time - extent.start_s
         for c, axis in enumerate(axes.ravel()):
             colour = colours(n % 10)

@@ -15,10 +15,12 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.detect import kind_of_path
+from triline.nodes.formats.line_orientation import OrientedLines, write_oriented_lines
 from triline.nodes.formats.trajectory_csv import read_trajectory_csv
 from triline.nodes.recording.access import Recording
 from triline.solver.geometry.ellipsoid import WGS84
 from triline.solver.geometry.frames import GEOGRAPHIC, BodyFrame, LocalFrame
+from triline.solver.geometry.rotation import matrix_from_angles
 
 CRS = {
     "EPSG:4979": ["X_deg", "Y_deg", "Z_m"],
@@ -123,3 +125,25 @@ def test_a_unit_that_the_crs_has_not_is_refused(tmp_path):
     wrong = FILES["trajectory.csv"].replace("X_m", "X_deg").replace(",70.0,", ",east,")
     with pytest.raises(UserError, match=r"trajectory.csv:3: X_deg: 'east' is not a number"):
         read_block(write_files(tmp_path / "word", trajectory=wrong))
+
+
+@pytest.mark.parametrize(
+    "crs", ["EPSG:4978", "EPSG:3413", "EPSG:32632"]
+)  # geocentric, polar, and nearly east and north
+def test_sigmas_of_lines_are_along_the_axes_of_the_crs(crs, tmp_path):
+    frame = LocalFrame(75.0, 10.0, 0.0, crs)
+    rng = np.random.default_rng(2)
+    n, place = 4000, np.array([100.0, -200.0, 1500.0])
+    sigma = np.array([0.1, 0.3, 0.8, 4e-5, 1e-5, 2e-4])
+    off = rng.normal(size=(n, 6)) * sigma
+    angles = np.array([0.02, -0.03, 1.0])
+    nothing = np.arange(n)
+    known = np.broadcast_to(np.diag(sigma**2), (n, 6, 6))
+    drawn = OrientedLines(
+        "S1", nothing, nothing, place + off[:, :3], matrix_from_angles(*(angles + off[:, 3:]).T), known
+    )
+    assert write_oriented_lines(tmp_path / "l.csv", [drawn], frame) == n
+    table = pd.read_csv(tmp_path / "l.csv")
+    names = ["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
+    stated = table[[f"sigma_{name}" for name in names]].to_numpy()[0]
+    assert stated == pytest.approx(table[names].std().to_numpy(), rel=0.06)
