@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas import messages as m
 from ..solver.camera.line_camera import CcdLine, Lens, LineCamera
+from ..solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
 from ..solver.geometry.frames import LocalFrame
 from ..solver.geometry.rotation import (
     R_BC_NOMINAL,
@@ -278,6 +280,21 @@ def camera_from(message: Any) -> LineCamera:
         for lens in message.lenses
     )
     return LineCamera(message.name, lenses, tuple(lines))
+
+
+def estimated_camera(camera: LineCamera, told: Iterable[Any]) -> tuple[LineCamera, int]:
+    """The camera with the additional parameters of a report, and how many there are (0: the camera itself)."""
+    sets = []
+    for make in SELF_CALIBRATIONS.values():
+        with suppress(ValueError):
+            sets.append(make(camera))
+    # what is not of the camera, as parameters of a strip, is in none of the sets
+    of_camera = {name for parameters in sets for name in parameters.names}
+    values = {p.name: p.value for p in told if p.value and p.name in of_camera}
+    for parameters in sets if values else ():
+        if values.keys() <= set(parameters.names):
+            return calibrated(camera, parameters, values), len(values)
+    return camera, 0
 
 
 def local_frame(project: Any) -> LocalFrame:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
-from ...solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
 from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation, known_crs
 from ...solver.geometry.rotation import quaternion_from_matrix
 from ...solver.orthoimage.error_band import GroundErrors
@@ -149,18 +147,7 @@ def estimated_camera(recording: Recording, camera: LineCamera) -> tuple[LineCame
     last = None
     for message in recording.messages("adjustment/report"):
         last = message.body if message.body.parameters else last
-    sets = []
-    for make in SELF_CALIBRATIONS.values():
-        with suppress(ValueError):
-            sets.append(make(camera))
-    # what is not of the camera, as parameters of a strip, is in none of the sets
-    of_camera = {name for parameters in sets for name in parameters.names}
-    told = last.parameters if last is not None else ()
-    values = {p.name: p.value for p in told if p.value and p.name in of_camera}
-    for parameters in sets if values else ():
-        if values.keys() <= set(parameters.names):
-            return calibrated(camera, parameters, values), len(values)
-    return camera, 0
+    return convert.estimated_camera(camera, last.parameters if last is not None else ())
 
 
 def camera_of_table(table: Path) -> Path:

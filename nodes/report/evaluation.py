@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -246,8 +247,11 @@ def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Arr
     return result
 
 
-def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
-    """Point ids and rays with the filtered orientation, without those the adjustment rejected; None without any."""
+def usable_rays(flight: Flight) -> tuple[list[str], ImageRays, ImageRays] | None:
+    """Point ids and rays with the filtered orientation, without those the adjustment rejected; None without any.
+
+    The rays are first those of the camera as it is stated, then those of the camera as it was estimated last.
+    """
     filtered, camera = flight.poses.get(flight.measured), flight.camera
     if filtered is None or camera is None:
         return None
@@ -277,22 +281,26 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays] | None:
     pose = path.at(table[:, 2])
     nearest = np.clip(np.searchsorted(path.time_s, table[:, 2]), 0, len(path) - 1)
     covariance = filtered.covariance[nearest]
-    return [str(i) for i in ids], ImageRays(
+    rays = ImageRays(
         point.astype(np.int64), table[:, 2], table[:, 3], pose.position_l, pose.angles, pose.velocity_l,
         pose.angle_rate, xy, pitch, camera.focal_length_mm[ccd], table[:, 4], table[:, 5], covariance,
         table[:, 6].astype(np.int64),
     )  # fmt: skip
+    told = next((report.parameters for _, report in reversed(flight.reports) if report.parameters), ())
+    xy, pitch = convert.estimated_camera(camera, told)[0].image_coordinates(ccd, table[:, 1])
+    return [str(i) for i in ids], rays, replace(rays, xy_mm=xy, pitch_mm=pitch)
 
 
 def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
     """Point ids, coordinates (p, 3) and covariance (p, 3, 3) by space intersection, by name of INTERSECTED.
 
-    All rows use the same rays: those that the final orientation covers, where there is one.
+    All rows use the same rays: those that the final orientation covers, where there is one. The camera that was
+    estimated with refined orientation goes with it.
     """
     usable = usable_rays(flight)
     if usable is None:
         return {}
-    ids, rays = usable
+    ids, rays, refined = usable
     corrections = {name: _corrections(flight, pose, rays.time_s) for name, pose in INTERSECTED.items()}
     common = np.ones(len(rays.time_s), dtype=bool)
     for found in corrections.values():
@@ -305,7 +313,8 @@ def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]
             continue
         correction, covariance = found
         names = list(ImageRays.__dataclass_fields__)
-        chosen = {field: getattr(rays, field)[common] for field in names if field != "orientation_covariance"}
+        of = refined if INTERSECTED[name] else rays
+        chosen = {field: getattr(of, field)[common] for field in names if field != "orientation_covariance"}
         chosen["position_l"] = chosen["position_l"] + correction[common, :3]
         chosen["angles"] = chosen["angles"] + correction[common, 3:]
         stated = covariance[common] if np.isfinite(covariance[common]).all() else None

@@ -144,6 +144,20 @@ def test_points_that_only_one_of_both_has_are_not_compared(messages):
     assert points["direct_georeferencing"]["n"] == points["adjusted"]["n"] < whole["adjusted"]["n"]
 
 
+def test_refined_orientation_goes_with_the_camera_that_was_estimated_with_it(messages):
+    flight = collect(messages)
+    right = evaluate_flight(flight)["points"]
+    line = flight.camera.lines[0]
+    off = replace(line, xy_mm=line.xy_mm + np.array([0.05, 0.0]))
+    flight.camera = replace(flight.camera, lines=(off, *flight.camera.lines[1:]))
+    flight.reports[-1][1].parameters.add(name=f"xp_{line.id}", value=0.05)
+    found = evaluate_flight(flight)["points"]
+    assert found["final"]["rmse_m"] == pytest.approx(right["final"]["rmse_m"], abs=1e-6)
+    assert found["live"]["rmse_m"] == pytest.approx(right["live"]["rmse_m"], abs=1e-6)
+    before, wrong = (rows["direct_georeferencing"]["rmse_m"] for rows in (right, found))
+    assert np.abs(np.subtract(before, wrong)).max() > 0.1  # before triangulation the camera is the one that is stated
+
+
 def test_without_truth_the_table_is_of_check_points(messages, tmp_path):
     path = write_recording(tmp_path / "real.mcap", [x for x in messages if not x.topic.startswith("truth/")])
     flight, held = read(path)
