@@ -392,6 +392,13 @@ def role_of(ground_point: Any) -> str:
     return m.GroundPoint.Role.Name(ground_point.role).lower()
 
 
+def given_of(ground_point: Any) -> Array:
+    """(3,) coordinates of a GroundPoint; NaN where its role says that they are not given, and so are approximate."""
+    role = role_of(ground_point)
+    xyz = np.array([ground_point.x, ground_point.y, ground_point.z])
+    return np.where([role != "height", role != "height", role != "planimetric"], xyz, np.nan)
+
+
 def tie_message(point: str, images: Iterable[dict[str, Any]]) -> Any:
     """A TiePoint; each image is a dict of ImagePoint's fields."""
     return m.TiePoint(point=point, images=[m.ImagePoint(**image) for image in images])

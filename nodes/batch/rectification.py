@@ -247,10 +247,11 @@ def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrient
 
 
 def known_points(recording: Recording) -> Array:
-    """(n, 3) local coordinates of object points as adjusted last, and of ground control."""
+    """(n, 3) local coordinates of object points as adjusted last, and of ground control with a height."""
     points: dict[str, Any] = {}
     for message in recording.messages("observation/control"):
-        points[message.body.point] = message.body
+        if convert.role_of(message.body) != "planimetric":
+            points[message.body.point] = message.body
     for message in recording.messages("point/object"):
         points[message.body.point] = message.body
     xyz = np.array([(p.x, p.y, p.z) for p in points.values()]).reshape(-1, 3)

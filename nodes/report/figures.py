@@ -90,16 +90,17 @@ def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
 
 
 def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: bool) -> None:
-    """Control and check points, with planimetric residual vectors and height bars."""
+    """Control and check points, with planimetric residual vectors and height bars of what is given."""
     rows = []
     for id, g in flight.ground.items():
-        given = np.array([g.x, g.y, g.z])
         adjusted = flight.points.get(id)
-        left = np.array([adjusted.x, adjusted.y, adjusted.z]) - given if adjusted is not None else np.full(3, np.nan)
-        rows.append((given, left, convert.role_of(g) == "check"))
+        left = np.full(3, np.nan)
+        if adjusted is not None:
+            left = np.array([adjusted.x, adjusted.y, adjusted.z]) - convert.given_of(g)
+        rows.append((np.array([g.x, g.y, g.z]), left, convert.role_of(g) == "check"))
     if not rows:
         return
-    largest = max((float(np.nanmax(np.abs(left))) for _, left, _ in rows if np.isfinite(left).all()), default=0.0)
+    largest = max((float(np.nanmax(np.abs(left))) for _, left, _ in rows if np.isfinite(left).any()), default=0.0)
     scale = length_km / largest if largest > 0 else 0.0
     for check, color, marker, label in ((False, CONTROL, "^", "control"), (True, CHECK, "s", "check")):
         chosen = [(given, left) for given, left, is_check in rows if is_check is check]

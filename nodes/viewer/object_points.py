@@ -34,6 +34,7 @@ class PointsPart(Part):
         self._settling: deque[tuple[float, list[tuple[Array, Array, Color]]]] = deque()
         self._faded_s = -np.inf
         self._given: dict[str, tuple[Array, str]] = {}
+        self._counts: dict[str, Array] = {}  # the same, NaN where a coordinate is not given
         self._given_changed = False
         self._misfit: dict[str, Array] = {}
         self._misfit_changed = False
@@ -42,6 +43,7 @@ class PointsPart(Part):
         body = message.body
         if message.topic == "observation/control":
             self._given[body.point] = np.array([body.x, body.y, body.z]), convert.role_of(body)
+            self._counts[body.point] = convert.given_of(body)
             self._given_changed = True
         elif message.topic == "point/object":
             self._take_point(body)
@@ -54,7 +56,7 @@ class PointsPart(Part):
             return
         bad = any(r.rejected for r in body.residuals)
         if body.point in self._given and body.status == body.FINAL:
-            self._misfit[body.point] = xyz - self._given[body.point][0]
+            self._misfit[body.point] = np.nan_to_num(xyz - self._counts[body.point])
             self._misfit_changed = True
         if body.status == body.LIVE:
             self._live[body.point] = xyz, REJECTED if bad else LIVE

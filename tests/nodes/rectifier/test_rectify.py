@@ -14,6 +14,7 @@ from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main
+from triline.nodes.convert import ground_point_message
 from triline.nodes.errors import UserError
 from triline.nodes.formats.dem import read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
@@ -383,6 +384,14 @@ def test_heights_are_those_that_the_raster_states(tmp_path):
         with pytest.raises(UserError, match="heights in ft, wanted metres"):
             read()
     assert read_dem(path, "+proj=utm +zone=32 +datum=WGS84 +vunits=ft +type=crs").unit == "ft"
+
+
+def test_relief_is_of_points_with_a_height(tmp_path):
+    with RecordingWriter(tmp_path / "control.mcap") as writer:
+        for k, role in enumerate(("control", "planimetric", "height", "check")):
+            body = ground_point_message(role, (10.0 * k, 0.0, 100.0 + k), np.eye(3), role)
+            writer.write(Message("observation/control", k, body, "import"))
+    assert work.known_points(Recording(tmp_path / "control.mcap"))[:, 2].tolist() == [100.0, 102.0, 103.0]
 
 
 # ---- the node

@@ -244,6 +244,30 @@ def test_nothing_of_the_map_is_cut_off(messages, east, north):
             assert box.y1 <= whole.y1 + 0.1 and box.y0 >= whole.y0 - 0.1 and box.x0 >= whole.x0 - 0.1, artist
 
 
+@pytest.mark.parametrize("role", ["planimetric", "height"])
+def test_misfits_of_the_map_are_of_given_coordinates_alone(messages, role):
+    """A planimetric point stands at any height, and a height point at any place."""
+    flight = collect(messages)
+
+    def largest():
+        with styled():
+            figure = trajectory_map(flight)
+        return next(
+            re.search(r"largest (.*) m", t.get_text()).group(1)
+            for t in figure.axes[0].texts
+            if "largest" in t.get_text()
+        )
+
+    before = float(largest())
+    for id, given in flight.ground.items():
+        flight.ground[id] = moved = type(given).FromString(given.SerializeToString())
+        moved.role = m.GroundPoint.Role.Value(role.upper())
+        far = ("z",) if role == "planimetric" else ("x", "y")
+        for axis in far:
+            setattr(moved, axis, getattr(moved, axis) + 60.0)
+    assert 0.0 < float(largest()) <= before < 10.0
+
+
 def test_rejected_rays_are_marked_though_their_points_are_gone(messages):
     marked = {x.body.point for x in messages if x.topic == "point/object" for r in x.body.residuals if r.rejected}
     given_up = sorted(marked)[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -95,6 +96,20 @@ def test_residuals_in_object_space_have_the_stated_scale(notes, messages):
     assert len(misfits) == len(adjusted) >= 3
     p, g = adjusted[0], given[adjusted[0].point]
     np.testing.assert_allclose(misfits[0], scale * np.array([p.x - g.x, p.y - g.y, p.z - g.z]), rtol=1e-9)
+
+
+def test_misfits_are_of_given_coordinates_alone(messages):
+    """A planimetric point stands at any height."""
+    canvas, own = Notebook(), ("configuration/", "observation/control", "trajectory/", "point/object")
+    chosen = [m for m in messages if m.topic.startswith(own)]
+    for k, message in enumerate(chosen):
+        if message.topic == "observation/control":
+            body = type(message.body).FromString(message.body.SerializeToString())
+            body.role, body.z = body.PLANIMETRIC, body.z + 60.0
+            chosen[k] = replace(message, body=body)
+    show(chosen, canvas)
+    vectors = canvas.drawn["points/misfit"][1]
+    assert len(vectors) and np.abs(vectors[:, :2]).max() > 0.0 and np.abs(vectors[:, 2]).max() == 0.0
 
 
 def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages, bar_px=1.0):
