@@ -226,10 +226,11 @@ def _surface(fit: SurfaceFit) -> dict[str, Any]:
 def accuracies(result: BatchResult) -> dict[str, Any]:
     """Empirical and theoretical accuracy of check, control and tie points, and of direct georeferencing.
 
-    Direct georeferencing is compared with the check points, or with the control where there are none.
+    Direct georeferencing is compared with the check points, or with the control where there are none. Coordinates of
+    control that were left out are compared with nothing.
     """
     network, points, sigma = result.network, result.adjusted_points(), result.point_sigma_m
-    surveyed = network.control
+    surveyed = result.kept_control
     tie = np.ones(network.n_points, dtype=bool)
     tie[network.check.point] = tie[surveyed.point] = False
     reference = network.check if len(network.check) else surveyed

@@ -325,13 +325,16 @@ def _known(a: SceneAdjustment, *roles: str) -> NDArray[np.int64]:
 def differences(a: SceneAdjustment, *roles: str) -> tuple[NDArray[np.int64], Array]:
     """Determined known points (k,) of some roles, and adjusted minus given (k, 3): east, north, up, metres.
 
-    NaN where the role says that a coordinate is not given.
+    NaN where the role says that a coordinate is not given, and where it was left out.
     """
     known, k = a.problem.block.known, _known(a, *roles)
     points = known.point[k]
     d = points_enu(a.problem, a.solution.state.position_e, known.position_e[k], points)
     check = np.array([known.role[i] == "check" for i in k], dtype=bool)
-    return points, np.where(known.given[k] | check[:, None], d, np.nan)
+    d = np.where(known.given[k] | check[:, None], d, np.nan)
+    for p, axis in a.snooping.coordinates if a.snooping else ():
+        d[points == p, axis] = np.nan
+    return points, d
 
 
 def point_sigmas(a: SceneAdjustment) -> Array:
@@ -345,7 +348,7 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, roles in (("check", ("check",)), ("control", ("control", "planimetric", "height"))):
         points, d = differences(a, *roles)
-        found[key] = _accuracy(d, sigma[points])
+        found[key] = _accuracy(d, np.where(np.isfinite(d), sigma[points], np.nan))
     tie = a.solution.determined.copy()
     tie[known.point] = False
     found["tie"] = {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()}
@@ -406,8 +409,9 @@ def _reliability(a: SceneAdjustment) -> dict[str, Any]:
 
 
 def _given_w(a: SceneAdjustment, p: int, axis: int) -> float:
+    """Normalised residual of a coordinate, adjusted minus given, as blocks of flights have it."""
     problem, s = a.problem, a.solution
-    miss = problem.R_e_enu[p][:, axis] @ (problem.given_e[p] - s.state.position_e[p])
+    miss = problem.R_e_enu[p][:, axis] @ (s.state.position_e[p] - problem.given_e[p])
     variance = problem.covariance_enu[p, axis, axis] + np.nan_to_num(s.points_covariance[p, axis, axis])
     return float(miss / np.sqrt(variance))
 

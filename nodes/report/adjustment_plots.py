@@ -91,6 +91,7 @@ def draw_points(adjustment: Adjustment) -> Any:
     network, points = result.network, result.adjusted_points()
     figure, axis = plt.subplots(figsize=(9, 7.5))
     axis.plot(*network.approximate_l[:, :2].T, ".", color=_GREY, markersize=2.5, label="object points")
+    kept = {"check": network.check, "control": result.kept_control}
     sets = (("check", network.check, _RED, "o"), ("control", network.control, _GREEN, "^"))
     differences = []
     for _, given, _, _ in sets:
@@ -104,7 +105,7 @@ def draw_points(adjustment: Adjustment) -> Any:
         if not len(given):
             continue
         at = np.where(np.isfinite(given.xyz_l), given.xyz_l, points[given.point])
-        rms = np.sqrt(np.nanmean(d**2, axis=0)) if np.isfinite(d).any() else np.full(3, np.nan)
+        rms = result.compare(kept[name], points, result.point_sigma_m).rmse_m  # as the table of results has it
         label = f"{name} ({len(given)}): RMS {rms[0]:.3f}, {rms[1]:.3f}, {rms[2]:.3f} m"
         axis.plot(at[:, 0], at[:, 1], marker, color=colour, markersize=5, label=label)
         flat = np.nan_to_num(d[:, :2]) * scale

@@ -196,6 +196,16 @@ class BatchResult:
         """(p, 3) metres, a posteriori."""
         return np.sqrt(np.maximum(np.einsum("pii->pi", self.point_covariance), 0.0))
 
+    @property
+    def kept_control(self) -> Control:
+        """The control without the coordinates that were left out: as if they were not given."""
+        control = self.network.control
+        sigma = control.sigma_m.copy()
+        for r in self.rejected:
+            if r.ray < 0:
+                sigma[control.point == r.point, r.axis] = np.inf
+        return replace(control, sigma_m=sigma)
+
     def compare(self, with_: Control, points_l: Array, sigma_m: Array) -> PointAccuracy:
         """Accuracy of points (p, 3) with sigmas (p, 3) against given coordinates, without points that are doubtful."""
         sure = ~np.isin(with_.point, [d.point for d in self.doubtful])

@@ -538,6 +538,7 @@ def test_one_control_point_a_kilometre_off_is_left_out(folder, tmp_path):
     assert (culprit, "X") in left_out or culprit in by_ray
     assert result["sigma0"] == pytest.approx(1.0, abs=0.08)
     assert max(result["check"]["rmse_m"]) < 0.3
+    assert max(result["control"]["rmse_m"]) < 0.1  # of the coordinates that take part
 
 
 def test_unknown_option_is_a_usage_error(folder):

@@ -345,6 +345,18 @@ def test_new_scenes(made, tmp_path, capsys):
         assert match in capsys.readouterr().err
 
 
+def test_control_that_is_left_out_counts_in_no_accuracy(block, capsys):
+    path = block / "ground_points.csv"
+    first = rows(path)[0]
+    path.write_text(path.read_text().replace(first["Z_m"], str(float(first["Z_m"]) + 80.0), 1))
+    assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [(r["point"], r["coordinate"], r["w"] < 0) for r in result["rejected_control"]] == [
+        (first["point"], "Z", True)  # adjusted minus given
+    ]
+    assert result["control"]["n"] == 9 and result["control"]["max_m"][2] < 5.0
+
+
 def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys):
     path = block / "image_points.csv"
     lines = path.read_text().splitlines()
