@@ -310,15 +310,17 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
         except ValueError as error:
             reader.problems["malformed"] += 1
             reader.last_problem = str(error)
+    lost = sum(not sample.valid for sample in samples)  # SBET has neither a flag nor sigmas
+    samples = [sample for sample in samples if sample.valid]
     if len(samples) < 2:
-        raise UserError(f"{reader.path}: {len(samples)} poses on {args.topic}, wanted at least 2")
+        raise UserError(f"{reader.path}: {len(samples)} valid poses on {args.topic}, wanted at least 2")
     time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     position = np.array([sample.position_l for sample in samples])
     quaternion = np.array([sample.quaternion for sample in samples])
     seconds = (time_ns - time_ns[0]) * 1e-9
     velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
     write_sbet_poses(target, time_ns, position, matrix_from_quaternion(quaternion), velocity_l, frame, R_bc_of(project))
-    return {"records": len(time_ns)}
+    return {"records": len(time_ns)} | ({"poses left out, not valid": lost} if lost else {})
 
 
 #: Those that write tables.

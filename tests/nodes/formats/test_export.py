@@ -294,6 +294,20 @@ def test_what_is_refined_again_takes_the_place_of_what_was_said_before(refined_t
     assert np.diff(records[:, 0]) == pytest.approx([0.2, 0.2, 0.7, 0.2], abs=1e-6)
 
 
+def test_sbet_has_no_poses_that_are_not_valid(tmp_path, capsys):
+    poses = [
+        Message(
+            "trajectory/filtered", START + i, pose_message(START + i * 10**8, [i, 5.0, 1000.0], [0.0] * 3, valid=i > 2)
+        )
+        for i in range(8)
+    ]
+    path = write_recording(tmp_path / "flight.mcap", [_project(), *poses])
+    words = ["export", str(path), "--topic", "trajectory/filtered", "--sbet", str(tmp_path / "o.sbet")]
+    assert main(words) == 0
+    assert "5 records, 3 poses left out, not valid" in capsys.readouterr().out
+    assert len(np.fromfile(tmp_path / "o.sbet", "<f8")) == 5 * 17
+
+
 def _geometry(blob: bytes) -> tuple[int, np.ndarray]:
     """WKB type and coordinates of a GeoPackage geometry."""
     magic, version, flags, srs = struct.unpack_from("<2sBBi", blob)
