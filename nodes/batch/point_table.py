@@ -42,7 +42,7 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
             best[body.point] = body
     if not best:
         raise UserError(f"{reader.path}: no message on point/object: `triline process` makes them")
-    project = reader.first("configuration/project")
+    project = reader.last("configuration/project")
     frame = convert.local_frame(project if project is not None else m.Project())
     xyz = np.array([(p.x, p.y, p.z) for p in best.values()])
     none = np.full(9, np.nan)

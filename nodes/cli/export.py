@@ -162,7 +162,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     name = ""
     with new_file(target) as part:
         if args.points is not None:
-            project = reader.first("configuration/project")
+            project = reader.last("configuration/project")
             refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
             result["points"] = write_points(reader, part, covariance=bool(args.covariance))
         else:
@@ -274,7 +274,7 @@ def _write_parquet(
 
 
 def _project_and_frame(reader: RecordingReader) -> tuple[Any, LocalFrame | None]:
-    project = reader.first("configuration/project")
+    project = reader.last("configuration/project")
     return project, None if project is None else local_frame(project)
 
 

@@ -44,7 +44,7 @@ class _Collected:
     def add(self, message: Message) -> None:
         body = message.body
         if message.topic == "configuration/project":
-            self.project = self.project or body
+            self.project = body
         elif message.topic == "configuration/camera":
             self.camera = body
         elif message.topic == "configuration/strip":

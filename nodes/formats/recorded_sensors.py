@@ -67,7 +67,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     if platform_file is not None:
         platform = read_platform(platform_file, notes)
     else:
-        project = reader.first("configuration/project")
+        project = reader.last("configuration/project")
         arm = np.zeros(3) if project is None else convert.lever_arm_of(project)
         x, y, z = (float(v) for v in arm)
         wander = (0.0, 0.0, 0.0)

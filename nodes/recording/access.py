@@ -140,12 +140,12 @@ class Recording:
         )
 
     def camera(self) -> LineCamera:
-        """The camera."""
-        return convert.camera_from(self._first("configuration/camera"))
+        """The camera, as it was stated last."""
+        return convert.camera_from(self._last("configuration/camera"))
 
     def project(self) -> Any:
-        """The Project message: frame, mounting, a-priori accuracies."""
-        return self._first("configuration/project")
+        """The Project message, as it was stated last: frame, mounting, a-priori accuracies."""
+        return self._last("configuration/project")
 
     def true_world(self) -> str:
         """By what the world of a simulation differs from what is stated; "" where it does not, or is not known."""
@@ -164,8 +164,8 @@ class Recording:
         rows = [[getattr(body, name) for name in columns] for body in self.last_strips().values()]
         return pd.DataFrame(rows, columns=pd.Index(columns)).set_index("id")
 
-    def _first(self, topic: str) -> Any:
-        body = self.reader.first(self._check(topic))
+    def _last(self, topic: str) -> Any:
+        body = self.reader.last(self._check(topic))
         if body is None:
             raise UserError(f"{self.reader.path}: no {topic} in it")
         return body

@@ -388,3 +388,9 @@ class RecordingReader:
         """The body of the first message of a topic, None where there is none."""
         message = next(iter(self.messages([topic])), None)
         return None if message is None else message.body
+
+    def last(self, topic: str) -> Any | None:
+        """The body of the last message of a topic by stamp, which replaces the others; None where there is none."""
+        numbers = self.sort(self.select([topic]))
+        message = next(iter(self.decode(numbers[::-1])), None)
+        return None if message is None else message.body

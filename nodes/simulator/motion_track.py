@@ -65,7 +65,7 @@ def _of_recording(recording: Recording, held: set[str]) -> NavigationTrack:
     topic = next((topic for topic in POSE_TOPICS if topic in held), None)
     if topic is None:
         raise UserError(f"{path}: no poses in this recording, wanted one of {', '.join(POSE_TOPICS)}")
-    project = recording.reader.first("configuration/project")
+    project = recording.reader.last("configuration/project")
     assert project is not None
     frame = convert.local_frame(project)
     poses = recording.poses(topic).one_a_time()

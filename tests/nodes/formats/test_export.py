@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import struct
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -15,18 +16,20 @@ from recording_file import write_recording
 from small_block import simulated_block
 
 from triline.nodes.cli import main
-from triline.nodes.convert import gnss_message, ground_point_message, pose_message
+from triline.nodes.convert import camera_message, gnss_message, ground_point_message, pose_message
 from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.formats.detect import Options, read_any
 from triline.nodes.formats.rows import ElementLayout, RowLayout, repeated_messages
 from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages
 from triline.nodes.node import Message
+from triline.nodes.recording.access import Recording
 from triline.nodes.recording.writer import RecordingWriter
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
 from triline.schemas.topics import TOPICS
 from triline.schemas.units import UNITS
+from triline.solver.camera.sensors import preset
 from triline.solver.geometry.frames import LocalFrame
 
 FRAME = LocalFrame(47.5, 10.6, 0.0)
@@ -292,6 +295,26 @@ def test_what_is_refined_again_takes_the_place_of_what_was_said_before(refined_t
     records = np.fromfile(tmp_path / "o.sbet", "<f8").reshape(-1, 17)
     assert records[:, 3] == pytest.approx([1001.0] * 5, abs=0.01)
     assert np.diff(records[:, 0]) == pytest.approx([0.2, 0.2, 0.7, 0.2], abs=1e-6)
+
+
+def test_configuration_that_is_stated_again_counts(tmp_path):
+    """As for the nodes, which begin anew with it."""
+    again = m.Project(name="p", crs="local", origin_latitude=48.5, origin_longitude=10.6)
+    camera, other = preset("ads40-small"), replace(preset("ads40-small"), name="other")
+    poses = [
+        Message("trajectory/smoothed", START + 10 + i, pose_message(START + i * 10**8, [i, 5.0, 1000.0], [0.0] * 3))
+        for i in range(4)
+    ]
+    path = write_recording(tmp_path / "flight.mcap", [
+        _project(), Message("configuration/camera", START, camera_message(camera), "test"),
+        Message("configuration/project", START + 5, again, "test"),
+        Message("configuration/camera", START + 5, camera_message(other), "test"), *poses,
+    ])  # fmt: skip
+    recording = Recording(path)
+    assert recording.project().origin_latitude == 48.5 and recording.camera().name == "other"
+    words = ["export", str(path), "--topic", "trajectory/smoothed", "--sbet", str(tmp_path / "o.sbet")]
+    assert main(words) == 0
+    assert np.degrees(np.fromfile(tmp_path / "o.sbet", "<f8")[1]) == pytest.approx(48.5, abs=1e-3)
 
 
 def test_sbet_has_no_poses_that_are_not_valid(tmp_path, capsys):
