@@ -29,6 +29,7 @@ block and sensor folders, other formats                test_block_folder, test_d
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ import numpy as np
 import pytest
 import sample_messages as sample
 import zenoh
-from bus_rig import Rig, simulated_flight, triline, wait_for, wait_for_nodes
+from bus_rig import TRILINE, Rig, simulated_flight, triline, wait_for, wait_for_nodes
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
@@ -407,7 +408,9 @@ def test_a_recorder_without_room_says_so_and_goes_on_when_there_is_room(tmp_path
         bus.subscribe("status/recorder", lambda raw: states.append(codec.decode(raw.topic, raw.data).state))
         heard: list[float] = []
         bus.subscribe("sensor/attitude", lambda raw: heard.append(time.monotonic()))
-        recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
+        # -B: of byte code there would be room for a part, too, and other tests would trip over that
+        words = [sys.executable, "-B", *TRILINE[1:], "node", "recorder", "-o", str(tmp_path / "a.mcap")]
+        recorder = rig.start_program(words, "recorder")
         wait_for(lambda: "recorder" in bus.alive(), 40, "the recorder")
         replay = rig.start("replay", simulated_flight(90), "--rate", 1.5, "--wait-for", "navigator,adjuster")
         wait_for(lambda: len(heard) > 900, 30, "some chunks")
