@@ -165,7 +165,7 @@ def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
 
 def _camera(reader: RecordingReader, path: Path) -> bytes:
     """The message of a camera in place of that of the recording."""
-    body = reader.first(CAMERA)
+    body = reader.last(CAMERA)
     if body is None:
         raise UserError(f"{reader.path}: no {CAMERA} in it, so --camera has nothing to stand for")
     return codec.encode(camera_message(read_camera_instead(path, camera_from(body))))

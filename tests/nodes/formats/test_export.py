@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sqlite3
 import struct
-from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -15,9 +14,10 @@ from full_disk import files_of_at_most
 from recording_file import write_recording
 from small_block import simulated_block
 
-from triline.nodes.cli import main
+from triline.nodes.cli import main, process
 from triline.nodes.convert import camera_message, gnss_message, ground_point_message, pose_message
 from triline.nodes.formats.block_messages import block_messages
+from triline.nodes.formats.camera_json import write_camera
 from triline.nodes.formats.detect import Options, read_any
 from triline.nodes.formats.rows import ElementLayout, RowLayout, repeated_messages
 from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages
@@ -300,7 +300,7 @@ def test_what_is_refined_again_takes_the_place_of_what_was_said_before(refined_t
 def test_configuration_that_is_stated_again_counts(tmp_path):
     """As for the nodes, which begin anew with it."""
     again = m.Project(name="p", crs="local", origin_latitude=48.5, origin_longitude=10.6)
-    camera, other = preset("ads40-small"), replace(preset("ads40-small"), name="other")
+    camera, other = preset("ads40-small"), preset("ads40")
     poses = [
         Message("trajectory/smoothed", START + 10 + i, pose_message(START + i * 10**8, [i, 5.0, 1000.0], [0.0] * 3))
         for i in range(4)
@@ -311,7 +311,9 @@ def test_configuration_that_is_stated_again_counts(tmp_path):
         Message("configuration/camera", START + 5, camera_message(other), "test"), *poses,
     ])  # fmt: skip
     recording = Recording(path)
-    assert recording.project().origin_latitude == 48.5 and recording.camera().name == "other"
+    assert recording.project().origin_latitude == 48.5 and recording.camera().name == other.name
+    write_camera(tmp_path / "calibrated.json", other)  # which can stand for that one alone
+    assert process._camera(recording.reader, tmp_path / "calibrated.json")
     words = ["export", str(path), "--topic", "trajectory/smoothed", "--sbet", str(tmp_path / "o.sbet")]
     assert main(words) == 0
     assert np.degrees(np.fromfile(tmp_path / "o.sbet", "<f8")[1]) == pytest.approx(48.5, abs=1e-3)
