@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,7 @@ from ..formats.new_file import new_file
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
+from .misspecified_flights import Flown, KeptFlights, code_digest
 from .misspecified_nodes import through_nodes
 from .progress import progress
 
@@ -59,6 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--csv", metavar="FILE", help="also write a row of figures for each row and setting")
+    parser.add_argument(
+        "--flights", metavar="FILE",
+        help="keep each flight there as soon as it is flown, and take from there what the same code has flown before: "
+        "a study of hours goes on where it was stopped",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,18 +80,7 @@ def run(args: argparse.Namespace) -> int:
     motion = _motion(args) if args.motion else None
     rows = [row for row in ROWS if row in args.rows]
     keys = [(setting, row) for setting in args.settings for row in rows]
-    seeds = range(args.first, args.first + args.seeds)
-    cases = [
-        (setting, row, seed, args.strips, args.seconds, args.online, motion, args.told)
-        for setting, row in keys
-        for seed in seeds
-    ]
-    flights: dict[tuple[str, str], list[FlightFigures]] = {key: [] for key in keys}
-    with progress("flights", args.quiet or args.json) as tell, ProcessPoolExecutor(args.jobs) as pool:
-        for i, found in enumerate((pool.map if args.jobs > 1 else map)(_fly, cases)):
-            flights[cases[i][:2]].append(found)
-            if tell is not None:
-                tell((i + 1) / len(cases))
+    flights = _flights(args, keys, motion)
     cells = cells_of(flights)
     if args.csv:
         write_csv(cells, Path(args.csv))
@@ -91,6 +89,45 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(lines(cells, args.seeds, _flown(args))))
     return 0
+
+
+def _flights(
+    args: argparse.Namespace, keys: Sequence[tuple[str, str]], motion: RealMotion | None
+) -> dict[tuple[str, str], list[FlightFigures]]:
+    """Every row with the first seed, then with the next: a study that is stopped has something of each."""
+    kept, plan, code = (KeptFlights(Path(args.flights)) if args.flights else None), _plan(args), code_digest()
+    if kept is not None and (other := kept.of_other_code(code)):
+        print(f"{kept.path}: {other} of {len(kept)} flights are of other code and are not taken", file=sys.stderr)
+    seeds = range(args.first, args.first + args.seeds)
+    wanted = [Flown(setting, row, seed, plan, code) for seed in seeds for setting, row in keys]
+    found = {flown: kept.get(flown) if kept is not None else None for flown in wanted}
+    missing = [flown for flown in wanted if found[flown] is None]
+    cases = [(f.setting, f.row, f.seed, args.strips, args.seconds, args.online, motion, args.told) for f in missing]
+    with progress("flights", args.quiet or args.json) as tell, _pool(min(args.jobs, len(cases))) as pool:
+        for i, figures in enumerate((pool.map if pool else map)(_fly, cases), 1):
+            found[missing[i - 1]] = figures
+            if kept is not None:
+                kept.add(missing[i - 1], figures)
+            if tell is not None:
+                tell(i / len(cases))
+    flights: dict[tuple[str, str], list[FlightFigures]] = {key: [] for key in keys}
+    for flown, figures in found.items():
+        if figures is not None:
+            flights[flown.setting, flown.row].append(figures)
+    return flights
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor | nullcontext[None]:
+    return ProcessPoolExecutor(jobs) if jobs > 1 else nullcontext()
+
+
+def _plan(args: argparse.Namespace) -> str:
+    """What was asked for but rows, settings and seeds; a motion by what is in its file."""
+    words = {name: getattr(args, name) for name in ("strips", "seconds", "online", "told")}
+    if args.motion:
+        words |= {"motion": hashlib.sha256(Path(args.motion).read_bytes()).hexdigest()[:12]}
+        words |= {"from": args.from_s, "ground": args.ground}
+    return ", ".join(f"{name} {value}" for name, value in words.items())
 
 
 def _motion(args: argparse.Namespace) -> RealMotion:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from places import MOTION, needs_motion
 
-from triline.nodes.cli import main
+from triline.nodes.cli import main, study_misspecified
+from triline.nodes.cli.misspecified_flights import Flown, KeptFlights
 from triline.nodes.cli.misspecified_nodes import answer_of, processed, through_nodes
 from triline.nodes.report.evaluation import evaluate
 from triline.nodes.report.flight import collect
@@ -169,3 +170,64 @@ def test_a_boresight_is_not_taken_for_the_camera():
     answer = through_nodes(simulation, [])
     assert not any("calibration of the camera" in event for event in answer.events)
     assert online_quality(simulation, answer, np.zeros(3)).points_m < 0.2
+
+
+SHORT = ("study", "misspecified", "--seconds", "12", "--settings", "rtk", "--online", "window", "--jobs", "1", "--json")
+
+
+def figures_of(capsys, *words: str) -> tuple[dict, str]:
+    """What a short study says: without its processor time, and on the terminal."""
+    assert main([*SHORT, *words]) == 0
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    for cell in document["cells"]:
+        for one in (cell, *cell["each"]):
+            del one["seconds"]
+    return document, err
+
+
+def test_a_study_that_was_stopped_goes_on(tmp_path, capsys, monkeypatch):
+    kept = tmp_path / "flights.jsonl"
+    words = ("--rows", "stated", "--flights", str(kept))
+    figures_of(capsys, *words, "--seeds", "1")
+    with kept.open("a") as file:
+        file.write('{"flight": {"setting"')  # killed while it wrote
+    resumed, _ = figures_of(capsys, *words, "--seeds", "2")
+    assert len(kept.read_text().splitlines()) == 2
+    monkeypatch.setattr(study_misspecified, "fly", None)  # nothing is flown again
+    again, err = figures_of(capsys, *words, "--seeds", "2")
+    assert again == resumed and not err
+    monkeypatch.undo()
+    assert figures_of(capsys, *words[:2], "--seeds", "2")[0] == resumed
+
+
+def test_flights_of_other_code_or_another_plan_are_not_taken(tmp_path, capsys, monkeypatch):
+    kept = tmp_path / "flights.jsonl"
+    words = ("--rows", "stated", "--seeds", "1", "--flights", str(kept))
+    figures_of(capsys, *words)
+    _, err = figures_of(capsys, *words, "--seconds", "14")
+    assert len(kept.read_text().splitlines()) == 2 and not err
+    monkeypatch.setattr(study_misspecified, "code_digest", lambda: "0123456789ab")
+    _, err = figures_of(capsys, *words)
+    assert err == f"{kept}: 2 of 2 flights are of other code and are not taken\n"
+    assert len(kept.read_text().splitlines()) == 3
+
+
+def test_figures_that_are_not_known_come_back_as_such(tmp_path):
+    """JSON has no NaN: a batch that gave up must not become one without errors."""
+    flown = Flown("rtk", "stated", 1, "strips 1", "0123456789ab")
+    figures = replace(GOOD, batch=Quality(np.nan), component_factors={"image": np.nan}, events=["a", "b"])
+    KeptFlights(tmp_path / "flights.jsonl").add(flown, figures)
+    found = KeptFlights(tmp_path / "flights.jsonl").get(flown)
+    assert repr(found) == repr(figures)
+
+
+@pytest.mark.parametrize("text", ["name,x,y\n", "{}\n", "[1]\n", '{"flight": {}, "figures": {}}\n', "no line", "\n"])
+def test_a_file_of_something_else_is_left_alone(text, tmp_path, capsys):
+    foreign = tmp_path / "other.csv"
+    foreign.write_text(text)
+    assert main([*SHORT, "--flights", str(foreign)]) == 1
+    assert capsys.readouterr().err.strip().endswith(f"{foreign}: line 1: wanted a flight of triline study misspecified")
+    assert foreign.read_text() == text
+    assert main([*SHORT, "--flights", str(tmp_path / "no" / "folder")]) == 1
+    assert "cannot be written" in capsys.readouterr().err
