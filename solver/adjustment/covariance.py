@@ -16,6 +16,8 @@ from .adjustment import Solution
 from .elimination import Cluster
 from .normal_equations import couplings
 
+_UNIT = np.eye(2)
+
 #: Rays for which dense rows are held at a time.
 ROWS = 1024
 
@@ -45,7 +47,7 @@ class Cofactors:
         The residual of a ray with weight 0 is that of a prediction from the others.
         """
         sign = np.where(ray_weight > 0, -1.0, 1.0)
-        return np.eye(2) + sign[:, None, None] * self.observed
+        return _UNIT + sign[:, None, None] * self.observed
 
 
 def cofactors(solution: Solution) -> Cofactors:

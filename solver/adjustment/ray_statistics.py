@@ -51,31 +51,55 @@ def ray_statistics(solution: Solution, cofactors: Cofactors) -> RayStatistics:
     return statistics_of_rays(rays, lin, solution.whitening, solution.ray_weight, cofactors)
 
 
-def statistics_of_rays(
-    rays: Rays, lin: Linearisation, whitening: Whitening, weight: Array, cofactors: Cofactors
-) -> RayStatistics:
-    """Whitened residuals of rays with weights (n,) turned back into lines and samples.
+@dataclass(frozen=True)
+class InSigmas:
+    """What turns whitened residuals of n rays into lines and samples in their sigmas.
 
     The covariance of a residual is ``M M^T``, where the columns of M are what one sigma of the line and one sigma of
     the sample move it by; so ``M^-1 v`` are the residuals of line and sample in their sigmas.
+
+    Attributes
+    ----------
+    back : (n, 2, 2) ``M^-1``
+    unit : (n, 2) cofactors of line and sample: 1, or sigma0^-2 where the image sigma was re-estimated
+    sigma_px : (n, 2) a-priori
     """
-    # robust weights fade away; what hardly has any is as good as left out
-    weight = np.where(weight > 1e-6, weight, 0.0)
-    Qvv = cofactors.residuals(weight)
-    # a ray with part of its weight: P^-1 - A Q A^T, in the units of full weight
-    part = np.where((weight > 0) & (weight < 1), 1.0 / np.where(weight > 0, weight, 1.0) - 1.0, 0.0)
-    Qvv = Qvv + part[:, None, None] * np.eye(2)
-    back = _in_sigmas(rays, lin, whitening)
-    v = np.einsum("nij,jn->ni", back, lin.residual)
-    C = back @ Qvv @ np.swapaxes(back, 1, 2)
-    q = np.einsum("nii->ni", C)
-    unit = np.einsum("nij,nij->ni", back, back)  # 1, or sigma0^-2 where the image sigma was re-estimated
-    unit = unit * (1.0 + part[:, None])
-    redundancy = np.where((weight > 0)[:, None], q / unit, 0.0)
-    controlled = q / unit > UNCONTROLLED
-    w = np.where(controlled, v / np.sqrt(np.where(controlled, q, 1.0)), 0.0)
-    sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
-    return RayStatistics(v * sigma, sigma * np.sqrt(unit), np.clip(redundancy, 0.0, 1.0), w, _joint(v, C, unit))
+
+    back: Array
+    unit: Array
+    sigma_px: Array
+
+    @classmethod
+    def of(cls, rays: Rays, lin: Linearisation, whitening: Whitening) -> InSigmas:
+        sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
+        back = _inverse(whitened_pixels(rays, lin, whitening) * sigma[:, None])
+        return cls(back, np.einsum("nij,nij->ni", back, back), sigma)
+
+    def statistics(self, residual: Array, weight: Array, cofactors: Cofactors) -> RayStatistics:
+        """Statistics of whitened residuals (2, n) of rays with weights (n,)."""
+        # robust weights fade away; what hardly has any is as good as left out
+        weight = np.where(weight > 1e-6, weight, 0.0)
+        Qvv, unit, back = cofactors.residuals(weight), self.unit, self.back
+        if not ((weight == 0.0) | (weight >= 1.0)).all():
+            # a ray with part of its weight: P^-1 - A Q A^T, in the units of full weight
+            part = np.where((weight > 0) & (weight < 1), 1.0 / np.where(weight > 0, weight, 1.0) - 1.0, 0.0)
+            Qvv, unit = Qvv + part[:, None, None] * np.eye(2), unit * (1.0 + part[:, None])
+        v = np.einsum("nij,jn->ni", back, residual)
+        C = back @ Qvv @ back.swapaxes(1, 2)
+        q = np.einsum("nii->ni", C)
+        share = q / unit
+        controlled = share > UNCONTROLLED
+        redundancy = np.where((weight > 0)[:, None], share, 0.0)
+        w = np.where(controlled, v / np.sqrt(np.where(controlled, q, 1.0)), 0.0)
+        sigma, number = self.sigma_px, np.minimum(np.maximum(redundancy, 0.0), 1.0)
+        return RayStatistics(v * sigma, sigma * np.sqrt(unit), number, w, _joint(v, C, unit))
+
+
+def statistics_of_rays(
+    rays: Rays, lin: Linearisation, whitening: Whitening, weight: Array, cofactors: Cofactors
+) -> RayStatistics:
+    """Whitened residuals of rays with weights (n,) turned back into lines and samples."""
+    return InSigmas.of(rays, lin, whitening).statistics(lin.residual, weight, cofactors)
 
 
 def whitened_pixels(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
@@ -94,12 +118,6 @@ def pixels_of_motion(rates: Array, line_period_s: Array, pitch_mm: Array, orient
     M[:, 0, 1] = g[0] * pitch[0]
     M[:, 1, 1] = g[1] * pitch[0] + g[2] * pitch[1]
     return M
-
-
-def _in_sigmas(rays: Rays, lin: Linearisation, whitening: Whitening) -> Array:
-    """What turns whitened residuals into line and sample in their sigmas (n, 2, 2)."""
-    sigma = np.stack([rays.sigma_line_px, rays.sigma_sample_px], axis=1)
-    return _inverse(whitened_pixels(rays, lin, whitening) * sigma[:, None])
 
 
 def _inverse(M: Array) -> Array:

@@ -14,7 +14,7 @@ from ..arrays import Array, Bools, IntArray
 
 Blocks = list[Array]
 
-_potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
+_potrf, _potri, _potrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=float)
 
 #: Eigenvalues of the scaled matrix below this are taken as zero: where only its own diagonal is known for a scale, and
 #: where that before the points were eliminated is, of which elimination leaves rounding.
@@ -99,7 +99,10 @@ class DenseFactor:
         if self._factor is None:
             return self.inverse() @ rhs
         scale = self.scale if rhs.ndim == 1 else self.scale[:, None]
-        return scale * cho_solve((self._factor, True), scale * rhs, check_finite=False)
+        if not rhs.size:
+            return scale * rhs
+        found, _ = _potrs(self._factor, scale * rhs, lower=1)
+        return scale * found
 
     def inverse(self) -> Array:
         """(n, n) cofactor matrix."""

@@ -11,6 +11,7 @@ from .rotation import quaternion_conjugate, quaternion_multiply, vector_from_qua
 from .trajectory import Poses, Trajectory, noise_between, slopes
 
 Array = NDArray[np.floating]
+IntArray = NDArray[np.intp]
 
 #: Smoothed poses are waited for so long, s, after the time they belong to: longer than a smoother lags behind, and than
 #: a filter that has aligned itself in motion reaches back to its first data. Tuned: a shorter one makes orientation
@@ -194,7 +195,7 @@ class MeasuredTrajectory:
         for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
             if len(source) < 2 or not mine.any():
                 continue
-            i = np.clip(np.searchsorted(source.time_s, t[mine], side="right") - 1, 0, len(source) - 2)
+            i = _before(source.time_s, t[mine])
             step = source.time_s[i + 1] - source.time_s[i]
             good[mine] = source.covers(t[mine]) & (step <= self.gap_s)
         return good
@@ -204,7 +205,7 @@ class MeasuredTrajectory:
         if len(self._smoothed) < 2:
             return np.zeros(len(t), dtype=bool)
         times = self._smoothed.time_s
-        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        i = _before(times, t)
         near = (times[i + 1] - times[i] <= self.gap_s) | (t == times[i])
         return near & (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
 
@@ -257,3 +258,8 @@ class MeasuredTrajectory:
         for trajectory in (self._filtered, self._smoothed):
             if len(trajectory):
                 trajectory.forget(before_s)
+
+
+def _before(times: Array, t: Array) -> IntArray:
+    """Sample before each time (m,), of samples at times (n,): never the last one."""
+    return np.minimum(np.maximum(times.searchsorted(t, side="right") - 1, 0), len(times) - 2)

@@ -76,7 +76,7 @@ def angles_from_matrix(R_lc: ArrayLike) -> Array:
     """Angles ``(omega, phi, kappa)`` in radians, shape (..., 3), of rotations (..., 3, 3); phi in [-pi/2, pi/2]."""
     R = np.asarray(R_lc, dtype=float)
     omega = np.arctan2(-R[..., 1, 2], R[..., 2, 2])
-    phi = np.arcsin(np.clip(R[..., 0, 2], -1.0, 1.0))
+    phi = np.arcsin(np.minimum(np.maximum(R[..., 0, 2], -1.0), 1.0))
     kappa = np.arctan2(-R[..., 0, 1], R[..., 0, 0])
     return np.stack([omega, phi, kappa], axis=-1)
 

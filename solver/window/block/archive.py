@@ -86,11 +86,11 @@ class Archive:
 
     def holds(self, columns: IntArray) -> bool:
         """Whether all these unknowns are kept; drifts (negative numbers) are."""
-        kept = (columns < 0) | np.isin(columns, self._shared)
+        kept = columns < 0
         for strip in self.strips.values():
             if len(strip.numbers):
                 kept |= (columns >= strip.numbers[0]) & (columns <= strip.numbers[-1])
-        return bool(kept.all())
+        return bool(kept.all()) or bool(np.isin(columns[~kept], self._shared).all())
 
     @property
     def over(self) -> list[str]:

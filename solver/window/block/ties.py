@@ -218,12 +218,15 @@ class EarlierStrips:
         """Modes that no batch in the window (columns of each) touches and none will; their patches are closed."""
         if not self.present:
             return np.empty(0, dtype=np.int64)
-        busy = {int(c) for columns in used for c in columns}
-        gone = [np.empty(0, dtype=np.int64)]
-        for patch in self._patches:
-            if len(patch.numbers) and patch.used_s <= limit_s and int(patch.numbers[0]) not in busy:
-                gone.append(patch.numbers)
-                patch.numbers, patch.closed = gone[0], True
+        none = np.empty(0, dtype=np.int64)
+        old = [patch for patch in self._patches if len(patch.numbers) and patch.used_s <= limit_s]
+        if not old:
+            return none
+        busy = np.isin([patch.numbers[0] for patch in old], np.concatenate([none, *used]))
+        gone = [none]
+        for patch in (patch for patch, needed in zip(old, busy, strict=True) if not needed):
+            gone.append(patch.numbers)
+            patch.numbers, patch.closed = none, True
         return np.concatenate(gone)
 
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import get_lapack_funcs
 
 from ...arrays import Array
 from ..state.strip import WindowStrip
 from ..state.unknowns import WindowState, block_of
+
+(_trtrs,) = get_lapack_funcs(("trtrs",), dtype=float)
 
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
@@ -193,7 +195,9 @@ def _eliminated(matrix: Array, rhs: Array, first: int) -> _Eliminated | None:
         root = np.linalg.cholesky(matrix[:first, :first])
     except np.linalg.LinAlgError:
         return None
-    y = solve_triangular(root, np.column_stack([matrix[:first, first:], rhs[:first]]), lower=True, check_finite=False)
+    y = np.column_stack([matrix[:first, first:], rhs[:first]])
+    if first:  # solve_triangular asks more of its arguments than such a small system takes
+        y, _ = _trtrs(root.T, y, lower=0, trans=1)
     X, y = y[:, :-1], y[:, -1]
     log_det = 2.0 * float(np.log(np.diagonal(root)).sum())
     return _Eliminated(matrix[first:, first:] - X.T @ X, rhs[first:] - X.T @ y, log_det, float(y @ y))

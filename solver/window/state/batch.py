@@ -17,10 +17,12 @@ from ...adjustment.layout import Layout
 from ...adjustment.linearisation import Linearisation, linearise, linearise_and_weigh
 from ...adjustment.network import Rays
 from ...adjustment.normal_equations import ControlWeights, inverse_factors, point_normals
-from ...adjustment.ray_statistics import RayStatistics, statistics_of_rays
+from ...adjustment.ray_statistics import InSigmas, RayStatistics
 from ...adjustment.surface_control import SurfaceControl
 from ...arrays import Array, Bools, IntArray
 from .unknowns import Border, Information, WindowState
+
+_UNIT = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,7 @@ class Batch:
     groups: list[Group] | None = None
     judged: tuple[int, Cofactors, RayStatistics] | None = field(init=False, repr=False, default=None)
     _of_rays: tuple[Linearisation, Array] | None = field(init=False, repr=False, default=None)
+    _in_sigmas: tuple[Linearisation, Rays, InSigmas] | None = field(init=False, repr=False, default=None)
     _without_points: tuple[Array, Array] | None = field(init=False, repr=False, default=None)
     _left: tuple[Array, IntArray, bool] | None = field(init=False, repr=False, default=None)
 
@@ -329,12 +332,12 @@ class Batch:
         L = self.inverse_factors
         n, p = len(self.rays), self.n_points
         D, u = self.coupling, len(self.columns)
-        inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ np.swapaxes(D, 1, 2) + np.eye(3)
-        points = np.swapaxes(L, 1, 2) @ inner @ L
+        inner = (D.reshape(3 * p, u) @ Q).reshape(p, 3, u) @ D.swapaxes(1, 2) + _UNIT
+        points = L.swapaxes(1, 2) @ inner @ L
         W, rows = self.without_points
         through = (rows.reshape(2 * n, u) @ Q).reshape(n, 2, u)
-        observed = through @ np.swapaxes(rows, 1, 2) + W @ np.swapaxes(W, 1, 2)
-        return Cofactors(np.diagonal(Q).copy(), points, observed)
+        observed = through @ rows.swapaxes(1, 2) + W @ W.swapaxes(1, 2)
+        return Cofactors(Q.diagonal().copy(), points, observed)
 
     @property
     def full_rows(self) -> Array:
@@ -346,7 +349,7 @@ class Batch:
     @property
     def through_points(self) -> Array:
         """How the rays at full weight hang on the points, times their inverse factors (n, 2, 3)."""
-        return self.lin.point.transpose(2, 0, 1) @ np.swapaxes(self.inverse_factors, 1, 2)[self.rays.point]
+        return self.lin.point.transpose(2, 0, 1) @ self.inverse_factors.swapaxes(1, 2)[self.rays.point]
 
     @property
     def without_points(self) -> tuple[Array, Array]:
@@ -415,12 +418,19 @@ class Batch:
             theta = state.values(self.columns)
             self.back_substitute(theta)
             cofactors = self.cofactors(state.covariance(self.columns))
-            statistics = statistics_of_rays(self.rays, self._at(theta), self.whitening, self.weight, cofactors)
+            statistics = self._measured().statistics(self._residual_at(theta), self.weight, cofactors)
             self.judged = state.solution, cofactors, statistics
         return self.judged[1], self.judged[2]
 
-    def _at(self, theta: Array) -> Linearisation:
-        """The linear equations with their residuals at values (u,) of the unknowns and the present points.
+    def _measured(self) -> InSigmas:
+        """What makes lines and samples of the residuals at the present linearisation."""
+        known = self._in_sigmas
+        if known is None or known[0] is not self.lin or known[1] is not self.rays:
+            self._in_sigmas = known = self.lin, self.rays, InSigmas.of(self.rays, self.lin, self.whitening)
+        return known[2]
+
+    def _residual_at(self, theta: Array) -> Array:
+        """Whitened residuals (2, n) of the linear equations at values (u,) of the unknowns and the present points.
 
         They are as good as the linearisation, which follows the unknowns (`relinearisation`).
         """
@@ -428,4 +438,4 @@ class Batch:
         rows = self.full_rows.reshape(2 * n, -1)
         shift = (self.points_l - self.origin_l).take(self.rays.point, axis=0)
         moved = np.einsum("ckn,nk->cn", self.lin.point, shift) + (rows @ (theta - self.theta)).reshape(n, 2).T
-        return replace(self.lin, residual=self.lin.residual - moved)
+        return self.lin.residual - moved
