@@ -68,7 +68,8 @@ class Rectified:
 def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOrientation, int]:
     """The orientation of a recording: which it is, the orientation, and the stamp (ns) that its times count from.
 
-    Where its poses have covariances, it has them, too.
+    Where its poses have covariances, it has them, too. Poses that are not valid take no part: where there are no others
+    lines have no orientation.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
 
     Raises
     ------
-    UserError : the recording does not hold it
+    UserError : the recording does not hold it, or too few of its poses are valid
     """
     path = recording.reader.path
     topics = (*(t for t in ORIENTATIONS.values() if not t.endswith("/")), "trajectory/filtered", "trajectory/smoothed")
@@ -93,42 +94,48 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
         has = f"it has {', '.join(there)}" if there else "it has none"
         missing = ORIENTATIONS[name].rstrip("/") if measured or name == "measured" else "trajectory"
         raise UserError(f"{path}: no {name} orientation ({missing}): {has}; 'triline process' makes it")
-    if name == "truth":
-        base = recording.poses("truth/trajectory").one_a_time()
-    else:
-        base = _measured(recording, held, smoothed=name != "live")
+    stated = _poses(recording, "truth/trajectory") if name == "truth" else _measured(recording, name != "live")
+    base = stated.part(stated.valid)
+    not_valid = len(stated.time_ns) - len(base.time_ns)
+    if len(base.time_ns) < 2:
+        kind = "true" if name == "truth" else "measured"
+        raise UserError(f"{path}: {len(base.time_ns)} valid poses of the {kind} trajectory, wanted at least 2")
     reference_ns = int(base.time_ns[0])
     gap_s = max(0.3, 2.5 * float(np.median(np.diff(base.time_ns))) * 1e-9)
     orientation = LineOrientation((base.time_ns - reference_ns) * 1e-9, base.position_l, base.quaternion, gap_s)
-    stated = base
+    orientation.not_valid = not_valid
     if name in REFINED:
         # whole strips come again when the block is refined with later ones; live is the first answer
-        refined = recording.poses(ORIENTATIONS[name]).one_a_time(keep_first=name == "live")
+        refined = _poses(recording, ORIENTATIONS[name], keep_first=name == "live")
         if name == "whole" and "orientation/final" in held:  # of a strip whose backward pass is missing
             refined = _with_final(recording, refined)
+        refined = refined.part(refined.valid)
         try:
             orientation.refine((refined.time_ns - reference_ns) * 1e-9, refined.position_l, refined.quaternion)
         except ValueError as error:
             raise UserError(f"{path}: {ORIENTATIONS[name]}: {error}") from None
-        stated = refined
+        base = refined
     if name == "truth":
         orientation.state_covariance([0.0], np.zeros((1, 6, 6)))
-    elif np.isfinite(stated.covariance).all(axis=(1, 2)).any():
-        orientation.state_covariance((stated.time_ns - reference_ns) * 1e-9, stated.covariance)
+    elif np.isfinite(base.covariance).all(axis=(1, 2)).any():
+        orientation.state_covariance((base.time_ns - reference_ns) * 1e-9, base.covariance)
     return name, orientation, reference_ns
 
 
-def _measured(recording: Recording, held: set[str], smoothed: bool) -> PoseTable:
-    """Filtered poses, or smoothed ones and filtered ones where there are none yet."""
-    best = "trajectory/smoothed" if smoothed else "trajectory/filtered"
-    other = "trajectory/filtered" if smoothed else "trajectory/smoothed"
-    if best not in held:
-        return recording.poses(other).one_a_time()
-    poses = recording.poses(best).one_a_time()
-    if smoothed and other in held:
-        more = recording.poses(other).one_a_time()
-        poses = _joined(poses, more, (more.time_ns < poses.time_ns[0]) | (more.time_ns > poses.time_ns[-1]))
-    return poses
+def _poses(recording: Recording, topic: str, keep_first: bool = False) -> PoseTable:
+    return recording.poses(topic).one_a_time(keep_first)
+
+
+def _measured(recording: Recording, smoothed: bool) -> PoseTable:
+    """Filtered poses or smoothed ones, and the others before the first of them that is valid and behind the last."""
+    topics = (
+        ("trajectory/smoothed", "trajectory/filtered") if smoothed else ("trajectory/filtered", "trajectory/smoothed")
+    )
+    poses, more = (_poses(recording, topic) for topic in topics)
+    valid = poses.time_ns[poses.valid]
+    if not len(valid):
+        return more if more.valid.any() else poses
+    return _joined(poses, more, (more.time_ns < valid[0]) | (more.time_ns > valid[-1]))
 
 
 def _with_final(recording: Recording, whole: PoseTable) -> PoseTable:
@@ -174,8 +181,8 @@ def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Pat
     return camera, None
 
 
-def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines]]:
-    """Which orientation it is (of `ORIENTATIONS`), and all lines of all strips with it.
+def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Iterator[OrientedLines], int]:
+    """Which orientation it is (of `ORIENTATIONS`), all lines of all strips with it, and how many poses are not valid.
 
     Raises
     ------
@@ -200,7 +207,7 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
                 covariance = orientation.covariance_at(time_s[known])
             yield OrientedLines(strip.id, known, stamps[known], position, R, covariance)
 
-    return name, parts()
+    return name, parts(), orientation.not_valid
 
 
 def _line_stamps(recording: Recording, strip: Any) -> NDArray[np.int64]:

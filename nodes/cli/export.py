@@ -166,10 +166,11 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
             refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
             result["points"] = write_points(reader, part, covariance=bool(args.covariance))
         else:
-            name, lines = lines_of_recording(recording, args.orientation)
+            name, lines, not_valid = lines_of_recording(recording, args.orientation)
             frame, project = project_frame(recording), recording.project()
             refuse_missing_grids(frame.crs, path)
             result |= {"orientation": name, "lines": _write_lines(args.format, part, lines, frame, R_bc_of(project))}
+            result |= {"poses left out, not valid": not_valid} if not_valid else {}
     said = ", ".join(f"{v} {k}" for k, v in list(result.items())[2:])
     if args.per_line:
         result |= _write_camera(recording, name, target)

@@ -118,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
         "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
         "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
+        "poses_not_valid": of.orientation.not_valid,
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args)
@@ -183,5 +184,7 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> 
         print(f"  camera of {result['camera']}")
     if done.left_out:
         print("  left out: " + ", ".join(f"{n} lines {why}" for why, n in done.left_out.items()))
+    if result["poses_not_valid"]:
+        print(f"  {result['poses_not_valid']} poses are not valid and give no orientation")
     if done.missed_rays:
         print(f"  {done.missed_rays} rays did not meet the ground")

@@ -354,7 +354,7 @@ def _layer_of_strip(
             held[0], folder, stem, settings.crs, settings.gsd, settings.tile, settings.sigma,
             name=f"{path.stem} {strip}", camera=_camera_name(of.camera, of.ccd),
             told={"lines": sum(done.strips.values()), "left_out": done.left_out, "missed_rays": done.missed_rays,
-                  "orientation": of.orientation_name, "ground": of.ground},
+                  "orientation": of.orientation_name, "poses_not_valid": of.orientation.not_valid, "ground": of.ground},
         )  # fmt: skip
     finally:
         held[0].close()
@@ -447,6 +447,11 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
             f"{step['balanced_tone_rms']:.2f} after the balance (RMS of the lines; of single nodes "
             f"{step['raw_rms']:.2f} and {step['balanced_rms']:.2f})"
         )
+    for layer in result["layers"]:
+        for why, lines in layer.get("left_out", {}).items():
+            print(f"  left out of {layer['name']}: {lines} lines {why}")
+        if layer.get("poses_not_valid"):
+            print(f"  {layer['name']}: {layer['poses_not_valid']} poses are not valid and give no orientation")
     for name in result["empty"]:
         print(f"  nothing of {name}")
     rest = [result[name] for name in ("source", "seams", "sigma", "stac") if result[name]]

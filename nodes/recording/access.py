@@ -59,6 +59,10 @@ class PoseTable:
         time = self.time_ns if keep_first else self.time_ns[::-1]
         rows = np.unique(time, return_index=True)[1]
         rows = rows if keep_first else len(time) - 1 - rows
+        return self.part(rows)
+
+    def part(self, rows: NDArray[Any]) -> PoseTable:
+        """Some rows, by number or by whether."""
         return PoseTable(*(values[rows] for values in vars(self).values()))
 
 

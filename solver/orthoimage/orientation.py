@@ -26,6 +26,10 @@ class LineOrientation:
     time_s, position_l, quaternion : (n,), (n, 3), (n, 4) measured poses, ascending
     gap_s : measured poses farther apart than this have a gap between them
 
+    Attributes
+    ----------
+    not_valid : how many measured poses were not taken because they are not to be relied on; for people
+
     Raises
     ------
     ValueError : fewer than two poses, times that do not increase
@@ -33,6 +37,7 @@ class LineOrientation:
 
     def __init__(self, time_s: ArrayLike, position_l: ArrayLike, quaternion: ArrayLike, gap_s: float = GAP_S) -> None:
         self.measured = Trajectory(time_s, position_l, quaternion)
+        self.not_valid = 0
         self._gap_s = gap_s
         self._knots: tuple[Array, Array] | None = None
         self._covariance: tuple[Array, Array] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main
-from triline.nodes.convert import ground_point_message
+from triline.nodes.convert import ground_point_message, time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.dem import read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
@@ -353,6 +354,33 @@ def test_lost_blocks_leave_a_hole_and_are_told(flown, folder, capsys):
     with rasterio.open(folder / "holes.tif") as a, rasterio.open(folder / "whole.tif") as b:
         share = 1 - (a.read(1) > 0).sum() / (b.read(1) > 0).sum()
     assert 0.8 < share / (gone / sum(whole["strips"].values())) < 1.3
+
+
+def test_poses_that_are_not_valid_give_no_orientation(flown, folder, capsys):
+    """As of a navigator that still seeks its heading: the place of the antenna, and no attitude."""
+    begin = next(iter(Recording(flown).last_strips().values())).first_line_time_ns + 8 * 10**9
+    lost = 0
+    with RecordingWriter(folder / "aligning.mcap") as writer:
+        for message in RecordingReader(flown).sorted_messages():
+            if message.topic == "trajectory/filtered" and time_ns(message.body.timestamp) < begin:
+                message.body.valid, message.body.reason, lost = False, "aligning", lost + 1
+                turned = message.body.pose.orientation
+                turned.x, turned.y, turned.z, turned.w = 0.0, 0.0, 1.0, 0.0
+            if not message.topic.startswith(("trajectory/smoothed", "orientation", "orthoimage")):
+                writer.write(message)
+    result = _rectify(capsys, folder / "aligning.mcap", folder / "aligning.tif", "--gsd", 3)
+    assert result["orientation"] == "measured" and result["poses_not_valid"] == lost > 10
+    total = sum(_rectify(capsys, flown, folder / "whole.tif", "--orientation", "truth", "--gsd", 3)["strips"].values())
+    left, there = result["left_out"]["without orientation"], sum(result["strips"].values())
+    assert left + there == total and left == pytest.approx(8.0 * total / 20.0, abs=0.02 * total)
+    table = folder / "aligning.csv"
+    assert main(["export", str(folder / "aligning.mcap"), "--per-line", str(table)]) == 0
+    assert f"{lost} poses left out, not valid" in capsys.readouterr().out
+    with open(table) as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == there and min(float(row["time_s"]) for row in rows) >= begin * 1e-9 - 0.01
+    spread = np.ptp([float(row["kappa_deg"]) for row in rows])
+    assert spread < 5.0
 
 
 def test_heights_that_cannot_be_used(folder, flown, capsys):
