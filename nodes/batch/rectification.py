@@ -430,19 +430,21 @@ def frame_for(frame: LocalFrame, crs: str) -> LocalFrame:
 
     Raises
     ------
-    UserError : PROJ does not know the CRS, or it is not projected
+    UserError : PROJ does not know the CRS, it is not projected, or the frame lies outside its area
     """
     other = LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
     if crs == "local":
         return other
     try:
         known_crs(crs, geocentric=False)
-        other.to_crs(np.zeros((1, 3)))
+        inside = bool(np.isfinite(other.to_crs(np.zeros((1, 3)))).all())
         geographic = other.is_geographic
     except ValueError as error:
         raise UserError(f"--crs: {error}") from None
     if geographic:
         raise UserError(f"--crs {crs}: is geographic, wanted a projected CRS such as EPSG:32632")
+    if not inside:
+        raise UserError(f"--crs {crs}: the project lies outside its area")
     return other
 
 

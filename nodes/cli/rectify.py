@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
         "poses_not_valid": of.orientation.not_valid,
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
-    _tell(result, done, args)
+    _tell(result, done, args, grid.frame.units[0])
     tell_damage("rectify", recording.reader)
     return 0
 
@@ -166,13 +166,13 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
 
 
-def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace) -> None:
+def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace, unit: str) -> None:
     if args.json:
         print(json.dumps(result, indent=2))
         return
     lines = sum(done.strips.values())
     print(
-        f"{args.output}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} m in {result['crs']}, "
+        f"{args.output}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} {unit} in {result['crs']}, "
         f"{lines} lines of {result['ccd']}, {result['orientation']} orientation, {result['ground']}, "
         f"{result['seconds']:.1f} s"
     )

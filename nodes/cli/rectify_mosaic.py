@@ -41,7 +41,7 @@ from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from . import rectify_image
 from .progress import progress
-from .rectify_recording import Prepared, cells_of, check_strips, prepared
+from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
 
 #: Cells a side of a tile: least, and when nobody asks for another.
 LEAST_TILE, TILE = 128, 1024
@@ -330,7 +330,7 @@ def _layer_of_strip(
     stamp = path.stat()
     of = _prepared_once(f"{vars(args)} {stamp.st_size} {stamp.st_mtime_ns}", path, _Held(args))
     grid = GroundGrid(of.target, settings.gsd)
-    factor = max(int(grid.gsd / of.pixel_m + 0.1), 1)
+    factor = pixels_together(grid, of.pixel_m)
     held: list[SpillingMosaic] = []
 
     def mosaic(dtype: Any) -> SpillingMosaic:

@@ -12,7 +12,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import LocalFrame
 from ...solver.orthoimage.error_band import GroundErrors
-from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
+from ...solver.orthoimage.ground_grid import GroundGrid, metres_a_unit, utm_of
 from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.surface import Ellipsoid, Surface, UnderAir
 from ..batch.rectification import (
@@ -116,10 +116,15 @@ def cells_of(args: argparse.Namespace, of: Prepared) -> tuple[GroundGrid, int]:
     ------
     UserError : too many cells
     """
-    grid = GroundGrid(of.target, args.gsd or float(f"{of.pixel_m:.2g}"))
+    grid = GroundGrid(of.target, args.gsd or float(f"{of.pixel_m / metres_a_unit(of.target):.2g}"))
     if not args.mosaic:  # a mosaic is not held in memory
         _check_size(of.recording, of.camera, of.ccd, of.pixel_m, grid)
-    return grid, max(int(grid.gsd / of.pixel_m + 0.1), 1)
+    return grid, pixels_together(grid, of.pixel_m)
+
+
+def pixels_together(grid: GroundGrid, pixel_m: float) -> int:
+    """How many pixels each way are put together, where cells are so much larger."""
+    return max(int(grid.cell_m / pixel_m + 0.1), 1)
 
 
 def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
@@ -193,7 +198,7 @@ def _errors(
 
 def _check_size(recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid) -> None:
     lines = max((int(message.body.lines) for message in recording.messages("configuration/strip")), default=0)
-    cells = lines * camera.lines[ccd].pixels * (pixel / grid.gsd) ** 2
+    cells = lines * camera.lines[ccd].pixels * (pixel / grid.cell_m) ** 2
     if cells > MOST_CELLS:
         raise UserError(
             f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ class GroundGrid:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.gsd) and self.gsd > 0):
             raise ValueError(f"cells of {self.gsd}, wanted more than 0")
+
+    @cached_property
+    def cell_m(self) -> float:
+        """Side of a cell on the ground at the origin of the local frame, metres; maps may be in feet, or enlarge."""
+        return self.gsd * metres_a_unit(self.frame)
 
     def cells(self, point_l: Array) -> Array:
         """Column and row (..., 2) of local points (..., 3)."""
@@ -81,6 +87,14 @@ def _basis(s: Array) -> Array:
     x, y, z = s.T
     xx, yy, xy = x * x, y * y, x * y
     return np.stack([np.ones(len(s)), x, y, z, xx, xy, yy, xx * x, xx * y, xy * y, yy * y, x * z, y * z], axis=1)
+
+
+def metres_a_unit(frame: LocalFrame) -> float:
+    """Metres on the ground that a unit of the CRS of a local frame is, at its origin; the mean of both axes."""
+    step_m = 100.0
+    x, y, _ = frame.to_crs(step_m * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])).T
+    area = abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
+    return float(step_m / np.sqrt(area))
 
 
 def utm_of(frame: LocalFrame) -> str:

@@ -299,6 +299,7 @@ def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder
         (["--dem", __file__], "not a raster"),
         (["--height", "9000"], "below the ground"),
         (["--height", "1", "--dem", "points"], "wanted one of them"),
+        (["--crs", "+proj=gnom +lat_0=-49 +lon_0=-170 +datum=WGS84 +type=crs"], "lies outside its area"),
     ],
 )
 def test_refusals(flown, folder, capsys, options, text):
@@ -354,6 +355,29 @@ def test_lost_blocks_leave_a_hole_and_are_told(flown, folder, capsys):
     with rasterio.open(folder / "holes.tif") as a, rasterio.open(folder / "whole.tif") as b:
         share = 1 - (a.read(1) > 0).sum() / (b.read(1) > 0).sum()
     assert 0.8 < share / (gone / sum(whole["strips"].values())) < 1.3
+
+
+def test_cells_in_feet_are_as_large_as_those_in_metres(flown, folder, capsys):
+    """Also which pixels are put together goes by the size of a cell on the ground."""
+    foot = 1200.0 / 3937.0
+    utm = "+proj=utm +zone=32 +datum=WGS84 +units={} +type=crs"
+    made = {}
+    for unit, size in (("m", 1.0), ("us-ft", foot)):
+        for gsd in (None, 6.0):
+            words = [] if gsd is None else ["--gsd", gsd / size]
+            crs = utm.format(unit)
+            made[unit, gsd] = _rectify(capsys, flown, folder / "unit.tif", "--height", 0, "--crs", crs, *words)
+    for gsd in (None, 6.0):
+        metres, feet = made["m", gsd], made["us-ft", gsd]
+        assert feet["gsd"] * foot == pytest.approx(metres["gsd"], rel=0.05)
+        assert feet["pixels_together"] == metres["pixels_together"]
+        assert feet["rows"] == pytest.approx(metres["rows"], rel=0.06)
+    assert made["m", 6.0]["pixels_together"] > 1 == made["m", None]["pixels_together"]
+    # a map that is enlarged as much as Web Mercator is here: by 1 / cos 49 deg
+    mercator = _rectify(capsys, flown, folder / "unit.tif", "--height", 0, "--crs", "EPSG:3857")
+    assert mercator["gsd"] == pytest.approx(made["m", None]["gsd"] / np.cos(np.radians(48.9)), rel=0.05)
+    assert main(["rectify", str(flown), "-o", str(folder / "unit.tif"), "--crs", utm.format("us-ft")]) == 0
+    assert " ft_us in +proj=utm" in capsys.readouterr().out
 
 
 def test_poses_that_are_not_valid_give_no_orientation(flown, folder, capsys):
