@@ -62,13 +62,14 @@ class HeightRaster:
     ----------
     paths : rasters of one CRS and cell size (tiles of SRTM, say); values stand for the middle of their cells
     crs : in place of that of the files
-    datum : of the heights, of `DATUMS`; may be left out where the CRS says it
+    datum : of the heights, of `DATUMS`; may be left out where the CRS says it. Heights are in the unit of the vertical
+        CRS, where there is one, and depths where it counts downwards
     ellipsoid : of the sensor that looks at them
 
     Raises
     ------
-    UserError : no raster, turned, without CRS, of another planet, in feet, without a vertical datum, rasters that do
-        not fit, a geoid that is not at hand
+    UserError : no raster, turned, without CRS, of another planet, in feet that no CRS states, without a vertical
+        datum, rasters that do not fit, a geoid that is not at hand
     """
 
     def __init__(
@@ -100,7 +101,12 @@ class HeightRaster:
             metres = np.radians(1.0) * ellipsoid.semi_major_m
             width = width[0] * metres * max(float(np.cos(middle)), 1e-3), width[1] * metres
         self.cell_m = float(min(width))
+        self._unit_m = _unit_m(whole)
         self.datum, self._above = self._datum(first.path, datum, stated)
+        for file in self._files:
+            unit = unit_of_heights(file.source)
+            if unit and self._unit_m == 1.0:
+                raise UserError(f"{file.path}: heights in {unit}, wanted metres, or a vertical CRS with that unit")
 
     # -- what is checked -----------------------------------------------------------------------------------------------
 
@@ -118,9 +124,6 @@ class HeightRaster:
         t, path = file.transform, file.path
         if t.b or t.d:
             raise UserError(f"{path}: is turned, wanted a raster along its axes")
-        unit = unit_of_heights(file.source)
-        if unit:
-            raise UserError(f"{path}: heights in {unit}, wanted metres")
         if file.rows < 2 or file.columns < 2:
             raise UserError(f"{path}: {file.rows} x {file.columns} heights, wanted at least 2 x 2")
         other = abs(t.a / first.transform.a - 1.0) + abs(t.e / first.transform.e - 1.0)
@@ -161,7 +164,7 @@ class HeightRaster:
                 return f"{constant:g} m above the ellipsoid", lambda lat, lon: np.full(np.shape(lat), constant)
             if Path(datum).exists():
                 return f"above {Path(datum).name}", _GeoidRaster(Path(datum), self.ellipsoid)
-            stated = _vertical(datum)
+            stated, self._unit_m = _vertical(datum)
         if isinstance(stated, str):
             return "above the ellipsoid", None
         return f"above {stated.name}", _proj_geoid(path, stated)
@@ -194,10 +197,15 @@ class HeightRaster:
             right = min(column + columns, first_column + file.columns)
             if top >= bottom or left >= right:
                 continue
-            z = _window(file, top - first_row, left - first_column, bottom - top, right - left)
+            z = self._window(file, top - first_row, left - first_column, bottom - top, right - left)
             part = out[top - row : bottom - row, left - column : right - column]
             part[:] = np.where(np.isnan(part), z, part)
         return out
+
+    def _window(self, file: RasterFile, *place: int) -> NDArray[np.float32]:
+        """Heights of a window of one file, metres."""
+        z = _read(file, *place)
+        return z if self._unit_m == 1.0 else z * np.float32(self._unit_m)
 
     def range_over(self, lat: Array, lon: Array) -> tuple[float, float] | None:
         """Lowest and highest height above the ellipsoid around points, by a thinned-out window; None for none."""
@@ -214,7 +222,7 @@ class HeightRaster:
             if r0 >= r1 or c0 >= c1:
                 continue
             thin = max(1, -(-max(r1 - r0, c1 - c0) // MOST_SIDE))
-            z = _window(file, r0, c0, r1 - r0, c1 - c0, thin)
+            z = self._window(file, r0, c0, r1 - r0, c1 - c0, thin)
             if np.isfinite(z).any():
                 low, high = min(low, float(np.nanmin(z))), max(high, float(np.nanmax(z)))
                 slack = THIN_SLACK_M if thin > 1 else slack
@@ -241,8 +249,8 @@ class HeightRaster:
         return out
 
 
-def _window(file: RasterFile, row: int, column: int, rows: int, columns: int, thin: int = 1) -> NDArray[np.float32]:
-    """Heights of a window of one file, every ``thin``-th.
+def _read(file: RasterFile, row: int, column: int, rows: int, columns: int, thin: int = 1) -> NDArray[np.float32]:
+    """Values of a window of one file, every ``thin``-th.
 
     Raises
     ------
@@ -303,7 +311,15 @@ def _split(crs: Any) -> tuple[Any, Any]:
     return crs, None
 
 
-def _vertical(name: str) -> Any:
+def _unit_m(crs: Any) -> float:
+    """Metres that a unit of the heights of a CRS is, less than zero for depths; 1 where it says nothing of heights."""
+    axis = crs.axis_info[-1]
+    direction = axis.direction.lower()
+    return {"up": 1.0, "down": -1.0}.get(direction, 0.0) * axis.unit_conversion_factor or 1.0
+
+
+def _vertical(name: str) -> tuple[Any, float]:
+    """The vertical CRS of a name, or "ellipsoid", and the unit of its heights in metres."""
     import pyproj
     from pyproj.exceptions import CRSError
 
@@ -314,9 +330,9 @@ def _vertical(name: str) -> Any:
     if crs.is_compound:
         crs = crs.sub_crs_list[1]
     if crs.is_vertical:
-        return crs
+        return crs, _unit_m(crs)
     if len(crs.axis_info) > 2:
-        return "ellipsoid"
+        return "ellipsoid", _unit_m(crs)
     raise UserError(f"--dem-datum {name}: {crs.name} says nothing of heights, wanted {DATUMS}")
 
 

@@ -111,7 +111,7 @@ def heights_in_frame(
     Parameters
     ----------
     frame : the local frame; its own CRS does not matter
-    crs : of the heights; above the ellipsoid where it says nothing of heights
+    crs : of the heights, which may be in feet or depths in it; above the ellipsoid where it says nothing of heights
     z : (rows, columns) heights at nodes, NaN where not known
     x0, y0 : CRS coordinates of the first node
     dx, dy : from column to column and from row to row, of either sign
@@ -141,14 +141,17 @@ def heights_in_frame(
     if nx * ny > MOST_NODES:
         raise ValueError(f"{nx} x {ny} heights are too many, wanted at most {MOST_NODES}")
     given = HeightField(0.0, 0.0, 1.0, z)
+    first = other.from_crs(np.array([[x0, y0, middle], [x0, y0, middle + 1.0]]))
+    unit_m = float(first[1, 2] - first[0, 2])  # of the heights, in the local frame
+    start_m = float(np.median(corners[:, 2]))
     field = np.empty((ny, nx))
     x_l = left + step_m * np.arange(nx)
     for i in range(ny):
-        point = np.stack([x_l, np.full(nx, bottom + step_m * i), np.full(nx, middle)], axis=1)
+        point = np.stack([x_l, np.full(nx, bottom + step_m * i), np.full(nx, start_m)], axis=1)
         for _ in range(3):  # the place in the CRS hardly depends on the height
             place = other.to_crs(point)
             h = given.height((place[:, 0] - x0) / dx, (place[:, 1] - y0) / dy)
             known = np.isfinite(h)
-            point[:, 2] += np.where(known, h - place[:, 2], 0.0)
+            point[:, 2] += np.where(known, unit_m * (h - place[:, 2]), 0.0)
             field[i] = np.where(known, point[:, 2], np.nan)
     return HeightField(float(left), float(bottom), step_m, field)

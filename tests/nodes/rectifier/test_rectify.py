@@ -17,7 +17,7 @@ from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main
 from triline.nodes.convert import ground_point_message, time_ns
 from triline.nodes.errors import UserError
-from triline.nodes.formats.dem import read_dem
+from triline.nodes.formats.dem import dem_in_frame, read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
 from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.node import Message
@@ -28,6 +28,7 @@ from triline.nodes.rectifier.rectifier import Rectifier
 from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.viewer.scene import Scene
 from triline.schemas import messages as m
+from triline.solver.geometry.frames import LocalFrame
 from triline.solver.orthoimage.ground_grid import GroundGrid
 from triline.solver.orthoimage.surface import HeightField
 from triline.solver.simulation.imagery import ground_sample
@@ -435,7 +436,18 @@ def test_heights_are_those_that_the_raster_states(tmp_path):
     for read in (lambda: read_dem(path, "ellipsoid"), lambda: HeightRaster([path], None, "ellipsoid")):
         with pytest.raises(UserError, match="heights in ft, wanted metres"):
             read()
-    assert read_dem(path, "+proj=utm +zone=32 +datum=WGS84 +vunits=ft +type=crs").unit == "ft"
+    in_feet = "+proj=utm +zone=32 +datum=WGS84 +vunits=ft +type=crs"
+    assert read_dem(path, in_feet).unit == "ft"
+    raster = HeightRaster([path], in_feet)
+    assert raster.heights(0, 0, 3, 4) == pytest.approx(450.0 * 0.3048)
+    # the field of a raster in feet lies where that of the same heights in metres does
+    local = LocalFrame(47.85, 9.0, 0.0)
+    place = replace(local, crs="EPSG:32632").from_crs(np.array([[5e5 + 15.0, 5.3e6 - 15.0, 450.0 * 0.3048]]))
+    lat, lon, _ = np.radians(local.to_geodetic(place)).T
+    assert raster.range_over(lat, lon) == pytest.approx((450.0 * 0.3048,) * 2)
+    assert raster.at(lat, lon) == pytest.approx(450.0 * 0.3048)
+    height = dem_in_frame(path, local, in_feet).height(*place[:, :2].T)
+    assert height == pytest.approx(place[:, 2], abs=1e-3)
 
 
 def test_relief_is_of_points_with_a_height(tmp_path):
