@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,15 @@ def _is_read_of(folder: Path, file: Path) -> bool:
     small = [path for path in texts if path.is_file() and path.stat().st_size <= _LONGEST_TEXT]
     named = re.compile(rf"(?<![\w.-]){re.escape(file.name)}(?![\w.-])")  # not as a part of another name
     return any(named.search(path.read_text(encoding="utf-8", errors="replace")) for path in small)
+
+
+def refuse_over_files(written: Iterable[Path | str | None], read: Iterable[Path]) -> None:
+    """Raise UserError where a file to write is one of those that are read, as those of a folder that is named whole."""
+    there = [Path(path) for path in written if path is not None and os.path.isfile(path)]
+    for path in read if there else ():
+        for output in there:
+            if os.path.isfile(path) and os.path.samefile(path, output):
+                raise UserError(f"{output}: the output would overwrite {path}, which is read")
 
 
 def refuse_folder_of_inputs(folder: Path) -> None:

@@ -133,8 +133,6 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"{args.input}: is a folder, wanted a recording with image lines")
     for path in (args.output, *(() if args.sigma is None else (Path(args.sigma),))):
         refuse_unless_file(path)
-        if path.resolve() == args.input.resolve():
-            raise UserError(f"{path}: the orthoimage would overwrite the recording")
     if args.sigma is not None and Path(args.sigma).resolve() == args.output.resolve():
         raise UserError("-o, --sigma: wanted different files")
     for name in ("gsd", "height"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from ..formats.new_file import refuse_unless_file
 from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, read_table
 from .locate import with_refraction
+from .outputs import refuse_over_files
 from .progress import progress
 
 Array = NDArray[np.floating]
@@ -187,8 +189,7 @@ def _check(args: argparse.Namespace) -> None:
     for path in (args.output, args.mask, args.sigma):
         if path is not None:
             refuse_unless_file(Path(path))
-            if Path(path).resolve() == Path(args.input).resolve():
-                raise UserError(f"{path}: would overwrite the image")
+    refuse_over_files((args.output, args.mask, args.sigma), rasters_of_heights(args.dem or ()))
     named = [str(Path(p).resolve()) for p in (args.output, args.mask, args.sigma) if p is not None]
     if len(set(named)) < len(named):
         raise UserError("-o, --mask, --sigma: wanted different files")
@@ -368,7 +369,7 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
         if not np.isfinite(edge_of(model, ground)[0]).any():
             raise UserError(f"{args.sensor}: the image does not see the ground at {h:g} m")
         return ground
-    raster = HeightRaster(_rasters(args.dem), args.dem_crs, args.dem_datum, sensor.ellipsoid)
+    raster = HeightRaster(rasters_of_heights(args.dem), args.dem_crs, args.dem_datum, sensor.ellipsoid)
     low = high = guess
     for _ in range(2):
         places = [edge_of(model, Ground(h, h, h, 1.0, ""), 60) for h in {low, high}]
@@ -392,7 +393,7 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
     return Ground(raster, low, high, covered, f"heights of {raster.name} {raster.datum}")
 
 
-def _rasters(names: list[str]) -> list[Path]:
+def rasters_of_heights(names: Iterable[str]) -> list[Path]:
     """Rasters that are named, and those in folders."""
     out: list[Path] = []
     for name in names:

@@ -40,6 +40,7 @@ from ..formats.new_file import refuse_unless_file
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from . import rectify_image
+from .outputs import refuse_over_files
 from .progress import progress
 from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
 
@@ -86,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args, outputs)
     workers = args.workers or len(os.sched_getaffinity(0))
     kinds = _kinds(args)
+    _refuse_inputs(args, outputs, kinds)
     crs, gsd = _cells(args, kinds)
     settings = MosaicSettings(
         None if crs == "local" else crs, gsd, args.tile or TILE, args.balance or "fall-off", args.seams or "cut",
@@ -133,8 +135,6 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
         refuse_unless_file(path)
         if not path.parent.is_dir():
             raise UserError(f"{path}: no folder {path.parent}")
-        if path.resolve() in [p.resolve() for p in args.input]:
-            raise UserError(f"{path}: the mosaic would overwrite what it is made of")
     if len({str(p.resolve()) for p in named}) < len(named):
         raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
     for name in _NOT_OF_MOSAIC:
@@ -191,6 +191,17 @@ def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
     if len({path.resolve() for path in inputs}) < len(inputs):
         raise UserError("the same input twice")
     return out
+
+
+def _refuse_inputs(args: argparse.Namespace, outputs: Outputs, kinds: list[tuple[str, Path, str | None]]) -> None:
+    """Refuse to write over what is read: also the names that nobody gave, and what is read of folders."""
+    heights: list[Path] = []
+    if any(kind == "image" for kind, _, _ in kinds):
+        heights = rectify_image.rasters_of_heights(args.dem or ())
+    named = [
+        Path(name) for name in (*(meta for _, _, meta in kinds), *(args.dem or ()), args.camera) if name is not None
+    ]
+    refuse_over_files((*_assets(outputs).values(), args.stac), [*(path for _, path, _ in kinds), *heights, *named])
 
 
 def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) -> tuple[str, float]:

@@ -142,6 +142,22 @@ def test_what_does_not_go_together_is_named(block, tmp_path, capsys, words, told
     assert told in error and "Traceback" not in error and not (tmp_path / "x.tif").exists()
 
 
+def test_no_output_is_written_over_what_is_read(block, tmp_path, capsys):
+    """Neither by a name that nobody gave, nor over a recording of a folder."""
+    shutil.copy(block.files[0], tmp_path / "a.source.tif")
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    (folder / "day1.mcap").write_bytes(b"a recording")
+    for words in (
+        [tmp_path / "a.source.tif", "--mosaic", "-o", tmp_path / "a.tif"],
+        [folder, "--mosaic", "-o", tmp_path / "b.tif", "--source", folder / "day1.mcap"],
+    ):
+        assert main(["rectify", *map(str, words)]) == 1
+        assert "the output would overwrite" in capsys.readouterr().err
+    assert (tmp_path / "a.source.tif").read_bytes() == block.files[0].read_bytes()
+    assert (folder / "day1.mcap").read_bytes() == b"a recording"
+
+
 def test_options_of_a_mosaic_want_it(block, tmp_path, capsys):
     assert main(["rectify", str(block.files[0]), "--sensor", "x", "--tile", "256", "-o", str(tmp_path / "x.tif")]) == 1
     assert "--tile: goes with --mosaic" in capsys.readouterr().err

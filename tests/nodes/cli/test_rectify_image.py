@@ -456,6 +456,11 @@ def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys)
     whole = rectify(tmp_path, image, path, "--dem", dem, *args, name="whole.tif").read()
     tiles = rectify(tmp_path, image, path, "--dem", half, *args, name="tiles.tif").read()
     assert whole.shape == tiles.shape and np.abs(whole - tiles).max() < 1e-3
+    before = (half / "left.tif").read_bytes()
+    for words in (["-o", half / "left.tif"], ["-o", tmp_path / "o.tif", "--sigma", half / "left.tif"]):
+        told = refused(capsys, image, "--sensor", path, "--dem", half, "--dem-datum", "ellipsoid", *words)
+        assert "left.tif: the output would overwrite" in told
+    assert (half / "left.tif").read_bytes() == before and not (tmp_path / "o.tif").exists()
 
 
 def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
