@@ -590,11 +590,11 @@ def _features(
 
 
 def _summary(told: dict[Key, Any], layers: list[Layer]) -> dict[str, Any]:
-    cells = {layer.name: 0 for layer in layers}
+    cells = [0] * len(layers)
     total = np.zeros(5)
     for t in told.values():
         for k, n in t["cells"].items():
-            cells[layers[int(k)].name] += n
+            cells[int(k)] += n
         for seam in t["seams"]:
             n = max(seam["nodes"], 1)
             tones = [seam[name][1] ** 2 / n for name in ("raw", "balanced")]  # of the seam as a whole

@@ -201,9 +201,13 @@ def _like(raster: Raster, dtype: str, bands: int, nodata: float) -> Raster:
 
 
 def layer_of_orthoimage(
-    path: Path, sigma: Path | None, folder: Path, stem: str, crs: str, gsd: float, tile: int
+    path: Path, sigma: Path | None, folder: Path, stem: str, crs: str, gsd: float, tile: int, name: str
 ) -> Layer:
     """A finished orthoimage as a layer: its values stay where they are, the steepness is the distance to its edge.
+
+    Parameters
+    ----------
+    name : of the layer, for people
 
     Raises
     ------
@@ -252,7 +256,7 @@ def layer_of_orthoimage(
                 for i in range((row + r) // tile, (row + r + h - 1) // tile + 1):
                     tiles |= {(i, j) for j in range((column + c) // tile, (column + c + w - 1) // tile + 1)}
     return Layer(
-        path.stem, "", str(path), str(steepness), sigma and str(sigma), row, column, source.rows, source.columns,
+        name, "", str(path), str(steepness), sigma and str(sigma), row, column, source.rows, source.columns,
         source.count, dtype.name, float(nodata), sorted(tiles), {},
     )  # fmt: skip
 

@@ -7,6 +7,7 @@ import copy
 import json
 import os
 import time
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -251,6 +252,7 @@ def _layer_jobs(
     jobs = []
     asked = set(args.strip or ())
     found: set[str] = set()
+    names = _names([path for _, path, _ in kinds])
     for number, (kind, path, meta) in enumerate(kinds):
         strips: list[str | None] = [None]
         if kind == "recording":
@@ -262,10 +264,19 @@ def _layer_jobs(
         for k, strip in enumerate(strips):
             stem = f"{number:04d}_{k:04d}"
             done = folder / "layers" / f"{stem}.json"
-            jobs.append(Job(done, (kind, path, meta, strip, folder, stem, settings, crs, _plain(args))))
+            jobs.append(Job(done, (kind, path, names[number], meta, strip, folder, stem, settings, crs, _plain(args))))
     if asked - found and any(kind == "recording" for kind, _, _ in kinds):
         raise UserError(f"--strip {sorted(asked - found)[0]}: in none of the recordings")
     return jobs
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """What inputs are called: by their files, or by so many of their folders as it takes to tell them apart."""
+    for parts in range(1, max(len(path.parts) for path in paths) + 1):
+        names = ["/".join(path.with_suffix("").parts[-parts:]) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in paths]
 
 
 def _plain(args: argparse.Namespace) -> argparse.Namespace:
@@ -274,26 +285,25 @@ def _plain(args: argparse.Namespace) -> argparse.Namespace:
 
 
 def layer_job(
-    kind: str, path: Path, meta: str | None, strip: str | None, folder: Path, stem: str, settings: MosaicSettings,
-    crs: str, args: argparse.Namespace,
+    kind: str, path: Path, name: str, meta: str | None, strip: str | None, folder: Path, stem: str,
+    settings: MosaicSettings, crs: str, args: argparse.Namespace,
 ) -> None:  # fmt: skip
     """One strip, image or orthoimage to a layer."""
     inside, gsd, tile = folder / "layers", settings.gsd, settings.tile
     if kind == "orthoimage":
-        layer = layer_of_orthoimage(path, None if meta is None else Path(meta), inside, stem, crs, gsd, tile)
+        layer = layer_of_orthoimage(path, None if meta is None else Path(meta), inside, stem, crs, gsd, tile, name)
     elif kind == "image":
         target = inside / f"{stem}.tif"
         sigma = inside / f"{stem}.sigma.tif" if settings.sigma else None
         of = _for_image(args, path, meta, crs, gsd, target, sigma)
         told = rectify_image.rectified(of)[4]
-        found = layer_of_orthoimage(target, sigma, inside, stem, crs, gsd, tile)
-        layer = Layer(**{**vars(found), "name": path.stem, "told": told})
+        layer = replace(layer_of_orthoimage(target, sigma, inside, stem, crs, gsd, tile, name), told=told)
     else:
         assert strip is not None
-        layer = _layer_of_strip(args, path, strip, inside, stem, settings)
+        layer = _layer_of_strip(args, path, f"{name} {strip}", strip, inside, stem, settings)
     done = inside / f"{stem}.json"
     if layer is None:
-        write_json(done, None if strip is None else f"{path.name} {strip}")
+        write_json(done, None if strip is None else f"{name} {strip}")
     else:
         layer.write(done)
 
@@ -336,7 +346,7 @@ class _Held:
 
 
 def _layer_of_strip(
-    args: argparse.Namespace, path: Path, strip: str, folder: Path, stem: str, settings: MosaicSettings
+    args: argparse.Namespace, path: Path, name: str, strip: str, folder: Path, stem: str, settings: MosaicSettings
 ) -> Layer | None:
     stamp = path.stat()
     of = _prepared_once(f"{vars(args)} {stamp.st_size} {stamp.st_mtime_ns}", path, _Held(args))
@@ -363,7 +373,7 @@ def _layer_of_strip(
     try:
         return layer_of_mosaic(
             held[0], folder, stem, settings.crs, settings.gsd, settings.tile, settings.sigma,
-            name=f"{path.stem} {strip}", camera=_camera_name(of.camera, of.ccd),
+            name=name, camera=_camera_name(of.camera, of.ccd),
             told={"lines": sum(done.strips.values()), "left_out": done.left_out, "missed_rays": done.missed_rays,
                   "orientation": of.orientation_name, "poses_not_valid": of.orientation.not_valid, "ground": of.ground},
         )  # fmt: skip
@@ -414,7 +424,8 @@ def _result(
         "tile": settings.tile, "balance": settings.balance, "seams_by": settings.seams, "feather": settings.feather,
         "cameras": cameras, "usual_difference": usual,
         "layers": [
-            {"name": layer.name, "cells": done["cells"][layer.name], **layer.told} for layer in layers
+            {"name": layer.name, "cells": cells, **layer.told}
+            for layer, cells in zip(layers, done["cells"], strict=True)
         ],
         "bands": balanced, "seam_lines": done["seams"], "step_across_seams": done["step_across_seams"],
     }  # fmt: skip

@@ -71,6 +71,24 @@ def test_mosaic_shows_the_ground_in_one_tone(block, made, capsys):
     assert block.sigma_m[0] - 1e-6 <= np.nanmin(sigma) and np.nanmax(sigma) <= block.sigma_m[-1] + 1e-6
 
 
+def test_inputs_of_one_name_are_told_apart(block, tmp_path, capsys):
+    """Every layer has its own cells and its own name, although the files of both days are called alike."""
+    for day, path in zip(("day1", "day2"), block.files, strict=False):
+        (tmp_path / day).mkdir()
+        shutil.copy(path, tmp_path / day / "ortho.tif")
+    inputs = [str(tmp_path / day / "ortho.tif") for day in ("day1", "day2")]
+    target = tmp_path / "both.tif"
+    assert main(["rectify", *inputs, "--mosaic", "--tile", "256", "--workers", "1", "-o", str(target), "--json"]) == 0
+    layers = json.loads(capsys.readouterr().out)["layers"]
+    assert [layer["name"] for layer in layers] == ["day1/ortho", "day2/ortho"]
+    with rasterio.open(target.with_suffix(".source.tif")) as source:
+        numbers = source.read(1)
+        assert source.tags()["layers"] == "1 day1/ortho, 2 day2/ortho"
+    assert [layer["cells"] for layer in layers] == [(numbers == 1).sum(), (numbers == 2).sum()]
+    seams = json.loads(target.with_suffix(".seams.geojson").read_text())["features"]
+    assert {tuple(seam["properties"]["layers"]) for seam in seams} == {("day1/ortho", "day2/ortho")}
+
+
 def test_seam_lines_are_where_the_source_changes(made):
     seams = json.loads(made.with_suffix(".seams.geojson").read_text())["features"]
     pairs = {tuple(f["properties"]["layers"]) for f in seams}
