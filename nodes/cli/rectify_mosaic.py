@@ -7,7 +7,9 @@ import copy
 import json
 import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -49,6 +51,8 @@ from .rectify_recording import Prepared, cells_of, check_strips, pixels_together
 LEAST_TILE, TILE = 128, 1024
 #: Options (as attributes) that only a mosaic takes.
 OPTIONS = ("tile", "balance", "seams", "feather", "source", "seam_lines", "input_sigma", "stac", "keep")
+#: Image lines that are older count seconds of the project's own: nobody recorded any in 1972. Definition.
+FIRST_UTC_S = 2 * 365 * 86400
 #: Ends of the names of recordings; everything else is an image.
 _RECORDINGS = (".mcap",)
 #: Options of images and recordings that a mosaic of several does not take.
@@ -90,6 +94,8 @@ def run(args: argparse.Namespace) -> int:
     kinds = _kinds(args)
     _refuse_inputs(args, outputs, kinds)
     crs, gsd = _cells(args, kinds)
+    if args.stac is not None and crs == "local":
+        raise UserError("--stac: wanted a map projection (--crs), not the local frame")
     settings = MosaicSettings(
         None if crs == "local" else crs, gsd, args.tile or TILE, args.balance or "fall-off", args.seams or "cut",
         8 if args.feather is None else args.feather, args.sigma is not None,
@@ -362,7 +368,9 @@ def _layer_of_strip(
         of.camera, of.ccd, of.surface, grid, args.resampling, of.orientation, of.reference_ns, factor, of.errors, mosaic
     )
     ccd = of.camera.lines[of.ccd].id
+    stamps: list[int] = []
     for block in line_blocks(of.recording, ccd, [strip]):
+        stamps += block.times_ns()[[0, -1]].tolist() if len(block.pixels) else []
         try:
             work.add(block)
         except ValueError as error:
@@ -374,11 +382,20 @@ def _layer_of_strip(
         return layer_of_mosaic(
             held[0], folder, stem, settings.crs, settings.gsd, settings.tile, settings.sigma,
             name=name, camera=_camera_name(of.camera, of.ccd),
-            told={"lines": sum(done.strips.values()), "left_out": done.left_out, "missed_rays": done.missed_rays,
+            told={"lines": sum(done.strips.values()), "first_line_utc": _utc(stamps, min),
+                  "last_line_utc": _utc(stamps, max), "left_out": done.left_out, "missed_rays": done.missed_rays,
                   "orientation": of.orientation_name, "poses_not_valid": of.orientation.not_valid, "ground": of.ground},
         )  # fmt: skip
     finally:
         held[0].close()
+
+
+def _utc(stamps: list[int], which: Callable[[list[int]], int]) -> str | None:
+    """The first or the last stamp, ns, in words; None where they are the project's own count and no UTC."""
+    time_s = which(stamps) * 1e-9 if stamps else 0.0
+    if time_s < FIRST_UTC_S:
+        return None
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def _camera_name(camera: LineCamera, ccd: int) -> str:

@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 
 from ...solver.rectification.grid import transformer_to
-from ..errors import UserError
 from .new_file import new_file
 
 #: Places along each edge of the extent, whose longitudes and latitudes give the footprint.
 _EDGE = 9
-_TYPES = {
-    ".tif": "image/tiff; application=geotiff; profile=cloud-optimized", ".vrt": "application/xml",
-    ".geojson": "application/geo+json",
-}  # fmt: skip
+_COG, _VRT, _LINES = (
+    "image/tiff; application=geotiff; profile=cloud-optimized", "application/xml", "application/geo+json",
+)  # fmt: skip
 _ROLES = {"mosaic": ["data"], "source": ["metadata"], "seams": ["metadata"], "sigma": ["metadata"]}
 
 
@@ -29,19 +27,19 @@ def write_stac_item(
 ) -> None:  # fmt: skip
     """Write the item; paths of assets are as seen from its folder.
 
+    Its time is from the first image line to the last, where all layers tell theirs, else that of its making.
+
     Parameters
     ----------
-    crs, gsd : of the cells
+    crs, gsd : of the cells, in a map projection
     done : first row and column (numbered over the projection), rows, columns
     result : of the command; layers and seams go into the properties
     assets : name -> file
 
     Raises
     ------
-    UserError : a local frame, which has no place on the Earth, or a file that cannot be written
+    UserError : a file that cannot be written
     """
-    if crs == "local":
-        raise UserError("--stac: wanted a map projection (--crs), not the local frame")
     import pyproj
 
     left, top = done["column"] * gsd, -done["row"] * gsd
@@ -55,6 +53,8 @@ def write_stac_item(
     )
     lon, lat = transformer_to(crs).transform(x, y, direction="INVERSE")
     ring = [[round(float(a), 8), round(float(b), 8)] for a, b in zip([*lon, lon[0]], [*lat, lat[0]], strict=True)]
+    raster = _VRT if mosaic.suffix == ".vrt" else _COG
+    made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     epsg = pyproj.CRS.from_user_input(crs).to_epsg()
     item = {
         "type": "Feature", "stac_version": "1.0.0", "id": mosaic.stem,
@@ -62,7 +62,7 @@ def write_stac_item(
         "geometry": {"type": "Polygon", "coordinates": [ring]},
         "bbox": [min(p[0] for p in ring), min(p[1] for p in ring), max(p[0] for p in ring), max(p[1] for p in ring)],
         "properties": {
-            "datetime": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"), "gsd": gsd,
+            **_times(result["layers"], made), "created": made, "gsd": _metres(crs, left, right, bottom, top, gsd),
             "proj:epsg": epsg, "proj:shape": [done["rows"], done["columns"]],
             "proj:transform": [gsd, 0.0, left, 0.0, -gsd, top],
             "triline:layers": [layer["name"] for layer in result["layers"]],
@@ -70,9 +70,31 @@ def write_stac_item(
         },
         "links": [],
         "assets": {
-            name: {"href": os.path.relpath(file, path.parent), "type": _TYPES[file.suffix], "roles": _ROLES[name]}
+            name: {
+                "href": os.path.relpath(file, path.parent), "type": _LINES if name == "seams" else raster,
+                "roles": _ROLES[name],
+            }
             for name, file in assets.items() if file is not None
         },
     }  # fmt: skip
     with new_file(path) as part:
         part.write_text(json.dumps(item, indent=2) + "\n", encoding="utf-8")
+
+
+def _times(layers: list[dict[str, Any]], made: str) -> dict[str, str | None]:
+    """When the images were taken."""
+    spans = [(layer.get("first_line_utc"), layer.get("last_line_utc")) for layer in layers]
+    first, last = ([t for t in times if t] for times in zip(*spans, strict=True))
+    if len(first) < len(spans):
+        return {"datetime": made}
+    return {"datetime": None, "start_datetime": min(first), "end_datetime": max(last)}
+
+
+def _metres(crs: str, left: float, right: float, bottom: float, top: float, gsd: float) -> float:
+    """Side of a cell in the middle of the mosaic, metres on the ground."""
+    import pyproj
+
+    x, y = 0.5 * (left + right), 0.5 * (bottom + top)
+    lon, lat = transformer_to(crs).transform([x, x + gsd, x], [y, y, y + gsd], direction="INVERSE")
+    sides = pyproj.Geod(ellps="WGS84").inv([lon[0]] * 2, [lat[0]] * 2, lon[1:], lat[1:])[2]
+    return float(f"{float(np.sqrt(sides[0] * sides[1])):.3g}")

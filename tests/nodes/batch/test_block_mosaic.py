@@ -105,6 +105,7 @@ def test_stac_item_says_where_the_mosaic_is(made):
     assert item["type"] == "Feature" and item["stac_version"] == "1.0.0"
     assert {"mosaic", "source", "seams", "sigma"} == set(item["assets"])
     assert all((made.parent / asset["href"]).exists() for asset in item["assets"].values())
+    assert item["properties"]["gsd"] == GSD and item["properties"]["datetime"] == item["properties"]["created"]
     west, south, east, north = item["bbox"]
     assert 8.99 < west < east < 9.05 and 48.7 < south < north < 48.8
 

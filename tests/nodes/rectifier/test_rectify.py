@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -379,6 +380,33 @@ def test_cells_in_feet_are_as_large_as_those_in_metres(flown, folder, capsys):
     assert mercator["gsd"] == pytest.approx(made["m", None]["gsd"] / np.cos(np.radians(48.9)), rel=0.05)
     assert main(["rectify", str(flown), "-o", str(folder / "unit.tif"), "--crs", utm.format("us-ft")]) == 0
     assert " ft_us in +proj=utm" in capsys.readouterr().out
+
+
+def test_stac_item_tells_when_lines_were_taken_and_cells_in_metres(flown, folder, capsys):
+    crs, target = "+proj=utm +zone=32 +datum=WGS84 +units=us-ft +type=crs", folder / "mosaic.tiff"
+    words = ["--mosaic", "--height", 0, "--crs", crs, "--gsd", 20, "--workers", 1, "--stac", folder / "item.json"]
+    _rectify(capsys, flown, target, *words)
+    item = json.loads((folder / "item.json").read_text())
+    about = item["properties"]
+    assert about["datetime"] is None and about["gsd"] == pytest.approx(20 * 1200 / 3937, rel=1e-2)
+    strip = next(iter(Recording(flown).last_strips().values()))
+    first, last = (datetime.fromisoformat(about[f"{end}_datetime"]).timestamp() for end in ("start", "end"))
+    assert first == pytest.approx(strip.first_line_time_ns * 1e-9, abs=1e-3)
+    assert last - first == pytest.approx((strip.lines - 1) / strip.line_rate_hz, abs=2e-3)
+    assert item["assets"]["mosaic"]["type"].endswith("profile=cloud-optimized")
+    local = [
+        "rectify",
+        str(flown),
+        "--mosaic",
+        "--crs",
+        "local",
+        "-o",
+        str(folder / "of_local.tif"),
+        "--stac",
+        str(folder / "of_local.json"),
+    ]
+    assert main(local) == 1 and "wanted a map projection" in capsys.readouterr().err
+    assert not (folder / "of_local.tif").exists()
 
 
 def test_poses_that_are_not_valid_give_no_orientation(flown, folder, capsys):
