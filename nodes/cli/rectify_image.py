@@ -89,8 +89,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--occlusions", action="store_true", help="leave out what relief hides from the sensor")
     group.add_argument("--mask", metavar="FILE", help="GeoTIFF that says why cells are missing")
     group.add_argument("--sigma", metavar="FILE", help="GeoTIFF of planimetric and height sigma, metres")
-    group.add_argument("--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"), help="m")
-    group.add_argument("--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"), help="degrees")
+    group.add_argument(
+        "--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"),
+        help="of the orbit, m; of a frame camera east, north, up",
+    )  # fmt: skip
+    group.add_argument(
+        "--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"),
+        help="about the axes of the body, degrees; of a frame camera about east, north, up",
+    )  # fmt: skip
     group.add_argument("--pixel-sigma", type=float, metavar="PX", help="of what is measured in the image (matching)")
     group.add_argument("--height-sigma", type=float, metavar="M", help="of the heights")
     group.add_argument(
@@ -482,7 +488,7 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor, ground: Ground) -> Err
             raise UserError(
                 f"{args.sensor}: --position-sigma and --attitude-sigma go with a rigorous model, not with RPC"
             )
-        rpc_m2 = 0.5 * (bare.error_bias_m**2 + bare.error_random_m**2)
+        rpc_m2 = bare.error_bias_m**2 + bare.error_random_m**2
     if fit is not None:
         sensor.notes.append("sigma: of the correction by control, in place of the orientation's")
     elif not (oriented or rpc_m2 or stated.time_s):

@@ -127,7 +127,7 @@ class Rpc:
     to_ground : (sample, line, height m) -> (longitude deg, latitude deg); None where the file has none. It only starts
         the direct location, which is the inverse of ``to_image``
     lines, samples : size of the image; 0 where it is unknown
-    error_bias_m, error_random_m : accuracy as the file states it (root mean square, horizontal), 0 where it does not
+    error_bias_m, error_random_m : accuracy as the file states it (root mean square of east, and of north), 0 where none
     """
 
     to_image: RationalFunctions

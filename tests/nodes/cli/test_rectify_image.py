@@ -276,6 +276,17 @@ def test_a_frame_camera_and_its_sigmas(tmp_path):
     assert np.nanmin(planimetric) > 15.0 and np.nanmax(planimetric) < 30.0 and np.nanmax(np.abs(up - 5.0)) < 1e-3
 
 
+def test_stated_errors_of_an_rpc_are_of_each_axis(scene, tmp_path):
+    """As RPC00B has them: bias and random error, metres per horizontal axis."""
+    _, _, model, _, _, image = scene
+    rpc = replace(fit_to_model(model, -100.0, 1100.0).rpc, error_bias_m=3.0, error_random_m=4.0)
+    write_rpb(tmp_path / "scene.RPB", rpc)
+    sigma = tmp_path / "sigma.tif"
+    rectify(tmp_path, image, tmp_path / "scene.RPB", "--height", 400, "--sigma", sigma)
+    planimetric, height = rasterio.open(sigma).read()
+    assert np.nanmedian(planimetric) == pytest.approx(np.sqrt(2.0) * 5.0, rel=1e-4) and np.nanmax(height) == 0.0
+
+
 def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
     """The metadata are off by 0.02 degrees, the control by what is stated, one point by 60 pixels."""
     truth, meta, rng = tmp_path / "truth.json", tmp_path / "frame.json", np.random.default_rng(2)
