@@ -235,9 +235,11 @@ def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) 
 
 def _plan(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]], settings: MosaicSettings) -> dict:
     """What the results of jobs depend on: another plan begins anew."""
-    files = [path for _, path, _ in kinds] + [Path(m) for _, _, m in kinds if m is not None]
-    files += [Path(p) for p in args.dem or () if p != "points"]
-    files += [] if args.camera is None else [args.camera]
+    named = [Path(m) for _, _, m in kinds if m is not None] + [Path(p) for p in args.dem or () if p != "points"]
+    named += [Path(p) for p in (args.dem_datum, args.camera) if p is not None]
+    # of a folder all that lies in it: tiles of heights, a flight with its [dem], metadata of a scene
+    files = [path for _, path, _ in kinds]
+    files += [file for path in named for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
     of = ("orientation", "ccd", "strip", "dem", "dem_crs", "dem_datum", "height", "resampling", "refraction", "model",
           "nodata", "occlusions", "position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma")  # fmt: skip
     stated = [path.stat() if path.exists() else None for path in files]

@@ -474,6 +474,29 @@ def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys)
     assert (half / "left.tif").read_bytes() == before and not (tmp_path / "o.tif").exists()
 
 
+def test_a_mosaic_begins_anew_where_a_tile_of_heights_or_the_geoid_has_changed(scene, tmp_path, capsys):
+    _, path, _, relief, dem, image = scene
+    tiles, geoid = tmp_path / "tiles", tmp_path / "geoid.tif"
+    tiles.mkdir()
+
+    def write(target, heights):
+        shutil.copy(dem, target)
+        with rasterio.open(target, "r+") as raster:
+            raster.write(heights.astype(np.float32), 1)
+
+    words = ["--sensor", path, "--mosaic", "--workers", 1, "--keep", "--gsd", 10, "--dem", tiles, "--dem-datum", geoid]
+    made = []
+    for name, heights in (("both", relief.z), ("tile", relief.z + 150.0), ("geoid", 0.0 * relief.z + 50.0)):
+        if name != "geoid":
+            write(tiles / "tile.tif", heights)
+        if name != "tile":
+            write(geoid, 0.0 * relief.z if name == "both" else heights)
+        out = tmp_path / "block.tif"
+        assert main(["rectify", str(image), "-o", str(out), "-q", *map(str, words)]) == 0
+        made.append(rasterio.open(out).read())
+    assert not np.array_equal(made[0], made[1]) and not np.array_equal(made[1], made[2])
+
+
 def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     _, path, model, _, dem, image = scene
     base = [image, "--sensor", path, "-o", tmp_path / "o.tif", "--height", 0]
