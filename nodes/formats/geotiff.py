@@ -20,7 +20,7 @@ from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
 from .keys import is_there
 from .new_file import new_file
-from .raster_open import as_stated, open_raster, unit_of_heights
+from .raster_open import known_heights, open_raster, unit_of_heights
 
 Array = NDArray[np.floating]
 
@@ -85,8 +85,7 @@ def read_heights(path: Path) -> Heights:
             crs = source.crs.to_wkt()
             ellipsoidal = source.tags().get(_DATUM) == "ellipsoid"
             unit = unit_of_heights(source)
-            with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
-                z = as_stated(source, np.ma.filled(band.astype(float), np.nan))
+            z = known_heights(source, band, float)
     except RasterioError as error:
         raise UserError(f"{path}: not a raster that can be read: {' '.join(str(error).split())}") from None
     if not np.isfinite(z).any():

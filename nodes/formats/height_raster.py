@@ -13,7 +13,7 @@ from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.rectification.terrain import bilinear
 from ..errors import UserError
 from .keys import is_there
-from .raster_open import as_stated, open_raster, unit_of_heights
+from .raster_open import known_heights, open_raster, unit_of_heights
 
 Array = NDArray[np.floating]
 
@@ -267,9 +267,7 @@ def _read(file: RasterFile, row: int, column: int, rows: int, columns: int, thin
     except RasterioError as error:
         place = f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1}"
         raise UserError(f"{file.path}: heights of {place} cannot be read: {' '.join(str(error).split())}") from None
-    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
-        z = np.ma.filled(band.astype(np.float32), np.nan)
-    return as_stated(source, z)
+    return known_heights(source, band, np.float32)
 
 
 class _GeoidRaster:

@@ -10,8 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+#: Values that mean that no height is known, in rasters that do not say which does; so do those beyond `_NO_HEIGHT`.
+_VOIDS, _NO_HEIGHT = (-9999.0, -32767.0, -32768.0), 1e30
 #: Units of heights that count as metres.
 _METRES = ("", "m", "metre", "meter", "metres", "meters")
 
@@ -43,6 +46,18 @@ def as_stated(source: Any, values: NDArray[Any]) -> NDArray[Any]:
     """Values of the first band of a dataset, times the scale and plus the offset that it states."""
     scale, offset = source.scales[0], source.offsets[0]
     return values if scale == 1.0 and offset == 0.0 else values * values.dtype.type(scale) + values.dtype.type(offset)
+
+
+def known_heights(source: Any, band: Any, dtype: Any) -> NDArray[Any]:
+    """Heights of a masked window of the first band as the raster states them, NaN where not known.
+
+    Voids that a raster has without a no-data value would be holes of ten kilometres.
+    """
+    with np.errstate(invalid="ignore"):  # damaged files hold signalling NaN
+        z = np.ma.filled(band.astype(dtype), np.nan)
+        if source.nodata is None:
+            z[np.isin(z, _VOIDS) | (np.abs(z) > _NO_HEIGHT)] = np.nan
+        return as_stated(source, z)
 
 
 @contextmanager

@@ -478,6 +478,22 @@ def test_heights_are_those_that_the_raster_states(tmp_path):
     assert height == pytest.approx(place[:, 2], abs=1e-3)
 
 
+@pytest.mark.parametrize("void", [-9999.0, -32767.0, -32768.0, float(np.finfo(np.float32).min)])
+@pytest.mark.parametrize("stated", [True, False])
+def test_voids_are_no_heights_also_where_the_raster_does_not_say_so(tmp_path, void, stated):
+    path, z = tmp_path / "void.tif", np.full((1, 4, 5), 450.0, dtype=np.float32)
+    z[0, 1, 2] = void
+    place = rasterio.Affine(10.0, 0.0, 5e5, 0.0, -10.0, 5.3e6)
+    shape = {"driver": "GTiff", "width": 5, "height": 4, "count": 1, "dtype": "float32"}
+    with rasterio.open(
+        path, "w", crs="EPSG:32632", transform=place, nodata=void if stated else None, **shape
+    ) as target:
+        target.write(z)
+    whole = HeightRaster([path], None, "ellipsoid").heights(0, 0, 4, 5)
+    for found in (read_dem(path, "ellipsoid").z_m, whole):
+        assert np.isnan(found[1, 2]) and np.isnan(found).sum() == 1 and np.nanmin(found) == 450.0
+
+
 def test_relief_is_of_points_with_a_height(tmp_path):
     with RecordingWriter(tmp_path / "control.mcap") as writer:
         for k, role in enumerate(("control", "planimetric", "height", "check")):
