@@ -352,7 +352,7 @@ class StripRectifier:
                 steps = np.maximum([p[near] - p[0], p[-1] - p[-1 - near]], 0.2 * near) * (STRAIGHT_ON / near)
                 line[:, j] = np.interp(p_wanted, np.concatenate([[p[0] - steps[0]], p, [p[-1] + steps[1]]]), on)
             else:
-                line[:, j] = np.interp(p_wanted, p, lines[met], left=np.nan, right=np.nan)
+                line[:, j] = _between_neighbours(p_wanted, p, lines[met], np.flatnonzero(met))
             q[:, j] = np.interp(p_wanted, p, self._place[met, j, 1])
         if not np.isfinite(q).any():
             return None
@@ -366,7 +366,7 @@ class StripRectifier:
             if np.count_nonzero(met) < 2:
                 continue
             across = np.maximum.accumulate(q[i, met])
-            table[i].real = np.interp(q_wanted, across, line[i, met], left=np.nan, right=np.nan)
+            table[i].real = _between_neighbours(q_wanted, across, line[i, met], np.flatnonzero(met))
             table[i].imag = np.interp(q_wanted, across, sample[met])
         return q0, table
 
@@ -424,6 +424,17 @@ class _Axes:
                 right = np.minimum(right, np.floor((low - at) / by_column).astype(np.int64) + 1)
         some = right > left
         return rows[some], left[some], (right - left)[some]
+
+
+def _between_neighbours(wanted: Array, x: Array, y: Array, number: NDArray[np.intp]) -> Array:
+    """Values at places by those at places x (n,), which increase; NaN outside them, and between two that are no
+    neighbours by their numbers: what lies between saw no ground."""
+    out = np.interp(wanted, x, y, left=np.nan, right=np.nan)
+    gap = np.diff(number) > 1
+    if gap.any():
+        k = np.clip(np.searchsorted(x, wanted, side="right") - 1, 0, len(x) - 2)
+        out[gap[k] & (wanted > x[k]) & (wanted < x[k + 1])] = np.nan
+    return out
 
 
 def _bilinear(table: NDArray[Any], p: Array, q: Array) -> NDArray[Any]:

@@ -285,6 +285,27 @@ def test_missing_lines_stay_empty_and_the_others_in_place():
     assert (b ^ c).sum() < 4 * PIXELS
 
 
+def test_ground_whose_height_is_not_known_stays_empty():
+    """Nothing is put between the rays on either side of it, across the flight or along it."""
+    flight, grid, field = _Flight(), GroundGrid(FRAME, GSD), _field()
+    image = np.random.default_rng(8).integers(1, 4000, (300, PIXELS), dtype=np.uint16)
+    z = field.z_m.copy()
+    side = np.arange(len(z)) * field.step_m + field.x_m
+    y, x = np.nonzero((np.abs(side[:, None] + 60.0) < 70.0) & (np.abs(side[None] + 80.0) < 70.0))
+    z[y, x] = np.nan
+    whole, holed = (_mosaic(_rectified(flight, image, surface, grid)) for surface in (field, replace(field, z_m=z)))
+    row0, row1, column0, column1 = whole.extent()
+    a, b = (m.read(row0, row1, column0, column1).astype(int) for m in (whole, holed))
+    e, n = grid.centre(np.arange(column0, column1)[None], np.arange(row0, row1)[:, None])
+    unknown = np.isnan(replace(field, z_m=z).height(*np.broadcast_arrays(e, n)))
+    # a corner may lie between two rays
+    assert (unknown & (a > 0)).sum() > 5000 and not (b[ndimage.binary_erosion(unknown, iterations=8)] > 0).any()
+    near = ndimage.binary_dilation(unknown, iterations=40)  # as far as from one ray to the next
+    inner = ndimage.binary_erosion(a > 0, iterations=3)
+    assert (b > 0)[inner & ~near].all()
+    assert np.percentile(np.abs(a - b)[(a > 0) & (b > 0)], 99) < 0.02 * a[a > 0].std()
+
+
 def test_between_lines_that_a_wrong_pose_puts_apart_nothing_is_worked_on(monkeypatch):
     """Not so far that they are left out, but many bands of 8 lines: each would take as long as one with lines."""
     flight, grid = _Flight(jitter=0.0), GroundGrid(FRAME, 1.2)
