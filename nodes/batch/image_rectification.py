@@ -89,6 +89,9 @@ class SourceImage:
         if len(set(source.dtypes)) > 1:
             self.dtype = np.result_type(*[np.dtype(name) for name in source.dtypes])
         self.nodata = nodata if nodata is not None else source.nodata
+        # GDAL leaves out of means what the file states; what the command line does, it does not know
+        stated = np.array([np.inf if source.nodata is None else source.nodata])
+        self._unstated = nodata is not None and not np.array_equal(stated, [nodata], equal_nan=True)
         self.descriptions = tuple(text or "" for text in source.descriptions)
 
     def crop(self) -> tuple[int, int] | None:
@@ -106,9 +109,26 @@ class SourceImage:
         window = Window(sample * factor, line * factor, samples * factor, lines * factor)  # type: ignore[call-arg]
         if factor == 1:
             return self.file.source.read(window=window)
+        if self._unstated:
+            return self._means(self.file.source.read(window=window), lines, samples, factor)
         return self.file.source.read(
             window=window, out_shape=(self.bands, lines, samples), resampling=Resampling.average
         )
+
+    def _means(self, pixels: NDArray[Any], lines: int, samples: int, factor: int) -> NDArray[Any]:
+        """Means (bands, lines, samples) of the data among pixels, no data where there is none of it."""
+        assert self.nodata is not None
+        blocks = pixels.reshape(len(pixels), lines, factor, samples, factor)
+        there = self.valid(blocks)
+        if there is None:
+            there = np.ones(blocks.shape, dtype=bool)
+        count = there.sum(axis=(2, 4))
+        mean = np.where(there, blocks, 0).sum(axis=(2, 4), dtype=np.float64) / np.maximum(count, 1)
+        if self.dtype.kind in "iu":
+            mean = np.rint(mean)
+            step = 1.0 if self.nodata < np.iinfo(self.dtype).max else -1.0
+            mean = np.where(mean == self.nodata, self.nodata + step, mean)
+        return np.where(count > 0, mean, self.nodata).astype(self.dtype)
 
     def valid(self, band: NDArray[Any]) -> Mask | None:
         """Which values of a band are data, None for all."""

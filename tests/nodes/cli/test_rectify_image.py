@@ -203,6 +203,19 @@ def test_bits_bands_no_data_and_resampling(scene, tmp_path):
             assert set(np.unique(values)) <= set(np.unique(bands))
 
 
+@pytest.mark.parametrize("stated", [7, None])
+def test_no_data_takes_no_part_where_pixels_are_put_together(scene, tmp_path, stated):
+    """Whether the file states it or the command line does."""
+    _, path, _, _, _, _ = scene
+    pixels = np.full((1, TRUTH.lines, TRUTH.samples), 200, dtype=np.uint8)
+    pixels[0, :, : TRUTH.samples // 2 + 3] = 7
+    image = write_image(tmp_path / "half.tif", pixels, nodata=stated)
+    words = ["--height", 0, "--gsd", 40] if stated else ["--height", 0, "--gsd", 40, "--nodata", 7]
+    out = rectify(tmp_path, image, path, *words)
+    values = out.read(1)
+    assert out.nodata == 7 and set(np.unique(values)) == {7, 200} and (values == 200).sum() > 500
+
+
 def test_values_that_would_be_taken_for_no_data_stay(scene, tmp_path):
     _, path, *_ = scene
     image = write_image(tmp_path / "black.tif", np.zeros((1, TRUTH.lines, TRUTH.samples), dtype=np.uint8))
