@@ -159,7 +159,10 @@ def make_mosaic(
         stage(labels_job, jobs, share, following)
         share = following
     jobs = [
-        Job(_file(folder, "tiles", key, "json"), (folder, key, _some(layers, near(key, settings.halo())), settings))
+        Job(
+            _file(folder, "tiles", key, "json"),
+            (folder, key, _some(layers, near(key, settings.halo())), settings, layers[0].nodata),
+        )
         for key in tiles
     ]
     stage(cells_job, jobs, 0.5, 1.0)
@@ -394,8 +397,13 @@ def _labelled(folder: Path, key: Key, wide: int, indices: list[int], n: int) -> 
 # -- cells ---------------------------------------------------------------------------------------------------------
 
 
-def cells_job(folder: Path, key: Key, layers: dict[int, Layer], settings: MosaicSettings) -> None:
-    """Cells of a tile, the layer that each is mostly of, their sigmas, and the seams in the tile."""
+def cells_job(folder: Path, key: Key, layers: dict[int, Layer], settings: MosaicSettings, nodata: float) -> None:
+    """Cells of a tile, the layer that each is mostly of, their sigmas, and the seams in the tile.
+
+    Parameters
+    ----------
+    nodata : of the mosaic; layers may have others
+    """
     size, n, halo = settings.tile, settings.tile // NODE, settings.halo()
     row, column, wide = key[0] * size - halo, key[1] * size - halo, size + 2 * halo
     windows = _windows(layers, row, column, wide, wide)
@@ -419,8 +427,8 @@ def cells_job(folder: Path, key: Key, layers: dict[int, Layer], settings: Mosaic
     mixed = sum(w[None] * v for w, v in zip(weights, mine, strict=True))
     there = known[:, core[0], core[1]].any(axis=0)
     dtype = np.dtype(some.dtype)
-    raster = _raster(settings, key, some)
-    write_tile(_file(folder, "tiles", key, "tif"), raster, _finished(mixed, there, dtype, some.nodata))
+    raster = replace(_raster(settings, key, some), nodata=nodata)
+    write_tile(_file(folder, "tiles", key, "tif"), raster, _finished(mixed, there, dtype, nodata))
     source = np.where(there, np.array([w.index for w in windows])[np.argmax(weights, axis=0)] + 1, 0)
     raster = replace(raster, bands=1, dtype="uint16", nodata=0, descriptions=())
     write_tile(_file(folder, "tiles", key, "source.tif"), raster, source[None].astype(np.uint16))

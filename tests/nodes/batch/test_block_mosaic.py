@@ -89,6 +89,26 @@ def test_inputs_of_one_name_are_told_apart(block, tmp_path, capsys):
     assert {tuple(seam["properties"]["layers"]) for seam in seams} == {("day1/ortho", "day2/ortho")}
 
 
+def test_a_mosaic_has_one_no_data_value(tmp_path):
+    """Also where it is of a layer with another one alone."""
+    inputs = []
+    for k, nodata in enumerate((0, 65535)):
+        values = np.full((1, 200, 300), 1000, dtype=np.uint16)
+        values[0, 50:150, 100:200] = nodata
+        inputs.append(tmp_path / f"ortho{k}.tif")
+        place = rasterio.Affine(GSD, 0, LEFT + 800 * k * GSD, 0, -GSD, TOP)
+        shape = {"driver": "GTiff", "height": 200, "width": 300, "count": 1, "dtype": "uint16", "crs": "EPSG:32632"}
+        with rasterio.open(inputs[-1], "w", transform=place, nodata=nodata, **shape) as target:
+            target.write(values)
+    target = tmp_path / "block.tif"
+    words = [*map(str, inputs), "--mosaic", "--tile", "128", "--workers", "1", "-o", str(target), "-q"]
+    assert main(["rectify", *words]) == 0
+    with rasterio.open(target) as image:
+        values = image.read(1)
+        assert image.nodata == 0 and set(np.unique(values)) == {0, 1000}
+        assert (values == 1000).sum() == 2 * (200 * 300 - 100 * 100)
+
+
 def test_seam_lines_are_where_the_source_changes(made):
     seams = json.loads(made.with_suffix(".seams.geojson").read_text())["features"]
     pairs = {tuple(f["properties"]["layers"]) for f in seams}
