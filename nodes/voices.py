@@ -8,6 +8,7 @@ so `process` comes to the same one as the live run.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -220,6 +221,39 @@ class Voices:
             self._voices[key] = _Voice(held.source, held.start, held.stamp_ns, held.body)
             passed.append(now)
         return Heard(tuple(passed), notes=(f"{topic} of {source!r} is used from now on ({by})",))
+
+
+class RecordedVoices:
+    """Which messages of a recording nodes use, for who reads it without running one.
+
+    Attributes
+    ----------
+    left_out : how many of a topic are not used, and the newest line that says why
+    """
+
+    def __init__(self) -> None:
+        self._voices = Voices()
+        self.left_out: dict[str, tuple[int, str]] = {}
+
+    def used(self, message: Message) -> tuple[Message, ...]:
+        """What nodes use because of a message, in the order of `order_key`: itself, nothing, or what an operator's
+        verdict lets in."""
+        if topics.find(message.topic).family is Family.TRUTH:  # no node that decides hears it
+            return (message,)
+        heard = self._voices.hear(message)
+        if not heard.pass_on and message.topic != VERDICT:
+            n, text = self.left_out.get(message.topic, (0, ""))
+            self.left_out[message.topic] = n + 1, (heard.alarms or (text,))[-1]
+        return heard.pass_on
+
+    def all_used(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """The same for many messages."""
+        for message in messages:
+            yield from self.used(message)
+
+    def lines(self) -> list[str]:
+        """What is not used, a line a topic."""
+        return [f"{topic}: {n} not used by the nodes: {why}" for topic, (n, why) in self.left_out.items()]
 
 
 def _same(one: Any, other: Any) -> bool:

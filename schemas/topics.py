@@ -141,6 +141,13 @@ def find(topic: str) -> Topic:
 
 
 @lru_cache(maxsize=1024)
+def begins_flight(topic: str) -> bool:
+    """Whether a message on a topic tells that a flight has begun: it was measured, or computed from measurements."""
+    row = find(topic)
+    return row.family in (Family.SENSOR, Family.OBSERVATION, Family.RESULT) and not row.latched
+
+
+@lru_cache(maxsize=1024)
 def rank(topic: str) -> int:
     """Place in the table: decides between messages with equal stamps."""
     return TOPICS.index(find(topic))

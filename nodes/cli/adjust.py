@@ -54,6 +54,7 @@ from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.summary import damage_lines
 from ..terminal import drawing, plain
+from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
 from .dem_options import add_dem_options, dem_settings
 from .locate import refraction_of
@@ -257,8 +258,10 @@ def read_input(path: Path) -> BlockData:
         raise UserError(f"{path}: no such file or folder")
     refuse_importable(path)
     reader = RecordingReader(path, by_ranges=True)
-    block = block_from_messages(reader.messages(TOPICS), path.name)
-    return replace(block, notes=(*(f"damaged recording: {line}" for line in damage_lines(reader)), *block.notes))
+    voices = RecordedVoices()
+    block = block_from_messages(voices.all_used(reader.sorted_messages(TOPICS)), path.name)
+    damage = (f"damaged recording: {line}" for line in damage_lines(reader))
+    return replace(block, notes=(*damage, *voices.lines(), *block.notes))
 
 
 def refuse_worker_options(args: argparse.Namespace) -> None:

@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         if args.verbose:
             for name, n in result["poses_left_out"].items():
                 print(f"{name}: {n} poses that are not valid, left out of the statistics")
+        lines += result["not_used"]
         if not compared:
             lines.append("no accuracy: neither truth nor check points to compare with")
         print("\n".join(lines))

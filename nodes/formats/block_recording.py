@@ -23,7 +23,7 @@ from .block_messages import SIGMAS
 #: What `block_from_messages` reads.
 TOPICS = (
     *("configuration/project", "configuration/camera", "configuration/strip"),
-    *("observation/control", "observation/tie", "trajectory/filtered", "trajectory/smoothed"),
+    *("observation/control", "observation/verdict", "observation/tie", "trajectory/filtered", "trajectory/smoothed"),
 )
 
 #: Differences below this share of a variance are rounding.

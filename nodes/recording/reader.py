@@ -25,6 +25,7 @@ from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
 from ..errors import UserError
 from ..node import Message
+from ..voices import FIXED, VERDICT, RecordedVoices
 from . import mcap_scan as scan
 from .index import CHANNEL_METADATA, Channel, Index, Recorded
 from .ranges import Ranged, open_ranged
@@ -382,7 +383,8 @@ class RecordingReader:
                 self.problems["malformed"] += 1
                 self.last_problem = f"{raw.topic} {raw.envelope.sequence} of {raw.envelope.source!r}: {error}"
                 continue
-            yield Message(raw.topic, raw.envelope.stamp_ns, body, raw.envelope.source, raw.envelope.sequence)
+            e = raw.envelope
+            yield Message(raw.topic, e.stamp_ns, body, e.source, e.sequence, e.start)
 
     def first(self, topic: str) -> Any | None:
         """The body of the first message of a topic, None where there is none."""
@@ -390,7 +392,25 @@ class RecordingReader:
         return None if message is None else message.body
 
     def last(self, topic: str) -> Any | None:
-        """The body of the last message of a topic by stamp, which replaces the others; None where there is none."""
+        """The body of the last message of a topic by stamp, which replaces the others; None where there is none.
+
+        Of project and camera: of the last that nodes use, which take no other one in flight without an operator's word.
+        """
         numbers = self.sort(self.select([topic]))
+        if topic in FIXED and len(numbers) > 1:
+            bodies = [message.body for message in self.decode(numbers)]
+            if any(body != bodies[0] for body in bodies):
+                return self._last_used(topic)
         message = next(iter(self.decode(numbers[::-1])), None)
         return None if message is None else message.body
+
+    def _last_used(self, topic: str) -> Any | None:
+        flown = [c.id for c in self.channels.values() if c.known and topics.begins_flight(c.topic)]
+        numbers = np.flatnonzero(np.isin(self.channel_of, flown))
+        firsts = numbers[np.unique(self.channel_of[numbers], return_index=True)[1]]
+        voices, body = RecordedVoices(), None
+        for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), firsts))):
+            for used in voices.used(message):
+                if used.topic == topic:
+                    body = used.body
+        return body

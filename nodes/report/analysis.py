@@ -32,12 +32,13 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     Returns
     -------
     the result of `evaluate_flight`, and ``recording`` (file, bytes, start, seconds, messages, project, camera, strips),
-    ``damage`` (one line each), ``topics`` (messages, rate, gaps, unusable, by topic), ``nodes`` (newest status),
-    ``parameters`` (of the newest report that has any), ``rejected_observations`` (the largest first), ``latency_s``
-    (median, max), ``integrity`` (see `integrity.integrity`; absent where no report has a light), ``tracks`` (see
-    `tracks.tracks`), ``events``
+    ``damage`` (one line each), ``not_used`` (messages that nodes did not use, a line a topic), ``topics`` (messages,
+    rate, gaps, unusable, by topic), ``nodes`` (newest status), ``parameters`` (of the newest report that has any),
+    ``rejected_observations`` (the largest first), ``latency_s`` (median, max), ``integrity`` (see
+    `integrity.integrity`; absent where no report has a light), ``tracks`` (see `tracks.tracks`), ``events``
     """
-    result = {"recording": _recording(flight, held), "damage": held.damage, **evaluate_flight(flight)}
+    result = {"recording": _recording(flight, held), "damage": held.damage, "not_used": flight.not_used}
+    result |= evaluate_flight(flight)
     result["topics"] = {
         row.topic: {
             "messages": row.messages,

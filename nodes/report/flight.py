@@ -15,6 +15,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
 from ..node import Message
+from ..voices import RecordedVoices
 
 Array = NDArray[np.floating]
 Key = tuple[str, str, str, int, int, str]
@@ -127,7 +128,8 @@ class Flight:
     ground : control and check points by id; truth_points : true coordinates by id
     reports : adjustment reports in order; rejected : the rejected observations they name, once each, without those
         that were accepted again later
-    counts : messages taken in, by topic; refused : messages that hold no usable value
+    counts : messages looked at, by topic; refused : messages that hold no usable value
+    not_used : lines about messages that nodes did not use either
     status : newest status of each node
     """
 
@@ -151,6 +153,7 @@ class Flight:
     status: dict[str, Any] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
+    not_used: list[str] = field(default_factory=list)
 
     @property
     def measured(self) -> str:
@@ -181,23 +184,28 @@ class Flight:
 
 
 def collect(messages: Iterable[Message]) -> Flight:
-    """Read the messages of a recording once; messages that cannot be used are counted and raise no error."""
-    flight = Flight()
+    """Read the messages of a recording once; messages that cannot be used are counted and raise no error.
+
+    Of configuration, sensors and control those count that nodes use, see `RecordedVoices`.
+    """
+    flight, voices = Flight(), RecordedVoices()
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
     for message in messages:
-        topic, body, stamp = message.topic, message.body, message.stamp_ns
+        topic, stamp = message.topic, message.stamp_ns
         flight.counts[topic] += 1
         if topic.startswith(("configuration/", "observation/control", "truth/point", "status/")):
             configured_ns.append(stamp)
         else:
             flight.start_ns = min(flight.start_ns or stamp, stamp)
             flight.end_ns = max(flight.end_ns, stamp)
-        try:
-            _take(flight, rows, rejected, topic, stamp, body)
-        except (ValueError, IndexError, np.linalg.LinAlgError):
-            flight.refused[topic] += 1
+        for used in voices.used(message):
+            try:
+                _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
+            except (ValueError, IndexError, np.linalg.LinAlgError):
+                flight.refused[used.topic] += 1
+    flight.not_used = voices.lines()
     if not flight.start_ns and configured_ns:
         flight.start_ns, flight.end_ns = min(configured_ns), max(configured_ns)
     flight.poses = {name: _poses(samples, keep_first=name == "live") for name, samples in rows.items() if samples}

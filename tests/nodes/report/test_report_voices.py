@@ -1,0 +1,92 @@
+"""Who reads a recording takes the project, the camera and the control that nodes used, and no others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from recording_file import write_recording
+from synthetic_flight import flight_messages
+
+from triline.nodes.cli import main
+from triline.nodes.formats.block_recording import TOPICS
+from triline.nodes.node import Message
+from triline.nodes.recording.access import Recording
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.report.evaluation import evaluate
+from triline.nodes.voices import RecordedVoices
+from triline.schemas import messages as m
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return flight_messages(seconds=34.0, points=150)
+
+
+def _of(messages, topic):
+    return next(x for x in messages if x.topic == topic)
+
+
+def _moved(messages, seconds: float, **more) -> Message:
+    """The project with another origin, so long after the first fix."""
+    was = _of(messages, "configuration/project")
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.origin_latitude += 0.1
+    stamp = _of(messages, "sensor/gnss").stamp_ns + round(seconds * SECOND)
+    return replace(was, body=body, stamp_ns=stamp, sequence=was.sequence + 1, **more)
+
+
+def _said(messages, seconds: float) -> Message:
+    body = m.Verdict(topic="configuration/project", accepted=True, by="Ann")
+    stamp = _of(messages, "sensor/gnss").stamp_ns + round(seconds * SECOND)
+    return Message("observation/verdict", stamp, body, "surveyor", 0)
+
+
+def _latitude(path) -> float:
+    return Recording(path).project().origin_latitude
+
+
+@pytest.mark.parametrize(("seconds", "more"), [(5.0, {}), (5.0, {"source": "intruder"})])
+def test_a_project_that_nodes_refused_does_not_count(messages, tmp_path, seconds, more):
+    was = _of(messages, "configuration/project").body.origin_latitude
+    path = write_recording(tmp_path / "flight.mcap", [*messages, _moved(messages, seconds, **more)])
+    assert _latitude(path) == was
+    right = evaluate(write_recording(tmp_path / "right.mcap", messages))["orientation"]
+    assert evaluate(path)["orientation"]["measured"] == right["measured"]  # places of GNSS are in its frame
+
+
+def test_a_project_counts_before_the_flight_and_on_an_operators_word(messages, tmp_path):
+    other = _moved(messages, 5.0)
+    path = write_recording(tmp_path / "said.mcap", [*messages, other, _said(messages, 6.0)])
+    assert _latitude(path) == other.body.origin_latitude
+    early = replace(other, stamp_ns=_of(messages, "configuration/project").stamp_ns)  # sensors begin with this stamp
+    assert _latitude(write_recording(tmp_path / "early.mcap", [*messages, early])) == other.body.origin_latitude
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_report_says_what_was_not_used(messages, tmp_path, capsys):
+    path = write_recording(tmp_path / "flight.mcap", [*messages, _moved(messages, 5.0)])
+    page = tmp_path / "report.html"
+    assert main(["analyze", str(path), "-o", str(page), "--json"]) == 0
+    (line,) = json.loads(capsys.readouterr().out)["not_used"]
+    assert line.startswith("configuration/project: 1 not used by the nodes: ") and "than the flight began with" in line
+    assert "another one than the flight began with" in page.read_text()
+    assert main(["analyze", str(path), "-o", str(page)]) == 0
+    assert line in capsys.readouterr().out.splitlines()
+
+
+def test_adjust_takes_control_of_the_source_that_nodes_hear(messages, tmp_path):
+    was = _of(messages, "observation/control")
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.z += 100.0
+    stamp = _of(messages, "sensor/gnss").stamp_ns + 5 * SECOND
+    other = replace(was, body=body, stamp_ns=stamp, source="intruder", sequence=0)
+    path = write_recording(tmp_path / "flight.mcap", [*messages, other])
+    voices = RecordedVoices()
+    used = [*voices.all_used(RecordingReader(path).sorted_messages(TOPICS))]
+    heights = [x.body.z for x in used if x.topic == was.topic and x.body.point == was.body.point]
+    assert heights == [was.body.z]
+    assert voices.left_out["observation/control"][0] == 1
