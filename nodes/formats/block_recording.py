@@ -38,6 +38,7 @@ class _Collected:
     camera: Any = None
     strips: dict[str, Any] = field(default_factory=dict)
     ground: dict[str, Any] = field(default_factory=dict)
+    refused: set[str] = field(default_factory=set)
     ties: list[tuple[str, Any]] = field(default_factory=list)
     poses: dict[str, list[tuple[int, str, Any]]] = field(default_factory=dict)
 
@@ -51,6 +52,8 @@ class _Collected:
             self.strips[body.id] = body
         elif message.topic == "observation/control":
             self.ground[body.point] = body
+        elif message.topic == "observation/verdict" and not body.topic:
+            (self.refused.discard if body.accepted else self.refused.add)(body.point)
         elif message.topic == "observation/tie":
             self.ties.extend((body.point, image) for image in body.images)
         elif message.topic in ("trajectory/filtered", "trajectory/smoothed"):
@@ -179,6 +182,9 @@ def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating]
 def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
     ids, xyz, covariance, roles = [], [], [], []
     for id, body in found.ground.items():
+        if id in found.refused:
+            notes.append(f"ground point {id}: its coordinates do not count, as an operator said in flight")
+            continue
         if len(body.covariance) != 9 or not np.isfinite([body.x, body.y, body.z, *body.covariance]).all():
             notes.append(f"ground point {id} has no usable covariance or coordinates and was left out")
             continue

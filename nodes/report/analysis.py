@@ -80,6 +80,7 @@ def _unusable(flight: Flight, row: TopicSummary) -> int | None:
 
 def _recording(flight: Flight, held: Holdings) -> dict[str, Any]:
     start = datetime.fromtimestamp((held.span_ns[0] if held.span_ns else flight.start_ns) / convert.SECOND_NS, UTC)
+    roles = [convert.role_of(g) for id, g in flight.ground.items() if id not in flight.refused_ground]
     return {
         "file": Path(held.file).name,
         "bytes": held.size_bytes,
@@ -91,8 +92,8 @@ def _recording(flight: Flight, held: Holdings) -> dict[str, Any]:
         "strips": len(flight.strips),
         "tie_points": len({look.point for look in flight.looks}),
         "rays": len(flight.looks),
-        "control_points": sum(convert.role_of(g) != "check" for g in flight.ground.values()),
-        "check_points": sum(convert.role_of(g) == "check" for g in flight.ground.values()),
+        "control_points": sum(role != "check" for role in roles),
+        "check_points": sum(role == "check" for role in roles),
     }
 
 

@@ -58,7 +58,8 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
       (with these orientations), ``adjusted_live``, ``adjusted`` and ``adjusted_whole`` (as published), against true
       points that were not given as control: ``n, rmse_m, mean_m, max_m, sigma_m, nees``; where there are both direct
       georeferencing and adjusted points, all rows count only points that both have;
-    - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points;
+    - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points, without
+      those of which the adjuster or an operator left one out;
     - ``improvement``: RMSE of direct georeferencing (filtered) / triangulated: ``points`` (3), ``of`` (the row of
       TRIANGULATED that is meant), ``orientation`` (6, of "final");
     - ``ended_early``: strips whose end the recording does not reach: ``strip, flown_s, planned_s``;
@@ -77,7 +78,7 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     rows = {**intersections, **_adjusted(flight)}
     shared = _shared(rows)
     check, control = _given(flight, "check"), _given(flight, "control")
-    given = {id for id, g in flight.ground.items() if convert.role_of(g) != "check"}
+    given = {id for id, g in flight.ground.items() if convert.role_of(g) != "check"} - flight.refused_ground
     truth = {id: xyz for id, xyz in flight.truth_points.items() if id not in given}  # given coordinates are no result
     for target, known in (("points", truth), ("check", check), ("control", control)):
         known = {id: xyz for id, xyz in known.items() if shared is None or id in shared}
@@ -384,8 +385,9 @@ def _adjusted(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
 
 
 def _given(flight: Flight, role: str) -> dict[str, Array]:
-    """Given coordinates of check points or of full control points."""
-    return {id: np.array([g.x, g.y, g.z]) for id, g in flight.ground.items() if convert.role_of(g) == role}
+    """Given coordinates of check points or of full control points, of which none was left out."""
+    of_role = {id: flight.given(id) for id, g in flight.ground.items() if convert.role_of(g) == role}
+    return {id: xyz for id, xyz in of_role.items() if np.isfinite(xyz).all()}
 
 
 def _point_row(ids: list[str], xyz: Array, covariance: Array, known: dict[str, Array]) -> dict[str, Any] | None:

@@ -96,7 +96,7 @@ def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: boo
         adjusted = flight.points.get(id)
         left = np.full(3, np.nan)
         if adjusted is not None:
-            left = np.array([adjusted.x, adjusted.y, adjusted.z]) - convert.given_of(g)
+            left = np.array([adjusted.x, adjusted.y, adjusted.z]) - flight.given(id)
         rows.append((np.array([g.x, g.y, g.z]), left, convert.role_of(g) == "check"))
     if not rows:
         return

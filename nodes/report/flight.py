@@ -125,7 +125,8 @@ class Flight:
     gnss, attitude : messages as measured, in order of arrival
     live_points, points, whole_points : first LIVE, last FINAL (or last LIVE, without one) and last WHOLE message of
         each object point
-    ground : control and check points by id; truth_points : true coordinates by id
+    ground : control and check points by id; refused_ground : those whose coordinates do not count on an operator's
+        word; truth_points : true coordinates by id
     reports : adjustment reports in order; rejected : the rejected observations they name, once each, without those
         that were accepted again later
     counts : messages looked at, by topic; refused : messages that hold no usable value
@@ -146,6 +147,7 @@ class Flight:
     points: dict[str, Any] = field(default_factory=dict)
     whole_points: dict[str, Any] = field(default_factory=dict)
     ground: dict[str, Any] = field(default_factory=dict)
+    refused_ground: set[str] = field(default_factory=set)
     truth_points: dict[str, Array] = field(default_factory=dict)
     reports: list[tuple[int, Any]] = field(default_factory=list)
     rejected: list[Any] = field(default_factory=list)
@@ -163,6 +165,12 @@ class Flight:
     def seconds(self, time_ns: Any) -> Any:
         """Seconds since the start of the flight."""
         return (np.asarray(time_ns) - self.start_ns) / SECOND_NS
+
+    def given(self, point: str) -> Array:
+        """(3,) coordinates of a ground point that count; NaN for those that are not given, or were left out."""
+        xyz = convert.given_of(self.ground[point])
+        out = [r.coordinate for r in self.rejected if r.point == point and r.coordinate]
+        return np.where([point in self.refused_ground or axis in out for axis in "XYZ"], np.nan, xyz)
 
     def strip_times(self, strip: str) -> tuple[int, int] | None:
         """First and last line of a strip, UTC ns; None where the number of lines is not known."""
@@ -205,7 +213,10 @@ def collect(messages: Iterable[Message]) -> Flight:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
             except (ValueError, IndexError, np.linalg.LinAlgError):
                 flight.refused[used.topic] += 1
-    flight.not_used = voices.lines()
+    flight.not_used = voices.lines() + [
+        f"ground point {point}: its coordinates do not count, as an operator said in flight"
+        for point in sorted(flight.refused_ground & flight.ground.keys())
+    ]
     if not flight.start_ns and configured_ns:
         flight.start_ns, flight.end_ns = min(configured_ns), max(configured_ns)
     flight.poses = {name: _poses(samples, keep_first=name == "live") for name, samples in rows.items() if samples}
@@ -269,6 +280,8 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         flight.attitude.append(_finite(body, body.roll, body.pitch, body.heading, *body.covariance))
     elif topic == "observation/control":
         flight.ground[body.point] = _finite(body, body.x, body.y, body.z)
+    elif topic == "observation/verdict" and not body.topic:
+        (flight.refused_ground.discard if body.accepted else flight.refused_ground.add)(body.point)
     elif topic == "truth/point":
         _finite(body, body.x, body.y, body.z)
         flight.truth_points[body.point] = np.array([body.x, body.y, body.z])

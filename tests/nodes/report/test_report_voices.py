@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from recording_file import write_recording
 from synthetic_flight import flight_messages
 
 from triline.nodes.cli import main
-from triline.nodes.formats.block_recording import TOPICS
+from triline.nodes.formats.block_recording import TOPICS, block_from_messages
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.report.evaluation import evaluate
+from triline.nodes.report.evaluation import evaluate, evaluate_flight
+from triline.nodes.report.flight import collect
 from triline.nodes.voices import RecordedVoices
 from triline.schemas import messages as m
 
@@ -90,3 +92,49 @@ def test_adjust_takes_control_of_the_source_that_nodes_hear(messages, tmp_path):
     heights = [x.body.z for x in used if x.topic == was.topic and x.body.point == was.body.point]
     assert heights == [was.body.z]
     assert voices.left_out["observation/control"][0] == 1
+
+
+# ---- control whose coordinates do not count
+
+
+def _refused(messages) -> tuple[list[Message], str]:
+    """The flight with a control point 5 m wrong in height that an operator refused, and its name."""
+    was = next(x for x in messages if x.topic == "observation/control" and x.body.role == m.GroundPoint.CONTROL)
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.z += 5.0
+    verdict = Message(
+        "observation/verdict", was.stamp_ns + SECOND, m.Verdict(point=body.point, accepted=False), "surveyor", 0
+    )
+    return [replace(x, body=body) if x is was else x for x in messages] + [verdict], body.point
+
+
+def test_control_that_an_operator_refused_counts_in_no_accuracy(messages):
+    spoilt, name = _refused(messages)
+    flight = collect(spoilt)
+    result, right = evaluate_flight(flight), evaluate_flight(collect(messages))
+    for row, before in zip(result["control"].values(), right["control"].values(), strict=True):
+        assert row["n"] == before["n"] - 1 and row["max_m"][2] < 3.0
+    assert result["points"]["adjusted"]["n"] == right["points"]["adjusted"]["n"] + 1  # a result as all others
+    assert flight.not_used == [f"ground point {name}: its coordinates do not count, as an operator said in flight"]
+
+
+def test_a_coordinate_that_the_adjuster_left_out_counts_in_no_accuracy_of_the_control(messages):
+    spoilt, name = _refused(messages)
+    spoilt.pop()
+    *_, last = (x for x in spoilt if x.topic == "adjustment/report")
+    report = type(last.body).FromString(last.body.SerializeToString())
+    report.rejected.add(point=name, coordinate="Z", reason="contradicts", w=9.0, off=5.0)
+    flight = collect(replace(x, body=report) if x is last else x for x in spoilt)
+    assert np.isnan(flight.given(name)).tolist() == [False, False, True]
+    row = evaluate_flight(flight)["control"]["adjusted"]
+    assert row["n"] == evaluate_flight(collect(messages))["control"]["adjusted"]["n"] - 1
+    assert row["max_m"][2] < 3.0
+
+
+def test_adjust_takes_no_coordinates_that_an_operator_refused(messages):
+    spoilt, name = _refused(messages)
+    block, before = (block_from_messages(x, "flight") for x in (spoilt, messages))
+    assert name in before.ground.id and set(before.ground.id) - set(block.ground.id) == {name}
+    assert any(name in note and "an operator said" in note for note in block.notes)
+    accepted = replace(spoilt[-1], body=m.Verdict(point=name, accepted=True))
+    assert name in block_from_messages([*spoilt, accepted], "flight").ground.id
