@@ -302,6 +302,14 @@ def local_frame(project: Any) -> LocalFrame:
     return LocalFrame(project.origin_latitude, project.origin_longitude, project.origin_height, project.crs or "local")
 
 
+def same_frame(one: Any, other: Any) -> bool:
+    """Whether the local frames of two Project messages are the same, so that coordinates in both can be compared."""
+    names = ("origin_latitude", "origin_longitude", "origin_height")
+    return all(getattr(one, name) == getattr(other, name) for name in names) and (
+        (one.crs or "local") == (other.crs or "local")
+    )
+
+
 def R_bc_of(project: Any) -> Array:
     """Image to body, with the boresight of a Project message."""
     if not project.boresight_deg:

@@ -244,6 +244,11 @@ class RecordedVoices:
         if not heard.pass_on and message.topic != VERDICT:
             n, text = self.left_out.get(message.topic, (0, ""))
             self.left_out[message.topic] = n + 1, (heard.alarms or (text,))[-1]
+        elif message.topic == VERDICT:  # what it lets in was left out before
+            for topic in {used.topic for used in heard.pass_on} & self.left_out.keys():
+                n, text = self.left_out.pop(topic)
+                if n > 1:
+                    self.left_out[topic] = n - 1, text
         return heard.pass_on
 
     def all_used(self, messages: Iterable[Message]) -> Iterator[Message]:

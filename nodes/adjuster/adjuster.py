@@ -261,10 +261,12 @@ class Adjuster(Node):
         return []
 
     def _configure(self, topic: str, body: Any, stamp_ns: int) -> list[Message]:
+        another_frame = False
         if topic == "configuration/project":
             if body == self._project:
                 return []
             convert.slow_errors_of(body)
+            another_frame = self._project is not None and not convert.same_frame(body, self._project)
             self._project = body
         else:
             if body == self._camera:
@@ -285,12 +287,22 @@ class Adjuster(Node):
             slow = slow.with_some_wander(finest_pixel(camera))
         self._window = Window(camera, slow, self.options, parameters, self._platform, surface=surface)
         self._strips.begin_window(self._window)
-        self._outputs.reference_ns = self._reference_ns
+        self._outputs.begin_window(self._reference_ns, another_frame)
+        self._next_live, self._newest_pose_s = -np.inf, None
         for strip in self._strips.bodies.values():
             self._begin(strip)
         for point in self._control.bodies.values():
             self._control.take(point, self._window)
-        return told + ([self._log("configuration changed: the window starts again", warning=True)] if again else [])
+        if not again:
+            return told
+        words = "configuration changed: the window starts again"
+        if another_frame:
+            self.counters["another local frame"] += 1
+            words += (
+                "; its local frame has another origin or CRS than before, so results from now on do not go with those "
+                "before, and control has to be stated in it"
+            )
+        return [*told, self._log(words, warning=True)]
 
     def _surface(self) -> tuple[SurfaceControl | None, list[Message]]:
         """The elevation model that tie points lie on, if there is one, in the frame of the project; what there is to

@@ -52,6 +52,13 @@ class AdjusterOutputs:
         self._told_ns, self._told_kind = 0, ""  # the last word about the light
         self._strip = ""
 
+    def begin_window(self, reference_ns: int, another_frame: bool) -> None:
+        """Times of a window count from another moment; orientation in another frame is not handed out any more."""
+        self.reference_ns = reference_ns
+        self._invalid.clear()
+        if another_frame:
+            self.store = OrientationStore()
+
     def live(self, orientation: RefinedOrientation, stamp_ns: int) -> list[Message]:
         """Live orientation."""
         return orientations("orientation/live", orientation, self.reference_ns, stamp_ns, self._poses.validity)

@@ -106,10 +106,13 @@ class PoseBuffer:
         self._invalid: dict[bool, list[tuple[float, float, str]]] = {False: [], True: []}
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Forget all poses: times count from another moment from now on."""
         for waiting in self._waiting.values():
             waiting.clear()
         self._latest.clear()
+        self._seen = {False: ([], []), True: ([], [])}
+        self._invalid = {False: [], True: []}
+        self._attitude_lost, self._left_out = False, (0.0, 0.0)
         self.first_known_s = np.inf
 
     def add(self, time_s: float, pose: convert.PlainPose, smoothed: bool, reason: str) -> None:

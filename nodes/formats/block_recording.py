@@ -15,7 +15,7 @@ from ...solver.adjustment.network import Strip
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.slow_errors import SlowErrors
-from ..convert import SECOND_NS, camera_from, local_frame, role_of, slow_errors_of
+from ..convert import SECOND_NS, camera_from, local_frame, role_of, same_frame, slow_errors_of
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
@@ -45,6 +45,8 @@ class _Collected:
     def add(self, message: Message) -> None:
         body = message.body
         if message.topic == "configuration/project":
+            if self.project is not None and not same_frame(body, self.project):
+                self.poses.clear()  # those are in another local frame
             self.project = body
         elif message.topic == "configuration/camera":
             self.camera = body

@@ -136,7 +136,7 @@ class Navigator(Node):
         self._frame = convert.local_frame(message.body)
         self._seen = Counter()
         self._project = content
-        self._reference_ns = message.stamp_ns
+        self._reference_ns = self._reference_ns or message.stamp_ns  # what the clocks have shown is told by these times
         return ()
 
     def _verdict(self, message: Message) -> None:

@@ -197,6 +197,7 @@ def collect(messages: Iterable[Message]) -> Flight:
     Of configuration, sensors and control those count that nodes use, see `RecordedVoices`.
     """
     flight, voices = Flight(), RecordedVoices()
+    before = 0  # poses and points of a local frame that has been given up
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
@@ -209,11 +210,17 @@ def collect(messages: Iterable[Message]) -> Flight:
             flight.start_ns = min(flight.start_ns or stamp, stamp)
             flight.end_ns = max(flight.end_ns, stamp)
         for used in voices.used(message):
+            if used.topic == "configuration/project" and _is_another_frame(flight, used.body):
+                before += _forget_results(flight, rows)
             try:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
             except (ValueError, IndexError, np.linalg.LinAlgError):
                 flight.refused[used.topic] += 1
-    flight.not_used = voices.lines() + [
+    flight.not_used = voices.lines()
+    if before:
+        what = "poses and object points of before the project got another origin or CRS"
+        flight.not_used.append(f"{before} {what}: they are in another local frame")
+    flight.not_used += [
         f"ground point {point}: its coordinates do not count, as an operator said in flight"
         for point in sorted(flight.refused_ground & flight.ground.keys())
     ]
@@ -248,6 +255,19 @@ def _key(r: Any) -> Key:
     """Ids; line and sample in hundredths of a pixel, (0, 0) where they are not finite; the coordinate of control."""
     line, sample = (round(100 * v) if np.isfinite(v) else 0 for v in (r.line, r.sample))
     return r.point, r.strip, r.ccd, line, sample, getattr(r, "coordinate", "")
+
+
+def _is_another_frame(flight: Flight, project: Any) -> bool:
+    return flight.project is not None and not convert.same_frame(project, flight.project)
+
+
+def _forget_results(flight: Flight, rows: dict[str, list[Any]]) -> int:
+    """Forget poses and object points; returns how many there were."""
+    points = (flight.live_points, flight.points, flight.whole_points)
+    n = sum(map(len, rows.values())) + len({id for of in points for id in of})
+    for results in (*rows.values(), *points):
+        results.clear()
+    return n
 
 
 def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], topic: str, stamp: int, body: Any):

@@ -346,3 +346,33 @@ def test_a_strip_joined_in_its_middle_says_so_and_begins_there(done, flight):
     assert model.extent.start_s * 1e9 + node._reference_ns == pytest.approx(joined - 10e9, abs=6e9)
     assert min(seconds(p) for p in bodies(outputs, "orientation/final")) > (joined - EPOCH) * 1e-9 - 6.0
     assert not [text for text, _ in lines(done[1]) if "joined" in text]
+
+
+@pytest.mark.parametrize("another", ["image_sigma_px", "origin_latitude"])
+def test_another_project_in_flight_starts_the_window_again_and_live_orientation_goes_on(flight, another):
+    messages = flight[1]
+    was = next(x for x in messages if x.topic == "configuration/project").body
+    project = type(was).FromString(was.SerializeToString())
+    setattr(project, another, getattr(project, another) + 0.01)
+    k = next(i for i, x in enumerate(messages) if x.stamp_ns > EPOCH + 18e9)
+    again = Message("configuration/project", messages[k].stamp_ns, project, "surveyor", 1)
+    spoilt = []
+    for x in messages[:k]:  # an attitude that is not known yet, early in the flight
+        if x.topic.startswith("trajectory/") and seconds(x.body) < 5.0:
+            body = type(x.body).FromString(x.body.SerializeToString())
+            body.valid, body.reason = False, "aligning"
+            x = replace(x, body=body)
+        spoilt.append(x)
+    node = Adjuster(grid_hz=10.0)
+    outputs = run(node, [*spoilt, again, *messages[k:]])
+    times = np.array([seconds(p) for p in bodies(outputs, "orientation/live")])
+    grid = np.unique(times[np.abs(10 * times - np.round(10 * times)) < 1e-6].round(6))
+    assert len(grid) > 0.9 * 280 and np.diff(grid).max() < 1.0
+    kinds = ("orientation/live", "orientation/final", "orientation/whole")
+    after = [p for topic in kinds for p in bodies(outputs, topic) if seconds(p) > 19]
+    assert len(after) > 300 and all(p.valid for p in after)
+    (told,) = [p.message for p in bodies(outputs, "event/log") if "the window starts again" in p.message]
+    assert ("another origin or CRS" in told) == (another == "origin_latitude")
+    assert node.counters["another local frame"] == (another == "origin_latitude")
+    early = node.query("orientation", {"t": str(EPOCH + 10 * 10**9)})
+    assert (early is None) == (another == "origin_latitude")  # in the frame before

@@ -229,6 +229,17 @@ def test_tenths_of_a_second_are_named_after_a_turn_and_corrected_on_the_operator
     assert len(off) > 300 and max(off) < 0.5
 
 
+def test_another_project_in_flight_leaves_what_the_clocks_have_shown():
+    messages = late_receiver(0.9, False)
+    k = 3 * len(messages) // 10  # before the turn
+    project = type(messages[0].body).FromString(messages[0].body.SerializeToString())
+    project.image_sigma_px *= 2.0
+    again = Message("configuration/project", messages[k].stamp_ns, project, "surveyor", 1)
+    node, events, _ = heard([*messages[:k], again, *messages[k:]])
+    assert any("GNSS clock 0.8" in text and "left out" in text for text in events), events
+    assert "GNSS is left out" in node.alarm
+
+
 def test_a_recording_is_processed_with_the_clock_set_right():
     _, events, poses = heard(late_receiver(0.9, True), Navigator(filtered_s=1.0, smooth_every_s=4.0, gnss_clock_s=-0.9))
     assert not any("clock" in text for text in events) and len(poses) > 300

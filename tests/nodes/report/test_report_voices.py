@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,18 @@ def test_a_project_counts_before_the_flight_and_on_an_operators_word(messages, t
     assert _latitude(path) == other.body.origin_latitude
     early = replace(other, stamp_ns=_of(messages, "configuration/project").stamp_ns)  # sensors begin with this stamp
     assert _latitude(write_recording(tmp_path / "early.mcap", [*messages, early])) == other.body.origin_latitude
+
+
+def test_results_in_a_local_frame_that_was_given_up_are_left_out_and_told(messages, tmp_path):
+    path = write_recording(tmp_path / "said.mcap", [*messages, _moved(messages, 15.0), _said(messages, 16.0)])
+    flight = collect(RecordingReader(path).sorted_messages())
+    change = _said(messages, 16.0).stamp_ns
+    kept = [x for x in messages if x.topic == "trajectory/filtered" and x.stamp_ns > change]
+    assert len(flight.poses["filtered"]) == len(kept) < sum(x.topic == "trajectory/filtered" for x in messages)
+    block = block_from_messages(RecordedVoices().all_used(RecordingReader(path).sorted_messages(TOPICS)), "flight")
+    assert block.strips[0].trajectory.start_s * SECOND + block.time_reference_ns > change
+    (line,) = flight.not_used
+    assert re.match(r"\d+ poses and object points of before the project got another origin or CRS", line)
 
 
 @pytest.mark.usefixtures("undrawn")
