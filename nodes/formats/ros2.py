@@ -9,7 +9,7 @@ file that was cut off, or one of another profile, and stops at the first damaged
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from heapq import merge
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...schemas import messages as m
 from ...schemas.topics import rank
 from ...solver.geometry.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
-from ..convert import attitude_message, gnss_message
+from ..convert import attitude_message, check_angles, check_inertial, check_place, gnss_message
 from ..errors import UserError
 from ..node import Message
 from ..recording.reader import RecordingReader
@@ -36,6 +36,8 @@ IMU = "sensor_msgs/msg/Imu"
 #: Taken where a message says that its covariance is not known.
 FIX_SIGMA_M = (5.0, 5.0, 10.0)
 ATTITUDE_SIGMA_RAD = (0.01, 0.01, 0.03)
+#: What is counted of messages whose values nodes would refuse, as of other sensors.
+IMPOSSIBLE = "with values that no aircraft has"
 _FLU_FRD = np.array([1.0, -1.0, -1.0])
 _DIAGONAL = [0, 4, 8]
 #: Inertial samples that are converted at once.
@@ -161,8 +163,11 @@ def fix_messages(
     for time_ns, fix in decoded(payloads, FIX, left_out):
         variance = fix.position_covariance[_DIAGONAL]
         known = fix.position_covariance_type != 0 and np.isfinite(variance).all() and (variance > 0).all()
-        nominal += not known
         place, sigma = (fix.latitude, fix.longitude, fix.altitude), np.sqrt(variance) if known else FIX_SIGMA_M
+        if not _passes(check_place, *place):
+            left_out[IMPOSSIBLE] += 1
+            continue
+        nominal += not known
         yield Message("sensor/gnss", time_ns, gnss_message(time_ns, place, sigma), source)
     _note(notes, topic, left_out)
     if nominal:
@@ -197,18 +202,23 @@ def inertial_messages(
         rate_variance = np.array([s.angular_velocity_covariance for s in read])[:, _DIAGONAL]
         measured = (force_variance[:, 0] != -1) & (rate_variance[:, 0] != -1)
         angles, sigma, oriented, assumed = _attitudes(read)
-        nominal += int(assumed.sum())
         columns = (force, rate, _sigma(force_variance), _sigma(rate_variance))
         for k, (time, interval, f, w, force_sigma, rate_sigma) in enumerate(
             zip(time_ns, interval_ns, *(column.tolist() for column in columns), strict=True)
         ):
-            if measured[k]:
+            # a first sample has no interval yet
+            if measured[k] and not _passes(check_inertial, interval or 1, tuple(f), tuple(w)):
+                left_out[IMPOSSIBLE] += 1
+            elif measured[k]:
                 body = m.Imu(
                     time_ns=time, interval_ns=interval, force_x=f[0], force_y=f[1], force_z=f[2],
                     rate_x=w[0], rate_y=w[1], rate_z=w[2], force_sigma=force_sigma, rate_sigma=rate_sigma,
                 )  # fmt: skip
                 yield Message("sensor/imu", time, body, source)
-            if oriented[k]:
+            if oriented[k] and not _passes(check_angles, *angles[k].tolist()):
+                left_out[IMPOSSIBLE] += 1
+            elif oriented[k]:
+                nominal += int(assumed[k])
                 yield Message("sensor/attitude", time, attitude_message(time, angles[k], sigma[k]), source)
     _note(notes, topic, left_out)
     if nominal:
@@ -226,9 +236,18 @@ def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDA
     oriented = (variance[:, 0] != -1) & (np.abs(length - 1.0) < 1e-3)
     q[~oriented] = 0.0, 0.0, 0.0, 1.0
     R_nb = R_ENU_NED.T @ matrix_from_quaternion(q) * _FLU_FRD
-    known = np.all(variance > 0, axis=1)
-    sigma = np.where(known[:, None], np.sqrt(np.maximum(variance, 0.0)), ATTITUDE_SIGMA_RAD)
+    known = np.all((variance > 0) & np.isfinite(variance), axis=1)
+    sigma = np.where(known[:, None], np.sqrt(np.where(known[:, None], variance, 0.0)), ATTITUDE_SIGMA_RAD)
     return navigation_from_matrix(R_nb), sigma, oriented, oriented & ~known
+
+
+def _passes(check: Callable[..., None], *values: Any) -> bool:
+    """Whether values are such as an aircraft has."""
+    try:
+        check(*values)
+    except ValueError:
+        return False
+    return True
 
 
 def _sigma(variance: Array) -> Array:

@@ -168,6 +168,32 @@ def test_numbers_of_no_orientation_and_no_noise_are_left_out_without_a_warning(t
     assert found["sensor/imu"][0].body.rate_sigma == 0.0
 
 
+def test_values_that_no_aircraft_has_are_left_out_as_of_other_sensors(tmp_path):
+    t = [START_NS + i * STEP_NS for i in range(6)]
+    samples, fixes = [imu(time) for time in t], [fix(time, 1.0) for time in t]
+    samples[1].linear_acceleration.x = 9806.65  # in mm/s^2
+    samples[2].angular_velocity.z = np.nan
+    samples[3].orientation = _type("geometry_msgs/msg/Quaternion", 1.0, 0.0, 0.0, 0.0)  # on its back
+    samples[4].orientation_covariance[:] = np.inf
+    fixes[0].latitude = 4810.0  # degrees and minutes
+    fixes[3].altitude = np.nan
+    bag = [
+        *(("/imu", s.header.stamp.nanosec, s) for s in samples),
+        *(("/fix", f.header.stamp.nanosec, f) for f in fixes),
+    ]
+    imported = read_any(write_bag(tmp_path / "bag", bag))
+    messages = list(imported.messages)
+    found = by_topic(messages)
+    assert [(x.stamp_ns - START_NS) // STEP_NS for x in found["sensor/imu"]] == [0, 3, 4, 5]
+    assert [(x.stamp_ns - START_NS) // STEP_NS for x in found["sensor/attitude"]] == [0, 1, 2, 4, 5]
+    assert np.isfinite([x.body.covariance[0] for x in found["sensor/attitude"]]).all()
+    assert [(x.stamp_ns - START_NS) // STEP_NS for x in found["sensor/gnss"]] == [1, 2, 4, 5]
+    assert messages[0].topic == "configuration/project"
+    assert messages[0].body.origin_latitude == 48.1  # of the first fix that can be one
+    assert "/imu: messages left out: 3 with values that no aircraft has" in imported.notes
+    assert "/fix: messages left out: 2 with values that no aircraft has" in imported.notes
+
+
 def test_what_a_message_does_not_know_is_left_out_or_assumed_with_a_note(tmp_path):
     t = [START_NS + i * STEP_NS for i in range(5)]
     samples = [
