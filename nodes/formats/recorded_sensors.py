@@ -69,6 +69,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     else:
         project = reader.last("configuration/project")
         arm = np.zeros(3) if project is None else convert.lever_arm_of(project)
+        notes.append(_place_of_unit(arm))
         x, y, z = (float(v) for v in arm)
         wander = (0.0, 0.0, 0.0)
         if project is not None and len(project.wander_sigma_m) == 3:
@@ -80,6 +81,16 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     fixes = _fixes(gnss, start_ns)
     offset_s = start_ns / convert.SECOND_NS
     return RecordedSensors(path_of(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
+
+
+def _place_of_unit(arm: NDArray[np.floating]) -> str:
+    """What positions are of: a recording knows where the antenna is from the camera, not from the inertial unit."""
+    if not arm.any():
+        return "configuration/project: no lever arm; the antenna is taken to sit on the inertial unit (--platform)"
+    return (
+        "configuration/project: the lever arm goes from the camera to the antenna; the inertial unit is taken to sit "
+        "in the perspective centre, and positions are of that (--platform gives the lever arm of the unit)"
+    )
 
 
 def _grade(imu: list[Any], notes: list[str]) -> InertialGrade:

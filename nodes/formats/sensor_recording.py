@@ -31,7 +31,8 @@ def sensor_messages(
     """``configuration/project``, ``sensor/imu``, ``sensor/gnss`` and ``sensor/attitude``, sorted by stamp and rank.
 
     Times in the files count from the Unix epoch. Increments are divided by their interval. Each sample carries
-    the noise of the inertial unit as its sigma; messages have no field for its biases and the initial attitude.
+    the noise of the inertial unit as its sigma; messages have no field for its biases, the initial attitude, and where
+    it sits: the project has the lever arm from the camera to the antenna, and slow errors of GNSS.
     ``grade`` takes the place of the unit in platform.toml.
 
     Raises
@@ -57,6 +58,10 @@ def sensor_messages(
         boresight_deg=platform.boresight_deg,
         image_sigma_px=Apriori.image_sigma_px,
     )
+    if any(platform.wander_sigma_ned_m):
+        north, east, down = platform.wander_sigma_ned_m
+        project.wander_sigma_m.extend((east, north, down))
+        project.wander_time_s = platform.wander_time_s
     if folder.gnss is not None:
         project.origin_latitude = round(float(np.degrees(np.nanmedian(folder.gnss.lat))), 6)
         lon = np.unwrap(folder.gnss.lon[np.isfinite(folder.gnss.lon)])

@@ -303,6 +303,27 @@ def test_platform_keys_are_read(tmp_path):
     assert any("unknown" in n for n in read.notes)
 
 
+def test_what_a_recording_of_a_folder_keeps_of_the_platform_and_what_positions_are_of(tmp_path, capsys):
+    slow = "[gnss]\nwander_sigma_m = [0.1, 0.2, 0.3]\nwander_time_s = 20\n"
+    folder = write(tmp_path / "sensors", platform="camera_lever_arm_m = [0, 0, 1.5]\n" + PLATFORM + slow)
+    recording = tmp_path / "flight.mcap"
+    assert main(["import", str(folder), "-o", str(recording), "-q"]) == 0
+    project = RecordingReader(recording).last("configuration/project")
+    assert list(project.lever_arm_m) == pytest.approx([0.5, 0.1, -2.7])
+    assert list(project.wander_sigma_m) == [0.2, 0.1, 0.3] and project.wander_time_s == 20  # X is east
+    capsys.readouterr()
+    heights, notes = [], []
+    for source in (folder, recording):
+        out = tmp_path / source.stem
+        assert main(["navigate", str(source), "-o", str(out), "--json", "--no-page", "--rate", "1"]) == 0
+        notes.append(json.loads(capsys.readouterr().out)["notes"])
+        rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+        heights.append(np.median(rows[20:, 3]))
+    assert heights[0] - heights[1] == pytest.approx(1.5, abs=0.1)  # of the unit, and of the camera below it
+    said = "the inertial unit is taken to sit in the perspective centre, and positions are of that"
+    assert not any(said in note for note in notes[0]) and any(said in note for note in notes[1])
+
+
 def test_a_flight_across_the_date_line_has_its_origin_there(tmp_path):
     folder = write(tmp_path / "sensors")
     table = np.loadtxt(folder / "gnss.csv", delimiter=",", skiprows=1)
