@@ -33,6 +33,8 @@ EXAMPLE = """triline confirm GCP3 --port 17447
 LARGEST_CLOCK_S = 100.0
 #: Longest wait for ground points and platform time, and for the answer to the verdict, s.
 LISTEN_S, NOBODY_S, ANSWER_S = 1.0, 4.0, 6.0
+#: So much longer for both where nodes live that are not heard: over a full downlink all comes late, s.
+SLOW_S = 20.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,12 +70,15 @@ def run(args: argparse.Namespace) -> int:
         if args.source:
             bus.subscribe(topic, heard.take_source)
         bus.prepare(["observation/verdict"])
-        _wait(lambda: heard.stamp_ns > 0, NOBODY_S)
+        slow_s = 0.0
+        if not _wait(lambda: heard.stamp_ns > 0, NOBODY_S) and bus.alive():
+            slow_s = SLOW_S
+            _wait(lambda: heard.stamp_ns > 0, slow_s)
         time.sleep(LISTEN_S)
         if not heard.stamp_ns:
             raise UserError(f"no node sends on the bus of platform {bus.platform}")
         if args.source:  # GNSS may come once a second
-            _wait(lambda: bool(heard.sources), NOBODY_S)
+            _wait(lambda: bool(heard.sources), NOBODY_S + slow_s)
         if not topic and heard.points and args.point not in heard.points:
             raise UserError(f"{args.point} is no ground point of this flight, there are {_few(heard.points)}")
         if args.source and not args.reject and args.source not in heard.sources:
@@ -86,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         heard.sent.set()
         counts_ns = heard.stamp_ns + VERDICT_AHEAD_NS
         bus.publish(Message("observation/verdict", counts_ns, verdict))
-        _wait(lambda: heard.answer != "" or heard.nothing != "", ANSWER_S)
+        _wait(lambda: heard.answer != "" or heard.nothing != "", ANSWER_S + slow_s)
         answered = _wait(lambda: heard.answer != "", LISTEN_S if heard.nothing else 0.0)
     if args.json:
         result = {"point": args.point, "accepted": not args.reject, "answer": heard.answer, "looks": heard.looks}

@@ -159,6 +159,31 @@ def test_a_verdict_beside_a_recorder_says_that_no_data_come(monkeypatch, capsys)
     assert "GCP1: the verdict was sent, but no data come; it counts when they do" in capsys.readouterr().err
 
 
+def test_a_verdict_waits_longer_for_nodes_that_live_and_are_heard_late(monkeypatch, capsys):
+    """Over a full downlink the first message and the answer come after more than the usual wait."""
+    for name, seconds in (("ANSWER_S", 0.3), ("LISTEN_S", 0.2), ("NOBODY_S", 0.3)):
+        monkeypatch.setattr(confirm, name, seconds)
+    port, stop, sent = free_port(), threading.Event(), threading.Event()
+    with Bus(port=port, source="adjuster") as bus:
+        bus.announce("adjuster")
+        bus.subscribe("observation/verdict", lambda raw: sent.set())
+
+        def report() -> None:
+            stop.wait(2.5)  # what waits on the link
+            while not sent.wait(0.05) and not stop.is_set():
+                bus.publish(Message("status/adjuster", sample.EPOCH_NS, sample.body("status/adjuster"), "adjuster"))
+            stop.wait(1.5)
+            bus.publish(Message("event/log", sample.EPOCH_NS, m.Log(name="adjuster", message="GCP1 is confirmed")))
+
+        reporting = threading.Thread(target=report, daemon=True)
+        reporting.start()
+        code = main(["confirm", "GCP1", "--port", str(port)])
+        stop.set()
+        reporting.join()
+    said = capsys.readouterr()
+    assert (code, said.out) == (0, "GCP1 is confirmed\n"), said.err
+
+
 def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
     camera = sample.body("configuration/camera")
     other = copy.deepcopy(camera)
