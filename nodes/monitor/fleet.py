@@ -67,6 +67,11 @@ class Aircraft:
         return max(self.report.sigma[:3]), max(self.report.protection[:3], default=0.0)
 
     @property
+    def sigma0(self) -> float | None:
+        """Of the newest report; None while nothing is redundant."""
+        return self.report.sigma0 if self.report is not None and self.report.redundancy > 0 else None
+
+    @property
     def alarms(self) -> list[str]:
         """What its nodes want an operator to look at."""
         return list(dict.fromkeys(status.alarm for status in self.nodes.values() if status.alarm))
@@ -141,7 +146,7 @@ class FleetOverview:
                         "reason": f"silent; last known: {light}" if silent and light else reason,
                         "sigma_m": sigma_m,
                         "protection_m": protection_m,
-                        "sigma0": None if aircraft.report is None else aircraft.report.sigma0,
+                        "sigma0": aircraft.sigma0,
                         "lag_s": aircraft.lag_s,
                         "link": "linked" if aircraft.linked else "gone",
                         "heard_s": ago_s,

@@ -150,7 +150,7 @@ class Monitor(Node):
             view.report = body
             view.parameters = body.parameters or view.parameters
             view.updates += 1
-            view.rejected = max(view.rejected, body.rejected_total)
+            view.rejected = body.rejected_total - body.returned_total  # as the report of the flight counts them
             view.final_until_ns = max(view.final_until_ns, body.window_start_ns)
         elif message.topic == "event/log":
             level = convert.enum_name(m.Log.Level, body.level)

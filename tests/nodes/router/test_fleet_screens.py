@@ -10,6 +10,7 @@ from rich.console import Console
 
 from triline.nodes import convert
 from triline.nodes.monitor.fleet import SILENT_S, FleetOverview, screen
+from triline.nodes.monitor.monitor import Monitor
 from triline.nodes.node import Message
 from triline.nodes.viewer.canvas import FleetLayout, NullCanvas
 from triline.nodes.viewer.fleet_scene import FleetScene
@@ -63,6 +64,22 @@ def test_each_aircraft_has_a_row_and_one_that_is_silent_has_no_light():
     assert (one["light"], one["link"], one["heard_s"]) == ("unknown", "gone", SILENT_S + 1.0)
     assert "last known: good" in one["reason"] and two["light"] == "weak"
     assert "a1 unknown gone, heard 16 s ago" in overview.line() and "7 to come" in overview.line()
+
+
+def test_where_nothing_is_redundant_there_is_no_sigma0():
+    overview = FleetOverview()
+    for platform, redundancy in (("a1", 90), ("a2", 0)):
+        report = m.AdjustmentReport(sigma0=1.02 if redundancy else 0.0, redundancy=redundancy)
+        overview.take(platform, RawMessage("adjustment/report", Envelope(1, "adjuster", 0, 1), codec.encode(report)))
+    assert [row["sigma0"] for row in overview.rows()] == [1.02, None]
+    assert "1.02" in shown(overview) and "0.00" not in shown(overview)
+
+
+def test_the_monitor_counts_rejected_observations_as_the_report_of_a_flight_does():
+    monitor = Monitor()
+    report = m.AdjustmentReport(rejected_total=46, returned_total=4)
+    monitor.step(Message("adjustment/report", sample.EPOCH_NS, report))
+    assert monitor.overview.rejected == 42 and "42 rejected" in monitor.overview.line()
 
 
 class Canvas(NullCanvas):
