@@ -72,6 +72,9 @@ def test_demo_leaves_recording_scene_and_report_with_better_orientation(demo):
     for direct, final in zip(points["direct_georeferencing"]["rmse_m"], points["adjusted"]["rmse_m"], strict=True):
         assert final < direct / 2
     assert 0.7 < result["sigma0"] < 1.2
+    direct, adjusted = (points[row]["rmse_m"] for row in ("direct_georeferencing", "adjusted"))
+    assert result["improvement"] == [a / b for a, b in zip(direct, adjusted, strict=True)]
+    assert result["rays"] >= 2 * result["ties"] > 40 and result["redundancy"] > 0
     # on a busy machine the orthoimage may get the end of the strip after the lines it belongs to
     assert not [what for what in result["lost"] if not (what.startswith("rectifier: ") and what.endswith(" late"))]
 

@@ -50,10 +50,22 @@ def run(args: argparse.Namespace) -> int:
     demo = Demo(args)
     result = demo.fly()
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json.dumps(for_programs(result), indent=2))
     else:
         print(demo.summary(result))
     return 1 if "no_report" in result else 0
+
+
+def for_programs(result: dict[str, Any]) -> dict[str, Any]:
+    """The result with the few figures at the top level that programs read: ``ties`` (tie points published), ``rays``,
+    and ``improvement`` (X, Y, Z) of object points; what else is better stands in ``improvement_in_full``."""
+    out = dict(result)
+    if "recording" in result:
+        out |= {"ties": result["recording"]["tie_points"], "rays": result["recording"]["rays"]}
+    better = out.pop("improvement", {})
+    if "points" in better:
+        out["improvement"] = better["points"]
+    return out | ({"improvement_in_full": better} if better else {})
 
 
 class Demo(LiveFlight):

@@ -320,6 +320,7 @@ class LiveFlight:
         lines = ["", *(accuracy_lines(result) if "report" in result else [])]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
         lines += [f"damaged recording: {text}" for text in result.get("damage", [])]
+        lines += result.get("not_used", [])
         lines += [f"no report: {result['no_report']}"] if "no_report" in result else []
         lines += self.remarks(result)
         if result["lost"]:

@@ -14,6 +14,7 @@ from synthetic_flight import flight_messages, spoilt_copy
 
 from triline.nodes import convert
 from triline.nodes.cli import main
+from triline.nodes.cli.demo import for_programs
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses, orientation_errors
 from triline.nodes.report.figures import errors
@@ -332,3 +333,14 @@ def test_numbers_that_are_not_finite_do_no_harm(messages, seed, tmp_path):
     assert flight.refused["point/object"] and flight.refused["sensor/gnss"]
     # what is left is as good as before
     assert max(result["points"]["adjusted"]["max_m"]) < 1.0
+
+
+def test_figures_of_a_demo_for_programs_stand_at_the_top_level(recording):
+    flight, held = read(recording)
+    result = analyse(flight, held)
+    told = for_programs(result)
+    assert told["improvement"] == result["improvement"]["points"] and len(told["improvement"]) == 3
+    assert told["improvement_in_full"] == result["improvement"]
+    assert told["ties"] == len({look.point for look in flight.looks}) and told["rays"] == len(flight.looks)
+    assert {"redundancy", "sigma0"} <= told.keys()
+    assert for_programs({"no_report": "disk full"}) == {"no_report": "disk full"}
