@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.navigation.clock_check import offset_in_words
+from ...solver.navigation.clock_offset import inertial_offsets
 from ...solver.navigation.error_state import Observation
+from ...solver.navigation.inertial_cleaning import Finding
 from ...solver.navigation.inertial_data import GnssData, InertialData
 from ...solver.navigation.post_processing import (
     Navigated,
@@ -97,6 +100,8 @@ def run(args: argparse.Namespace) -> int:
     except NavigationError as error:
         raise UserError(f"{source}: {folder.named(error.finding)}") from None
     findings = [*findings, *(f for s in stretches for f in s.findings)]
+    if not args.no_checks:
+        findings += _clock_findings(folder, inertial, gnss)
     notes = [*folder.notes, *(folder.named(f) for f in findings)]
     for note in notes:
         _say(quiet, f"note: {note}")
@@ -135,6 +140,17 @@ def _aids(
         a = folder.attitude
         aids += headings(a.time_s, a.angles[:, 2], a.sigma[:, 2])
     return aids
+
+
+def _clock_findings(folder: SensorFolder, inertial: InertialData, gnss: GnssData) -> list[Finding]:
+    """Tenths of a second between the clocks, which turns show, and which nothing else does."""
+    found = []
+    for time_s, offset in inertial_offsets(inertial, gnss, folder.platform.settings):
+        words = f"{offset_in_words(offset.offset_s, 'inertial')}, +- {offset.sigma_s:.2f} s"
+        seen = f"seen at {time_s + folder.offset_s:.1f} s"
+        text = f"{words}, {seen}: positions are off by what is flown in this time"
+        found.append(Finding("clock offset", "gnss.time", text, fatal=False))
+    return found
 
 
 def write_trajectory(

@@ -14,9 +14,11 @@ from ...solver.navigation.inertial_cleaning import Finding
 from ...solver.navigation.inertial_data import TACTICAL, GnssData, InertialGrade
 from .. import convert
 from ..errors import UserError
+from ..node import Message
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.summary import damage_lines
+from ..voices import VERDICT, RecordedVoices
 from .sensor_folder import Platform, SensorFolder, read_platform
 
 _FIELDS = {
@@ -53,17 +55,25 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     UserError : not a recording, or no inertial data in it
     """
     reader = RecordingReader(path, by_ranges=True)
-    imu = [message.body for message in reader.sorted_messages(["sensor/imu"])]
-    gnss = [message.body for message in reader.sorted_messages(["sensor/gnss"])]
+    voices, corrections = RecordedVoices(), list[Message]()
+    imu: list[Any] = []
+    fixes_of: list[Message] = []
+    for message in voices.all_used(reader.sorted_messages(["sensor/imu", "sensor/gnss", VERDICT])):
+        if message.topic == "sensor/imu":
+            imu.append(message.body)
+        elif message.topic == "sensor/gnss":
+            fixes_of.append(message)
+        elif message.body.topic == "sensor/gnss":  # of a clock: others are the voices' own
+            corrections.append(message)
     if not imu:
         raise UserError(f"{path}: no sensor/imu in this recording, wanted raw inertial data")
-    if not gnss:
+    if not fixes_of:
         raise UserError(f"{path}: no sensor/gnss in this recording, wanted GNSS positions")
     start_ns = imu[0].time_ns // convert.SECOND_NS * convert.SECOND_NS
     time_s = (np.array([b.time_ns for b in imu], dtype=np.int64) - start_ns) * 1e-9
     rate = np.array([(b.rate_x, b.rate_y, b.rate_z) for b in imu])
     force = np.array([(b.force_x, b.force_y, b.force_z) for b in imu])
-    notes = damage_lines(reader)
+    notes = [*damage_lines(reader), *voices.lines()]
     if platform_file is not None:
         platform = read_platform(platform_file, notes)
     else:
@@ -78,9 +88,23 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
         platform = Platform(lever_arm_m=(x, y, z), grade=_grade(imu, notes), wander_sigma_ned_m=wander)
         if project is not None and project.wander_time_s > 0.0:
             platform = replace(platform, wander_time_s=project.wander_time_s)
-    fixes = _fixes(gnss, start_ns)
+    fixes = _fixes([message.body for message in fixes_of], start_ns)
+    if corrections:
+        added_s = _added_to_times(fixes_of, corrections, notes)
+        fixes = replace(fixes, time_s=fixes.time_s + added_s)
     offset_s = start_ns / convert.SECOND_NS
     return RecordedSensors(path_of(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
+
+
+def _added_to_times(fixes: list[Message], corrections: list[Message], notes: list[str]) -> NDArray[np.floating]:
+    """What an operator said in flight that is to be added to the times of fixes (n,), s: what holds from a verdict on
+    holds from the last one before it, and from the first one on it holds for what was before it, too."""
+    said = np.array([c.body.clock_s for c in corrections])
+    stamps = np.array([c.stamp_ns for c in corrections], dtype=np.int64)
+    which = np.searchsorted(stamps, [message.stamp_ns for message in fixes], side="right") - 1
+    told = ", then ".join(f"{c.body.clock_s:+.3f} s ({c.body.by or 'an operator'})" for c in corrections)
+    notes.append(f"sensor/gnss: times of fixes are corrected as was said in flight, from the start on: {told}")
+    return said[np.maximum(which, 0)]
 
 
 def _place_of_unit(arm: NDArray[np.floating]) -> str:

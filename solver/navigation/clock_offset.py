@@ -96,6 +96,23 @@ def inertial_offset(inertial: InertialData, gnss: GnssData, settings: Navigation
     return None
 
 
+def inertial_offsets(
+    inertial: InertialData, gnss: GnssData, settings: NavigationSettings
+) -> list[tuple[float, Offset]]:
+    """Offsets of a flight as `OffsetWatch` tells them: from which time on, s, and how large."""
+    watch, told, k = OffsetWatch(), [], 0
+    watch.settings = settings
+    dt = inertial.dt_s[:, None]
+    samples = np.column_stack([inertial.time_s, dt, inertial.dv / dt, inertial.dtheta / dt]).tolist()
+    for i, time_s in enumerate(gnss.time_s.tolist()):
+        while k < len(samples) and samples[k][0] <= time_s:
+            watch.sample(*samples[k])
+            k += 1
+        if watch.fix(gnss[i : i + 1]) and watch.offset is not None:
+            told.append((time_s, watch.offset))
+    return told
+
+
 def _inertial_step(window: DataWindow, settings: NavigationSettings) -> tuple[float, float, float]:
     """Correction of the offset, its sigma (with that of the misfit) and the misfit after it."""
     c = window.curve()
