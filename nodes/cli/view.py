@@ -12,12 +12,18 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import UserError
 from ..formats.new_file import new_file
+from ..node import Message
+from ..voices import VERDICT, RecordedVoices
 from .bus_options import add_bus_arguments, bus_of, reporter
 from .damage import tell_damage
 from .outputs import refuse_input_as_output
+
+if TYPE_CHECKING:
+    from ..recording.reader import RecordingReader
 
 EXAMPLE = """triline view flight.mcap --web
   triline view --fleet --secure survey/ann      # all aircraft in the air: docs/fleet.md"""
@@ -47,9 +53,8 @@ def run(args: argparse.Namespace) -> int:
 
     reader = RecordingReader(args.recording)
     from ..viewer.rerun_canvas import RerunCanvas, open_canvas
-    from ..viewer.scene import TOPICS, TRUTH_TOPICS
 
-    messages = reader.sorted_messages((*TOPICS, *TRUTH_TOPICS))
+    messages = _messages(reader)
     signal.signal(signal.SIGTERM, _stop)
     process = None
     try:
@@ -70,6 +75,14 @@ def run(args: argparse.Namespace) -> int:
         if process is not None:
             process.close()
     return 0
+
+
+def _messages(reader: RecordingReader) -> Iterator[Message]:
+    """What a recording holds for a scene, without the configuration and control that nodes did not use."""
+    from ..viewer.scene import TOPICS, TRUTH_TOPICS, is_shown
+
+    used = RecordedVoices().all_used(reader.sorted_messages((*TOPICS, *TRUTH_TOPICS, VERDICT)))
+    return (message for message in used if is_shown(message.topic))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import pytest
 from recording_file import write_recording
 from synthetic_flight import flight_messages
 
-from triline.nodes.cli import main
+from triline.nodes.cli import main, view
 from triline.nodes.formats.block_recording import TOPICS, block_from_messages
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
@@ -91,6 +91,18 @@ def test_the_report_says_what_was_not_used(messages, tmp_path, capsys):
     assert "another one than the flight began with" in page.read_text()
     assert main(["analyze", str(path), "-o", str(page)]) == 0
     assert line in capsys.readouterr().out.splitlines()
+
+
+def test_a_scene_has_no_project_that_nodes_refused(messages, tmp_path):
+    path = write_recording(tmp_path / "flight.mcap", [*messages, _moved(messages, 5.0)])
+    shown = list(view._messages(RecordingReader(path)))
+    assert [x.body.origin_latitude for x in shown if x.topic == "configuration/project"] == [
+        _of(messages, "configuration/project").body.origin_latitude
+    ]
+    assert {x.topic for x in shown} >= {"trajectory/filtered", "orientation/final", "point/object"}
+    path = write_recording(tmp_path / "said.mcap", [*messages, _moved(messages, 5.0), _said(messages, 6.0)])
+    topics = [x.topic for x in view._messages(RecordingReader(path))]
+    assert topics.count("configuration/project") == 2 and "observation/verdict" not in topics
 
 
 def test_adjust_takes_control_of_the_source_that_nodes_hear(messages, tmp_path):
