@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from ...solver.accuracy import angle_difference
 from ...solver.navigation.error_state import Innovation
 from ...solver.navigation.inertial_data import GnssData
 from ...solver.navigation.post_processing import Navigated
@@ -29,7 +30,7 @@ def trajectory(stretches: list[Navigated], gnss: GnssData) -> Figure:
     """Plan, and height against time."""
     scale = 6378137.0
     lat0, lon0 = float(gnss.lat[0]), float(gnss.lon[0])
-    east, north = (gnss.lon - lon0) * scale * np.cos(lat0), (gnss.lat - lat0) * scale
+    east, north = angle_difference(gnss.lon, lon0) * scale * np.cos(lat0), (gnss.lat - lat0) * scale
     wide = float(np.ptp(east)) > 1.8 * float(np.ptp(north))
     fig = figure(5.8 if wide else 5.2)
     plan, height = fig.subplots(2, 1) if wide else fig.subplots(1, 2, width_ratios=(1.0, 1.15))
@@ -39,7 +40,8 @@ def trajectory(stretches: list[Navigated], gnss: GnssData) -> Figure:
         t = _times(s)
         g = s.best.at(t).geodetic
         name = "inertial sensor" if s is stretches[0] else None
-        plan.plot((g[:, 1] - lon0) * scale * np.cos(lat0), (g[:, 0] - lat0) * scale, color=_COLOURS[0], label=name)
+        flown = angle_difference(g[:, 1], lon0) * scale * np.cos(lat0), (g[:, 0] - lat0) * scale
+        plan.plot(*flown, color=_COLOURS[0], label=name)
         height.plot(t, g[:, 2], color=_COLOURS[0])
     plan.plot(east[:1], north[:1], "^", color="k", ms=6, label="first fix")
     plan.set(xlabel="east, m", ylabel="north, m")

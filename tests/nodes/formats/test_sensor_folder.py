@@ -15,6 +15,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.sensor_folder import read_platform, read_sensor_folder
 from triline.nodes.formats.sensor_recording import sensor_messages
 from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.report import navigation_page, navigation_plots
 from triline.solver.geometry.frames import LocalFrame
 
 RATES = "time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s"
@@ -334,3 +335,16 @@ def test_a_flight_across_the_date_line_has_its_origin_there(tmp_path):
     np.savetxt(folder / "gnss.csv", table, "%.14g", ",", header=GNSS, comments="")
     project = next(sensor_messages(folder, [])).body
     assert abs(project.origin_longitude) > 179.9
+
+
+def test_the_plan_of_a_flight_across_the_date_line_is_as_large_as_the_flight(tmp_path, monkeypatch):
+    folder = write(tmp_path / "sensors")
+    table = np.loadtxt(folder / "gnss.csv", delimiter=",", skiprows=1)
+    table[:, 2] += 180.0 - np.median(table[:, 2])
+    table[:, 2] = (table[:, 2] + 180.0) % 360.0 - 180.0
+    np.savetxt(folder / "gnss.csv", table, "%.14g", ",", header=GNSS, comments="")
+    drawn = []
+    trajectory = navigation_plots.trajectory
+    monkeypatch.setattr(navigation_page, "_PLOTS", (("T", lambda *a: drawn.append(trajectory(*a)) or drawn[0], ""),))
+    assert main(["navigate", str(folder), "-o", str(tmp_path / "out"), "-q"]) == 0
+    assert np.ptp(drawn[0].axes[0].get_xlim()) < 20_000.0  # m; it was 40 000 km
