@@ -11,6 +11,7 @@ from ..node import Message
 from .canvas import Canvas, Color
 from .scene_part import CHECK, CONTROL, FILTERED, FINAL, Part, Pieces
 from .scene_state import SceneState
+from .trajectories import LARGEST_GAP_NS
 
 Array = NDArray[np.floating]
 _STEP_NS = convert.SECOND_NS
@@ -33,7 +34,10 @@ class MapPart(Part):
         return True
 
     def pose(self, topic: str, sample: PoseSample) -> None:
+        before_ns = self._last.get(topic, sample.time_ns)
         if topic == "orientation/final" and self.state.frame is not None and self._due(topic, sample.time_ns):
+            if sample.time_ns - before_ns > LARGEST_GAP_NS:  # what was flown from strip to strip is not known
+                self._final.cut()
             self._final.add(self.state.frame.to_geodetic(sample.position_l)[:2])
 
     def take(self, message: Message) -> None:
@@ -49,7 +53,8 @@ class MapPart(Part):
             canvas.geographic_points(entity, np.array(rows), [FILTERED] * len(rows), 2.0)
 
         def line(entity: str, rows: list[Array]) -> None:
-            canvas.geographic_line(entity, np.array(rows), FINAL)
+            if len(rows) > 1:
+                canvas.geographic_line(entity, np.array(rows), FINAL)
 
         def ground(entity: str, rows: list[tuple[Array, Color]]) -> None:
             canvas.geographic_points(entity, np.array([place for place, _ in rows]), [color for _, color in rows], 4.0)

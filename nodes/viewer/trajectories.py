@@ -20,7 +20,7 @@ _STYLE = {  # topic -> entity, colour, radius, label
     "truth/trajectory": ("flight/truth", TRUTH, 0.9, "truth"),
 }
 _STEP_NS = int(0.2 * SECOND_NS)
-_LARGEST_GAP_NS = 2 * SECOND_NS  # deviations are not joined over turns
+LARGEST_GAP_NS = 2 * SECOND_NS  # deviations are not joined over turns
 _ELLIPSOID_STEP_NS = 2 * SECOND_NS
 _SIGMAS = 3.0
 
@@ -44,7 +44,7 @@ class FlightPart(Part):
             return
         if topic == "truth/trajectory" and not self.state.on_strip(sample.time_ns):
             return
-        gone = topic != "trajectory" and sample.time_ns - last > _LARGEST_GAP_NS
+        gone = topic != "trajectory" and sample.time_ns - last > LARGEST_GAP_NS
         if gone or sample.strip != strip:
             self._lines[topic].cut()
         if self._add(topic, sample) and topic == "orientation/final":

@@ -169,6 +169,18 @@ def test_the_map_shows_where_it_is(notes):
     assert np.abs(track - [47.0, 8.0]).max() < 0.1 and np.ptp(track[:, 0]) > 0.005
 
 
+def test_the_map_draws_no_final_track_from_strip_to_strip(messages):
+    final = [m for m in messages if m.topic == "orientation/final"]
+    begin, end = (convert.time_ns(final[len(final) * k // 6].body.timestamp) for k in (2, 3))
+    assert end - begin > 3e9
+    canvas = Notebook()
+    show([m for m in messages if m not in final or not begin < convert.time_ns(m.body.timestamp) < end], canvas)
+    lines = canvas.pieces("map/final")
+    assert len(lines) == 2
+    north = [np.abs(np.diff(line[:, 0])).max() for line in lines]
+    assert max(north) < 2e-3  # degrees a second of flight: nothing is drawn across the gap
+
+
 def test_truth_is_not_shown_when_it_is_not_wanted(messages):
     canvas = Notebook()
     show(messages, canvas, truth=False)
