@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ...schemas import codec
 from ...schemas.envelope import RawMessage
 from ..bus.processes import NodeGroup
+from ..convert import check_place
 from ..errors import UserError
 from ..monitor.sensor_watch import SensorWatch
 from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
@@ -93,6 +94,8 @@ class FirstData:
             return
         try:
             body: Any = codec.decode(raw.topic, raw.data)
+            if raw.topic == "sensor/gnss":  # the origin of the local frame is to be where a flight can be
+                check_place(body.latitude, body.longitude, body.altitude)
         except ValueError:
             return
         with self._lock:

@@ -224,6 +224,10 @@ def test_first_data():
     first.take(RawMessage("sensor/imu", Envelope(T + 7, "imu", 0), encode(m.Imu(time_ns=T + 7, force_z=-9.8))))
     assert (first.newest_ns, first.place) == (T + 7, None)
     first.take(RawMessage("sensor/imu", Envelope(T + 9, "imu", 0), b"\xff"))  # not decodable
+    for place in ((4807.4, 9.0, 500.0), (48.1, 9.0, float("nan"))):  # of somebody's own publisher
+        fix = encode(gnss_message(T + 8, place, (1.0, 1.0, 2.0)))
+        first.take(RawMessage("sensor/gnss", Envelope(T + 8, "gnss", 0), fix))
+        assert (first.newest_ns, first.place) == (T + 7, None)
     fix = encode(gnss_message(T, (48.1234567, 9.0, 500.0), (1.0, 1.0, 2.0)))
     first.take(RawMessage("sensor/gnss", Envelope(T, "gnss", 0), fix))
     assert (first.newest_ns, first.place) == (T + 7, (48.123457, 9.0))
