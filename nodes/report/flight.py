@@ -310,6 +310,7 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
     elif topic == "configuration/camera":
         flight.camera = convert.camera_from(body)
     elif topic == "configuration/strip":
+        convert.check_strip(body, stamp)
         known = flight.strips.get(body.id)
         if known is None or body.lines or not known.lines:
             flight.strips[body.id] = body

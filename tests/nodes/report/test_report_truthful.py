@@ -189,6 +189,16 @@ def test_a_flight_that_ended_early_is_named(messages, tmp_path):
     assert analyse(flight, held)["ended_early"] == []
 
 
+@pytest.mark.parametrize(("field", "value"), [("line_rate_hz", 0.0), ("first_line_time_ns", 10**15), ("lines", 2**31)])
+def test_a_strip_that_nodes_refuse_does_not_take_the_place_of_the_one_that_is_flown(messages, field, value):
+    was = next(x for x in messages if x.topic == "configuration/strip")
+    body = type(was.body).FromString(was.body.SerializeToString())
+    setattr(body, field, value)
+    flight = collect([*messages, replace(was, body=body, stamp_ns=was.stamp_ns + 10**9, sequence=1)])
+    assert flight.refused["configuration/strip"] == 1 and flight.strips["S1"] == was.body
+    assert evaluate_flight(flight)["orientation"] == evaluate_flight(collect(messages))["orientation"]
+
+
 # ---- info and the report
 
 
