@@ -295,9 +295,11 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         for r in body.returned:
             rejected.pop(rejected_key(r), None)
     elif topic == "sensor/gnss":
-        flight.gnss.append(_finite(body, body.latitude, body.longitude, body.altitude, *body.position_covariance))
+        convert.check_place(body.latitude, body.longitude, body.altitude)
+        flight.gnss.append(_finite(body, *body.position_covariance))
     elif topic == "sensor/attitude":
-        flight.attitude.append(_finite(body, body.roll, body.pitch, body.heading, *body.covariance))
+        convert.check_angles(body.roll, body.pitch, body.heading)
+        flight.attitude.append(_finite(body, *body.covariance))
     elif topic == "observation/control":
         flight.ground[body.point] = _finite(body, body.x, body.y, body.z)
     elif topic == "observation/verdict" and not body.topic:

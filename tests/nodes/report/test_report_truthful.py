@@ -199,6 +199,21 @@ def test_a_strip_that_nodes_refuse_does_not_take_the_place_of_the_one_that_is_fl
     assert evaluate_flight(flight)["orientation"] == evaluate_flight(collect(messages))["orientation"]
 
 
+@pytest.mark.parametrize(("topic", "field", "value"), [("gnss", "latitude", 4700.0), ("attitude", "heading", 150.0)])
+def test_measurements_that_nodes_refuse_are_unusable_here_too(messages, topic, field, value):
+    k = next(
+        i for i, x in enumerate(messages) if x.topic == f"sensor/{topic}" and x.stamp_ns > messages[0].stamp_ns + 10**10
+    )
+    body = type(messages[k].body).FromString(messages[k].body.SerializeToString())
+    setattr(body, field, value)
+    flight = collect([*messages[:k], replace(messages[k], body=body), *messages[k + 1 :]])
+    assert flight.refused[f"sensor/{topic}"] == 1
+    right = evaluate_flight(collect(messages))["orientation"]["measured"]
+    found = evaluate_flight(flight)["orientation"]["measured"]
+    assert found["rmse_m"] == pytest.approx(right["rmse_m"], rel=0.05)
+    assert found["rmse_deg"] == pytest.approx(right["rmse_deg"], rel=0.05)
+
+
 # ---- info and the report
 
 
