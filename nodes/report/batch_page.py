@@ -68,9 +68,9 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     lit = [row for row in rows if row["light"]]
     if lit:
         bad = sum(_mood(row) == "failed" for row in lit)
-        time = np.array([row["seconds"] or 0.0 for row in lit])
+        time = np.array([row["lit_s"] or 0.0 for row in lit])
         share = float(np.average([row["light"]["good"] for row in lit], weights=time if time.sum() else None))
-        tiles.append((f"{100 * share:.0f} %", "of the time under a good light", ""))
+        tiles.append((f"{100 * share:.0f} %", "of the time on strips under a good light", ""))
         tiles += [(str(bad), "flights mostly under a failed light", "bad")] if bad else []
     return tiles
 

@@ -34,7 +34,8 @@ def flight_rows(plans: Sequence[Plan], progress: Progress) -> list[dict[str, Any
     - ``flight, recording, bytes``; ``state``: "finished", "failed" or "unfinished"; ``reason``: of the first failure;
     - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job),
       ``attempts``, ``output`` and ``log`` (paths below the folder of results, None where they are not);
-    - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS), ``rmse_m`` (X, Y, Z) of object points
+    - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS in ``lit_s``, the time on strips),
+      ``rmse_m`` (X, Y, Z) of object points
       ``against`` "truth" or "check points", ``tracks``: of the report, see `analysis.analyse`; None without one;
     - ``adjust``: ``sigma0, rejected, check_rmse_m`` of the batch adjustment; None without one.
     """
@@ -65,6 +66,7 @@ def _row(plan: Plan, progress: Progress) -> dict[str, Any]:
         "sigma0": report.get("sigma0"),
         "nees": report.get("orientation", {}).get("final", {}).get("nees"),
         "light": report.get("integrity", {}).get("share"),
+        "lit_s": report.get("integrity", {}).get("seconds"),
         "rmse_m": report[against][of]["rmse_m"] if against and of else None,
         "against": {"points": "truth", "check": "check points"}[against] if against and of else None,
         "tracks": report.get("tracks"),
