@@ -230,7 +230,7 @@ def _accuracy(args: argparse.Namespace) -> Accuracy:
     default = Accuracy()
     x, y, z = position or default.position_m
     omega, phi, kappa = attitude or default.attitude_deg
-    return Accuracy((x, y, z), (omega, phi, kappa), bool(position or attitude))
+    return Accuracy((x, y, z), (omega, phi, kappa), position is not None, attitude is not None)
 
 
 def read_camera_of(text: str) -> LineCamera:

@@ -229,11 +229,8 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
-        if track.sigma_ned_m is None and not options.accuracy.stated:
-            east, _, up = options.accuracy.position_m
-            omega, _, kappa = options.accuracy.attitude_deg
-            taken = f"{east:g} and {up:g} m, {omega:g} and {kappa:g} deg taken (--position-sigma, --attitude-sigma)"
-            notes.append(f"{path.name}: no accuracies of the poses: {taken}")
+        if track.sigma_ned_m is None:
+            notes.extend(_assumed(path, options.accuracy))
         strip = None
         if options.lines is not None:  # the images are the strip, not the poses
             strip = _strip_of(options, options.lines, track if track.line_rate_hz > 0 else None)
@@ -247,6 +244,22 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         notes.extend(strip.notes)
         messages = with_lines(messages, strip, notes)
     return Imported(kind, messages, notes)
+
+
+def _assumed(path: Path, accuracy: Accuracy) -> list[str]:
+    """A note about accuracies of poses that neither the file nor the user states."""
+    assumed = [
+        (f"{values[0]:g} and {values[2]:g} {unit}", option)
+        for values, unit, option, stated in (
+            (accuracy.position_m, "m", "--position-sigma", accuracy.position_stated),
+            (accuracy.attitude_deg, "deg", "--attitude-sigma", accuracy.attitude_stated),
+        )
+        if not stated
+    ]
+    if not assumed:
+        return []
+    values, options = (", ".join(column) for column in zip(*assumed, strict=True))
+    return [f"{path.name}: no accuracies of the poses: {values} taken ({options})"]
 
 
 def _image_topics(options: Options) -> ImageTopics:

@@ -72,8 +72,8 @@ def read_positions(path: Path, day: date | None = None) -> NavigationTrack:
 
 def position_messages(track: NavigationTrack, accuracy: Accuracy, notes: list[str], source: str) -> Iterator[Message]:
     """``configuration/project`` and ``sensor/gnss`` of positions."""
-    sigma = accuracy.position_m if accuracy.stated else POSITION_SIGMA_M
-    if not accuracy.stated:
+    sigma = accuracy.position_m if accuracy.position_stated else POSITION_SIGMA_M
+    if not accuracy.position_stated:
         taken = f"{sigma[0]:g} m and {sigma[2]:g} m in height taken (--position-sigma)"
         notes.append(f"{track.name}: no accuracies of the positions: {taken}")
     notes.append(f"{track.name}: positions without attitudes: they become sensor/gnss, not poses")

@@ -56,23 +56,35 @@ class Mounting:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """1-sigma accuracies of poses for files that give none, and in place of those in the file where ``stated``.
+    """1-sigma accuracies of poses for files that give none, and in place of those in the file where they are stated.
 
     Attributes
     ----------
     position_m : X, Y, Z (east, north, up)
     attitude_deg : omega, phi, kappa
-    stated : given by the user
+    position_stated, attitude_stated : given by the user
     """
 
     position_m: tuple[float, float, float] = DgrOptions.offset_sigma_m
     attitude_deg: tuple[float, float, float] = DgrOptions.shift_sigma_deg
-    stated: bool = False
+    position_stated: bool = False
+    attitude_stated: bool = False
 
     @property
     def covariance(self) -> Array:
         """(6, 6) of a pose."""
         return np.diag(np.concatenate([self.position_m, np.radians(self.attitude_deg)])) ** 2
+
+    def of_poses(self, covariance: Array | None, n: int) -> Array:
+        """(n, 6, 6) of n poses whose file gives covariances (n, 6, 6), or None; what is stated takes their place."""
+        if covariance is None:
+            return np.broadcast_to(self.covariance, (n, 6, 6))
+        out = covariance.copy()
+        for part, stated in ((slice(0, 3), self.position_stated), (slice(3, 6), self.attitude_stated)):
+            if stated:
+                out[:, part, :] = out[:, :, part] = 0.0
+                out[:, part, part] = self.covariance[part, part]
+        return out
 
 
 @dataclass(frozen=True)
@@ -231,8 +243,7 @@ def track_messages(
     frame = frame_of(track) if frame is None else frame
     start = int(track.time_ns[0])
     position, R_lc, covariance = camera_poses(track, frame, mounting)
-    if covariance is None or accuracy.stated:
-        covariance = np.broadcast_to(accuracy.covariance, (len(track), 6, 6))
+    covariance = accuracy.of_poses(covariance, len(track))
     sigma = np.sqrt(np.median(np.einsum("nii->ni", covariance), axis=0))
     attitude_deg = np.degrees(sigma[3:]).tolist()
     project = m.Project(

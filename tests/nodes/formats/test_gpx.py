@@ -55,7 +55,7 @@ def test_points_with_attitudes_are_poses(tmp_path, heading):
 
 def test_points_without_attitudes_are_fixes(tmp_path, capsys):
     path, out = write(tmp_path / "a.gpx", [point(i) for i in range(4)]), tmp_path / "o.mcap"
-    accuracy = Accuracy((1.0, 2.0, 3.0), stated=True)
+    accuracy = Accuracy((1.0, 2.0, 3.0), position_stated=True)
     imported = read_any(path, options=Options(accuracy=accuracy, ground=GroundGiven(400.0)))
     project, *fixes = list(imported.messages)
     assert project.body.origin_height == 400.0 and {m.topic for m in fixes} == {"sensor/gnss"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -109,9 +110,44 @@ def test_accuracy_where_the_file_gives_none():
         np.testing.assert_allclose(project.offset_sigma_m, wanted_m, rtol=1e-3)
         np.testing.assert_allclose(np.sqrt(np.diagonal(pose.covariance))[:3], wanted_m, rtol=1e-3)
         np.testing.assert_allclose(np.degrees(np.sqrt(pose.covariance[5, 5])), project.shift_sigma_deg[2], rtol=1e-3)
-    stated = Accuracy((0.5, 0.6, 0.7), (0.01, 0.02, 0.03), stated=True)
+    stated = replace(accuracy, position_stated=True, attitude_stated=True)
     project = next(iter(track_messages(known, "x", accuracy=stated))).body
     np.testing.assert_allclose([*project.offset_sigma_m, *project.drift_sigma_deg], [0.5, 0.6, 0.7, 0.01, 0.02, 0.03])
+
+
+@pytest.mark.parametrize(
+    ("option", "wanted"),
+    [("--position-sigma", [0.5, 0.6, 0.7, 0.1, 0.2, 0.3]), ("--attitude-sigma", [0.2, 0.1, 0.3, 0.5, 0.6, 0.7])],
+)
+def test_an_accuracy_that_is_stated_leaves_the_other_one_of_the_file(option, wanted, tmp_path):
+    """Only what the user states takes the place of what the file says; heading north, omega is pitch and phi roll."""
+    path, out = tmp_path / "a.csv", tmp_path / "a.mcap"
+    rows = [f"2024-05-17T09:30:{s:02d}Z,{48 + 0.0005 * s},11,900,0,0,0,0.1,0.2,0.3,0.2,0.1,0.3" for s in range(4)]
+    head = "time,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg,sigma_n_m,sigma_e_m,sigma_d_m,"
+    path.write_text("\n".join([head + "sigma_roll_deg,sigma_pitch_deg,sigma_heading_deg", *rows, ""]))
+    assert main(["import", str(path), "-q", "-o", str(out), option, "0.5", "0.6", "0.7"]) == 0
+    reader = RecordingReader(out)
+    project = reader.last("configuration/project")
+    np.testing.assert_allclose([*project.offset_sigma_m, *project.shift_sigma_deg], wanted, rtol=1e-3)
+    pose = pose_sample(reader.last("trajectory/smoothed"))
+    sigma = np.sqrt(np.diagonal(pose.covariance)) * [1.0, 1.0, 1.0, *[180.0 / np.pi] * 3]
+    np.testing.assert_allclose(sigma, wanted, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ([], "0.2 and 0.2 m, 0.01 and 0.02 deg taken (--position-sigma, --attitude-sigma)"),
+        (["--position-sigma", "1", "1", "1"], "0.01 and 0.02 deg taken (--attitude-sigma)"),
+        (["--attitude-sigma", "1", "1", "1"], "0.2 and 0.2 m taken (--position-sigma)"),
+    ],
+)
+def test_what_is_assumed_of_poses_without_accuracies_is_told(options, told, tmp_path, capsys):
+    path = tmp_path / "a.csv"
+    rows = [f"2024-05-17T09:30:{s:02d}Z,{48 + 0.0005 * s},11,900,0,0,0" for s in range(4)]
+    path.write_text("\n".join(["time,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg", *rows, ""]))
+    assert main(["import", str(path), "-o", str(tmp_path / "a.mcap"), *options]) == 0
+    assert f"a.csv: no accuracies of the poses: {told}\n" in capsys.readouterr().out
 
 
 # ---- AVIRIS-NG
