@@ -542,7 +542,7 @@ def _write_orientation(a: SceneAdjustment, path: Path) -> None:
         columns["line"] += line.tolist()
         columns["time_s"] += t.tolist()
         stamps = sensor.reference_ns + np.round(t * 1e9).astype(np.int64)
-        columns["time_utc"] += [iso_utc(int(ns)) if sensor.reference_ns else "" for ns in stamps]
+        columns["time_utc"] += [iso_utc(int(ns), 9) if sensor.reference_ns else "" for ns in stamps]
         values = np.hstack([pose.position_e, Rotation.from_matrix(pose.R_eb).as_quat(), sigma])
         for name, column in zip((*_AXES, *_SIGMAS), values.T, strict=True):
             columns[name] += column.tolist()

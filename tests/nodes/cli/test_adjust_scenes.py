@@ -99,6 +99,10 @@ def test_refined_orientation_and_rpc_locate_the_adjusted_points(block, tmp_path)
     np.testing.assert_allclose(radius, 6_378_137.0 + 832_000.0, atol=100.0)
     sigma = columns(out / "trajectory_refined.csv", "sigma_along_m", "sigma_roll_deg")
     assert (sigma > 0).all() and (sigma[:, 0] < 6.0).all()
+    # to the nanosecond, as the metadata have the times: a millisecond is 7 m of the orbit
+    time = {(row["ccd"], row["line"]): row["time_utc"] for row in rows(block / "spot5-hrs" / "line_times.csv")}
+    refined = {(row["ccd"], row["line"]): row["time_utc"] for row in poses}
+    assert {key: refined[key] for key in time} == time
     # the polynomials take the adjusted points to their pixels
     points = {row["point"]: row for row in rows(out / "points.csv")}
     for ccd in "FB":
