@@ -129,8 +129,10 @@ def read_ground_points(
     UserError : ``file:line: column: what is wrong``, a CRS that PROJ does not know
     """
     table = read_table(path, GROUND, notes)
+    xyz = table.stack("X_m", "Y_m", "Z_m")
+    whole = np.isfinite(xyz).all(axis=1)  # planimetric points may have no height
     try:
-        around = LocalFrame.around(table.stack("X_m", "Y_m", "Z_m"), crs)
+        around = LocalFrame.around(xyz[whole] if whole.any() else np.nan_to_num(xyz), crs)
     except CrsError as error:
         raise UserError(f"{path}: {error}") from None
     frame = around if frame is None else LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)

@@ -14,6 +14,7 @@ from tracks import ns
 from triline.nodes.cli import main
 from triline.nodes.config import load
 from triline.nodes.convert import local_frame, pose_sample
+from triline.nodes.formats.block_folder import read_ground_points
 from triline.nodes.formats.flight_folder import read_flight
 from triline.nodes.formats.geotiff import Heights, write_heights
 from triline.nodes.recording.reader import RecordingReader
@@ -215,6 +216,23 @@ def test_control_far_from_the_flight_is_refused(folder):
     (folder / "flight.toml").write_text(TOML.replace(zone, "EPSG:32635"))
     (problem,) = read_flight(folder).problems
     assert problem.startswith("control.csv: no point lies within ") and "flight.crs (EPSG:32635)" in problem
+
+
+@pytest.mark.parametrize("heights", [1, 0])
+def test_control_without_a_height(heights, folder):
+    """As planimetric points have it: the flight was refused, with coordinates "outside the area" of its CRS."""
+    rows = (folder / "control.csv").read_text().splitlines()
+    for i in range(1, len(rows) - heights):
+        point, x, y, *_ = rows[i].split(",")
+        rows[i] = f"{point},{x},{y},,0.05,0.05,,planimetric"
+    (folder / "control.csv").write_text("\n".join([*rows, ""]))
+    flight = read_flight(folder)
+    assert not flight.problems
+    assert f"{3 - heights} points without height were put at {heights * (GROUND + 30):.1f} m" in "".join(flight.notes)
+    points, frame = read_ground_points(folder / "control.csv", "EPSG:32632", None, [])
+    place = frame.to_geodetic(points.xyz_l)
+    np.testing.assert_allclose(place[:, 0], LAT + 0.001 * np.arange(3), atol=1e-7)
+    np.testing.assert_allclose(place[:, 2], heights * (GROUND + 30), atol=1e-3)
 
 
 def test_lines_with_a_pose_each_need_no_times(folder, tmp_path):
