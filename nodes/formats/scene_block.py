@@ -331,7 +331,9 @@ def _image_points(
     image_of = np.empty(len(table), dtype=np.int64)
     unusable: list[str] = []
     for row, key in enumerate(zip(scene, ccd, strict=True)):
-        image_of[row] = place.get(key, only.get(key[0], -1) if not key[1] or only.get(key[0], -1) >= 0 else -1)
+        alone = only.get(key[0], -1)
+        other = alone >= 0 and key[1] and images[alone].ccd  # a line of another name
+        image_of[row] = place.get(key, -1 if other else alone)
         if image_of[row] < 0:
             what = f"strip: {key[0]!r} is not in project.toml"
             if key[0] in only:

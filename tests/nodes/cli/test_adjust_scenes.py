@@ -382,6 +382,23 @@ def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys)
     assert "points are not determined by their rays and were left out" in notes
 
 
+def test_image_points_of_a_line_that_its_scene_has_not(block, capsys):
+    """Of a scene with the line F alone those of F and those without a name count; those of B were taken for F's."""
+    times = block / "spot5-hrs" / "line_times.csv"
+    times.write_text("".join(line for line in times.read_text().splitlines(keepends=True) if line[:2] != "B,"))
+    path = block / "image_points.csv"
+    head, *points = path.read_text().splitlines()
+    first = [line.replace(",scene,F,", ",scene,,") for line in points[:3]]
+    path.write_text("\n".join([head, *first, *points[3:], ""]))
+    assert main(["adjust", str(block), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    of_b = sum(",scene,B," in line for line in points)
+    assert result["n_image_points"] == len(points) - of_b and result["converged"]
+    notes = "\n".join(result["notes"])
+    assert "ccd: 'B' is none of scene scene, which has F; the ray cannot be used" in notes
+    assert f"image_points.csv: {of_b - 5} more rays cannot be used" in notes
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [
