@@ -251,12 +251,17 @@ def _dimap_functions(model: Element, validity: Element | None, *, inverse: bool)
         raise UserError(f"{place.path}: {place.where}: {error}") from None
 
 
+def _stated(error_m: float) -> float:
+    """An error as files state it, in which -1 stands for one that is not known; 0 would be none."""
+    return error_m if error_m > 0 else -1.0
+
+
 def write_rpb(path: Path, rpc: Rpc) -> None:
     """Write an ``.RPB`` file; the result is read by GDAL beside an image of the same name."""
     f = rpc.to_image
     out = ['satId = "triline";', 'bandId = "P";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
-    out.append(f"\terrBias = {rpc.error_bias_m:.17g};")
-    out.append(f"\terrRand = {rpc.error_random_m:.17g};")
+    out.append(f"\terrBias = {_stated(rpc.error_bias_m):.17g};")
+    out.append(f"\terrRand = {_stated(rpc.error_random_m):.17g};")
     ends = {"samp": (3, 0), "line": (3, 1)}
     for what, ins, outs in (("Offset", f.in_offset, f.out_offset), ("Scale", f.in_scale, f.out_scale)):
         for name in ("line", "samp", "lat", "long", "height"):
@@ -278,7 +283,9 @@ def write_rpc_text(path: Path, rpc: Rpc) -> None:
     )
     units = {"LONG": "degrees", "LAT": "degrees", "HEIGHT": "meters", "SAMP": "pixels", "LINE": "pixels"}
     order = ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")
-    out = [f"{n}_{w}: {values[n][k]:.17g} {units[n]}" for k, w in enumerate(("OFF", "SCALE")) for n in order]
+    errors = (("ERR_BIAS", rpc.error_bias_m), ("ERR_RAND", rpc.error_random_m))
+    out = [f"{name}: {_stated(error):.17g} meters" for name, error in errors]
+    out += [f"{n}_{w}: {values[n][k]:.17g} {units[n]}" for k, w in enumerate(("OFF", "SCALE")) for n in order]
     for row, name in ((2, "LINE_NUM"), (3, "LINE_DEN"), (0, "SAMP_NUM"), (1, "SAMP_DEN")):
         out.extend(f"{name}_COEFF_{k + 1}: {c:.17g}" for k, c in enumerate(f.coefficients[row]))
     with new_file(path) as part:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,6 +88,27 @@ def test_the_same_polynomials_come_back(name, rpc, tmp_path):
     u, v, h = rng.uniform(0, 20_000, 50), rng.uniform(0, 6000, 50), rng.uniform(0, 2000, 50)
     located = rpc.direct(u, v, h)
     np.testing.assert_allclose(back.inverse(*located.T), np.stack([u, v], axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("errors", [(3.0, 0.25), (0.0, 0.0)])
+@pytest.mark.parametrize("name", ["a.tif", "a.RPB", "a_RPC.TXT"])
+def test_stated_errors_come_back(name, errors, rpc, tmp_path):
+    """Those that are not known are told as -1, as GDAL does it: 0 would say that there are none."""
+    stated = replace(rpc, error_bias_m=errors[0], error_random_m=errors[1])
+    path = WRITERS[name](tmp_path / name, stated)
+    back = read_scene(path).model("rpc")
+    assert (back.error_bias_m, back.error_random_m) == errors
+    if name != "a.tif":
+        found = re.findall(r"(?i)err_?(bias|rand) *[:=] *([-\d.]+)", path.read_text())
+        assert [float(value) for _, value in found] == ([-1.0, -1.0] if errors == (0.0, 0.0) else list(errors))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with rasterio.open(
+                tmp_path / "a.tif", "w", driver="GTiff", width=60, height=50, count=1, dtype="uint8"
+            ) as image:
+                image.write(np.zeros((1, 50, 60), dtype=np.uint8))
+            with rasterio.open(tmp_path / "a.tif") as image:
+                assert [image.rpcs.err_bias, image.rpcs.err_rand] == [float(value) for _, value in found]
 
 
 def test_gdal_gives_the_same_pixels(rpc):
