@@ -552,12 +552,13 @@ def _write_orientation(a: SceneAdjustment, path: Path) -> None:
 
 
 def _write_rpcs(a: SceneAdjustment, folder: Path) -> list[str]:
-    """Rational polynomials of the adjusted images that have a size; where none fits well a note says so."""
+    """Rational polynomials of the adjusted images; a note says where there are none, or where they fit badly."""
     heights = a.problem.block.ellipsoid.geodetic(a.solution.state.position_e[a.solution.determined])[:, 2]
     low, high = float(heights.min()) - _BEYOND_M, float(heights.max()) + _BEYOND_M
     notes = []
     for k, (entry, image) in enumerate(zip(a.data.images, a.problem.block.images, strict=True)):
         if entry.size_px is None:
+            notes.append(f"image {entry.name}: no RPC written: its metadata do not say how large it is")
             continue
         name = entry.name.replace("/", "_")
         located: Any = image.located(a.values_of(k))

@@ -188,9 +188,13 @@ def test_rpc_and_dlt_beside_rigorous(block, capsys):
         + '[rpc]\ncorrection = "affine"\nshift_sigma_px = 100\n'
         + '[scenes.forward]\nmetadata = "F.RPB"\nmodel = "dlt"\n[scenes.backward]\nmetadata = "B.RPB"\n'
     )
-    assert main(["adjust", str(block), "--json"]) == 0
+    out = block / "result"
+    assert main(["adjust", str(block), "-o", str(out), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["images"] == {"forward": "dlt", "backward": "rpc"}
+    for name in result["images"]:  # an .RPB does not state it
+        told = f"image {name}: no RPC written: its metadata do not say how large it is"
+        assert told in result["notes"] and told in json.loads((out / "result.json").read_text())["notes"]
     assert len(result["strips"]["forward"]["coefficients"]) == 11
     assert result["strips"]["backward"]["coefficients"]["line shift"]["sigma"] > 0
     assert not result["undetermined"] and result["converged"]
