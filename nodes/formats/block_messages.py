@@ -39,8 +39,11 @@ def block_messages(block: BlockData, source: str = "import") -> Iterator[Message
         Message("configuration/camera", start, camera_message(block.camera), source),
     ]
     ground = block.ground
-    for id, xyz, covariance, role in zip(ground.id, ground.xyz_l, ground.covariance, ground.role, strict=True):
-        first.append(Message("observation/control", start, ground_point_message(id, xyz, covariance, role), source))
+    radius = ground.target_radius_m or (0.0,) * len(ground.id)
+    columns = ground.id, ground.xyz_l, ground.covariance, ground.role, radius
+    for id, xyz, covariance, role, target_radius_m in zip(*columns, strict=True):
+        body = ground_point_message(id, xyz, covariance, role, target_radius_m)
+        first.append(Message("observation/control", start, body, source))
     streams: list[Iterable[Message]] = [first, _tie_messages(block, times, source)]
     for i in range(len(block.strips)):
         streams += [_pass_messages(block, times, i, source), _pose_messages(block, times, i, source)]

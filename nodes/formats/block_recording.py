@@ -182,7 +182,7 @@ def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating]
 
 
 def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
-    ids, xyz, covariance, roles = [], [], [], []
+    ids, xyz, covariance, roles, radius = [], [], [], [], []
     for id, body in found.ground.items():
         if id in found.refused:
             notes.append(f"ground point {id}: its coordinates do not count, as an operator said in flight")
@@ -194,7 +194,9 @@ def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
         xyz.append((body.x, body.y, body.z))
         covariance.append(np.reshape(body.covariance, (3, 3)))
         roles.append(role_of(body))
-    return KnownPoints(tuple(ids), np.array(xyz).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3), tuple(roles))
+        radius.append(body.target_radius)
+    places, covariances = np.array(xyz).reshape(-1, 3), np.array(covariance).reshape(-1, 3, 3)
+    return KnownPoints(tuple(ids), places, covariances, tuple(roles), tuple(radius))
 
 
 def _image_of(

@@ -118,7 +118,10 @@ def _write_ground_points(folder: Path, block: BlockData) -> None:
     columns |= dict(zip(("X_m", "Y_m", "Z_m"), xyz.T, strict=True))
     columns |= dict(zip(("sigma_X_m", "sigma_Y_m", "sigma_Z_m"), sigma.T, strict=True))
     columns["role"] = ground.role
+    if any(ground.target_radius_m):
+        columns["target_radius_m"] = ground.target_radius_m
     formats = _place_formats(block) | dict.fromkeys(("sigma_X_m", "sigma_Y_m", "sigma_Z_m"), ".6f")
+    formats["target_radius_m"] = ".6g"
     write_table(folder / "ground_points.csv", columns, formats)  # type: ignore[arg-type]
 
 

@@ -179,6 +179,19 @@ def test_block_becomes_a_flight_in_the_order_of_what_could_be_known():
     assert begun == ended == {"S1", "S2"} and looks == len(block.image)
 
 
+def test_signalised_points_stay_signalised(tmp_path):
+    """The radius of their discs goes into a folder and back, and into the messages, by which a matcher measures."""
+    block = simulated_block()
+    radius = tuple(0.25 * (k % 3) for k in range(len(block.ground)))
+    block = replace(block, ground=replace(block.ground, target_radius_m=radius))
+    write_block(tmp_path / "block", block)
+    block = read_block(tmp_path / "block")
+    assert block.ground.target_radius_m == radius
+    messages = list(block_messages(block))
+    assert [m.body.target_radius for m in messages if m.topic == "observation/control"] == list(radius)
+    assert block_from_messages(messages, "block").ground.target_radius_m == radius
+
+
 def test_looks_outside_their_strip_come_within_it(tmp_path):
     """They are for the adjuster to reject; their lines must not put a stamp anywhere."""
     text = "point,strip,ccd,line,sample\n" + "".join(
