@@ -35,6 +35,8 @@ POSE_STEP_S = 0.1
 _BEYOND = 3
 #: A model in the local frame that is off by more than this is told, pixels.
 _TOLD_PX = 0.01
+#: Scenes of one camera share its pixels; one whose pixels look further beside them than this is of another camera.
+_MOST_OFF_PX = 0.5
 #: A scene whose lines leave a constant rate by more than this cannot be a strip, lines.
 _MOST_OFF_LINES = 0.1
 #: The sigmas of a project that a recording carries.
@@ -91,7 +93,7 @@ def local_block(data: SceneBlockData) -> BlockData:
         trajectory = Trajectory(t.time_s + later, t.position_l, t.quaternion)
         id = f"{entry.scene.name}/{lens}"
         strips.append(Strip(id, trajectory, first + later, 1.0 / period, sensor.lines, lens=lens))
-    camera = _camera(cameras, images)
+    camera = _camera(data, cameras, images, notes)
     image = _image_points(data, images, strips, camera)
     ground = _ground(data, frame)
     apriori = Apriori(data.image_sigma_px, _sigmas(data, images, frame))
@@ -150,17 +152,45 @@ def _frame(data: SceneBlockData, sensors: list[PushbroomSensor]) -> LocalFrame:
     return LocalFrame(round(float(np.degrees(lat)), 6), round(float(np.degrees(lon)), 6), height, "EPSG:4979")
 
 
-def _camera(cameras: list[str], images: list[_Image]) -> LineCamera:
-    """A lens and a line for each line of detectors; scenes of one camera share them."""
+def _camera(data: SceneBlockData, cameras: list[str], images: list[_Image], notes: list[str]) -> LineCamera:
+    """A lens and a line for each line of detectors; scenes of one camera share them.
+
+    Raises
+    ------
+    UserError : scenes of one camera whose detectors look elsewhere
+    """
     tables: dict[str, list[_Image]] = {}
     for image in images:
         tables.setdefault(image.lens, []).append(image)
-    lenses = tuple(Lens(id, many[0].view.focal_length_mm) for id, many in tables.items())
-    lines = tuple(
-        CcdLine(id, id, np.mean([i.poses.xy_mm for i in many], axis=0), many[0].view.chips)
-        for id, many in tables.items()
+    lenses: list[Lens] = []
+    lines: list[CcdLine] = []
+    for id, many in tables.items():
+        focal_length_mm = many[0].view.focal_length_mm
+        for image in many[1:]:
+            if image.sensor.samples != many[0].sensor.samples:
+                what = f"{image.sensor.samples} samples, scene {many[0].entry.name} {many[0].sensor.samples}"
+                raise _another_camera(data, image, what)
+        own = [image.poses.xy_mm * (focal_length_mm / image.view.focal_length_mm) for image in many]
+        table = np.mean(own, axis=0)
+        pixel = float(np.median(np.linalg.norm(np.diff(table, axis=0), axis=1)))
+        for image, xy in zip(many, own, strict=True):
+            off = float(np.linalg.norm(xy - table, axis=1).max()) / pixel
+            if off > _MOST_OFF_PX:
+                raise _another_camera(data, image, f"detectors that look {off:.1f} px beside those of the others")
+            if off > _TOLD_PX:
+                name = image.entry.name
+                notes.append(f"scene {name}: its detectors look up to {off:.3f} px beside those of its camera")
+        lenses.append(Lens(id, focal_length_mm))
+        lines.append(CcdLine(id, id, table, many[0].view.chips))
+    return LineCamera(", ".join(cameras), tuple(lenses), tuple(lines))
+
+
+def _another_camera(data: SceneBlockData, image: _Image, what: str) -> UserError:
+    entry = image.entry
+    return UserError(
+        f"{data.name}: scene {entry.name} of camera {entry.scene.camera!r} has {what}: in a recording they share their "
+        "pixels, wanted another camera for it"
     )
-    return LineCamera(", ".join(cameras), lenses, lines)
 
 
 def _image_points(data: SceneBlockData, images: list[_Image], strips: list[Strip], camera: LineCamera) -> ImagePoints:

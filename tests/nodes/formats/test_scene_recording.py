@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 import rasterio
+from satellite_scenes import Truth, write_dimap2
 
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording, write_with_sensors
@@ -161,6 +162,36 @@ def test_bad_input(tmp_path, capsys):
         assert main(["import", *arguments, "-o", out]) != 0
         error = capsys.readouterr().err
         assert match in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("back", "match"),
+    [
+        ({"samples": 400}, "scene aft of camera 'pleiades' has 400 samples, scene fore 500"),
+        ({"gsd": 8e-6}, "of camera 'pleiades' has detectors that look 83.2 px beside those of the others"),
+        ({}, None),
+    ],
+)
+def test_scenes_of_one_camera_share_its_pixels(back, match, tmp_path, capsys):
+    """Those of two cameras of one name were averaged, and the focal length was that of the first, without a word."""
+    lines = ["[project]"]
+    for name, pitch, other in (("fore", 18.0, {}), ("aft", -18.0, back)):
+        truth = {"lines": 2000, "samples": 500, "gsd": 4e-6} | other
+        write_dimap2(
+            tmp_path / f"{name}.xml",
+            Truth(**truth, tilt_deg=(0.0, pitch, 0.0), phase_deg=40.0 - 0.1133 * pitch),
+        )
+        lines += [f"[scenes.{name}]", f'metadata = "{name}.xml"', 'camera = "pleiades"']
+    (tmp_path / "project.toml").write_text("\n".join([*lines, ""]))
+    rows = [f"{point},{name},,{line},100" for point, line in (("P", 900), ("Q", 990)) for name in ("fore", "aft")]
+    (tmp_path / "image_points.csv").write_text("\n".join(["point,strip,ccd,line,sample", *rows, ""]))
+    code = main(["import", str(tmp_path), "-o", str(tmp_path / "x.mcap")])
+    said = capsys.readouterr()
+    if match is None:
+        assert code == 0 and "px beside" not in said.out
+    else:
+        assert code == 1 and match in said.err and "wanted another camera for it" in said.err
+        assert said.err.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
