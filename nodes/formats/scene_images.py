@@ -27,6 +27,7 @@ def with_scene_images(
     block : from `local_block`
     messages : of the block
     given : one file a scene, ``scene`` or ``scene/lens``; the scenes tell the times
+    notes : gets remarks; all of them are there once the messages have been read
 
     Raises
     ------
@@ -58,7 +59,14 @@ def with_scene_images(
     lost = [strip.id for strip in block.strips if strip.id not in found]
     if lost:
         notes.append(f"no image of the scenes {', '.join(lost)}")
-    return merge(told, *(strip.blocks() for strip in found.values()), key=lambda m: (m.stamp_ns, rank(m.topic)))
+    merged = merge(told, *(strip.blocks() for strip in found.values()), key=lambda m: (m.stamp_ns, rank(m.topic)))
+    return _with_notes(merged, found.values(), notes)
+
+
+def _with_notes(messages: Iterable[Message], strips: Iterable[ImageStrip], notes: list[str]) -> Iterator[Message]:
+    """The messages; then notes get what was done to values that did not fit."""
+    yield from messages
+    notes += [note for strip in strips for image in strip.views.values() for note in image.notes()]
 
 
 def _strip(block: BlockData, name: str) -> Strip:

@@ -228,6 +228,19 @@ def test_pictures_of_scenes(pictures, tmp_path, capsys):
         assert (image.read(1) > 0).sum() > 25_000
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_grey_values_that_do_not_fit_are_told(pictures, tmp_path, capsys):
+    """As of the images of a flight."""
+    with rasterio.open(pictures / "F.tif") as image:
+        pixels = image.read(1)
+    low, high = np.percentile(pixels, (20, 70))
+    arguments = ["--lines", f"scene/F={pictures / 'F.tif'}", "--grey-range", str(low), str(high)]
+    assert main(["import", str(pictures / "pair"), *arguments, "-o", str(tmp_path / "x.mcap")]) == 0
+    said = capsys.readouterr().out
+    assert f"F.tif: {(pixels < low).sum()} values below the range, taken as 0\n" in said
+    assert f"F.tif: {(pixels > high).sum()} values above the range, taken as 65535\n" in said
+
+
 @pytest.mark.parametrize(
     ("lines", "more", "match"),
     [
