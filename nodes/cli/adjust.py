@@ -184,11 +184,14 @@ def run(args: argparse.Namespace) -> int:
             raise UserError("--camera does not go with satellite scenes")
         if args.keep is not None:
             raise UserError("--keep does not go with satellite scenes: their parameters are not tested")
+        if args.per_line:
+            raise UserError("--per-line does not go with satellite scenes: trajectory_refined.csv has their poses")
         if len(paths) > 1:
             raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
         if args.workers or args.scheduler:
             raise UserError("--workers and --scheduler do not go with satellite scenes")
         args.selfcal = args.selfcal or "none"
+        _refuse_free(args)
         return run_scenes(args)
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
@@ -196,8 +199,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--clock-sigma goes with one recording: each has a clock of its own")
     questions = args.variance_components
     args.selfcal = args.selfcal or (LEFT if questions else "none")
-    if args.free and args.selfcal == "none":
-        raise UserError("--free goes with additional parameters, wanted --selfcal")
+    _refuse_free(args)
     if args.keep is not None and args.selfcal in ("none", LEFT):
         tested = ", ".join(name for name in SELF_CALIBRATIONS if name != LEFT)
         raise UserError(f"--keep goes with additional parameters that are tested, wanted --selfcal, one of {tested}")
@@ -241,6 +243,11 @@ def run(args: argparse.Namespace) -> int:
         if args.output and not args.quiet:
             print(f"written to {args.output}")
     return 0
+
+
+def _refuse_free(args: argparse.Namespace) -> None:
+    if args.free and args.selfcal == "none":
+        raise UserError("--free goes with additional parameters, wanted --selfcal")
 
 
 def read_input(path: Path) -> BlockData:

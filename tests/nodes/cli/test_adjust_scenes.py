@@ -412,6 +412,8 @@ def test_image_points_of_a_line_that_its_scene_has_not(block, capsys):
         (["--model", "ppm", "--segments", "500"], "--segments 500, wanted 1 to 60"),
         (["--selfcal", "lens", "--keep", "all"], "--keep does not go with satellite scenes: their parameters are not"),
         (["--reweight"], "--reweight does not go with a block of satellite scenes"),
+        (["--free"], "--free goes with additional parameters, wanted --selfcal"),
+        (["--per-line", "-o", "result"], "--per-line does not go with satellite scenes: trajectory_refined.csv has"),
         (["--dem", "d.tif", "--dem-sigma", "1"], "--dem does not go with a block of satellite scenes"),
     ],
 )
