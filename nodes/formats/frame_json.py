@@ -20,6 +20,7 @@ from ...solver.location.frame_camera import FrameCamera
 from ...solver.orbit.motion import R_from_orbital
 from ..errors import UserError
 from .keys import Keys, read_json
+from .projection import refuse_missing_grids
 
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
 _WAYS = (
@@ -85,6 +86,7 @@ def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
         return C, R_eo @ matrix_from_navigation(*angles) @ R_BC_NOMINAL
     if exterior.has("crs"):
         position = np.array(exterior.numbers("position", 3))
+        refuse_missing_grids(exterior.text("crs"), path)
         try:
             frame = LocalFrame.around(position, exterior.text("crs"))
             local = frame.from_crs(position[None])[0]

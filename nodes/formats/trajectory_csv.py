@@ -14,6 +14,7 @@ from ...solver.geometry.rotation import matrix_from_angles
 from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column
 from .plausible import check_units
+from .projection import refuse_missing_grids
 from .table import Column, Table, read_table, separator_of
 from .time_columns import WANTED, time_columns, times_of
 from .track import NavigationTrack, checked
@@ -166,6 +167,7 @@ def _in_degrees(table: Table, name: str) -> np.ndarray:
 def _from_crs(path: Path, table: Table, crs: str | None) -> tuple[np.ndarray, np.ndarray]:
     if not crs or crs == "local":
         raise UserError(f"{path}: X_m, Y_m, Z_m of an unknown CRS, wanted --crs (for example EPSG:32632)")
+    refuse_missing_grids(crs, path)
     xyz = table.stack(*PLACE)
     try:
         frame = LocalFrame.around(xyz, crs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import date
 from math import radians
 
@@ -11,6 +12,8 @@ from tracks import ns
 
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
+from triline.nodes.formats.frame_json import read_frame
+from triline.nodes.formats.projection import missing_grids
 
 START = "2020-06-01T12:00:00"  # a Monday; GPS week 2108, second 129618
 N = 6
@@ -297,3 +300,21 @@ def test_resonon(tmp_path):
         path.write_text(text)
         with pytest.raises(UserError, match=wanted):
             read_track(path, "resonon", Options(day=day))
+
+
+def test_heights_above_a_geoid_that_is_not_here_are_refused(tmp_path):
+    """They were taken for heights above the ellipsoid without a word, 47 m off in the Alps."""
+    if not missing_grids("EPSG:32632+EPSG:5773"):
+        pytest.skip("PROJ has the geoid here")
+    path = tmp_path / "poses.csv"
+    rows = [f"2020-06-01T12:00:0{i}Z,600000,{5300000 + 50 * i},1000,0,0,90" for i in range(3)]
+    path.write_text("\n".join(["time,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg", *rows, ""]))
+    with pytest.raises(UserError, match=r"poses.csv: PROJ lacks the grid us_nga.*heights would be off by the geoid"):
+        read_any(path, options=Options(crs="EPSG:32632+EPSG:5773"))
+    assert len(read_track(path, "csv", Options(crs="EPSG:32632"))) == 3
+    exterior = {"crs": "EPSG:32632+EPSG:5773", "position": [600000, 5300000, 1000], "omega_phi_kappa_deg": [0, 0, 90]}
+    interior = {"focal_length_mm": 100, "pixel_size_mm": 0.01, "lines": 100, "samples": 100}
+    frame = tmp_path / "frame.json"
+    frame.write_text(json.dumps({"interior": interior, "exterior": exterior}))
+    with pytest.raises(UserError, match=r"frame.json: PROJ lacks the grid"):
+        read_frame(frame, [])
