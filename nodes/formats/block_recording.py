@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...schemas import messages as m
 from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from ...solver.adjustment.network import Strip
+from ...solver.geometry.frames import CrsError
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.slow_errors import SlowErrors
@@ -19,6 +20,7 @@ from ..convert import SECOND_NS, camera_from, local_frame, role_of, same_frame, 
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
+from .projection import missing_grids
 
 #: What `block_from_messages` reads.
 TOPICS = (
@@ -110,10 +112,21 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     ground = _ground_of(found, notes)
     point_ids, image = _image_of(found, camera, strips, ground, apriori)
     frame = local_frame(project)
+    notes += _missing_grids(frame.crs, name)
     return BlockData(
         project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
         heading=not any(pose[1] for pose in poses),  # poses that name a strip come from a block folder
     )  # fmt: skip
+
+
+def _missing_grids(crs: str, name: str) -> list[str]:
+    """A note where tables in the CRS cannot have its heights or positions here."""
+    try:
+        grids = [] if crs == "local" else missing_grids(crs)
+    except CrsError:  # whoever writes tables in it says so
+        return []
+    what = "heights or positions in tables may be off by the geoid or datum shift, all alike"
+    return [f"{name}: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what}"] if grids else []
 
 
 def _strips_of(

@@ -14,6 +14,7 @@ from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried
+from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.block_writer import write_block
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
@@ -322,8 +323,11 @@ def test_missing_geoid_grid_is_told(tmp_path):
     from triline.nodes.formats.projection import missing_grids
 
     grids = missing_grids("EPSG:32632+EPSG:5773")
-    notes = read_block(tmp_path).notes
-    assert bool(grids) == any("has no grid" in note for note in notes)
+    read = read_block(tmp_path)
+    assert bool(grids) == any("has no grid" in note for note in read.notes)
+    # so are those of a recording, which may have been made where PROJ has the grid
+    notes = block_from_messages(block_messages(read), "flight.mcap").notes
+    assert bool(grids) == any(note.startswith("flight.mcap: PROJ has no grid us_nga") for note in notes)
     assert missing_grids("EPSG:32632") == []
 
 
