@@ -242,12 +242,10 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         kind, sigmas = ("RPC" if isinstance(bare, Rpc) else "rigorous model"), scene.sigmas
     bare = with_refraction(args, bare)
     ellipsoid = WGS84 if isinstance(bare, Rpc) else bare.ellipsoid
-    if isinstance(bare, Rpc) and not (bare.lines and bare.samples):
-        bare = replace(bare, lines=image.lines, samples=image.samples)
-        unknown = True
-    else:
-        unknown = False
+    unknown = isinstance(bare, Rpc) and not (bare.lines and bare.samples)
     line, sample = _first_pixel(args, image, bare, unknown, notes)
+    if isinstance(bare, Rpc) and unknown:  # the scene reaches to the end of the image at least
+        bare = replace(bare, lines=line + image.lines, samples=sample + image.samples)
     model: Any = bare
     if (line, sample) != (0, 0) or (bare.lines, bare.samples) != (image.lines, image.samples):
         model = CroppedModel(bare, line, sample, image.lines, image.samples)

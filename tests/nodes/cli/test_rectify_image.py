@@ -174,6 +174,25 @@ def test_beside_the_rpc_warp_of_gdal(scene, tmp_path, with_dem):
         assert np.abs(ours[:, row, column] - exact).max() < 0.002
 
 
+def test_a_part_of_a_scene_whose_rpc_state_no_size(scene, tmp_path):
+    """As .RPB and _RPC.TXT: the size of the part was taken for that of the scene, and what lies beyond was lost."""
+    _, _, model, _, _, image = scene
+    write_rpb(tmp_path / "scene.RPB", fit_to_model(model, -100.0, 1100.0).rpc)
+    with rasterio.open(image) as source:
+        part = write_image(tmp_path / "part.tif", source.read()[:, 200:300, 60:220], nodata=-1.0)
+    args = (tmp_path / "scene.RPB", "--height", 400.0, "--gsd", 20)
+    whole = rectify(tmp_path, image, *args)
+    found = rectify(tmp_path, part, *args, "--first-pixel", 60, 200, name="part_ortho.tif")
+    column = round((found.transform.c - whole.transform.c) / 20)
+    row = round((whole.transform.f - found.transform.f) / 20)
+    there = whole.read()[:, row : row + found.height, column : column + found.width]
+    values = found.read()
+    seen = values[0] > 0
+    inner = (there[0] > 211) & (there[0] < 308) & (there[1] > 71) & (there[1] < 228)
+    assert inner.sum() > 1000 and seen[inner].all()
+    np.testing.assert_allclose(values[:, inner], there[:, inner], atol=0.02)
+
+
 def test_direct_way_gives_the_same_orthoimage(scene, tmp_path):
     _, path, _, _, dem, image = scene
     args = ("--dem", dem, "--dem-datum", "ellipsoid", "--mask")
