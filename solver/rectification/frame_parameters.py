@@ -76,7 +76,10 @@ def changed(camera: FrameCamera, name: str, by: float) -> FrameCamera:
         principal[("dx", "dy").index(name)] += by
     else:
         lens[("k1", "k2", "k3", "p1", "p2").index(name)] += by
-    return FrameCamera(C, R, f, pixel, camera.lines, camera.samples, principal_point_mm=principal, distortion=lens)
+    return FrameCamera(
+        C, R, f, pixel, camera.lines, camera.samples, principal_point_mm=principal, distortion=lens,
+        ellipsoid=camera.ellipsoid, refraction=camera.refraction,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

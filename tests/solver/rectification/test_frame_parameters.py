@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from triline.solver.location.refraction import Refraction
 from triline.solver.rectification.comparison import bilsat_camera
 from triline.solver.rectification.frame_parameters import FrameControl, changed, fit_frame, names_of, prior_sigmas
 from triline.solver.rectification.sampled import metres_a_radian
@@ -68,6 +69,18 @@ def test_the_camera_locates_and_a_blunder_is_left_out():
     truth, found, start = (c.ground(line, sample, np.full(25, 1000.0)) for c in (camera, fit.camera, bilsat_camera()))
     error, before = (np.sqrt(np.mean(np.sum((a - truth) ** 2, axis=1))) for a in (found, start))
     assert error < 15.0 < 150.0 < before
+
+
+def test_the_air_stays_where_it_is():
+    """Control of a camera that sees through the air and looks 40 degrees aside changes nothing of that camera."""
+    camera = changed(bilsat_camera(), "phi", np.radians(40.0)).with_refraction(Refraction())
+    line, sample = (a.ravel() for a in np.meshgrid(*[np.linspace(0, 2047, 5)] * 2))
+    lat, lon, height = camera.direct(line, sample, np.full(25, 500.0)).T
+    points, names = FrameControl(line, sample, lat, lon, height), ("omega", "phi", "kappa")
+    fit = fit_frame(camera, points, names, prior_sigma=np.full(3, 1e-3), snoop=False, **SIGMAS)
+    assert np.abs(fit.found.parameters).max() < 1e-12
+    found, truth = (c.ground(line, sample, np.full(25, 2000.0)) for c in (fit.camera, camera))
+    assert np.linalg.norm(found - truth, axis=1).max() < 1e-6
 
 
 def test_a_parameter_that_is_held():
