@@ -34,7 +34,7 @@ from ..camera_json import read_camera
 from ..keys import Keys, read_toml
 from ..table import Column, Table, read_table
 from .earth_orientation_file import installed_table
-from .scene import SatelliteScene, refuse_gap
+from .scene import SatelliteScene, refuse_gap, stated_velocity
 
 Array = NDArray[np.floating]
 
@@ -241,6 +241,9 @@ def _orbit(table: Table, stamps: NDArray[np.int64], reference: int, settings: _S
     V = None
     if all(name in table for name in ("VX_m_s", "VY_m_s", "VZ_m_s")):
         V = table.stack("VX_m_s", "VY_m_s", "VZ_m_s")
+    if V is not None and settings.orbit_model != "lagrange":
+        turning = settings.rotation_rate if settings.orbit_frame == "earth" else 0.0
+        V = stated_velocity(table.path.name, t, P, V, turning, notes)
     if settings.orbit_frame == "eme2000":
         P, V = P @ R_bias(), None if V is None else V @ R_bias()
     if settings.orbit_model == "polynomial":

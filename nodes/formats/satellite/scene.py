@@ -24,6 +24,8 @@ GAP_STEPS = 3.5
 #: Largest difference between stated velocities and the slope of the positions at which they count as the same, m/s.
 #: Tuned: velocities against the stars differ by hundreds.
 SAME_VELOCITY_M_S = 1.0
+#: Nodes that are left out in turn to judge velocities, and how many on each side they are met by.
+_LEFT_OUT, _NEIGHBOURS = 20, 4
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,46 @@ def velocity_misfit(time_s: Array, position: Array, velocity: Array) -> float:
         return 0.0
     slope = InterpolatedOrbit(time_s, position).at(time_s)[1]
     return float(np.abs((velocity - slope)[n // 4 : n - n // 4]).max())
+
+
+def stated_velocity(
+    file: str, time_s: Array, position: Array, velocity: Array, rotation_rate: float, notes: list[str]
+) -> Array | None:
+    """The velocities (n, 3) of an ephemeris if they are the slope of its positions, or what makes them so; else None.
+
+    They are the slope if nodes that are left out are met by their neighbours with velocities as well as without them.
+
+    Parameters
+    ----------
+    rotation_rate : of the frame of the positions against the stars, rad/s; velocities may be against these; 0 for none
+    notes : gets a remark where the velocities are changed or not used
+    """
+    turning = np.cross([0.0, 0.0, rotation_rate], position)
+    wanted = max(_left_out_m(time_s, position, None), SAME_VELOCITY_M_S * float(np.median(np.diff(time_s))))
+    off = [_left_out_m(time_s, position, v) for v in (velocity, velocity - turning)]
+    if off[0] <= wanted and (off[0] <= 10.0 * off[1] or off[0] <= SAME_VELOCITY_M_S):
+        return velocity
+    if off[1] < off[0] and off[1] <= wanted:
+        notes.append(f"{file}: velocities are against the stars, the rotation of the Earth was taken off")
+        return velocity - turning
+    notes.append(f"{file}: velocities are not the slope of the positions and were not used")
+    return None
+
+
+def _left_out_m(time_s: Array, position: Array, velocity: Array | None) -> float:
+    """How far at most some nodes lie from the orbit through their neighbours, metres; of two nodes, how far the second
+    lies from where the mean velocity leads, and infinite without velocities."""
+    n = len(time_s)
+    if n == 2:
+        if velocity is None:
+            return np.inf
+        return float(np.linalg.norm(position[1] - position[0] - velocity.mean(axis=0) * (time_s[1] - time_s[0])))
+    largest = 0.0
+    for k in np.unique(np.linspace(1, n - 2, min(n - 2, _LEFT_OUT)).astype(int)):
+        others = np.array([i for i in range(max(k - _NEIGHBOURS, 0), min(k + _NEIGHBOURS + 1, n)) if i != k])
+        orbit = InterpolatedOrbit(time_s[others], position[others], None if velocity is None else velocity[others])
+        largest = max(largest, float(np.linalg.norm(orbit.at(time_s[k : k + 1])[0][0] - position[k])))
+    return largest
 
 
 def refuse_gap(path: Path, where: str, tai_ns: list[int], first_ns: int, last_ns: int) -> None:

@@ -12,6 +12,7 @@ from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, wr
 from triline.nodes.errors import UserError
 from triline.nodes.formats.satellite.folder_writer import write_overpass
 from triline.nodes.formats.satellite.read import read_scene
+from triline.solver.geometry.earth import ROTATION_RATE
 from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 
 WRITERS = {
@@ -119,6 +120,40 @@ def test_a_mounting_of_a_lens_that_is_not_there(tmp_path):
         file.write("[lens.Q]\nboresight_deg = [0.0, 1.0, 0.0]\n")
     with pytest.raises(UserError, match=r"scene.toml: lens.Q: no lens of camera.json, wanted P"):
         read_scene(tmp_path / "scene")
+
+
+STARS = "ephemeris.csv: velocities are against the stars, the rotation of the Earth was taken off"
+NO_SLOPE = "ephemeris.csv: velocities are not the slope of the positions and were not used"
+
+
+@pytest.mark.parametrize("rows", [4, 6, 11])
+@pytest.mark.parametrize(
+    ("change", "notes"),
+    [
+        (lambda P, V: V, []),
+        (lambda P, V: V + np.cross([0.0, 0.0, ROTATION_RATE], P), [STARS]),
+        (lambda P, V: 1e-3 * V, [NO_SLOPE]),
+        (lambda P, V: V[:, [1, 0, 2]], [NO_SLOPE]),
+    ],
+)
+def test_velocities_of_a_folder_that_are_not_the_slope_of_its_positions(change, notes, rows, tmp_path):
+    """Such as those against the stars, beside Earth-fixed positions: the scene lay 7 km off, and nothing said so."""
+    folder = tmp_path / "scene"
+    write_overpass(folder, overpass(ORBITAL_SENSORS["spot5-hrs"], 36.0, 139.6))
+    right = read_scene(folder)
+    head, *lines = (folder / "ephemeris.csv").read_text().splitlines()
+    lines = {4: lines[3:7], 6: lines[2:8], 11: lines}[rows]  # about the scene
+    numbers = np.array([line.split(",")[1:] for line in lines], dtype=float)
+    numbers[:, 3:] = change(numbers[:, :3], numbers[:, 3:])
+    times = [line.split(",")[0] for line in lines]
+    text = [",".join([time, *(f"{x:.9f}" for x in row)]) for time, row in zip(times, numbers, strict=True)]
+    (folder / "ephemeris.csv").write_text("\n".join([head, *text, ""]))
+    scene = read_scene(folder)
+    assert [note for note in scene.notes if "velocities" in note] == notes
+    u, v = pixels(right.sensor)
+    off = np.linalg.norm(scene.sensor.ground(u, v, 0.0) - right.sensor.ground(u, v, 0.0), axis=1).max()
+    # without velocities an orbit through few nodes, a minute apart, is off by metres
+    assert off < (1e-3 if notes != [NO_SLOPE] else {4: 10.0, 6: 0.1, 11: 1e-3}[rows])
 
 
 def test_an_isd_is_read_as_usgscsm_reads_it(tmp_path):
