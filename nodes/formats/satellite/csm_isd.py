@@ -27,7 +27,7 @@ from ....solver.orbit.motion import Motion
 from ....solver.orbit.time_scales import tai_from_day
 from ...errors import UserError
 from ..keys import Keys, read_json
-from .scene import GAP_STEPS, SAME_VELOCITY_M_S, SatelliteScene, velocity_misfit
+from .scene import GAP_STEPS, SAME_VELOCITY_M_S, SatelliteScene, stated_velocity, velocity_misfit
 
 Array = NDArray[np.floating]
 
@@ -60,7 +60,7 @@ def read_isd(path: Path) -> SatelliteScene:
         radii.number("semimajor", positive=True) * scale, radii.number("semiminor", positive=True) * scale
     )
     lines, samples = file.integer("image_lines", low=1), file.integer("image_samples", low=2)
-    build = _body_fixed(file) if file.has("sensor_position") else _inertial(file, centre_s, notes)
+    build = _body_fixed(file, notes) if file.has("sensor_position") else _inertial(file, centre_s, notes)
     try:
         motion, times, look = build(), _line_times(file, lines), _look(file)
         middle = motion.at(times.time_of(np.array([0.5 * (lines - 1)])))
@@ -109,7 +109,7 @@ def _times(keys: Keys, count: int) -> Array:
     return times
 
 
-def _body_fixed(file: Keys) -> Callable[[], Motion]:
+def _body_fixed(file: Keys, notes: list[str]) -> Callable[[], Motion]:
     place, turn = file.table("sensor_position"), file.table("sensor_orientation")
     scale = _unit(place, "m")
     P = _array(place, "positions", 3) * scale
@@ -121,9 +121,10 @@ def _body_fixed(file: Keys) -> Callable[[], Motion]:
         raise place.refuse("velocities", f"{len(P)} rows, as many as positions")
     if len(P) >= 8:
         V = None
+    if V is not None:
+        V = stated_velocity(file.path.name, t, P, V, 0.0, notes)
 
     def build() -> Motion:
-
         return Motion(
             InterpolatedOrbit(t, P, V, margin_s=_BEYOND * (t[1] - t[0])),
             SplineAttitude(tq, q, margin_s=_BEYOND * (tq[1] - tq[0])),

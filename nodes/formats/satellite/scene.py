@@ -129,6 +129,8 @@ def stated_velocity(
     rotation_rate : of the frame of the positions against the stars, rad/s; velocities may be against these; 0 for none
     notes : gets a remark where the velocities are changed or not used
     """
+    if len(time_s) < 2:  # too few for an orbit, which is told
+        return velocity
     turning = np.cross([0.0, 0.0, rotation_rate], position)
     wanted = max(_left_out_m(time_s, position, None), SAME_VELOCITY_M_S * float(np.median(np.diff(time_s))))
     off = [_left_out_m(time_s, position, v) for v in (velocity, velocity - turning)]

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
+from satellite_scenes import OMEGA, Truth, write_dimap1, write_dimap2, write_isd
 from test_rpc_files import WRITERS as RPC_WRITERS
 
 from triline.nodes.formats.satellite.read import read_scene
@@ -203,3 +203,22 @@ def test_isd_without_velocities(inertial, tmp_path):
     isd["instrument_position" if inertial else "sensor_position"].pop("velocities")
     path.write_text(json.dumps(isd))
     np.testing.assert_allclose(located(path), wanted, atol=0.1)
+
+
+@pytest.mark.parametrize("against_the_stars", [False, True])
+def test_isd_with_few_positions_and_velocities(against_the_stars, tmp_path):
+    """Five positions are interpolated with their velocities, if these are their slope over the planet."""
+    path = write_isd(tmp_path / "scene.json", Truth())
+    wanted = located(path)
+    isd = json.loads(path.read_text())
+    table = isd["sensor_position"]
+    first = int(-isd["t0_ephemeris"] // isd["dt_ephemeris"]) - 1
+    isd["t0_ephemeris"] += first * isd["dt_ephemeris"]
+    P, V = (np.array(table[name][first : first + 5]) for name in ("positions", "velocities"))
+    if against_the_stars:
+        V = V + np.cross([0.0, 0.0, OMEGA], P)
+    table["positions"], table["velocities"] = P.tolist(), V.tolist()
+    path.write_text(json.dumps(isd))
+    said = ["scene.json: velocities are not the slope of the positions and were not used"] * against_the_stars
+    assert read_scene(path).notes == said
+    np.testing.assert_allclose(located(path), wanted, atol=0.01)
