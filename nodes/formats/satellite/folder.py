@@ -41,6 +41,8 @@ Array = NDArray[np.floating]
 FILES = ("ephemeris.csv", "attitude.csv", "line_times.csv", "camera.json")
 #: Words of scene.toml for the frames of the solver.
 _FRAMES = {"earth": "e", "gcrs": "i", "eme2000": "i", "orbital": "o"}
+#: Ellipsoids whose half axes differ by a larger share are of different planets.
+SAME_PLANET = 1e-3
 _TIME = (Column("time_utc", "text", optional=True), Column("time_s", optional=True))
 
 
@@ -155,6 +157,12 @@ def _settings(path: Path, notes: list[str]) -> _Settings:
     if body.has("semi_major_m"):
         a = body.number("semi_major_m", positive=True)
         ellipsoid = Ellipsoid(a, body.number("semi_minor_m", a, positive=True))
+        if abs(a / WGS84.semi_major_m - 1.0) > SAME_PLANET:
+            for name in ("ephemeris", "attitude"):
+                if _FRAMES.get(str(frames.raw(name))) == "i":
+                    raise frames.refuse(name, "earth or orbital: how this planet turns against the stars is not known")
+            if not body.has("rotation_rate_rad_s"):
+                raise body.refuse("rotation_rate_rad_s", "that of this planet, which is not the Earth")
     degrees = sigma.numbers("attitude_deg", 3, (0.0, 0.0, 0.0))
     try:
         sigmas = Sigmas(

@@ -157,6 +157,14 @@ def lines(name, change):
             "frames.attitude: 'sky', wanted one of earth",
         ),
         (lines("scene.toml", lambda r: ["[sigma]", "time_s = -1"]), "scene.toml: sigma: .*at least 0"),
+        (
+            lines("scene.toml", lambda r: ["[planet]", "semi_major_m = 1737400"]),
+            "scene.toml: planet.rotation_rate_rad_s: missing, wanted that of this planet",
+        ),
+        (
+            lines("scene.toml", lambda r: ["[frames]", "ephemeris = 'gcrs'", "[planet]", "semi_major_m = 1737400"]),
+            "scene.toml: frames.ephemeris: 'gcrs', wanted earth or orbital: how this planet turns",
+        ),
     ],
 )
 def test_folder(change, match, tmp_path):
