@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ....solver.geometry.ellipsoid import Ellipsoid
 from ....solver.location.look_directions import TableLook
 from ....solver.location.pushbroom import PushbroomSensor
 from ....solver.orbit.attitude import SplineAttitude, TableAttitude, unit_quaternions
@@ -27,7 +26,7 @@ from ....solver.orbit.motion import Motion
 from ....solver.orbit.time_scales import tai_from_day
 from ...errors import UserError
 from ..keys import Keys, read_json
-from .scene import GAP_STEPS, SAME_VELOCITY_M_S, SatelliteScene, stated_velocity, velocity_misfit
+from .scene import GAP_STEPS, SAME_VELOCITY_M_S, SatelliteScene, ellipsoid_of, stated_velocity, velocity_misfit
 
 Array = NDArray[np.floating]
 
@@ -56,7 +55,7 @@ def read_isd(path: Path) -> SatelliteScene:
     centre_s = file.number("center_ephemeris_time")
     radii = file.table("radii")
     scale = _unit(radii, "km")
-    ellipsoid = Ellipsoid(
+    ellipsoid = ellipsoid_of(
         radii.number("semimajor", positive=True) * scale, radii.number("semiminor", positive=True) * scale
     )
     lines, samples = file.integer("image_lines", low=1), file.integer("image_samples", low=2)

@@ -34,7 +34,7 @@ from ..camera_json import read_camera
 from ..keys import Keys, read_toml
 from ..table import Column, Table, read_table
 from .earth_orientation_file import installed_table
-from .scene import SatelliteScene, refuse_gap, stated_velocity
+from .scene import SatelliteScene, ellipsoid_of, refuse_gap, stated_velocity
 
 Array = NDArray[np.floating]
 
@@ -156,7 +156,7 @@ def _settings(path: Path, notes: list[str]) -> _Settings:
     ellipsoid = WGS84
     if body.has("semi_major_m"):
         a = body.number("semi_major_m", positive=True)
-        ellipsoid = Ellipsoid(a, body.number("semi_minor_m", a, positive=True))
+        ellipsoid = ellipsoid_of(a, body.number("semi_minor_m", a, positive=True))
         if abs(a / WGS84.semi_major_m - 1.0) > SAME_PLANET:
             for name in ("ephemeris", "attitude"):
                 if _FRAMES.get(str(frames.raw(name))) == "i":

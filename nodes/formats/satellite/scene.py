@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....solver.geometry.earth import ROTATION_RATE
+from ....solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ....solver.location.pushbroom import PushbroomSensor
 from ....solver.location.rpc import Rpc
 from ....solver.location.uncertainty import Sigmas
@@ -24,6 +25,8 @@ GAP_STEPS = 3.5
 #: Largest difference between stated velocities and the slope of the positions at which they count as the same, m/s.
 #: Tuned: velocities against the stars differ by hundreds.
 SAME_VELOCITY_M_S = 1.0
+#: Half axes that differ by less are the same, metres; GRS 80 has those of WGS 84 to a tenth of a millimetre.
+_SAME_AXIS_M = 1e-3
 #: Nodes that are left out in turn to judge velocities, and how many on each side they are met by.
 _LEFT_OUT, _NEIGHBOURS = 20, 4
 
@@ -68,6 +71,12 @@ class SatelliteScene:
         if chosen is None or (which == "rigorous" and sensor is None):
             raise UserError(f"no {which or 'rigorous'} model in a file of the kind {self.kind}")
         return chosen
+
+
+def ellipsoid_of(semi_major_m: float, semi_minor_m: float) -> Ellipsoid:
+    """The ellipsoid of two half axes; WGS 84 where they are its, as far as files write them out."""
+    near = max(abs(semi_major_m - WGS84.semi_major_m), abs(semi_minor_m - WGS84.semi_minor_m)) < _SAME_AXIS_M
+    return WGS84 if near else Ellipsoid(semi_major_m, semi_minor_m)
 
 
 def orbit_of(path: Path, where: str, tai_ns: list[int], position: Array, velocity: Array | None,

@@ -13,6 +13,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.satellite.folder_writer import write_overpass
 from triline.nodes.formats.satellite.read import read_scene
 from triline.solver.geometry.earth import ROTATION_RATE
+from triline.solver.geometry.ellipsoid import WGS84, Ellipsoid
 from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 
 WRITERS = {
@@ -120,6 +121,16 @@ def test_a_mounting_of_a_lens_that_is_not_there(tmp_path):
         file.write("[lens.Q]\nboresight_deg = [0.0, 1.0, 0.0]\n")
     with pytest.raises(UserError, match=r"scene.toml: lens.Q: no lens of camera.json, wanted P"):
         read_scene(tmp_path / "scene")
+
+
+def test_half_axes_of_the_earth_as_files_write_them_out(tmp_path):
+    """Those of the pages and of ISDs end earlier; such scenes were of "another planet" beside others."""
+    planet = "[planet]\nsemi_major_m = 6378137.0\nsemi_minor_m = 6356752.314245\n"
+    settings = "[frames]\nattitude = 'orbital'\n" + planet
+    assert read_scene(write_folder(tmp_path / "scene", Truth(), settings=settings)).sensor.ellipsoid is WGS84
+    assert read_scene(write_isd(tmp_path / "a.json", Truth(), semi_minor_km=6356.7523142)).sensor.ellipsoid is WGS84
+    other = read_scene(write_isd(tmp_path / "b.json", Truth(), semi_minor_km=6356.7513142)).sensor.ellipsoid
+    assert other == Ellipsoid(6378137.0, 6356751.3142) != WGS84
 
 
 STARS = "ephemeris.csv: velocities are against the stars, the rotation of the Earth was taken off"
