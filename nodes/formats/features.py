@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...schemas import topics
 from ...solver.geometry.frames import LocalFrame
-from ..convert import SECOND_NS
+from ..convert import SECOND_NS, given_of
 from ..errors import UserError
 from ..node import Message
 
@@ -141,7 +141,14 @@ def _points(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Featu
     else:
         names = bodies[0].DESCRIPTOR.enum_types_by_name["Role"].values_by_number
         properties["role"] = [names[body.role].name.lower() if body.role in names else "" for body in bodies]
-    properties |= _sigmas([body.covariance for body in bodies], 3, ("sigma_X_m", "sigma_Y_m", "sigma_Z_m"))
+    names = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
+    sigmas = _sigmas([body.covariance for body in bodies], 3, names)
+    if bodies[0].DESCRIPTOR.full_name == "triline.GroundPoint":  # what is not given or stated has none, and not zero
+        given = np.isfinite([given_of(body) for body in bodies])
+        stated = [any(body.covariance) for body in bodies]
+        for k, name in enumerate(names):
+            sigmas[name] = [v if g and s else None for v, g, s in zip(sigmas[name], given[:, k], stated, strict=True)]
+    properties |= sigmas
     return Features(_on_globe(frame, [(body.x, body.y, body.z) for body in bodies]), properties)
 
 

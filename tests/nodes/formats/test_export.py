@@ -268,6 +268,20 @@ def test_object_points_count_once_with_their_last_state(recording, tmp_path):
     assert features[0]["geometry"]["coordinates"][2] == pytest.approx(wanted[2], abs=1e-3)
 
 
+def test_known_points_have_the_sigmas_that_they_state(tmp_path):
+    """A coordinate that a role does not give had a sigma of 0 or next to it, and so had check points without sigma."""
+    C = np.diag([1e-4, 4e-4, 1e-10])  # a height has what the curvature of the Earth makes of X and Y
+    known = {"P": ("planimetric", C), "H": ("height", np.diag([0.0, 0.0, 9e-4])), "Q": ("check", np.zeros((3, 3)))}
+    bodies = [ground_point_message(id, [1.0, 2.0, 3.0], C, role) for id, (role, C) in known.items()]
+    messages = [_project(), *(Message("observation/control", START, body, "test") for body in bodies)]
+    path, target = write_recording(tmp_path / "a.mcap", messages), tmp_path / "c.geojson"
+    assert main(["export", str(path), "--topic", "observation/control", "--geojson", str(target), "-q"]) == 0
+    found = {f["properties"]["point"]: f["properties"] for f in json.loads(target.read_text())["features"]}
+    sigmas = {id: [p[f"sigma_{axis}_m"] for axis in "XYZ"] for id, p in found.items()}
+    assert sigmas["P"] == [pytest.approx(0.01), pytest.approx(0.02), None]
+    assert sigmas["H"] == [None, None, pytest.approx(0.03)] and sigmas["Q"] == [None] * 3
+
+
 @pytest.fixture(scope="module")
 def refined_twice(tmp_path_factory):
     """Strip S1, and strip S1 again, a metre higher, with S2."""
