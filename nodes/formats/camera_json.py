@@ -159,8 +159,13 @@ def write_camera(path: Path, camera: LineCamera) -> None:
             entry["distortion"] = list(lens.distortion)
         lenses.append(entry)
     lines = []
+    tables: set[str] = set()  # in small letters: some systems take capitals for the same
     for line in camera.lines:
-        table = f"{path.stem}_{''.join(c if c.isalnum() or c in '-_' else '_' for c in line.id)}.csv"
+        name = f"{path.stem}_{''.join(c if c.isalnum() or c in '-_' else '_' for c in line.id)}"
+        table, number = f"{name}.csv", 2
+        while table.lower() in tables:
+            table, number = f"{name}_{number}.csv", number + 1
+        tables.add(table.lower())
         write_table(
             path.parent / table,
             {"sample": range(line.pixels), "x_mm": line.xy_mm[:, 0], "y_mm": line.xy_mm[:, 1]},

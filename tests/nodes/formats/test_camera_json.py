@@ -14,6 +14,7 @@ from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geocal_xml import read_glas_camera
+from triline.solver.camera.line_camera import CcdLine, Lens, LineCamera
 from triline.solver.camera.sensors import PRESETS, brown_distortion, preset
 
 GLAS = DATA / "avirisng" / "cam_cal_2022_04_11_glas.xml"
@@ -150,6 +151,17 @@ def test_presets_survive_the_round_trip(tmp_path, name):
     for a, b in zip(again.lines, camera.lines, strict=True):
         assert (a.id, a.lens, a.chips) == (b.id, b.lens, b.chips)
         np.testing.assert_allclose(a.xy_mm, b.xy_mm, atol=1e-9)
+
+
+def test_lines_with_names_that_files_cannot_tell_apart(tmp_path):
+    """Each has a table of its own: the second one was written over the first, and both lines lay at one place."""
+    xy = [np.column_stack([np.full(5, x), np.arange(5.0)]) for x in (20.0, 0.0, -20.0)]
+    lines = tuple(CcdLine(id, "L", place) for id, place in zip(("N+", "N*", "n/"), xy, strict=True))
+    write_camera(tmp_path / "camera.json", LineCamera("c", (Lens("L", 50.0),), lines))
+    back = read_camera(tmp_path / "camera.json")
+    assert [line.id for line in back.lines] == ["N+", "N*", "n/"]
+    for line, place in zip(back.lines, xy, strict=True):
+        np.testing.assert_array_equal(line.xy_mm, place)
 
 
 def test_distorted_camera_is_not_distorted_twice(tmp_path):
