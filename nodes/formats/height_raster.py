@@ -167,7 +167,10 @@ class HeightRaster:
             stated, self._unit_m = _vertical(datum)
         if isinstance(stated, str):
             return "above the ellipsoid", None
-        return f"above {stated.name}", _proj_geoid(path, stated)
+        t = self._t
+        x, y = t.c + 0.5 * t.a * self.columns, t.f + 0.5 * t.e * self.rows
+        lon, lat = self._to_flat.transform(x, y, direction="INVERSE")
+        return f"above {stated.name}", _proj_geoid(path, stated, np.array([lat]), np.array([lon]))
 
     # -- terrain -------------------------------------------------------------------------------------------------------
 
@@ -334,8 +337,8 @@ def _vertical(name: str) -> tuple[Any, float]:
     raise UserError(f"--dem-datum {name}: {crs.name} says nothing of heights, wanted {DATUMS}")
 
 
-def _proj_geoid(path: Path, vertical: Any) -> Any:
-    """Geoid heights by PROJ; its grid has to be installed."""
+def _proj_geoid(path: Path, vertical: Any, lat_deg: Array, lon_deg: Array) -> Any:
+    """Geoid heights by PROJ; its grid has to be installed, and to reach to a place in the raster."""
     import pyproj
     from pyproj.crs import CompoundCRS
     from pyproj.exceptions import ProjError
@@ -344,7 +347,7 @@ def _proj_geoid(path: Path, vertical: Any) -> Any:
     wanted = pyproj.CRS.from_epsg(4979)
     missing = UserError(
         f"{path}: PROJ cannot tell {vertical.name} from the ellipsoid: its geoid grid is not installed (projsync gets "
-        "it), wanted --dem-datum with a raster of geoid heights or the geoid's height in metres"
+        "it) or does not reach there, wanted --dem-datum with a raster of geoid heights or the geoid's height in metres"
     )
     try:
         transformer = pyproj.Transformer.from_crs(source, wanted, always_xy=True, allow_ballpark=False, only_best=True)
@@ -360,5 +363,5 @@ def _proj_geoid(path: Path, vertical: Any) -> Any:
             raise missing
         return N
 
-    above(np.array([0.5]), np.array([0.5]))
+    above(lat_deg, lon_deg)
     return above

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
 import pytest
 import rasterio
+import rasterio.warp
 from notebook import Notebook
 from rio_cogeo.cogeo import cog_validate
 from synthetic_flight import flight_messages
@@ -492,6 +494,27 @@ def test_voids_are_no_heights_also_where_the_raster_does_not_say_so(tmp_path, vo
     whole = HeightRaster([path], None, "ellipsoid").heights(0, 0, 4, 5)
     for found in (read_dem(path, "ellipsoid").z_m, whole):
         assert np.isnan(found[1, 2]) and np.isnan(found).sum() == 1 and np.nanmin(found) == 450.0
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_geoid_of_one_country(whole, tmp_path):
+    """Its grid does not reach to the Gulf of Guinea, where it was tried: it was "not installed"."""
+    grid, path = tmp_path / "geoid.gtx", tmp_path / "flat.tif"
+    south, west, rows, columns = (-90.0, -180.0, 181, 361) if whole else (45.0, 5.0, 6, 11)
+    head = struct.pack(">4d2i", south, west, 1.0, 1.0, rows, columns)
+    grid.write_bytes(head + np.full(rows * columns, 47.0, dtype=">f4").tobytes())
+    shape = {"driver": "GTiff", "width": 20, "height": 20, "count": 1, "dtype": "float32"}
+    for north in (5.3e6, 0.3e6):
+        place = rasterio.Affine(100.0, 0.0, 6e5, 0.0, -100.0, north)
+        with rasterio.open(path, "w", crs="EPSG:32632", transform=place, **shape) as target:
+            target.write(np.full((1, 20, 20), 500.0, dtype=np.float32))
+        datum = f"+proj=longlat +datum=WGS84 +geoidgrids={grid} +type=crs"
+        if north < 1e6 and not whole:
+            with pytest.raises(UserError, match="or does not reach there"):
+                HeightRaster([path], None, datum)
+            continue
+        x, y = rasterio.warp.transform("EPSG:32632", "EPSG:4326", [6.01e5], [north - 1000.0])
+        assert HeightRaster([path], None, datum).at(np.radians(y), np.radians(x)) == pytest.approx(547.0)
 
 
 def test_relief_is_of_points_with_a_height(tmp_path):
