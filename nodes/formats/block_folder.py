@@ -21,7 +21,7 @@ from ..errors import UserError
 from .camera_json import read_camera
 from .keys import Keys, is_there, read_toml
 from .place_columns import PLACE, check_place_units, place_column
-from .projection import missing_grids
+from .projection import notes_of_heights
 from .table import Column, Table, one_line, read_table
 
 #: Files that make a folder a block folder (project.toml may be absent).
@@ -93,10 +93,7 @@ def read_block(folder: Path | str) -> BlockData:
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
     ground_table = read_table(folder / "ground_points.csv", GROUND, notes, may_be_empty=True)
     frame = _frame(folder, crs, poses, ground_table)
-    grids = missing_grids(crs) if crs != "local" else []
-    if grids:
-        what = "heights or positions may be off by the geoid or datum shift"
-        notes.append(f"project.toml: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what}, all alike")
+    notes.extend(f"project.toml: {note}" for note in notes_of_heights(crs))
 
     trajectories = _trajectories(poses, frame, notes)
     strips = _strips(strip_table, camera, trajectories, notes)

@@ -20,7 +20,7 @@ from ..convert import SECOND_NS, camera_from, local_frame, role_of, same_frame, 
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
-from .projection import missing_grids
+from .projection import notes_of_heights
 
 #: What `block_from_messages` reads.
 TOPICS = (
@@ -112,21 +112,19 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     ground = _ground_of(found, notes)
     point_ids, image = _image_of(found, camera, strips, ground, apriori)
     frame = local_frame(project)
-    notes += _missing_grids(frame.crs, name)
+    notes += _notes_of_heights(frame.crs, name)
     return BlockData(
         project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
         heading=not any(pose[1] for pose in poses),  # poses that name a strip come from a block folder
     )  # fmt: skip
 
 
-def _missing_grids(crs: str, name: str) -> list[str]:
-    """A note where tables in the CRS cannot have its heights or positions here."""
+def _notes_of_heights(crs: str, name: str) -> list[str]:
+    """Notes where tables in the CRS cannot have its heights or positions here."""
     try:
-        grids = [] if crs == "local" else missing_grids(crs)
+        return [f"{name}: {note}" for note in notes_of_heights(crs)]
     except CrsError:  # whoever writes tables in it says so
         return []
-    what = "heights or positions in tables may be off by the geoid or datum shift, all alike"
-    return [f"{name}: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what}"] if grids else []
 
 
 def _strips_of(

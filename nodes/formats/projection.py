@@ -64,12 +64,61 @@ def missing_grids(crs: str) -> list[str]:
     return sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available})
 
 
+def unknown_heights(crs: str) -> str:
+    """Name of the vertical part of a CRS, if PROJ knows no way from it to the ellipsoid, whatever grids there are.
+
+    "" where it knows one, and of a CRS without a vertical part.
+
+    PROJ takes such heights for ellipsoidal ones, as it does where a grid is missing (`missing_grids`).
+
+    Raises
+    ------
+    CrsError : as of `known_crs`
+    """
+    from pyproj.crs import CompoundCRS
+    from pyproj.exceptions import ProjError
+    from pyproj.transformer import Transformer, TransformerGroup
+
+    known = known_crs(crs)
+    if not known.is_compound:
+        return ""
+    vertical = known.sub_crs_list[1]
+    alone = CompoundCRS("WGS 84 and heights", ["EPSG:4326", vertical])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if TransformerGroup(alone, "EPSG:4979", always_xy=True).unavailable_operations:
+            return ""
+        try:
+            Transformer.from_crs(alone, "EPSG:4979", always_xy=True, allow_ballpark=False)
+        except ProjError:
+            return str(vertical.name)
+    return ""
+
+
+def notes_of_heights(crs: str) -> list[str]:
+    """What is to be said of places in a CRS that PROJ cannot bring to WGS 84 as they are meant, here or anywhere.
+
+    Raises
+    ------
+    CrsError : as of `known_crs`
+    """
+    if crs == "local":
+        return []
+    if grids := missing_grids(crs):
+        what = "heights or positions may be off by the geoid or datum shift, all alike"
+        return [f"PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what}"]
+    if name := unknown_heights(crs):
+        return [f"PROJ knows no geoid of {name!r}: heights count as ellipsoidal ones and may be off by it, all alike"]
+    return []
+
+
 def refuse_missing_grids(crs: str, where: object) -> None:
-    """Raise UserError where PROJ would take heights in a CRS for ellipsoidal ones, because it lacks the geoid, or where
-    it has no place for a point.
+    """Raise UserError where PROJ would take heights in a CRS for ellipsoidal ones, because it lacks the geoid or knows
+    none, or where it has no place for a point.
     """
     try:
         grids = [] if crs == "local" else missing_grids(crs)
+        unknown = "" if crs == "local" or grids else unknown_heights(crs)
     except CrsError as error:
         raise UserError(f"{where}: {error}") from None
     if grids:
@@ -77,4 +126,9 @@ def refuse_missing_grids(crs: str, where: object) -> None:
         raise UserError(
             f"{where}: PROJ lacks the grid {', '.join(grids[:3])} for {name!r}: heights would be off by the geoid "
             f"(`projsync --file {grids[0]}` fetches it)"
+        )
+    if unknown:
+        raise UserError(
+            f"{where}: PROJ knows no geoid of {unknown!r} in {known_crs(crs).name!r}: heights would be off by it; "
+            "wanted heights above the ellipsoid, or a vertical CRS with a geoid"
         )

@@ -34,7 +34,7 @@ from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
 from .block_folder import GROUND, known_points, trajectory_settings
 from .keys import Keys, read_toml
-from .projection import missing_grids
+from .projection import notes_of_heights
 from .satellite.read import read_scene
 from .satellite.scene import SatelliteScene
 from .table import Column, Table, read_table, write_table
@@ -307,12 +307,10 @@ def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> t
         middle = middle[np.isfinite(middle).all(axis=1)]
         try:
             frame = LocalFrame.around(middle, crs) if len(middle) else LocalFrame(0.0, 0.0, 0.0, crs)
-            grids = missing_grids(crs)
+            told = notes_of_heights(crs)
         except CrsError as error:
             raise UserError(f"{folder / 'project.toml'}: project.crs: {error}") from None
-        if grids:
-            notes.append(f"project.toml: PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; heights or "
-                         "positions may be off by the geoid or datum shift, all alike")  # fmt: skip
+        notes.extend(f"project.toml: {note}" for note in told)
     if not rows:
         return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ()), frame
     return known_points(table, frame, notes), frame

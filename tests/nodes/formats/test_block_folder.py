@@ -16,6 +16,7 @@ from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.block_writer import write_block
+from triline.nodes.formats.projection import refuse_missing_grids, unknown_heights
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
 from triline.solver.models.lim import LimOptions
@@ -329,6 +330,22 @@ def test_missing_geoid_grid_is_told(tmp_path):
     notes = block_from_messages(block_messages(read), "flight.mcap").notes
     assert bool(grids) == any(note.startswith("flight.mcap: PROJ has no grid us_nga") for note in notes)
     assert missing_grids("EPSG:32632") == []
+
+
+def test_heights_of_which_proj_knows_no_geoid_are_told(tmp_path):
+    """Such as DHHN92 of EPSG:5555: no grid is missing, and heights counted as ellipsoidal ones in silence."""
+    block = simulated_block("EPSG:25832")
+    write_block(tmp_path, block)
+    text = (tmp_path / "project.toml").read_text().replace("EPSG:25832", "EPSG:5555")
+    (tmp_path / "project.toml").write_text(text)
+    said = "PROJ knows no geoid of 'DHHN92 height': heights count as ellipsoidal ones and may be off by it, all alike"
+    read = read_block(tmp_path)
+    assert f"project.toml: {said}" in read.notes
+    assert f"flight.mcap: {said}" in block_from_messages(block_messages(read), "flight.mcap").notes
+    with pytest.raises(UserError, match=r"x.csv: PROJ knows no geoid of 'DHHN92 height' in 'ETRS89 / UTM zone 32N"):
+        refuse_missing_grids("EPSG:5555", "x.csv")
+    for crs in ("EPSG:25832", "EPSG:4979", "EPSG:4978", "EPSG:32632+EPSG:5773"):
+        assert unknown_heights(crs) == ""
 
 
 def test_coordinates_outside_the_crs(tmp_path):

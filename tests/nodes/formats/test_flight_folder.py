@@ -210,6 +210,13 @@ def test_lines_and_sensors_of_different_times_are_told(folder, tmp_path, capsys)
     assert problem.endswith("gnss.csv: no such file, wanted GNSS positions")
 
 
+def test_a_vertical_datum_without_a_geoid_is_refused(folder):
+    """No grid of it can be missing, and its heights would count as ellipsoidal ones."""
+    (folder / "flight.toml").write_text(TOML.replace('vertical_datum = "ellipsoid"', 'vertical_datum = "EPSG:5705"'))
+    (problem,) = read_flight(folder).problems
+    assert "flight.vertical_datum: PROJ knows no geoid of 'Baltic 1977 height': heights would be off by it" in problem
+
+
 def test_control_far_from_the_flight_is_refused(folder):
     """Such as that of another UTM zone: the flight went on without a word, and found no tie points."""
     zone = next(text for text in ("EPSG:32632", "EPSG:32633") if text in TOML)
