@@ -155,6 +155,10 @@ def _run(argv: list[str], job: bool) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(f"{name}: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
     except Exception as error:  # a fault of the program; -v shows where
+        frames = sys.modules.get("triline.solver.geometry.frames")  # a place that a CRS has not is none
+        if frames is not None and isinstance(error, frames.CrsError):
+            print(f"{name}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
+            return 1
         if verbose:
             raise
         what = " ".join(f"{type(error).__name__}: {error}".split())

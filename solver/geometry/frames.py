@@ -94,13 +94,20 @@ class LocalFrame:
         return out
 
     def to_crs(self, position_l: ArrayLike) -> Array:
-        """Project CRS coordinates of local points (n, 3)."""
+        """Project CRS coordinates of local points (n, 3).
+
+        Raises
+        ------
+        CrsError : PROJ does not know the CRS or a point lies outside its area
+        """
         position_l = np.asarray(position_l, dtype=float)
         if self.crs == "local":
             return position_l.copy()
         g = self.to_geodetic(position_l)
-        x, y, z = self._to_wgs84.transform(g[..., 1], g[..., 0], g[..., 2], direction="INVERSE")
-        return np.stack([x, y, z], axis=-1)
+        out = np.stack(self._to_wgs84.transform(g[..., 1], g[..., 0], g[..., 2], direction="INVERSE"), axis=-1)
+        if np.isinf(out).any():
+            raise CrsError(f"coordinates outside the area of {self.crs!r}")
+        return out
 
     def R_l_crs(self, xyz: ArrayLike) -> Array:
         """Rotation (n, 3, 3) from the CRS axes at points (n, 3) to the local frame: scale removed, convergence kept."""
@@ -226,9 +233,18 @@ def known_crs(crs: str, *, geocentric: bool = True):
 
 
 def _transformer(crs):
+    """To WGS 84 with ellipsoidal heights; where PROJ has the geoid of the heights, of its area alone.
+
+    Beyond it PROJ would take heights as they stand, and a block would have a step at a border.
+    """
     import pyproj.exceptions
 
     target = pyproj.CRS.from_epsg(4979)
+    if crs.is_compound:
+        try:
+            return pyproj.Transformer.from_crs(crs, target, always_xy=True, allow_ballpark=False)
+        except pyproj.exceptions.ProjError:  # it has not; that is told by whoever reads the CRS
+            pass
     try:
         return pyproj.Transformer.from_crs(crs.to_3d() if len(crs.axis_info) < 3 else crs, target, always_xy=True)
     except pyproj.exceptions.ProjError as error:

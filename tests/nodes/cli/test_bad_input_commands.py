@@ -21,6 +21,7 @@ from triline.nodes.cli.outputs import refuse_input_as_output
 from triline.nodes.formats.block_writer import write_block
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.writer import RecordingWriter
+from triline.solver.geometry.frames import CrsError
 
 # ---- weak networks and what the files say of them, as a user meets them
 
@@ -338,3 +339,15 @@ def test_coordinates_outside_the_crs_are_named_with_their_place(tmp_path, capsys
     code, out, err = run_main(capsys, "adjust", tmp_path)
     assert code == 1 and out == "" and len(err.splitlines()) == 1
     assert "trajectory.csv:2: " in err and "outside the area of 'EPSG:4326'" in err
+
+
+def test_a_place_that_a_crs_has_not_is_no_fault(tmp_path, monkeypatch, capsys):
+    """Such as a point of a flight beyond the geoid of the project's heights."""
+
+    def run(args):
+        raise CrsError("coordinates outside the area of 'EPSG:25832+7837'")
+
+    monkeypatch.setattr("triline.nodes.cli.info.run", run)
+    (tmp_path / "a.mcap").touch()
+    assert main(["info", str(tmp_path / "a.mcap")]) == 1
+    assert capsys.readouterr().err == "triline info: coordinates outside the area of 'EPSG:25832+7837'\n"

@@ -1,8 +1,13 @@
 """The ellipsoid, the local frame and coordinate reference systems, against PROJ and round trips."""
 
+import subprocess
+import sys
+import warnings
+
 import numpy as np
 import pyproj
 import pytest
+from pyproj.transformer import TransformerGroup
 
 from triline.solver.geometry import earth
 from triline.solver.geometry.frames import (
@@ -115,3 +120,44 @@ def test_attitude_covariance_by_sampling():
     R = R_ln @ matrix_from_navigation(*samples.T) @ np.diag([1.0, -1, -1])
     empirical = np.cov(angles_from_matrix(R).T)
     np.testing.assert_allclose(empirical, J_cov, rtol=0.05, atol=0.05 * J_cov.max())
+
+
+BORDER = """
+import sys
+import numpy as np
+from pyproj import datadir
+datadir.append_data_dir(sys.argv[1])
+from triline.solver.geometry.frames import CrsError, LocalFrame
+for place in ((600000, 5300000, 500), (600000, 5000000, 500)):
+    frame = LocalFrame(47.0, 10.0, 0.0, "EPSG:25832+7837")
+    try:
+        local = frame.from_crs(np.array([place]))
+        print(round(float(frame.to_geodetic(local)[0, 2]), 3), round(float(frame.to_crs(local)[0, 2]), 3))
+    except CrsError as error:
+        print(error)
+try:
+    LocalFrame(45.0, 10.0, 0.0, "EPSG:25832+7837").to_crs(np.zeros((1, 3)))
+except CrsError as error:
+    print(error)
+"""
+
+
+def test_heights_end_where_their_geoid_ends(tmp_path):
+    """Beyond the grid of a geoid PROJ takes heights as they stand: a block had a step of 47 m at the border."""
+    rasterio = pytest.importorskip("rasterio")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup("EPSG:25832+7837", "EPSG:4979", always_xy=True)
+    grids = {grid.short_name for way in group.unavailable_operations for grid in way.grids if not grid.available}
+    if len(grids) != 1:
+        pytest.skip("PROJ has the geoid here, or wants more than one grid")
+    shape = {"driver": "GTiff", "width": 100, "height": 90, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(
+        tmp_path / grids.pop(), "w", transform=rasterio.Affine(0.1, 0, 5.5, 0, -0.1, 56.0), **shape
+    ) as grid:  # from 47 to 56 degrees north
+        grid.write(np.full((1, 90, 100), 47.0, dtype=np.float32))
+        grid.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
+        grid.set_band_description(1, "geoid_undulation")
+    done = subprocess.run([sys.executable, "-c", BORDER, str(tmp_path)], capture_output=True, text=True, check=True)
+    outside = "coordinates outside the area of 'EPSG:25832+7837'"
+    assert done.stdout.splitlines() == ["547.0 500.0", outside, outside]
