@@ -220,6 +220,10 @@ def _check(args: argparse.Namespace) -> None:
         value = getattr(args, name)
         if value is not None and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
             raise UserError(f"--{name.replace('_', '-')}: wanted numbers of at least 0")
+        counts = args.control is not None if name == "pixel_sigma" else args.correction == "camera"
+        if value is not None and args.sigma is None and not (counts and name in ("pixel_sigma", "height_sigma")):
+            more = {"pixel_sigma": " or --control", "height_sigma": " or --correction camera"}.get(name, "")
+            raise UserError(f"--{name.replace('_', '-')}: goes with --sigma FILE{more}, for which it counts")
     if args.plain and args.compress is not None:
         raise UserError("--plain and --compress: wanted one of them")
     if args.workers is not None and args.workers < 1:

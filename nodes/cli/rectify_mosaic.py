@@ -58,6 +58,11 @@ _RECORDINGS = (".mcap",)
 #: Options of images and recordings that a mosaic of several does not take.
 _NOT_OF_MOSAIC = ("trajectory", "control", "correction", "first_pixel", "mask", "bounds", "direct", "plain")
 
+#: Options without effect where the inputs have no image with its metadata, no recording, or neither of them.
+_OF_IMAGES = ("model", "dem_datum", "nodata", "occlusions", "position_sigma", "attitude_sigma")
+_OF_RECORDINGS = ("orientation", "camera", "strip")
+_OF_BOTH = ("dem", "dem_crs", "height", "refraction", "ccd", "pixel_sigma", "height_sigma")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of a mosaic."""
@@ -92,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args, outputs)
     workers = args.workers or len(os.sched_getaffinity(0))
     kinds = _kinds(args)
+    _refuse_without_effect(args, {kind for kind, _, _ in kinds})
     _refuse_inputs(args, outputs, kinds)
     crs, gsd = _cells(args, kinds)
     if args.stac is not None and crs == "local":
@@ -198,6 +204,21 @@ def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
     if len({path.resolve() for path in inputs}) < len(inputs):
         raise UserError("the same input twice")
     return out
+
+
+def _refuse_without_effect(args: argparse.Namespace, kinds: set[str]) -> None:
+    """Refuse options of kinds of input that are not there."""
+    for names, wanted, words in (
+        (_OF_IMAGES, {"image"}, "an image and its --sensor"), (_OF_RECORDINGS, {"recording"}, "a recording"),
+        (_OF_BOTH, {"image", "recording"}, "a recording, or an image and its --sensor"),
+    ):  # fmt: skip
+        for name in names:
+            if rectify_image.is_given(args, name) and not kinds & wanted:
+                raise UserError(f"--{name.replace('_', '-')}: goes with {words}, and there is none")
+    if args.sigma is None:
+        for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
+            if rectify_image.is_given(args, name):
+                raise UserError(f"--{name.replace('_', '-')}: goes with --sigma FILE, for which it counts")
 
 
 def _refuse_inputs(args: argparse.Namespace, outputs: Outputs, kinds: list[tuple[str, Path, str | None]]) -> None:

@@ -546,6 +546,9 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     control.write_text(head + f"{lon + 40},{lat},0,5,5\n" * 3)
     assert "not in the image" in refused(capsys, *base, "--control", control)
     assert "--correction affine: goes with --control" in refused(capsys, *base, "--correction", "affine")
+    for name in ("pixel", "height"):
+        assert f"--{name}-sigma: goes with --sigma FILE or" in refused(capsys, *base, f"--{name}-sigma", 0.3)
+    assert "--attitude-sigma: goes with --sigma FILE" in refused(capsys, *base, "--attitude-sigma", 1, 1, 1)
     assert "wanted one of them" in refused(capsys, *base, "--dem", dem)
     assert "would overwrite" in refused(capsys, image, "--sensor", path, "-o", image)
     assert "no sigma is known" in refused(capsys, *base, "--sigma", tmp_path / "s.tif")
