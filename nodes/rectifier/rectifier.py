@@ -147,7 +147,8 @@ class Rectifier(Node):
         elif topic.startswith("orientation/"):
             sample = convert.pose_sample(body)
             image = self.images[topic.removeprefix("orientation/")]
-            image.add_refined(self._seconds(sample.time_ns), sample.position_l, sample.quaternion)
+            if sample.valid:
+                image.add_refined(self._seconds(sample.time_ns), sample.position_l, sample.quaternion)
         elif np.isfinite([body.x, body.y, body.z]).all():
             if topic == "point/object":
                 self._heights.pop(body.point, None)
@@ -172,6 +173,11 @@ class Rectifier(Node):
             raise ValueError("pose without covariance")
         self._filtered_seen |= not smoothed
         time_s = self._seconds(sample.time_ns)
+        if not sample.valid:
+            self.counters["poses not valid"] += 1
+            for image in self.images.values():
+                image.skip_pose(time_s)
+            return
         ordered = True
         for version, image in self.images.items():
             # the live image shows what was known at once; without a filter (an imported trajectory) smoothed poses lead

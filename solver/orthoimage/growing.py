@@ -64,6 +64,7 @@ class GrowingOrthoimage:
         self.grid: GroundGrid | None = None
         self._surface: Surface | None = None
         self._measured = MeasuredTrajectory()
+        self._skipped_s = -np.inf
         self._knots: list[tuple[float, Array]] = []
         self._unplaced: deque[tuple[float, Array, Array]] = deque()
         self._waiting: deque[WaitingLines] = deque()
@@ -88,6 +89,10 @@ class GrowingOrthoimage:
         late = self._measured.add([time_s], position_l[None], quaternion[None], covariance[None], smoothed)
         return late == 0
 
+    def skip_pose(self, time_s: float) -> None:
+        """A measured pose that is not to be relied on: lines about it get no orientation, and wait for none."""
+        self._skipped_s = max(self._skipped_s, time_s)
+
     def add_refined(self, time_s: float, position_l: Array, quaternion: Array) -> None:
         """A refined pose; one of the same or an earlier time takes the place of what was known from there on."""
         self._unplaced.append((time_s, position_l, quaternion))
@@ -111,14 +116,15 @@ class GrowingOrthoimage:
         """Rectify what can be; everything that waits, if nothing more will come."""
         if self._surface is None or self._rays is None or self.grid is None:
             return
+        newest = max(self._measured.end_s, self._skipped_s)
         while self._waiting:
             lines = self._waiting[0]
             end = float(lines.time_s[-1])
             refined = bool(self._knots) and self._knots[-1][0] >= end
-            waited = self._measured.end_s - end > self._patience_s or self._waiting_bytes > self._budget
+            waited = newest - end > self._patience_s or self._waiting_bytes > self._budget
             if not (refined or waited or everything):
                 break
-            if not everything and self._measured.end_s < end:
+            if not everything and newest < end:
                 break
             self._waiting.popleft()
             self._waiting_bytes -= lines.pixels.nbytes

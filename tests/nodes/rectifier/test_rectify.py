@@ -565,6 +565,27 @@ def test_node_gives_the_same_bytes_again(flown, folder):
         assert one == other and len(one) > 5
 
 
+def test_node_draws_no_lines_by_poses_that_are_not_valid(flown):
+    reader, node = RecordingReader(flown), Rectifier()
+    begin = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9
+    lost, tiles = 0, set()
+    for message in reader.sorted_messages([*node.inputs]):
+        if message.topic.startswith(("trajectory/smoothed", "orientation")):
+            continue
+        if message.topic == "trajectory/filtered" and time_ns(message.body.timestamp) < begin:
+            message.body.valid, lost = False, lost + 1
+            turned = message.body.pose.orientation
+            turned.x, turned.y, turned.z, turned.w = 0.0, 0.0, 1.0, 0.0
+        made = list(node.step(message))
+        assert not made or message.stamp_ns >= begin
+        tiles |= {(tile.body.row, tile.body.column) for tile in made if tile.topic == "orthoimage/live"}
+    list(node.finish())
+    assert node.counters["poses not valid"] == lost > 10 and tiles
+    without = node.counters["live lines without orientation"]
+    assert without == pytest.approx(8.0 * reader.last("configuration/strip").line_rate_hz, rel=0.05)
+    assert not node.counters["malformed"] and not node.counters["failed"]
+
+
 def test_node_counts_what_it_cannot_use(flown):
     node = Rectifier()
     assert node.state() == "waiting for configuration"
