@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...solver.rectification.grid import transformer_to
 from .new_file import new_file
+
+Array = NDArray[np.floating]
 
 #: Places along each edge of the extent, whose longitudes and latitudes give the footprint.
 _EDGE = 9
@@ -52,15 +55,14 @@ def write_stac_item(
         [np.full(len(s), bottom), bottom + s * (top - bottom), np.full(len(s), top), top - s * (top - bottom)]
     )
     lon, lat = transformer_to(crs).transform(x, y, direction="INVERSE")
-    ring = [[round(float(a), 8), round(float(b), 8)] for a, b in zip([*lon, lon[0]], [*lat, lat[0]], strict=True)]
+    geometry, bbox = _footprint(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
     raster = _VRT if mosaic.suffix == ".vrt" else _COG
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     epsg = pyproj.CRS.from_user_input(crs).to_epsg()
     item = {
         "type": "Feature", "stac_version": "1.0.0", "id": mosaic.stem,
         "stac_extensions": ["https://stac-extensions.github.io/projection/v1.1.0/schema.json"],
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-        "bbox": [min(p[0] for p in ring), min(p[1] for p in ring), max(p[0] for p in ring), max(p[1] for p in ring)],
+        "geometry": geometry, "bbox": bbox,
         "properties": {
             **_times(result["layers"], made), "created": made, "gsd": _metres(crs, left, right, bottom, top, gsd),
             "proj:epsg": epsg, "proj:shape": [done["rows"], done["columns"]],
@@ -79,6 +81,33 @@ def write_stac_item(
     }  # fmt: skip
     with new_file(path) as part:
         part.write_text(json.dumps(item, indent=2) + "\n", encoding="utf-8")
+
+
+def _footprint(lon: Array, lat: Array) -> tuple[dict[str, Any], list[float]]:
+    """Geometry and bounds of an outline (n,), degrees; across the date line two polygons, and west above east."""
+    across = np.ptp(lon) > 180.0
+    if across:
+        lon = np.where(lon < 0, lon + 360.0, lon)
+    outline = np.column_stack([lon, lat])
+    parts = [_cut(outline, -1.0), _cut(outline, 1.0) - [360.0, 0.0]] if across else [outline]
+    rings = [[[round(a, 8), round(b, 8)] for a, b in [*part.tolist(), part[0].tolist()]] for part in parts]
+    west, east = lon.min(), lon.max() - (360.0 if across else 0.0)
+    bounds = [round(float(v), 8) for v in (west, lat.min(), east, lat.max())]
+    if across:
+        return {"type": "MultiPolygon", "coordinates": [[ring] for ring in rings]}, bounds
+    return {"type": "Polygon", "coordinates": rings}, bounds
+
+
+def _cut(outline: Array, side: float) -> Array:
+    """The part (m, 2) of a convex outline (n, 2) west (side -1) or east (1) of 180 degrees."""
+    out = []
+    for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        before, after = side * (a[0] - 180.0), side * (b[0] - 180.0)
+        if before >= 0:
+            out.append(a)
+        if before * after < 0:
+            out.append(a + before / (before - after) * (b - a))
+    return np.array(out)
 
 
 def _times(layers: list[dict[str, Any]], made: str) -> dict[str, str | None]:

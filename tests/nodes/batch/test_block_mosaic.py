@@ -130,6 +130,43 @@ def test_stac_item_says_where_the_mosaic_is(made):
     assert 8.99 < west < east < 9.05 and 48.7 < south < north < 48.8
 
 
+def test_stac_item_across_the_date_line_does_not_go_round_the_world(tmp_path):
+    """In UTM zone 1: two polygons, and the bounds from west to east (RFC 7946)."""
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32601", always_xy=True).transform(180.0, 48.0)
+    place = rasterio.Affine(2, 0, round(x / 2) * 2 - 400, 0, -2, round(y / 2) * 2)
+    ortho, item = tmp_path / "ortho.tif", tmp_path / "item.json"
+    shape = {"driver": "GTiff", "height": 200, "width": 300, "count": 1, "dtype": "uint16", "crs": "EPSG:32601"}
+    with rasterio.open(ortho, "w", transform=place, nodata=0, **shape) as target:
+        target.write(np.full((1, 200, 300), 1000, dtype=np.uint16))
+    words = [
+        "rectify",
+        ortho,
+        "--mosaic",
+        "--tile",
+        128,
+        "-o",
+        tmp_path / "m.tif",
+        "--stac",
+        item,
+        "--workers",
+        1,
+        "-q",
+    ]
+    assert main([*map(str, words)]) == 0
+    told = json.loads(item.read_text())
+    west, _, east, _ = told["bbox"]
+    assert 179.9 < west < 180.0 and -180.0 < east < -179.9
+    a_degree = 111320.0 * np.cos(np.radians(48.0))
+    widths = []
+    for (ring,) in told["geometry"]["coordinates"]:
+        ring = np.array(ring)
+        assert (ring[0] == ring[-1]).all() and np.abs(np.abs(ring[:, 0]) - 180.0).min() == 0.0
+        widths.append(np.ptp(ring[:, 0]) * a_degree)
+    assert widths == pytest.approx([400.0, 200.0], abs=40.0)  # meridians are not parallel to the grid
+
+
 def test_workers_and_a_run_that_goes_on_give_the_same_bytes(block, made, tmp_path):
     other = tmp_path / "block.tif"
     assert main(_mosaic(block, other, "--workers", "2", "-q")) == 0
