@@ -39,7 +39,7 @@ class Aircraft:
     nodes : node -> NodeStatus
     report : newest AdjustmentReport
     linked : whether its router is linked with the ground
-    heard_s : when something of it was heard last, of a steady clock
+    heard_s : when something of it was heard last, of a steady clock; adjuster_s : the same of its adjuster's status
     """
 
     name: str
@@ -47,6 +47,7 @@ class Aircraft:
     report: Any = None
     linked: bool = False
     heard_s: float = 0.0
+    adjuster_s: float = 0.0
 
     @property
     def light(self) -> tuple[str, str]:
@@ -111,6 +112,8 @@ class FleetOverview:
             aircraft.heard_s = self._clock()
             if raw.topic.startswith("status/"):
                 aircraft.nodes[raw.topic.partition("/")[2]] = body
+                if raw.topic == "status/adjuster":
+                    aircraft.adjuster_s = aircraft.heard_s
             elif raw.topic == "adjustment/report":
                 aircraft.report = body
             elif raw.topic == "event/log":
@@ -136,7 +139,8 @@ class FleetOverview:
             now_s, rows = self._clock(), []
             for aircraft in sorted(self._aircraft.values(), key=lambda a: a.name):
                 ago_s = now_s - aircraft.heard_s if aircraft.heard_s else None
-                silent = ago_s is None or ago_s > SILENT_S
+                # another node may go on speaking: the light is the adjuster's
+                silent = ago_s is None or now_s - aircraft.adjuster_s > SILENT_S
                 light, reason = aircraft.light
                 sigma_m, protection_m = aircraft.accuracy_m or (None, None)
                 rows.append(

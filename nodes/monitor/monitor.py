@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,6 +27,10 @@ LOSSES: tuple[str, ...] = ("gaps", "duplicates", "late", "malformed", "dropped")
 MOST_NODES, LONGEST_NAME, LONGEST_TEXT = 40, 24, 200
 #: Alarms on the screen, at most.
 MOST_ALARMS = 6
+#: A node is silent that has said nothing of itself while another one has so often (twice a second).
+SILENT = 20
+#: Whose silence is an alarm: without them a flight is not what it seems. Sensors and onlookers may come and go.
+WATCHED = ("navigator", "matcher", "adjuster", "rectifier", "recorder")
 #: Said while nodes are stopped along the flow of data.
 ENDING = "ending: nodes finish what they have"
 
@@ -42,6 +46,8 @@ class Overview:
     rejected: int = 0
     final_until_ns: int = 0
     events: deque[tuple[int, str, str]] = field(default_factory=lambda: deque(maxlen=5))  # stamp, level, text
+    said: Counter[str] = field(default_factory=Counter)  # how often each node has told its status
+    said_then: dict[str, Counter[str]] = field(default_factory=dict)  # the same when a node told its own last
     ending: bool = False  # nodes are being stopped on purpose: that they fall silent is no alarm
 
     @property
@@ -72,18 +78,45 @@ class Overview:
                     sums[kind] += getattr(topic, kind)
         return sums
 
+    def take_status(self, name: str, status: Any) -> None:
+        """The newest status of a node."""
+        self.nodes[name] = status
+        self.said[name] += 1
+        self.said_then[name] = self.said.copy()
+
+    def is_silent(self, name: str) -> bool:
+        """Whether a node has fallen silent that was not stopped: what it said last holds no longer."""
+        then, status = self.said_then.get(name), self.nodes.get(name)
+        if then is None or status is None or status.state == STOPPING:
+            return False
+        return any(n - then[other] >= SILENT for other, n in self.said.items())
+
     def alarms(self) -> list[str]:
-        """What nodes want an operator to look at, each once; not those that are being stopped."""
+        """What nodes want an operator to look at, each once, and which have fallen silent; not those that are being
+        stopped."""
         if self.ending:
             return []
-        running = [s for s in self.nodes.values() if s.state != STOPPING]
-        return list(dict.fromkeys(plain(s.alarm, LONGEST_TEXT) for s in running if s.alarm))
+        silent = [name for name in WATCHED if self.is_silent(name)]
+        told = [f"{plain(name, LONGEST_NAME)} is silent: it stands still, has died, or is cut off" for name in silent]
+        running = [s for name, s in self.nodes.items() if s.state != STOPPING and not self.is_silent(name)]
+        return list(dict.fromkeys([*told, *(plain(s.alarm, LONGEST_TEXT) for s in running if s.alarm)]))
+
+    def state_of(self, name: str) -> str:
+        """What a node says of itself, or that it has fallen silent."""
+        state = self.nodes[name].state
+        return f"silent, last known: {state}" if self.is_silent(name) else state
+
+    def _light(self, name: str) -> dict[str, str]:
+        s = self.nodes[name]
+        if s.light and self.is_silent(name):
+            return {"light": "unknown", "reason": f"silent; last known: {s.light}"}
+        return {"light": s.light, "reason": s.light_reason}
 
     def as_json(self) -> dict[str, Any]:
         """For programs: state, light and troubles of each node, rates of topics, figures of the newest report."""
         nodes = {
             name: {
-                "state": s.state, "lag_s": s.lag_s, "queued": s.queued, "light": s.light, "reason": s.light_reason,
+                "state": self.state_of(name), "lag_s": s.lag_s, "queued": s.queued, **self._light(name),
                 "alarm": s.alarm, "last_problem": s.last_problem, "counters": {c.name: c.value for c in s.counters},
                 **{kind: sum(getattr(t, kind) for t in s.topics) for kind in LOSSES},
             }
@@ -143,7 +176,7 @@ class Monitor(Node):
         if message.topic.startswith("status/"):
             name = message.topic.partition("/")[2]
             if name in view.nodes or len(view.nodes) < MOST_NODES:
-                view.nodes[name] = body
+                view.take_status(name, body)
             else:
                 self.problem("too many nodes", f"status of a node {plain(name, LONGEST_NAME)} is not shown")
         elif message.topic == "adjustment/report":
@@ -179,8 +212,8 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
         bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
         text = ", ".join(_counted(n, kind) for kind, n in bad.items() if n)
         nodes.add_row(
-            Text(plain(name, LONGEST_NAME)), Text(plain(s.state, LONGEST_TEXT)), f"{s.lag_s:.2f} s", str(s.queued),
-            Text(text or "-", style="yellow" if text else "dim"),
+            Text(plain(name, LONGEST_NAME)), Text(plain(overview.state_of(name), LONGEST_TEXT)), f"{s.lag_s:.2f} s",
+            str(s.queued), Text(text or "-", style="yellow" if text else "dim"),
         )  # fmt: skip
 
     rates = "   ".join(

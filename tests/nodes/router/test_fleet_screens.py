@@ -10,7 +10,7 @@ from rich.console import Console
 
 from triline.nodes import convert
 from triline.nodes.monitor.fleet import SILENT_S, FleetOverview, screen
-from triline.nodes.monitor.monitor import Monitor
+from triline.nodes.monitor.monitor import SILENT, Monitor
 from triline.nodes.node import Message
 from triline.nodes.viewer.canvas import FleetLayout, NullCanvas
 from triline.nodes.viewer.fleet_scene import FleetScene
@@ -61,6 +61,9 @@ def test_each_aircraft_has_a_row_and_one_that_is_silent_has_no_light():
     overview.link("a1", "router", False)
     overview.take("a2", status("navigator"))
     one, two = overview.rows()
+    assert (two["light"], two["reason"]) == ("unknown", "silent; last known: weak")  # whatever its navigator says
+    overview.take("a2", status("adjuster", light="weak"))
+    one, two = overview.rows()
     assert (one["light"], one["link"], one["heard_s"]) == ("unknown", "gone", SILENT_S + 1.0)
     assert "last known: good" in one["reason"] and two["light"] == "weak"
     assert "a1 unknown gone, heard 16 s ago" in overview.line() and "7 to come" in overview.line()
@@ -80,6 +83,32 @@ def test_the_monitor_counts_rejected_observations_as_the_report_of_a_flight_does
     report = m.AdjustmentReport(rejected_total=46, returned_total=4)
     monitor.step(Message("adjustment/report", sample.EPOCH_NS, report))
     assert monitor.overview.rejected == 42 and "42 rejected" in monitor.overview.line()
+
+
+def test_a_node_that_has_died_is_told_and_its_light_holds_no_longer():
+    monitor = Monitor()
+
+    def say(node: str, times: int = 1, **fields) -> None:
+        for _ in range(times):
+            body = m.NodeStatus(**{"node": node, "state": "running", **fields})
+            monitor.step(Message(f"status/{node}", sample.EPOCH_NS, body))
+
+    view = monitor.overview
+    say("adjuster", light="good")
+    say("viewer")
+    say("matcher", state="stopping")
+    say("navigator", 10)
+    assert view.alarms() == [] and view.as_json()["nodes"]["adjuster"]["light"] == "good"
+    say("navigator", SILENT - 10)
+    assert view.alarms() == ["adjuster is silent: it stands still, has died, or is cut off"]
+    told = view.as_json()["nodes"]["adjuster"]
+    assert (told["state"], told["light"]) == ("silent, last known: running", "unknown")
+    assert "ALARM: adjuster is silent" in view.line()
+    say("adjuster", light="weak")  # it was started again
+    assert view.alarms() == [] and view.as_json()["nodes"]["adjuster"]["light"] == "weak"
+    say("navigator", SILENT)
+    view.ending = True
+    assert view.alarms() == []
 
 
 class Canvas(NullCanvas):
