@@ -232,10 +232,12 @@ def progress(flight: Flight) -> Figure | None:
     top.axhline(1.0, color="black", lw=0.8)
     top.plot(t, sigma0, color=FINAL, label="σ₀ of the window")
     total = np.array([r.sigma0_total for r in reports])
-    total = np.where(telling & (total > 0), total, np.nan)
+    so_far = np.array([r.redundancy_total or r.redundancy for r in reports])  # the window waits after restated sigmas
+    total = np.where((so_far >= _TELLING) & (total > 0), total, np.nan)
     if np.isfinite(total).any():
         top.plot(t, total, color=LIVE, label="σ₀ since the start")
-    largest = np.nanmax(np.abs(np.clip([sigma0, total], 0, 3) - 1)) if telling.any() else 0.0
+    shown = np.concatenate([sigma0, total])
+    largest = np.abs(np.clip(shown[np.isfinite(shown)], 0, 3) - 1).max(initial=0.0)
     margin = max(0.15, 1.2 * float(largest))
     top.set_ylim(max(0, 1 - margin), 1 + 1.6 * margin)  # room for the legend
     top.set_title("σ₀ (1 expected)")

@@ -18,7 +18,7 @@ from triline.nodes.cli import main
 from triline.nodes.report.accuracy_table import accuracy_lines
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight
-from triline.nodes.report.figures import residuals, residuals_by_ccd, trajectory_map
+from triline.nodes.report.figures import progress, residuals, residuals_by_ccd, trajectory_map
 from triline.nodes.report.flight import collect
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
@@ -165,6 +165,23 @@ def test_without_truth_the_table_is_of_check_points(messages, tmp_path):
     lines = accuracy_lines(result)
     assert lines[0].startswith("RMSE against check points")
     assert any(re.match(rf"  adjusted on-line, final +{result['check']['adjusted']['n']} ", line) for line in lines)
+
+
+def test_sigma0_since_the_start_is_drawn_where_that_of_the_window_waits(messages):
+    """After sigmas were restated the window says nothing for a while, and the flight as a whole does."""
+    flight = collect(messages)
+    flight.reports = [(stamp, type(r).FromString(r.SerializeToString())) for stamp, r in flight.reports]
+    for k, (_, r) in enumerate(flight.reports):
+        r.sigma0_total, r.redundancy_total = 1.2, 10 * k
+        if k >= len(flight.reports) // 2:
+            r.sigma0, r.redundancy = 0.0, 0
+    top = progress(flight).axes[0]
+    lines = {line.get_label(): np.asarray(line.get_ydata()) for line in top.get_lines()}
+    since, window = lines["σ₀ since the start"], lines["σ₀ of the window"]
+    half = len(since) // 2
+    assert np.isfinite(since[3:]).all() and np.isnan(window[half:]).all()
+    low, high = top.get_ylim()
+    assert low < 1.0 < 1.2 < high
 
 
 # ---- a flight that was not flown to its end
