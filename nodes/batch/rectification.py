@@ -437,14 +437,15 @@ def frame_for(frame: LocalFrame, crs: str) -> LocalFrame:
         return other
     try:
         known_crs(crs, geocentric=False)
-        inside = bool(np.isfinite(other.to_crs(np.zeros((1, 3)))).all())
         geographic = other.is_geographic
     except ValueError as error:
         raise UserError(f"--crs: {error}") from None
     if geographic:
         raise UserError(f"--crs {crs}: is geographic, wanted a projected CRS such as EPSG:32632")
-    if not inside:
-        raise UserError(f"--crs {crs}: the project lies outside its area")
+    try:
+        other.to_crs(np.zeros((1, 3)))
+    except ValueError:
+        raise UserError(f"--crs {crs}: the project lies outside its area") from None
     return other
 
 

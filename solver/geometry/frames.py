@@ -94,7 +94,7 @@ class LocalFrame:
         return out
 
     def to_crs(self, position_l: ArrayLike) -> Array:
-        """Project CRS coordinates of local points (n, 3).
+        """Project CRS coordinates of local points (n, 3); NaN of those that are not known.
 
         Raises
         ------
@@ -105,8 +105,10 @@ class LocalFrame:
             return position_l.copy()
         g = self.to_geodetic(position_l)
         out = np.stack(self._to_wgs84.transform(g[..., 1], g[..., 0], g[..., 2], direction="INVERSE"), axis=-1)
-        if np.isinf(out).any():
+        known = np.isfinite(position_l).all(axis=-1)
+        if not np.isfinite(out[known]).all():
             raise CrsError(f"coordinates outside the area of {self.crs!r}")
+        out[~known] = np.nan
         return out
 
     def R_l_crs(self, xyz: ArrayLike) -> Array:
