@@ -155,7 +155,8 @@ def _run(argv: list[str], job: bool) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(f"{name}: {where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
     except Exception as error:  # a fault of the program; -v shows where
-        frames = sys.modules.get("triline.solver.geometry.frames")  # a place that a CRS has not is none
+        # a place outside the area of a CRS comes from the input; who raises it has loaded the module
+        frames = sys.modules.get("triline.solver.geometry.frames")
         if frames is not None and isinstance(error, frames.CrsError):
             print(f"{name}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
             return 1

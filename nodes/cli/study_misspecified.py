@@ -95,7 +95,8 @@ def _flights(
     args: argparse.Namespace, keys: Sequence[tuple[str, str]], motion: RealMotion | None
 ) -> dict[tuple[str, str], list[FlightFigures]]:
     """Every row with the first seed, then with the next: a study that is stopped has something of each."""
-    kept, plan, code = (KeptFlights(Path(args.flights)) if args.flights else None), _plan(args), code_digest()
+    kept = KeptFlights(Path(args.flights)) if args.flights else None
+    plan, code = _plan(args), code_digest() if kept is not None else ""
     if kept is not None and (other := kept.of_other_code(code)):
         print(f"{kept.path}: {other} of {len(kept)} flights are of other code and are not taken", file=sys.stderr)
     seeds = range(args.first, args.first + args.seeds)

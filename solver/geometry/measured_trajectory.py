@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .rotation import quaternion_conjugate, quaternion_multiply, vector_from_quaternion
-from .trajectory import Poses, Trajectory, noise_between, slopes
+from .trajectory import Poses, Trajectory, noise_between, sample_before, slopes
 
 Array = NDArray[np.floating]
-IntArray = NDArray[np.intp]
 
 #: Smoothed poses are waited for so long, s, after the time they belong to: longer than a smoother lags behind, and than
 #: a filter that has aligned itself in motion reaches back to its first data. Tuned: a shorter one makes orientation
@@ -195,7 +194,7 @@ class MeasuredTrajectory:
         for source, mine in ((self._smoothed, by_smoothed), (self._filtered, ~by_smoothed)):
             if len(source) < 2 or not mine.any():
                 continue
-            i = _before(source.time_s, t[mine])
+            i = sample_before(source.time_s, t[mine])
             step = source.time_s[i + 1] - source.time_s[i]
             good[mine] = source.covers(t[mine]) & (step <= self.gap_s)
         return good
@@ -205,7 +204,7 @@ class MeasuredTrajectory:
         if len(self._smoothed) < 2:
             return np.zeros(len(t), dtype=bool)
         times = self._smoothed.time_s
-        i = _before(times, t)
+        i = sample_before(times, t)
         near = (times[i + 1] - times[i] <= self.gap_s) | (t == times[i])
         return near & (t >= self._smoothed.start_s) & (t <= self._smoothed.end_s)
 
@@ -258,8 +257,3 @@ class MeasuredTrajectory:
         for trajectory in (self._filtered, self._smoothed):
             if len(trajectory):
                 trajectory.forget(before_s)
-
-
-def _before(times: Array, t: Array) -> IntArray:
-    """Sample before each time (m,), of samples at times (n,): never the last one."""
-    return np.minimum(np.maximum(times.searchsorted(t, side="right") - 1, 0), len(times) - 2)

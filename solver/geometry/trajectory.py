@@ -136,13 +136,18 @@ class Trajectory:
         if not covered.all():
             bad = t[~covered][0]
             raise ValueError(f"time {bad:.6f} s outside the trajectory [{self.start_s:.6f}, {self.end_s:.6f}] s")
-        i = np.minimum(np.maximum(self.time_s.searchsorted(t, side="right") - 1, 0), len(self) - 2)
+        i = sample_before(self.time_s, t)
         h = (self.time_s[i + 1] - self.time_s[i])[:, None]
         return i, h, (t - self.time_s[i])[:, None] / h
 
     def _turned(self, i: NDArray[np.intp], theta: Array) -> Array:
         """Quaternions (m, 4), turned from those of samples by rotation vectors (m, 3)."""
         return quaternion_multiply(self.quaternion[i], quaternion_from_vector(theta))
+
+
+def sample_before(time_s: Array, at_s: Array) -> NDArray[np.intp]:
+    """Sample (m,) from which times (m,) are interpolated to the next, among samples at times (n,): never the last."""
+    return np.minimum(np.maximum(time_s.searchsorted(at_s, side="right") - 1, 0), len(time_s) - 2)
 
 
 def slopes(step: Array, change: Array) -> Array:
@@ -174,7 +179,7 @@ def noise_between(time_s: Array, covariance: Array, at_s: Array) -> Array:
     The white noise of the attitude shrinks between samples, since the interpolation averages; that of the position does
     not, it is correlated over many samples.
     """
-    i = np.minimum(np.maximum(time_s.searchsorted(at_s, side="right") - 1, 0), len(time_s) - 2)
+    i = sample_before(time_s, at_s)
     s = (at_s - time_s[i]) / (time_s[i + 1] - time_s[i])
     factor = np.ones((len(s), 6))
     factor[:, 3:] = np.sqrt(hermite_noise(s))[:, None]
