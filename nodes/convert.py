@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..schemas import messages as m
+from ..schemas.groups import grouped
 from ..solver.camera.line_camera import CcdLine, Lens, LineCamera
 from ..solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
 from ..solver.geometry.frames import LocalFrame
@@ -114,7 +115,9 @@ def pose_message(
     """
     if quaternion is None:
         quaternion = quaternion_from_matrix(matrix_from_angles(*np.asarray(angles, dtype=float)))
-    message = m.PoseInFrame(frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip, noise_time_s=noise_time_s)
+    message = grouped(m.PoseInFrame)(
+        frame_id=LOCAL_FRAME_ID, valid=valid, reason=reason, strip=strip, noise_time_s=noise_time_s
+    )
     set_time(message.timestamp, time_ns)
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = _plain(position_l)
@@ -354,7 +357,7 @@ def gnss_message(
     velocity_sigma_enu: ArrayLike | None = None,
 ) -> Any:  # fmt: skip
     """A LocationFix of latitude, longitude (degrees) and ellipsoidal height, sigmas east-north-up."""
-    message = m.LocationFix(frame_id="gnss_antenna", position_covariance_type=2)
+    message = grouped(m.LocationFix)(frame_id="gnss_antenna", position_covariance_type=2)
     set_time(message.timestamp, time_ns)
     message.latitude, message.longitude, message.altitude = (float(v) for v in np.asarray(geodetic_deg_m))
     message.position_covariance.extend(_diagonal(sigma_enu_m))
@@ -369,7 +372,9 @@ def gnss_message(
 def attitude_message(time_ns: int, rpy: ArrayLike, sigma: ArrayLike) -> Any:
     """An Attitude message; roll, pitch, heading and their sigmas in radians."""
     roll, pitch, heading = np.asarray(rpy, dtype=float).tolist()
-    return m.Attitude(time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=_diagonal(sigma))
+    return grouped(m.Attitude)(
+        time_ns=int(time_ns), roll=roll, pitch=pitch, heading=heading, covariance=_diagonal(sigma)
+    )
 
 
 def _diagonal(sigma: ArrayLike) -> list[float]:
@@ -384,7 +389,7 @@ def ground_point_message(
     """A GroundPoint; ``role`` is control, planimetric, height or check; a radius of 0 = not signalised."""
     x, y, z = (float(v) for v in np.asarray(position_l))
     cov = np.asarray(covariance, dtype=float).ravel().tolist()
-    return m.GroundPoint(
+    return grouped(m.GroundPoint)(
         point=point, x=x, y=y, z=z, covariance=cov, role=m.GroundPoint.Role.Value(role.upper()),
         target_radius=target_radius_m,
     )  # fmt: skip
@@ -409,7 +414,10 @@ def given_of(ground_point: Any) -> Array:
 
 def tie_message(point: str, images: Iterable[dict[str, Any]]) -> Any:
     """A TiePoint; each image is a dict of ImagePoint's fields."""
-    return m.TiePoint(point=point, images=[m.ImagePoint(**image) for image in images])
+    message = grouped(m.TiePoint)(point=point)
+    for image in images:
+        message.images.add(**image)
+    return message
 
 
 def iso(stamp_ns: int) -> str:

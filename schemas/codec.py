@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 
 from . import image_lines, topics
 from . import messages as m
+from .groups import grouped
 from .image_lines import LineBlock
 
 #: type -> field -> how many values it has where it has any.
@@ -65,7 +66,7 @@ def parse(topic: str, data: bytes | memoryview) -> Any:
     if row.type is m.RawImage:
         return image_lines.decode(data)
     try:
-        return row.type.FromString(data)
+        return grouped(row.type).from_bytes(data)
     except DecodeError as error:
         raise ValueError(f"not a {row.type_name}: {error}") from None
 

@@ -21,6 +21,12 @@ def message_class(full_name: str) -> Any:
     return message_factory.GetMessageClass(_POOL.FindMessageTypeByName(full_name))
 
 
+def new_class(file: descriptor_pb2.FileDescriptorProto) -> Any:
+    """The class of the first message type of a file that is not in the set; the types it is made of are."""
+    _POOL.Add(file)
+    return message_class(f"{file.package}.{file.message_type[0].name}")
+
+
 LocationFix = message_class("foxglove.LocationFix")
 PoseInFrame = message_class("foxglove.PoseInFrame")
 RawImage = message_class("foxglove.RawImage")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...solver.geometry.rotation import quaternion_from_angles
 from ...solver.window.output import WindowReport, WindowUpdate
 from ...solver.window.quality.light import kind
@@ -161,7 +162,7 @@ def object_point(point: AdjustedPoint, stamp_ns: int) -> Message:
     """An adjusted object point, with the residuals of its looks unless it comes from the backward pass."""
     x, y, z = point.xyz_l.tolist()
     status = _STATUS["WHOLE" if point.whole else "FINAL" if point.final else "LIVE"]
-    body = m.ObjectPoint(
+    body = grouped(m.ObjectPoint)(
         point=point.name, x=x, y=y, z=z, covariance=point.covariance.ravel().tolist(), rays=point.rays, role=point.role,
         status=status, checked=point.checked,
     )  # fmt: skip

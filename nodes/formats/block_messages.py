@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
@@ -229,19 +230,16 @@ def _tie_messages(block: BlockData, times: _Times, source: str) -> Iterator[Mess
     stamps = time_ns[order[after - 1]]
     for group in np.argsort(stamps, kind="stable"):
         rows = order[first[group] : after[group]]
-        looks = []
+        body = grouped(m.TiePoint)(point=block.point_ids[image.point[rows[0]]])
         for row in rows.tolist():
             _, strip, ccd = block.image_name(row)
-            looks.append(
-                m.ImagePoint(
-                    strip=block.strips[image.strip[row]].id if image.strip[row] >= 0 else strip,
-                    ccd=ccd,
-                    line=image.line[row],
-                    sample=image.sample[row],
-                    sigma_line=image.sigma_px[row],
-                    sigma_sample=of_sample[row],
-                    time_ns=int(time_ns[row]),
-                )
+            body.images.add(
+                strip=block.strips[image.strip[row]].id if image.strip[row] >= 0 else strip,
+                ccd=ccd,
+                line=image.line[row],
+                sample=image.sample[row],
+                sigma_line=image.sigma_px[row],
+                sigma_sample=of_sample[row],
+                time_ns=int(time_ns[row]),
             )
-        body = m.TiePoint(point=block.point_ids[image.point[rows[0]]], images=looks)
         yield Message("observation/tie", int(stamps[group]), body, source)

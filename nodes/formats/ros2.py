@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.geometry.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
 from ..convert import attitude_message, check_angles, check_inertial, check_place, gnss_message
@@ -210,7 +211,7 @@ def inertial_messages(
             if measured[k] and not _passes(check_inertial, interval or 1, tuple(f), tuple(w)):
                 left_out[IMPOSSIBLE] += 1
             elif measured[k]:
-                body = m.Imu(
+                body = grouped(m.Imu)(
                     time_ns=time, interval_ns=interval, force_x=f[0], force_y=f[1], force_z=f[2],
                     rate_x=w[0], rate_y=w[1], rate_z=w[2], force_sigma=force_sigma, rate_sigma=rate_sigma,
                 )  # fmt: skip

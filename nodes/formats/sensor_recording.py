@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import Apriori
 from ...solver.arrays import Array
@@ -121,7 +122,7 @@ def _imu(folder: SensorFolder, notes: list[str], source: str) -> Iterator[Messag
     grade, root = folder.platform.grade, np.sqrt(data.dt_s)
     for i, stamp in enumerate(_ns(data.time_s)):
         f, w = force[i], rate[i]
-        body = m.Imu(
+        body = grouped(m.Imu)(
             time_ns=stamp, interval_ns=round(float(data.dt_s[i]) * 1e9),
             force_x=f[0], force_y=f[1], force_z=f[2], rate_x=w[0], rate_y=w[1], rate_z=w[2],
             force_sigma=grade.accel_noise / root[i], rate_sigma=grade.gyro_noise / root[i],

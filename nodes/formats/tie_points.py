@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...solver.geometry.earth import geodetic_from_ecef
 from ..node import Message
 from .geocal_xml import TiePoints
@@ -55,19 +56,18 @@ def tie_point_messages(ties: TiePoints, name: str, source: str = "import") -> It
     yield Message("configuration/project", 0, project, source)
     names = strip_names(ties)
     for i in range(len(ties)):
-        looks = [
-            m.ImagePoint(
-                strip=names[k],
-                ccd=CCD,
-                line=ties.line[i, k],
-                sample=ties.sample[i, k],
-                sigma_line=ties.sigma_line[i, k],
-                sigma_sample=ties.sigma_sample[i, k],
-            )
-            for k in range(len(names))
-            if np.isfinite(ties.line[i, k]) and np.isfinite(ties.sample[i, k])
-        ]
-        yield Message("observation/tie", 0, m.TiePoint(point=f"T{i + 1:04d}", images=looks), source)
+        tie = grouped(m.TiePoint)(point=f"T{i + 1:04d}")
+        for k in range(len(names)):
+            if np.isfinite(ties.line[i, k]) and np.isfinite(ties.sample[i, k]):
+                tie.images.add(
+                    strip=names[k],
+                    ccd=CCD,
+                    line=ties.line[i, k],
+                    sample=ties.sample[i, k],
+                    sigma_line=ties.sigma_line[i, k],
+                    sigma_sample=ties.sigma_sample[i, k],
+                )
+        yield Message("observation/tie", 0, tie, source)
 
 
 def statistics(ties: TiePoints) -> dict[str, Any]:

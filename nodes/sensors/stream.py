@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...schemas.image_lines import LineBlock
 from ..convert import (
     LATEST_S,
@@ -160,7 +161,7 @@ class StreamParser:
             return [Message("sensor/attitude", stamp, attitude_message(time_ns, values[:3], values[3:6]))]
         interval_ns, f, w = int(words[1]), tuple(values[1:4]), tuple(values[4:7])
         check_inertial(interval_ns, f, w)
-        body = m.Imu(
+        body = grouped(m.Imu)(
             time_ns=time_ns, interval_ns=interval_ns, force_x=f[0], force_y=f[1], force_z=f[2],
             rate_x=w[0], rate_y=w[1], rate_z=w[2],
         )  # fmt: skip

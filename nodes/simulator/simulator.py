@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...schemas import messages as m
+from ...schemas.groups import grouped
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import rank
 from ...solver.geometry.rotation import quaternion_from_matrix
@@ -195,7 +196,7 @@ class Simulator(Node):
 
         def imu(i: int, epoch_ns: int) -> object:
             force, rate = measured.force[i].tolist(), measured.rate[i].tolist()
-            return m.Imu(
+            return grouped(m.Imu)(
                 time_ns=epoch_ns + int(after_ns[i]),
                 interval_ns=_ns(interval_s),
                 force_x=force[0],
