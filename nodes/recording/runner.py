@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -148,11 +149,12 @@ def process(
     drivers = [StepDriver(node) for node in running]
     recording = _Recorded(reader, instead or {})
     numbers = _usable(reader, made, summary)
+    last = _begin_of_end(reader, numbers, drivers)
     told = _Progress(progress, len(numbers))
     if apart and Ahead.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
         line = _Line(drivers[-1:], write, copy, summary, checked=True)
         ahead = Ahead(
-            lambda: _handed_on(recording, numbers, drivers[:-1], drivers[-1:]), " and ".join(summary.nodes[:-1])
+            lambda: _handed_on(recording, numbers, last, drivers[:-1], drivers[-1:]), " and ".join(summary.nodes[:-1])
         )
         try:
             done = 0
@@ -164,41 +166,76 @@ def process(
         summary.counters = {name: summary.counters.get(name, {}) for name in summary.nodes[:-1]} | summary.counters
     else:
         line = _Line(drivers, write, copy, summary)
-        for begin in range(0, len(numbers), TOGETHER):
-            part = numbers[begin : begin + TOGETHER]
+        for part in _parts(numbers[:last]):
             line.take(recording.messages(part))
             told.add(len(part))
+        line.begin_end()
+        for part in _parts(numbers[last:]):
+            line.take(recording.messages(part))
+            told.add(len(part))
+        line.work_off()
     line.finish()
     return summary
 
 
 #: Messages of a recording that are taken together.
 TOGETHER = 256
+#: The end of a recording, in which messages wait for their turn at each node, begins so long before its newest message
+#: that tells time, ns: sensors of a flight that was ended do not fall silent at the same moment, but within a second.
+END_NS = 1_000_000_000
+#: Families of messages that tell how far platform time is; observations may be stamped ahead of it.
+_TELL_TIME = (Family.CONFIGURATION, Family.SENSOR, Family.RESULT)
 #: A message that a node has made, on its way from the other process: topic, stamp, source, number, payload.
 Flat = tuple[str, int, str, int, bytes]
 #: What is handed on from there: how many recorded messages are next (negative: are next, and are left out), or what a
-#: node has made; None where the recording has ended; at last what the nodes there said.
+#: node has made; None where the end begins and after each part of it (`_Line`); at last what the nodes there said.
 Item = int | Flat | ProcessSummary | None
 
 
+def _parts(numbers: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Numbers that are taken together."""
+    for begin in range(0, len(numbers), TOGETHER):
+        yield numbers[begin : begin + TOGETHER]
+
+
+def _begin_of_end(reader: RecordingReader, numbers: NDArray[np.int64], drivers: Sequence[StepDriver]) -> int:
+    """At which of the inputs, which are in order, the end of the recording begins."""
+    listening = _Listening(drivers)
+    tell = [
+        id
+        for id, channel in reader.channels.items()
+        if channel.known and topics.find(channel.topic).family in _TELL_TIME and listening[channel.topic]
+    ]
+    stamps = reader.index.stamp_ns[numbers]
+    telling = stamps[np.isin(reader.index.channel[numbers], tell)]
+    return int(np.searchsorted(stamps, telling.max() - END_NS, side="right")) if len(telling) else len(numbers)
+
+
 def _handed_on(
-    recording: _Recorded, numbers: NDArray[np.int64], drivers: Sequence[StepDriver], others: Sequence[StepDriver]
+    recording: _Recorded,
+    numbers: NDArray[np.int64],
+    last: int,
+    drivers: Sequence[StepDriver],
+    others: Sequence[StepDriver],
 ) -> Iterator[Item]:
     """The first nodes over the recording: what they hand on to the others, in order."""
     summary = ProcessSummary()
     handed: list[Item] = []
     line = _Line(
         drivers, lambda raw: handed.append(_flat(raw)), lambda messages: handed.append(len(messages)), summary, others,
-        leave_out=lambda: handed.append(-1),
+        leave_out=lambda: handed.append(-1), part_over=lambda: handed.append(None),
     )  # fmt: skip
-    for begin in range(0, len(numbers), TOGETHER):
-        line.take(recording.messages(numbers[begin : begin + TOGETHER]))
+    for part in _parts(numbers[:last]):
+        line.take(recording.messages(part))
         yield from handed
         handed.clear()
-    line.settle()
-    yield from handed
-    handed.clear()
     yield None
+    line.begin_end()
+    for part in _parts(numbers[last:]):
+        line.take(recording.messages(part))
+        yield from handed
+        handed.clear()
+    line.work_off()
     line.finish()
     yield from handed
     yield summary
@@ -217,10 +254,12 @@ def _take(
         elif isinstance(item, tuple):
             topic, stamp_ns, source, sequence, data = item
             line.take_made(RawMessage(topic, Envelope(stamp_ns, source, sequence), data, stamp_ns))
-        elif item is None:
-            line.settle()
-        else:
+        elif item is not None:
             summary.add(item)
+        elif line.ending:
+            line.work_off()
+        else:
+            line.begin_end()
     return done
 
 
@@ -275,8 +314,32 @@ class _Listening(dict[str, list[StepDriver]]):
         return self[topic]
 
 
+@dataclass
+class _Inbox:
+    """What waits for a node at the end of a run.
+
+    Attributes
+    ----------
+    time_ns : how far it knows platform time to be
+    waiting : heap of messages with their places, and numbers that tell equal ones apart
+    """
+
+    driver: StepDriver
+    time_ns: int
+    waiting: list[tuple[Key, int, Message]] = field(default_factory=list)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the turn of a message has come: observations that are stamped ahead of time wait."""
+        return bool(self.waiting) and self.waiting[0][0][0] <= self.time_ns
+
+
 class _Line:
     """Nodes one after the other: hands inputs and outputs on in order, and has them written.
+
+    The end goes as on the bus (`bus.live`), where each node works on what has come up to the time that it knows of.
+    Then one after the other is ended: it works off what is stamped ahead of that time, says its last words, and the
+    others hear them. So the last words of a node come before what others have stamped ahead.
 
     Parameters
     ----------
@@ -287,6 +350,11 @@ class _Line:
     others : who is handed messages, and finds those of the recording checked
     checked : whether messages of the recording have been
     leave_out : is called in the place of a recorded message that cannot be decoded
+    part_over : is called after each part of the end; what comes then is written at once, else in order at last
+
+    Attributes
+    ----------
+    ending : whether the end has begun
     """
 
     def __init__(
@@ -298,9 +366,14 @@ class _Line:
         others: Sequence[StepDriver] = (),
         checked: bool = False,
         leave_out: Callable[[], None] = lambda: None,
+        part_over: Callable[[], None] | None = None,
     ) -> None:
         self._drivers, self._write, self._copy, self._summary = drivers, write, copy, summary
-        self._leave_out = leave_out
+        self._leave_out, self._part_over = leave_out, part_over
+        self.ending = False
+        self._inboxes: list[_Inbox] = []
+        self._numbers = count()
+        self._last: list[tuple[Key, int, Recorded | RawMessage]] = []  # of the end, to be written in order
         self._passed: list[Recorded] = []  # messages of the recording that are to be copied
         self._listening, self._needed = _Listening(drivers), _Listening([*drivers, *others])
         self._decode = codec.parse if checked else codec.decode
@@ -321,6 +394,11 @@ class _Line:
                     self._copy_passed()
                     self._leave_out()
                     continue
+            if self.ending:
+                message = Message(topic, stamp_ns, body, channel.source, sequence, channel.start)
+                key = order_key(topic, Envelope(stamp_ns, channel.source, sequence, channel.start))
+                self._bring(key, message, recorded)
+                continue
             if pending:
                 self._hand_on_pending(order_key(topic, Envelope(stamp_ns, channel.source, sequence, channel.start)))
             passed.append(recorded)
@@ -340,26 +418,74 @@ class _Line:
 
     def take_made(self, raw: RawMessage) -> None:
         """The next message, of a node before these."""
+        key = order_key(raw.topic, raw.envelope)
         if self._pending:
-            self._hand_on_pending(order_key(raw.topic, raw.envelope))
-        heard = bool(self._listening[raw.topic])
-        self._hand_on(_message(raw, codec.parse(raw.topic, raw.data)) if heard else None, raw)
+            self._hand_on_pending(key)
+        message = _message(raw, codec.parse(raw.topic, raw.data)) if self._listening[raw.topic] else None
+        if self.ending:
+            self._bring(key, message, raw)
+        else:
+            self._hand_on(message, raw)
 
-    def settle(self) -> None:
-        """Hand on what the nodes have put out so far."""
-        self._hand_on_pending(None)
+    def begin_end(self) -> None:
+        """What comes from now on waits at each node for its turn."""
+        self.ending = True
+        self._inboxes = [_Inbox(driver, driver.time_ns) for driver in self._drivers]
+        pending, self._pending = self._pending, []
+        for key, message, raw in pending:
+            self._bring(key, message, raw)
+
+    def work_off(self) -> None:
+        """The nodes work on what waits at them, in order, as far as each knows time to be."""
+        while due := [inbox for inbox in self._inboxes if inbox.is_due]:
+            self._work(min(due, key=lambda inbox: inbox.waiting[0][0]))
+        if self._part_over is not None:
+            self._part_over()
 
     def finish(self) -> None:
-        """There are no more inputs."""
-        self.settle()
-        for driver in self._drivers:
-            self._queue(driver.finish())
-            self.settle()
-            node = driver.node
+        """There are no more inputs: the nodes are ended, one after the other."""
+        while self._inboxes:
+            inbox = self._inboxes.pop(0)
+            while inbox.waiting:
+                self._work(inbox)
+            self._queue(inbox.driver.finish())
+            node = inbox.driver.node
             self._summary.counters[node.name] = dict(sorted(node.counters.items()))
             self._summary.states[node.name] = node.state()
             if node.last_problem:
                 self._summary.problems[node.name] = node.last_problem
+            self.work_off()
+        for _, _, item in sorted(self._last):
+            self._hand_out(item)
+        self._last.clear()
+        self._copy_passed()
+
+    def _bring(self, key: Key, message: Message | None, item: Recorded | RawMessage) -> None:
+        """Lay a message of the end before the nodes that listen to it."""
+        if self._part_over is None:
+            self._last.append((key, next(self._numbers), item))
+        else:
+            self._hand_out(item)
+        if message is None:
+            return
+        drivers, family = self._listening[message.topic], topics.find(message.topic).family
+        for inbox in self._inboxes:
+            if inbox.driver in drivers:
+                heapq.heappush(inbox.waiting, (key, next(self._numbers), message))
+                if family in _TELL_TIME:
+                    inbox.time_ns = max(inbox.time_ns, message.stamp_ns)
+
+    def _work(self, inbox: _Inbox) -> None:
+        message = heapq.heappop(inbox.waiting)[-1]
+        self._queue(inbox.driver.step(message))
+
+    def _hand_out(self, item: Recorded | RawMessage) -> None:
+        """Have a message of the end written."""
+        if isinstance(item, RawMessage):
+            self._copy_passed()
+            self._write(item)
+        else:
+            self._passed.append(item)
 
     def _queue(self, outputs: list[Message]) -> None:
         for output in outputs:
@@ -367,8 +493,12 @@ class _Line:
                 output.topic, Envelope(output.stamp_ns, output.source, output.sequence), codec.encode(output.body),
                 output.stamp_ns,
             )  # fmt: skip
-            heapq.heappush(self._pending, (order_key(output.topic, raw.envelope), output, raw))
             self._summary.outputs[output.topic] += 1
+            key = order_key(output.topic, raw.envelope)
+            if self.ending:
+                self._bring(key, output, raw)
+            else:
+                heapq.heappush(self._pending, (key, output, raw))
 
     def _hand_on(self, message: Message | None, raw: RawMessage) -> None:
         self._copy_passed()
@@ -377,8 +507,8 @@ class _Line:
             for driver in self._listening[raw.topic]:
                 self._queue(driver.step(message))
 
-    def _hand_on_pending(self, until: Key | None) -> None:
-        while self._pending and (until is None or self._pending[0][0] < until):
+    def _hand_on_pending(self, until: Key) -> None:
+        while self._pending and self._pending[0][0] < until:
             _, message, raw = heapq.heappop(self._pending)
             self._hand_on(message, raw)
 

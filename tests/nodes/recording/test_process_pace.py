@@ -11,11 +11,15 @@ from triline.nodes import convert, registry
 from triline.nodes.cli.process import at_pace
 from triline.nodes.config import build
 from triline.nodes.errors import UserError
+from triline.nodes.ordering import order_key
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.runner import process
 from triline.nodes.recording.runner_apart import Ahead
 from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.simulator.simulator import Simulator
+from triline.nodes.step_driver import StepDriver
+from triline.schemas import topics
+from triline.schemas.envelope import Envelope
 from triline.solver.accuracy import angle_difference
 from triline.solver.navigation.inertial_data import TACTICAL
 from triline.solver.simulation.error_models import ErrorModel
@@ -81,6 +85,43 @@ def test_what_only_the_last_node_needs_is_checked_by_the_process_ahead(flights, 
     assert found == expected
     assert (apart.inputs, apart.outputs, apart.dropped) == (alone.inputs, alone.outputs, alone.dropped)
     assert (apart.counters, apart.states) == (alone.counters, alone.states)
+
+
+def test_a_strip_that_was_cut_short_ends_as_on_the_bus(flights, tmp_path):
+    """Ties are stamped ahead, and the navigator's last words come before those that are stamped after the last sensor:
+    each node is given all its inputs in the order of their stamps."""
+    reader, path = RecordingReader(flights["attitude"][1]), tmp_path / "cut.mcap"
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 15 * 10**9
+    kept = []
+    for raw in reader.raws(reader.select()):
+        if raw.envelope.stamp_ns <= end_ns:
+            ahead_ns = 8 * 10**8 if raw.topic == "observation/tie" else 0
+            envelope = raw.envelope._replace(stamp_ns=raw.envelope.stamp_ns + ahead_ns)
+            kept.append(raw._replace(envelope=envelope, data=bytes(raw.data)))
+    kept.sort(key=lambda raw: order_key(raw.topic, raw.envelope))
+    with RecordingWriter(path) as writer:
+        for raw in kept:
+            writer.write_raw(raw)
+
+    def driven(name, given):
+        driver = StepDriver(build(registry.node_class(name), at_pace({}, "load")))
+        heard = [one for one in given if any(topics.find(row).matches(one.topic) for row in driver.inputs)]
+        heard.sort(key=lambda one: order_key(one.topic, Envelope(one.stamp_ns, one.source, one.sequence, one.start)))
+        return [output for one in heard for output in driver.step(one)] + driver.finish()
+
+    recorded = list(RecordingReader(path).sorted_messages())
+    poses = driven("navigator", recorded)
+    last_ns = max(pose.stamp_ns for pose in poses)
+    assert sum(one.topic == "observation/tie" and one.stamp_ns > last_ns for one in recorded) > 5
+    expected = [(one.topic, one.stamp_ns, one.body) for one in [*poses, *driven("adjuster", [*recorded, *poses])]]
+    for apart in (False, True) if Ahead.possible() else (False,):
+        out = tmp_path / "out.mcap"
+        out.write_bytes(processed(path, apart=apart)[1])
+        made = RecordingReader(out).sorted_messages(sorted({topic for topic, *_ in expected}))
+        found = [(one.topic, one.stamp_ns, one.body) for one in made if one.source in ("navigator", "adjuster")]
+        for topic in {topic for topic, *_ in expected}:
+            mine, theirs = ([row for row in rows if row[0] == topic] for rows in (found, expected))
+            assert mine == theirs, topic
 
 
 @pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
