@@ -36,7 +36,8 @@ class Rectifier(Node):
     """Rectifies one CCD line, put together to quick-look size, with the best orientation of now and again when it is
     final. Tiles that have changed are published every ``publish_s`` of platform time.
 
-    The ground is the relief between the adjusted object points; before there are enough of them, a height.
+    The ground is the relief between the adjusted object points; before there are enough of them, a height. The camera
+    is that of the orientations: with the parameters that the adjuster has estimated, as its reports say.
 
     Parameters
     ----------
@@ -56,6 +57,7 @@ class Rectifier(Node):
         "orientation/live",
         "orientation/final",
         "point/object",
+        "adjustment/report",
     )
     outputs = ("orthoimage/live", "orthoimage/final", "event/log")
 
@@ -97,6 +99,7 @@ class Rectifier(Node):
         self._next_relief_s = -np.inf
         self._surface: Surface | None = None
         self._mean_m = 0.0
+        self._parameters: Any = None  # of the newest report, as long as they have not been followed
         self._filtered_seen = False
         self.images = {
             "live": GrowingOrthoimage(LIVE_PATIENCE_S, self._budget),
@@ -149,6 +152,8 @@ class Rectifier(Node):
             image = self.images[topic.removeprefix("orientation/")]
             if sample.valid:
                 image.add_refined(self._seconds(sample.time_ns), sample.position_l, sample.quaternion)
+        elif topic == "adjustment/report":
+            self._parameters = body.parameters or self._parameters
         elif np.isfinite([body.x, body.y, body.z]).all():
             if topic == "point/object":
                 self._heights.pop(body.point, None)
@@ -251,6 +256,7 @@ class Rectifier(Node):
         if self._line < 0 or self._camera is None or self._frame is None:
             return
         self._look_at_ground(self._camera, self._frame)
+        self._follow_camera(self._camera)
         for version, image in self.images.items():
             image.work(everything)
             for name, count in (("without refined orientation", image.impatient), ("without orientation", image.lost)):
@@ -284,6 +290,19 @@ class Rectifier(Node):
         local = LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, "local")
         for image in self.images.values():
             image.set_ground(rays_of(camera, self._line, factor=self._factor), GroundGrid(local, gsd), self._surface)
+
+    def _follow_camera(self, camera: LineCamera) -> None:
+        """Rectify with the camera that the adjuster has estimated from now on."""
+        if self._parameters is None or any(image.grid is None for image in self.images.values()):
+            return
+        told, self._parameters = self._parameters, None
+        try:
+            rays = rays_of(convert.estimated_camera(camera, told)[0], self._line, factor=self._factor)
+        except ValueError as error:
+            self.problem("malformed", f"adjustment/report: {error}")
+            return
+        for image in self.images.values():
+            image.set_rays(rays)
 
     def _changed_tiles(self) -> list[Message]:
         out = []

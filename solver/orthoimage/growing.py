@@ -77,12 +77,18 @@ class GrowingOrthoimage:
         return self._measured
 
     def set_ground(self, rays: Rays, grid: GroundGrid, surface: Surface) -> None:
-        """What lines are rectified with from now on; rays and grid stay as they were first."""
+        """What lines are rectified with from now on; rays (but for `set_rays`) and grid stay as they were first."""
         if self._rays is None:
             self._rays, self.grid = rays, grid
         self._surface = surface
         if self._rectifier is not None:
             self._rectifier.surface = surface
+
+    def set_rays(self, rays: Rays) -> None:
+        """Rays of the same pixels with another calibration, for lines that come from now on."""
+        self._rays = rays
+        if self._rectifier is not None:
+            self._rectifier.rays = rays
 
     def add_pose(self, time_s: float, position_l: Array, quaternion: Array, covariance: Array, smoothed: bool) -> bool:
         """A measured pose; False for one that comes too late."""

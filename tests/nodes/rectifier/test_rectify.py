@@ -18,7 +18,7 @@ from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
 from triline.nodes.cli import main
-from triline.nodes.convert import ground_point_message, time_ns
+from triline.nodes.convert import camera_from, camera_message, estimated_camera, ground_point_message, time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.dem import dem_in_frame, read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
@@ -563,6 +563,31 @@ def test_node_gives_the_same_bytes_again(flown, folder):
             for p in (flown, again)
         )
         assert one == other and len(one) > 5
+
+
+def test_node_draws_with_the_camera_that_goes_with_the_orientations(flown):
+    """Parameters in the reports move the final orthoimage as much as a camera that has them in its pixels."""
+    reader = RecordingReader(flown)
+    told = [m.ParameterEstimate(name="dc", value=0.05), m.ParameterEstimate(name="yp_N", value=0.1)]
+    camera, n = estimated_camera(camera_from(reader.first("configuration/camera")), told)
+    assert n == 2
+    tiles = {}
+    for name in ("stated", "reported", "calibrated"):
+        node, newest = Rectifier(), {}
+        for message in reader.sorted_messages([*node.inputs]):
+            if message.topic == "configuration/camera" and name == "calibrated":
+                message = replace(message, body=camera_message(camera))
+            elif message.topic == "adjustment/report":
+                del message.body.parameters[:]
+                message.body.parameters.extend(told if name == "reported" else ())
+            newest |= {(t.body.row, t.body.column): t.body for t in node.step(message) if t.topic.endswith("final")}
+        newest |= {(t.body.row, t.body.column): t.body for t in node.finish() if t.topic.endswith("final")}
+        tiles[name] = {key: np.frombuffer(body.data, np.uint8) for key, body in newest.items()}
+    assert tiles["reported"].keys() == tiles["calibrated"].keys()
+    for key, tile in tiles["calibrated"].items():
+        np.testing.assert_array_equal(tiles["reported"][key], tile)
+    common = tiles["stated"].keys() & tiles["reported"].keys()
+    assert max((tiles["stated"][key] != tiles["reported"][key]).mean() for key in common) > 0.3
 
 
 def test_node_draws_no_lines_by_poses_that_are_not_valid(flown):
