@@ -18,7 +18,7 @@ from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ...solver.orthoimage.heights_of_points import heights_of_points
 from ...solver.orthoimage.mosaic import Mosaic
-from ...solver.orthoimage.orientation import LineOrientation
+from ...solver.orthoimage.orientation import SAME_S, LineOrientation
 from ...solver.orthoimage.strip import StripRectifier, rays_of
 from ...solver.orthoimage.surface import HeightField, Surface
 from ...solver.simulation.flight import Flight
@@ -246,7 +246,8 @@ def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrient
         position = frame.from_geodetic(*track.geodetic.T)
         R, time_ns = R_lc_from_navigation(frame, position, track.rpy), track.time_ns
     spans = [int(message.body.first_line_time_ns) for message in recording.messages("configuration/strip")]
-    if not any(time_ns[0] <= start <= time_ns[-1] for start in spans):
+    rounded_ns = round(SAME_S * convert.SECOND_NS)
+    if not any(time_ns[0] - rounded_ns <= start <= time_ns[-1] + rounded_ns for start in spans):
         raise UserError(f"{path}: its times do not reach the strips of {recording.reader.path}, wanted the same flight")
     seconds = (time_ns - time_ns[0]) * 1e-9
     gap_s = max(0.3, 2.5 * float(np.median(np.diff(seconds))))

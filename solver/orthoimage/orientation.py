@@ -13,6 +13,9 @@ Mask = NDArray[np.bool_]
 
 #: Measured poses farther apart than this have a gap between them; refined ones reach so far beyond the last, s.
 GAP_S, REACH_S = 0.3, 1.0
+#: A line so close to a measured pose was taken from there, s: tables state times to a microsecond, and seconds since
+#: 1970 are known to a tenth of it.
+SAME_S = 1e-6
 
 
 class LineOrientation:
@@ -98,7 +101,7 @@ class LineOrientation:
 
     def covers(self, time_s: ArrayLike) -> Mask:
         """Which times (n,) have an orientation; where there is refined orientation at all, a refined one."""
-        t = np.asarray(time_s, dtype=float)
+        t = self._on_poses(np.asarray(time_s, dtype=float))
         good = self._measured_at(t)
         if self._knots is not None:
             knots = self._knots[0]
@@ -115,7 +118,7 @@ class LineOrientation:
         ------
         ValueError : a time outside the measured poses
         """
-        t = np.asarray(time_s, dtype=float)
+        t = self._on_poses(np.asarray(time_s, dtype=float))
         poses = self.measured.at(t)
         position, angles = poses.position_l, poses.angles
         if self._knots is not None:
@@ -125,6 +128,15 @@ class LineOrientation:
         return position, matrix_from_angles(*angles.T)
 
     def _measured_at(self, t: Array) -> Mask:
+        """Whether times have a measured pose, or lie between two without a gap."""
         times = self.measured.time_s
         i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-        return self.measured.covers(t) & (times[i + 1] - times[i] <= self._gap_s)
+        there = (t == times[i]) | (t == times[i + 1])
+        return there | (self.measured.covers(t) & (times[i + 1] - times[i] <= self._gap_s))
+
+    def _on_poses(self, t: Array) -> Array:
+        """Times; those of measured poses where they are the same but for their rounding."""
+        times = self.measured.time_s
+        after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
+        nearest = np.where(t - times[after - 1] < times[after] - t, times[after - 1], times[after])
+        return np.where(np.abs(nearest - t) <= SAME_S, nearest, t)

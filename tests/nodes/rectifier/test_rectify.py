@@ -7,6 +7,7 @@ import json
 import struct
 from dataclasses import replace
 from datetime import datetime
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -204,6 +205,18 @@ def test_a_table_of_lines_comes_back_with_the_camera_of_its_orientation(flown, f
     assert main(["export", str(flown), "--per-line", str(table), "--orientation", "measured", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["camera"] is None
     assert not (folder / "exported" / "lines_camera.json").exists()
+
+
+def test_no_line_of_a_table_is_left_out_for_the_rounding_of_its_time(flown, folder, capsys):
+    table = folder / "rounded" / "lines.csv"
+    table.parent.mkdir()
+    assert main(["export", str(flown), "--per-line", str(table), "-q"]) == 0
+    rows = [row.split(",") for row in table.read_text().splitlines()]
+    for row, off in ((rows[1], "0.000000400"), (rows[-1], "-0.000000400")):
+        row[2] = str(Decimal(row[2]) + Decimal(off))
+    table.write_text("".join(",".join(row) + "\n" for row in rows))
+    told = _rectify(capsys, flown, folder / "rounded.tif", "--trajectory", table, "--height", 0)
+    assert told["strips"] == {"S1": len(rows) - 1} and not told["left_out"]
 
 
 def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):

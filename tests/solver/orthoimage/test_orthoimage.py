@@ -456,6 +456,17 @@ def test_refined_orientation_keeps_the_motion_between_its_poses():
     assert gap.covers(np.array([0.05, 1.0, 2.05])).tolist() == [True, False, True]
 
 
+def test_lines_of_a_table_have_its_orientation_to_the_ends_of_strips():
+    """A table of lines with a gap between strips; seconds since 1970 are known to a tenth of a microsecond."""
+    t = np.array([0.0, 0.1, 0.2, 5.0, 5.1, 5.2])
+    position = np.arange(18.0).reshape(6, 3)
+    table = LineOrientation(t, position, np.tile([0, 0, 0, 1.0], (6, 1)))
+    for rounding in (0.0, 1.2e-7, -1.2e-7):
+        assert table.covers(t + rounding).all()
+        np.testing.assert_array_equal(table.at(t + rounding)[0], position)
+    assert not table.covers(np.array([-1e-5, 0.20001, 4.99999, 5.20001])).any()
+
+
 def test_relief_from_points():
     rng = np.random.default_rng(10)
     xy = rng.uniform(-1000, 1000, (400, 2))
