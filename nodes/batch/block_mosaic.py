@@ -24,7 +24,15 @@ from ...solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance
 from ...solver.rectification.grid import transformer_to
 from ..errors import UserError
 from ..formats.geojson import write_line_features
-from ..formats.geotiff import SIGMA_BANDS, Raster, TilePlace, cloud_optimised, write_tile, write_virtual
+from ..formats.geotiff import (
+    SIGMA_BANDS,
+    Raster,
+    TilePlace,
+    cloud_optimised,
+    is_virtual,
+    write_tile,
+    write_virtual,
+)
 from ..formats.new_file import new_file
 from .mosaic_jobs import Job, Workers, read_json, write_json
 from .mosaic_layers import Layer, Window, sigma_of_layer, windows_of_layers
@@ -516,11 +524,11 @@ def _nodes_along(corners: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArr
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files of a mosaic.
+    """Files of a mosaic; each raster is a cloud-optimised GeoTIFF, or with the ending ``.vrt`` virtual, over the tiles.
 
     Attributes
     ----------
-    mosaic : a cloud-optimised GeoTIFF, or with the ending ``.vrt`` a virtual raster over the tiles
+    mosaic : grey values
     source : which layer each cell is mostly of, 1 for the first
     seams : the seam lines, GeoJSON
     sigma : in the plane and of the height, m; None without
@@ -530,6 +538,11 @@ class Outputs:
     source: Path
     seams: Path
     sigma: Path | None
+
+    @property
+    def need_tiles(self) -> bool:
+        """Whether one of them shows the tiles, which then have to stay."""
+        return any(path is not None and is_virtual(path) for path in (self.mosaic, self.source, self.sigma))
 
 
 def put_together(
@@ -567,7 +580,7 @@ def put_together(
             TilePlace(_file(folder, "tiles", k, end), k[0] * size - row, k[1] * size - column, size, size)
             for k in filled
         ]
-        if outputs.mosaic.suffix == ".vrt":
+        if is_virtual(path):
             tiles = [replace(tile, path=Path(os.path.abspath(tile.path))) for tile in tiles]
             write_virtual(Path(os.path.abspath(path)), about, tiles)
         else:

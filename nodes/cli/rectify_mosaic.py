@@ -38,6 +38,7 @@ from ..batch.mosaic_layers import (
 )
 from ..batch.rectification import Rectification, line_blocks
 from ..errors import UserError
+from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
 from ..formats.new_file import refuse_unless_file
 from ..formats.stac import write_stac_item
@@ -127,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     result["continued"] = before + counts["done before"] if continued else 0
     if args.stac is not None:
         write_stac_item(args.stac, outputs.mosaic, crs, gsd, done, result, _assets(outputs))
-    if not args.keep and outputs.mosaic.suffix != ".vrt":
+    if not args.keep and not outputs.need_tiles:
         remove_parts(folder)
     result["seconds"] = round(time.perf_counter() - begun, 3)
     _tell(result, args)
@@ -135,9 +136,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _outputs(args: argparse.Namespace) -> Outputs:
-    stem = args.output.with_suffix("")
+    stem, ending = args.output.with_suffix(""), ".vrt" if is_virtual(args.output) else ".tif"
     return Outputs(
-        args.output, args.source or Path(f"{stem}.source.tif"), args.seam_lines or Path(f"{stem}.seams.geojson"),
+        args.output, args.source or Path(f"{stem}.source{ending}"), args.seam_lines or Path(f"{stem}.seams.geojson"),
         None if args.sigma is None else Path(args.sigma),
     )  # fmt: skip
 

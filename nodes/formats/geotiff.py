@@ -279,6 +279,11 @@ class TilePlace:
     columns: int
 
 
+def is_virtual(path: Path) -> bool:
+    """Whether a raster of that name is a virtual one."""
+    return path.suffix.lower() == ".vrt"
+
+
 def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
     """A virtual raster (VRT of GDAL) over tiles, with paths as seen from its folder.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.rectification.grid import transformer_to
+from .geotiff import is_virtual
 from .new_file import new_file
 
 Array = NDArray[np.floating]
@@ -56,7 +57,6 @@ def write_stac_item(
     )
     lon, lat = transformer_to(crs).transform(x, y, direction="INVERSE")
     geometry, bbox = _footprint(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
-    raster = _VRT if mosaic.suffix == ".vrt" else _COG
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     epsg = pyproj.CRS.from_user_input(crs).to_epsg()
     item = {
@@ -73,8 +73,8 @@ def write_stac_item(
         "links": [],
         "assets": {
             name: {
-                "href": os.path.relpath(file, path.parent), "type": _LINES if name == "seams" else raster,
-                "roles": _ROLES[name],
+                "href": os.path.relpath(file, path.parent), "roles": _ROLES[name],
+                "type": _LINES if name == "seams" else _VRT if is_virtual(file) else _COG,
             }
             for name, file in assets.items() if file is not None
         },

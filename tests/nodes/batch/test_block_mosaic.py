@@ -197,6 +197,24 @@ def test_virtual_mosaic_of_tiles(block, made, tmp_path):
         assert (virtual.read(1) > 0).sum() == (whole.read(1) > 0).sum()
 
 
+@pytest.mark.parametrize("ending", ["tif", "vrt"])
+def test_each_raster_is_what_its_ending_says(block, made, tmp_path, capsys, ending):
+    """Also the one whose name nobody gave; tiles stay where one of them shows them."""
+    target = tmp_path / f"block.{ending}"
+    words = ["--workers", "1", "--json", "--stac", str(tmp_path / "item.json")]
+    named = ["--source", str(tmp_path / "source.vrt")] if ending == "tif" else []
+    assert main(_mosaic(block, target, *words, *named)) == 0
+    told = json.loads(capsys.readouterr().out)
+    assets = json.loads((tmp_path / "item.json").read_text())["assets"]
+    for name, of_whole in (("mosaic", "tif"), ("source", "source.tif"), ("sigma", "sigma.tif")):
+        virtual = told[name].endswith(".vrt")
+        assert assets[name]["type"] == ("application/xml" if virtual else assets["sigma"]["type"])
+        with rasterio.open(told[name]) as raster, rasterio.open(made.with_suffix(f".{of_whole}")) as whole:
+            assert raster.driver == ("VRT" if virtual else "GTiff")
+            np.testing.assert_array_equal(raster.read(1), whole.read(1))
+    assert told["source"] == str(tmp_path / ("source.vrt" if ending == "tif" else "block.source.vrt"))
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
