@@ -30,6 +30,7 @@ from ..formats.line_orientation import OrientedLines
 from ..formats.projection import refuse_missing_grids
 from ..formats.trajectory_csv import read_local_poses, read_trajectory_csv
 from ..recording.access import PoseTable, Recording
+from ..voices import VERDICT, RecordedVoices
 
 Array = NDArray[np.floating]
 
@@ -254,12 +255,31 @@ def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrient
     return LineOrientation(seconds, position, quaternion_from_matrix(R), gap_s), int(time_ns[0])
 
 
-def known_points(recording: Recording) -> Array:
-    """(n, 3) local coordinates of object points as adjusted last, and of ground control with a height."""
+def _ground_with_height(recording: Recording) -> dict[str, Any]:
+    """Ground control with a height that counts, by name: not what nodes or an operator refused in flight, nor points of
+    which the adjuster left a coordinate out."""
     points: dict[str, Any] = {}
-    for message in recording.messages("observation/control"):
-        if convert.role_of(message.body) != "planimetric":
-            points[message.body.point] = message.body
+    refused: set[str] = set()
+    left_out: set[tuple[str, str]] = set()
+    messages = recording.messages("observation/control", VERDICT, "adjustment/report")
+    for message in RecordedVoices().all_used(messages):
+        body = message.body
+        if message.topic == "observation/control":
+            points[body.point] = body
+        elif message.topic == "adjustment/report":
+            left_out |= {(r.point, r.coordinate) for r in body.rejected if r.coordinate}
+            left_out -= {(r.point, r.coordinate) for r in body.returned}
+        elif not body.topic:
+            (refused.discard if body.accepted else refused.add)(body.point)
+    refused |= {point for point, _ in left_out}
+    return {
+        name: body for name, body in points.items() if name not in refused and convert.role_of(body) != "planimetric"
+    }
+
+
+def known_points(recording: Recording) -> Array:
+    """(n, 3) local coordinates of object points as adjusted last, and of ground control with a height that counts."""
+    points = _ground_with_height(recording)
     for message in recording.messages("point/object"):
         points[message.body.point] = message.body
     xyz = np.array([(p.x, p.y, p.z) for p in points.values()]).reshape(-1, 3)

@@ -54,6 +54,7 @@ class Rectifier(Node):
         "sensor/lines/*",
         *POSES,
         "observation/control",
+        "observation/verdict",
         "orientation/live",
         "orientation/final",
         "point/object",
@@ -95,7 +96,8 @@ class Rectifier(Node):
         self._next_line: dict[str, int] = {}
         self._rest: WaitingLines | None = None
         self._heights: dict[str, tuple[float, float, float]] = {}
-        self._control: list[float] = []
+        self._control: dict[str, float] = {}
+        self._refused: set[str] = set()  # control that an operator refused
         self._next_relief_s = -np.inf
         self._surface: Surface | None = None
         self._mean_m = 0.0
@@ -154,12 +156,15 @@ class Rectifier(Node):
                 image.add_refined(self._seconds(sample.time_ns), sample.position_l, sample.quaternion)
         elif topic == "adjustment/report":
             self._parameters = body.parameters or self._parameters
+        elif topic == "observation/verdict":
+            if not body.topic:
+                (self._refused.discard if body.accepted else self._refused.add)(body.point)
         elif np.isfinite([body.x, body.y, body.z]).all():
             if topic == "point/object":
                 self._heights.pop(body.point, None)
                 self._heights[body.point] = body.x, body.y, body.z
             elif convert.role_of(body) in ("control", "height"):
-                self._control.append(body.z)
+                self._control[body.point] = body.z
 
     def _configure(self, body: Any, stamp_ns: int) -> None:
         if body == self._camera_body:
@@ -272,7 +277,8 @@ class Rectifier(Node):
         for old in list(self._heights)[: max(len(self._heights) - MOST_POINTS, 0)]:
             del self._heights[old]
         heights = np.array(list(self._heights.values())).reshape(-1, 3)
-        known = heights[:, 2] if len(heights) else np.array(self._control)
+        control = [z for point, z in self._control.items() if point not in self._refused]
+        known = heights[:, 2] if len(heights) else np.array(control)
         self._mean_m = float(np.median(known)) if len(known) else 0.0
         self._surface = Ellipsoid(frame, frame.height_m + self._mean_m)
         if len(heights) >= LEAST_POINTS:

@@ -538,6 +538,43 @@ def test_relief_is_of_points_with_a_height(tmp_path):
     assert work.known_points(Recording(tmp_path / "control.mcap"))[:, 2].tolist() == [100.0, 102.0, 103.0]
 
 
+def test_control_that_does_not_count_is_no_ground(tmp_path):
+    """Refused by an operator, of another source, left out by the adjuster; what came back counts."""
+    path = tmp_path / "control.mcap"
+    with RecordingWriter(path) as writer:
+        for k, name in enumerate(("good", "refused", "confirmed", "left out", "returned")):
+            body = ground_point_message(name, (10.0 * k, 0.0, 100.0 + k), np.eye(3), "control")
+            writer.write(Message("observation/control", k, body, "survey"))
+        other = ground_point_message("good", (0.0, 0.0, 900.0), np.eye(3), "control")
+        writer.write(Message("observation/control", 10, other, "somebody"))
+        for k, (name, accepted) in enumerate((("refused", False), ("confirmed", False), ("confirmed", True))):
+            writer.write(Message("observation/verdict", 20 + k, m.Verdict(point=name, accepted=accepted), "desk"))
+        out = [m.RejectedObservation(point=name, coordinate="Z") for name in ("left out", "returned")]
+        writer.write(Message("adjustment/report", 30, m.AdjustmentReport(rejected=out), "adjuster"))
+        writer.write(Message("adjustment/report", 31, m.AdjustmentReport(returned=out[1:]), "adjuster"))
+    assert work.known_points(Recording(path))[:, 2].tolist() == [100.0, 102.0, 104.0]
+
+
+def test_node_takes_no_height_of_control_that_an_operator_refused(flown):
+    """Before there are object points the ground is a plane at the height of control."""
+    reader, heights = RecordingReader(flown), []
+    for verdict in (False, True):
+        node, tiles = Rectifier(), []
+        for message in reader.sorted_messages([*node.inputs]):
+            if message.topic == "point/object":
+                continue
+            if message.topic == "observation/control":
+                message.body.role = m.GroundPoint.CHECK
+                wrong_point = ground_point_message("wrong", (0.0, 0.0, 400.0), np.eye(3), "control")
+                tiles += node.step(replace(message, body=wrong_point))
+                if verdict:
+                    no = m.Verdict(point="wrong", accepted=False)
+                    tiles += node.step(Message("observation/verdict", message.stamp_ns, no, "desk"))
+            tiles += node.step(message)
+        heights.append({tile.body.z for tile in tiles if tile.topic == "orthoimage/live"})
+    assert heights == [{400.0}, {0.0}]
+
+
 # ---- the node
 
 
