@@ -103,6 +103,10 @@ class Voices:
         self._flying = self._flying or family is Family.SENSOR
         return self._voiced(message, family)
 
+    def chosen(self, topic: str) -> str:
+        """The source of a topic that an operator has named; "" where nobody has."""
+        return self._chosen.get(topic, "")
+
     def alarm(self, now_ns: int) -> str:
         """The newest reason for alarm at a platform time; "" without one."""
         if not self._held:
@@ -250,6 +254,10 @@ class RecordedVoices:
                 if n > 1:
                     self.left_out[topic] = n - 1, text
         return heard.pass_on
+
+    def chosen(self, topic: str) -> str:
+        """The source of a topic that an operator has named; "" where nobody has."""
+        return self._voices.chosen(topic)
 
     def all_used(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The same for many messages."""

@@ -21,6 +21,7 @@ from ..bus.program import ProgramOptions
 from ..errors import UserError
 from ..recording.reader import RecordingReader
 from ..recording.runner import active_nodes, is_remade
+from ..voices import FIXED, VERDICT, RecordedVoices
 
 SECOND_NS = 1_000_000_000
 #: Between the end of a recording and its next round, platform time.
@@ -84,7 +85,8 @@ def play(
     publish : puts a message on the bus
     stop : ends it
     rate : speed, 0 = as fast as it goes
-    from_ns, to_ns : platform time to play, ends included; configuration and control from before are played always
+    from_ns, to_ns : platform time to play, ends included; of what was said before, what holds then is played always:
+        configuration, control, and an operator's verdicts
     loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names
     everything : also what nodes make anew
     start : tells this run from others in the envelopes
@@ -98,7 +100,8 @@ def play(
     left = np.isin(channel, list(leave_out))
     for id, count in zip(*np.unique(channel[left], return_counts=True), strict=True):
         result.left_out[reader.channels[int(id)].topic] += int(count)
-    head, body = _split(reader, numbers[~left], from_ns, to_ns)
+    before, body = _split(reader, numbers[~left], from_ns, to_ns)
+    head = _holding(reader, before)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):
@@ -108,8 +111,8 @@ def play(
     starts = _Starts(start)
     while not stop.is_set():
         shift_ns = result.rounds * span_ns
-        for number in head:
-            _publish(reader.raw(int(number)), publish, starts, shift_ns, result)
+        for raw in head:
+            _publish(raw, publish, starts, shift_ns, result)
         stop.wait(settle_s if result.rounds == 0 else 0.0)
         times = reader.index.receive_ns[body]
         pacer = Pacer(rate, stop)
@@ -132,19 +135,43 @@ def play(
 
 
 def _split(reader: RecordingReader, numbers: Any, from_ns: int | None, to_ns: int | None) -> tuple[Any, Any]:
-    """Numbers of the latched messages to send at once, and of the others in order of reception."""
+    """Numbers of what was said before, to be sent at once, and of the others; both in order of reception."""
     index = reader.index
     ordered = numbers[np.argsort(index.receive_ns[numbers], kind="stable")]
-    latched = np.array([topics.find(reader.channels[int(c)].topic).latched for c in index.channel[ordered]], dtype=bool)
+    names = [reader.channels[int(c)].topic for c in index.channel[ordered]]
+    latched = np.array([topics.find(name).latched for name in names], dtype=bool)
+    verdict = np.array([name == VERDICT for name in names], dtype=bool)
     stamps = index.stamp_ns[ordered]
     timed = np.flatnonzero(~latched)
     begin = stamps[timed].min() if len(timed) else 0
     begin = max(begin, from_ns) if from_ns is not None else begin
-    at_once = latched & (stamps <= begin)
+    at_once = (latched & (stamps <= begin)) | (verdict & (stamps < begin))
     inside = ~at_once & (stamps >= begin)
     if to_ns is not None:
         inside &= stamps <= to_ns
     return ordered[at_once], ordered[inside]
+
+
+def _holding(reader: RecordingReader, before: Any) -> list[RawMessage]:
+    """What nodes have to hear to begin with what was said before a flight's part.
+
+    Nodes that have not flown yet take any project and camera, so those that were refused in flight are left out; and
+    they do not know what a verdict on a topic was about, so it names the source that it let in.
+    """
+    voices, used, named = RecordedVoices(), set(), {}
+    for message in reader.decode(reader.sort(np.union1d(before, reader.first_flown()))):
+        used |= {(one.topic, one.source, one.start, one.sequence) for one in voices.used(message)}
+        if message.topic == VERDICT and message.body.accepted and not message.body.HasField("clock_s"):
+            message.body.publisher = message.body.publisher or voices.chosen(message.body.topic)
+            named[message.source, message.start, message.sequence] = codec.encode(message.body)
+    head = []
+    for number in before:
+        raw = reader.raw(int(number))
+        key = raw.envelope.source, raw.envelope.start, raw.envelope.sequence
+        if raw.topic in FIXED and (raw.topic, *key) not in used:
+            continue
+        head.append(raw._replace(data=named.get(key, raw.data)) if raw.topic == VERDICT else raw)
+    return head
 
 
 class _Starts:

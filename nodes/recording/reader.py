@@ -404,12 +404,15 @@ class RecordingReader:
         message = next(iter(self.decode(numbers[::-1])), None)
         return None if message is None else message.body
 
-    def _last_used(self, topic: str) -> Any | None:
+    def first_flown(self) -> NDArray[np.int64]:
+        """Numbers of the first message of each channel that tells that a flight has begun."""
         flown = [c.id for c in self.channels.values() if c.known and topics.begins_flight(c.topic)]
         numbers = np.flatnonzero(np.isin(self.channel_of, flown))
-        firsts = numbers[np.unique(self.channel_of[numbers], return_index=True)[1]]
+        return numbers[np.unique(self.channel_of[numbers], return_index=True)[1]]
+
+    def _last_used(self, topic: str) -> Any | None:
         voices, body = RecordedVoices(), None
-        for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), firsts))):
+        for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), self.first_flown()))):
             for used in voices.used(message):
                 if used.topic == topic:
                     body = used.body

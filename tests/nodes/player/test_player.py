@@ -1,0 +1,70 @@
+"""What `triline replay` puts on the bus of a part of a flight."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import sample_messages as sample
+
+from triline.nodes.node import Message
+from triline.nodes.player.player import play
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
+from triline.nodes.voices import Voices
+from triline.schemas import codec
+from triline.schemas import messages as m
+
+SECOND_NS = 10**9
+EPOCH_NS = 1_700_000_000 * SECOND_NS
+
+
+@pytest.fixture
+def flight(tmp_path):
+    """An operator refuses a point, lets a second receiver in and says its clock; nobody confirms another project."""
+    project, control = sample.body("configuration/project"), sample.body("observation/control")
+    rows = [(0, "configuration/project", project, "fly"), (0, "observation/control", control, "survey")]
+    for t in range(1, 12):
+        rows += [(t, "sensor/gnss", sample.body("sensor/gnss"), name) for name in ("first", "second") if t != 9]
+    rows.append((9, "sensor/gnss", sample.body("sensor/gnss"), "second"))
+    other = type(project)()
+    other.CopyFrom(project)
+    other.image_sigma_px = 7.0
+    rows += [
+        (4, "observation/verdict", m.Verdict(point=control.point, accepted=False, by="Eva"), "confirm"),
+        (5, "observation/verdict", m.Verdict(topic="sensor/gnss", accepted=True), "confirm"),
+        (6, "observation/verdict", m.Verdict(topic="sensor/gnss", accepted=True, clock_s=0.1), "confirm"),
+        (7, "configuration/project", other, "fly"),
+        (10, "observation/verdict", m.Verdict(topic="configuration/project", accepted=True), "confirm"),
+    ]
+    path = tmp_path / "flight.mcap"
+    with RecordingWriter(path) as writer:
+        for t, topic, body, source in sorted(rows, key=lambda row: row[0]):
+            writer.write(Message(topic, EPOCH_NS + t * SECOND_NS, body, source))
+    return RecordingReader(path)
+
+
+def _used(messages):
+    """What nodes take of messages: stamp, topic, source, content."""
+    voices = Voices()
+    used = [one for message in messages for one in voices.hear(message).pass_on]
+    return [(one.stamp_ns, one.topic, one.source, one.body.SerializeToString(deterministic=True)) for one in used]
+
+
+def test_a_part_of_a_flight_begins_with_what_holds_then(flight):
+    """Nodes take the same of it as of the whole flight."""
+    for begin_s in (2, 5, 6, 8):
+        begin_ns, played = EPOCH_NS + begin_s * SECOND_NS, []
+        play(flight, played.append, threading.Event(), rate=0.0, from_ns=begin_ns, settle_s=0.0, everything=True)
+        heard = []
+        for raw in played:
+            e = raw.envelope
+            heard.append(Message(raw.topic, e.stamp_ns, codec.decode(raw.topic, raw.data), e.source, e.sequence, 0))
+        whole, part = _used(flight.sorted_messages()), _used(heard)
+        wanted, found = ([row for row in rows if row[0] >= begin_ns] for rows in (whole, part))
+        last = {(topic, source) for _, topic, source, _ in wanted}
+        if begin_s > 7:  # what is said of a change before is lost with it
+            wanted = [row for row in wanted if row[1] != "configuration/project"]
+        assert ("sensor/gnss", "second") in last and found == wanted
+        before = {row[1:] for row in part if row[0] < begin_ns}
+        assert before == {row[1:] for row in whole if row[0] < begin_ns and row[1] != "sensor/gnss"}
