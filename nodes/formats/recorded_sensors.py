@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.inertial_cleaning import Finding
@@ -90,21 +91,26 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
             platform = replace(platform, wander_time_s=project.wander_time_s)
     fixes = _fixes([message.body for message in fixes_of], start_ns)
     if corrections:
-        added_s = _added_to_times(fixes_of, corrections, notes)
+        said = ", then ".join(f"{c.body.clock_s:+.3f} s ({c.body.by or 'an operator'})" for c in corrections)
+        notes.append(f"sensor/gnss: times of fixes are corrected as was said in flight, from the start on: {said}")
+        added_s = added_to_times([message.stamp_ns for message in fixes_of], corrections)
         fixes = replace(fixes, time_s=fixes.time_s + added_s)
     offset_s = start_ns / convert.SECOND_NS
     return RecordedSensors(path_of(path), time_s, rate, force, False, fixes, None, platform, notes, offset_s)
 
 
-def _added_to_times(fixes: list[Message], corrections: list[Message], notes: list[str]) -> NDArray[np.floating]:
+def added_to_times(stamps_ns: ArrayLike, corrections: Sequence[Message]) -> NDArray[np.floating]:
     """What an operator said in flight that is to be added to the times of fixes (n,), s: what holds from a verdict on
-    holds from the last one before it, and from the first one on it holds for what was before it, too."""
-    said = np.array([c.body.clock_s for c in corrections])
-    stamps = np.array([c.stamp_ns for c in corrections], dtype=np.int64)
-    which = np.searchsorted(stamps, [message.stamp_ns for message in fixes], side="right") - 1
-    told = ", then ".join(f"{c.body.clock_s:+.3f} s ({c.body.by or 'an operator'})" for c in corrections)
-    notes.append(f"sensor/gnss: times of fixes are corrected as was said in flight, from the start on: {told}")
-    return said[np.maximum(which, 0)]
+    holds from the last one before it, and from the first one on it holds for what was before it, too.
+
+    Parameters
+    ----------
+    stamps_ns : (n,) of the messages with the fixes
+    corrections : verdicts on the clock of ``sensor/gnss`` in order of their stamps; none = 0
+    """
+    said = np.array([c.body.clock_s for c in corrections] or [0.0])
+    stamps = np.array([c.stamp_ns for c in corrections] or [0], dtype=np.int64)
+    return said[np.maximum(np.searchsorted(stamps, stamps_ns, side="right") - 1, 0)]
 
 
 def _place_of_unit(arm: NDArray[np.floating]) -> str:

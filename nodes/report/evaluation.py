@@ -106,7 +106,7 @@ def triangulated(rows: dict[str, Any]) -> str | None:
 
 def ended_early(flight: Flight) -> list[dict[str, Any]]:
     """Strips whose planned end lies after that of the recording; for a strip that was ended its true length counts."""
-    measured = [convert.time_ns(g.timestamp) for g in flight.gnss[-1:]] + [a.time_ns for a in flight.attitude[-1:]]
+    measured = [*flight.gnss_ns[-1:].tolist(), *(a.time_ns for a in flight.attitude[-1:])]
     end_ns = max(measured, default=flight.end_ns)  # the end of the measurements, because results come after it
     found = []
     for id, strip in flight.strips.items():
@@ -163,11 +163,14 @@ def missing(flight: Flight) -> list[str]:
 
 
 def measured_poses(flight: Flight) -> PoseSeries | None:
-    """Orientation from the sensors alone: INS attitude, GNSS positions interpolated and reduced by the lever arm."""
+    """Orientation from the sensors alone: INS attitude, GNSS positions interpolated and reduced by the lever arm.
+
+    The clock of GNSS is as an operator corrected it in flight.
+    """
     if flight.project is None or len(flight.gnss) < 2 or not flight.attitude:
         return None
     frame = convert.local_frame(flight.project)
-    fixes = {convert.time_ns(g.timestamp): g for g in flight.gnss}
+    fixes = dict(zip(flight.gnss_ns.tolist(), flight.gnss, strict=True))
     fix_ns = np.array(sorted(fixes), dtype=np.int64)
     geodetic = np.array([[fixes[t].latitude, fixes[t].longitude, fixes[t].altitude] for t in fix_ns])
     antenna = frame.from_geodetic(*geodetic.T)

@@ -14,8 +14,9 @@ from ...schemas import messages as m
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
+from ..formats.recorded_sensors import added_to_times
 from ..node import Message
-from ..voices import RecordedVoices
+from ..voices import VERDICT, RecordedVoices
 
 Array = NDArray[np.floating]
 Key = tuple[str, str, str, int, int, str]
@@ -123,6 +124,7 @@ class Flight:
     start_ns : stamp of the first message that is not configuration; times in seconds count from it
     poses : by name, see POSE_TOPICS; names without messages are absent
     gnss, attitude : messages as measured, in order of arrival
+    gnss_ns : times of the fixes, UTC, as an operator corrected them in flight
     live_points, points, whole_points : first LIVE, last FINAL (or last LIVE, without one) and last WHOLE message of
         each object point
     ground : control and check points by id; refused_ground : those whose coordinates do not count on an operator's
@@ -141,6 +143,7 @@ class Flight:
     strips: dict[str, Any] = field(default_factory=dict)
     poses: dict[str, PoseSeries] = field(default_factory=dict)
     gnss: list[Any] = field(default_factory=list)
+    gnss_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     attitude: list[Any] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
     live_points: dict[str, Any] = field(default_factory=dict)
@@ -201,6 +204,8 @@ def collect(messages: Iterable[Message]) -> Flight:
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
+    fixed_ns: list[int] = []  # stamps of the fixes
+    clock: list[Message] = []  # what an operator said of it
     for message in messages:
         topic, stamp = message.topic, message.stamp_ns
         flight.counts[topic] += 1
@@ -214,8 +219,14 @@ def collect(messages: Iterable[Message]) -> Flight:
                 before += _forget_results(flight, rows)
             try:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
+                if used.topic == "sensor/gnss":
+                    fixed_ns.append(used.stamp_ns)
+                elif used.topic == VERDICT and used.body.topic == "sensor/gnss":  # others are the voices' own
+                    clock.append(used)
             except (ValueError, IndexError, np.linalg.LinAlgError):
                 flight.refused[used.topic] += 1
+    times = np.array([convert.time_ns(fix.timestamp) for fix in flight.gnss], dtype=np.int64)
+    flight.gnss_ns = times + np.rint(added_to_times(fixed_ns, clock) * convert.SECOND_NS).astype(np.int64)
     flight.not_used = voices.lines()
     if before:
         what = "poses and object points of before the project got another origin or CRS"

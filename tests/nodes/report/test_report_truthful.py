@@ -15,6 +15,7 @@ from synthetic_flight import flight_messages
 from triline.nodes import convert
 from triline.nodes.adjuster.pace import Pacing, pace_message
 from triline.nodes.cli import main
+from triline.nodes.node import Message
 from triline.nodes.report.accuracy_table import accuracy_lines
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight
@@ -229,6 +230,24 @@ def test_measurements_that_nodes_refuse_are_unusable_here_too(messages, topic, f
     found = evaluate_flight(flight)["orientation"]["measured"]
     assert found["rmse_m"] == pytest.approx(right["rmse_m"], rel=0.05)
     assert found["rmse_deg"] == pytest.approx(right["rmse_deg"], rel=0.05)
+
+
+def test_measured_orientation_has_the_clock_that_an_operator_said(messages):
+    """Fixes half a second late, and the word on it in the middle of the flight, which holds for all of them."""
+    late = []
+    for message in messages:
+        if message.topic == "sensor/gnss":
+            body = type(message.body).FromString(message.body.SerializeToString())
+            convert.set_time(body.timestamp, convert.time_ns(body.timestamp) + 5 * 10**8)
+            message = replace(message, body=body)
+        late.append(message)
+    right, wrong = (evaluate_flight(collect(told))["orientation"]["measured"] for told in (messages, late))
+    assert np.hypot(*wrong["rmse_m"][:2]) > 30  # half a second of 70 m/s
+    middle = len(late) // 2
+    said = m.Verdict(topic="sensor/gnss", accepted=True, clock_s=-0.5, by="Ann")
+    late.insert(middle, Message("observation/verdict", late[middle].stamp_ns, said, "confirm"))
+    found = evaluate_flight(collect(late))["orientation"]["measured"]
+    assert found["rmse_m"] == pytest.approx(right["rmse_m"], rel=1e-6)
 
 
 # ---- info and the report
