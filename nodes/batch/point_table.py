@@ -34,7 +34,7 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
     UserError : no object points in the recording
     """
     best: dict[str, Any] = {}
-    for message in reader.sorted_messages(["point/object"]):
+    for message in reader.in_frame(reader.sorted_messages(["point/object"])):
         body = message.body
         if np.isfinite([body.x, body.y, body.z]).all() and (
             body.point not in best or body.status >= best[body.point].status

@@ -82,7 +82,8 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
     """
     path = recording.reader.path
     topics = (*(t for t in ORIENTATIONS.values() if not t.endswith("/")), "trajectory/filtered", "trajectory/smoothed")
-    held = {topic for topic in topics if len(recording.reader.select([topic])) > 1}
+    reader, begin_ns = recording.reader, recording.reader.frame_begins_ns()
+    held = {topic for topic in topics if (reader.index.stamp_ns[reader.select([topic])] >= begin_ns).sum() > 1}
     there = [key for key, topic in ORIENTATIONS.items() if any(h.startswith(topic) for h in held)]
     measured = any(h.startswith("trajectory/") for h in held)
     if not measured:  # refined orientation alone comes too seldom to carry the motion of the platform
@@ -280,7 +281,7 @@ def _ground_with_height(recording: Recording) -> dict[str, Any]:
 def known_points(recording: Recording) -> Array:
     """(n, 3) local coordinates of object points as adjusted last, and of ground control with a height that counts."""
     points = _ground_with_height(recording)
-    for message in recording.messages("point/object"):
+    for message in recording.reader.in_frame(recording.messages("point/object")):
         points[message.body.point] = message.body
     xyz = np.array([(p.x, p.y, p.z) for p in points.values()]).reshape(-1, 3)
     return xyz[np.isfinite(xyz).all(axis=1)]

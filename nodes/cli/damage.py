@@ -1,9 +1,10 @@
-"""The line with which a command reports a damaged recording that it can still work on."""
+"""Lines with which a command reports what of a recording it does not use."""
 
 from __future__ import annotations
 
 import sys
 
+from ..convert import iso
 from ..recording.reader import RecordingReader
 from ..recording.summary import damage_lines
 
@@ -13,3 +14,11 @@ def tell_damage(command: str, reader: RecordingReader) -> None:
     lines = damage_lines(reader)
     if lines:
         print(f"triline {command}: {reader.path}: {'; '.join(lines)}", file=sys.stderr)
+
+
+def tell_other_frame(command: str, reader: RecordingReader) -> None:
+    """The same where results are in another local frame than that of the project."""
+    begin_ns = reader.frame_begins_ns()
+    if begin_ns:
+        what = "poses and object points are in another local frame and left out: the project became another one then"
+        print(f"triline {command}: {reader.path}: before {iso(begin_ns)} {what}", file=sys.stderr)

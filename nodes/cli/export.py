@@ -41,7 +41,7 @@ from ..node import Message
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
 from ..recording.summary import damage_lines
-from .damage import tell_damage
+from .damage import tell_damage, tell_other_frame
 from .outputs import refuse_input_as_output
 
 EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientation.csv
@@ -139,6 +139,8 @@ def run(args: argparse.Namespace) -> int:
         **({"beside": beside} if beside else {}), "skipped": skipped, "damaged_stretches": len(reader.damage),
         "damage": damage_lines(reader),
     }  # fmt: skip
+    if kind not in _TABLES and _is_result(args.topic):
+        tell_other_frame("export", reader)
     if args.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -174,6 +176,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
     said = ", ".join(f"{v} {k}" for k, v in list(result.items())[2:])
     if args.per_line:
         result |= _write_camera(recording, name, target)
+    tell_other_frame("export", reader)
     if args.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -210,8 +213,15 @@ def _messages(reader: RecordingReader, args: argparse.Namespace) -> Iterator[Mes
 
 
 def _answers(reader: RecordingReader, args: argparse.Namespace) -> list[Message]:
-    """Every N-th of the messages that no other one about the same time or point replaces."""
-    return answers(args.topic, reader.sorted_messages([args.topic]))[:: args.every]
+    """Every N-th of the messages that no other one about the same time or point replaces, in the local frame of the
+    project."""
+    messages = reader.sorted_messages([args.topic])
+    return answers(args.topic, reader.in_frame(messages) if _is_result(args.topic) else messages)[:: args.every]
+
+
+def _is_result(topic: str) -> bool:
+    """Whether a topic carries poses or points that nodes computed in the local frame."""
+    return topics.find(topic).family is topics.Family.RESULT
 
 
 def _layout(args: argparse.Namespace) -> RowLayout:

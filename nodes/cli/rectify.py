@@ -18,7 +18,7 @@ from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
-from .damage import tell_damage
+from .damage import tell_damage, tell_other_frame
 from .progress import progress
 from .rectify_recording import cells_of, prepared
 
@@ -123,6 +123,7 @@ def run(args: argparse.Namespace) -> int:
     }  # fmt: skip
     _tell(result, done, args, grid.frame.units[0])
     tell_damage("rectify", recording.reader)
+    tell_other_frame("rectify", recording.reader)
     return 0
 
 

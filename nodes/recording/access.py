@@ -126,10 +126,13 @@ class Recording:
         return _spread(pd.DataFrame(rows))
 
     def poses(self, topic: str = "orientation/final") -> PoseTable:
-        """The poses of a topic that carries PoseInFrame messages, as arrays."""
+        """The poses of a topic that carries PoseInFrame messages, as arrays.
+
+        Those that are in another local frame, which a project before in the same flight had, are left out.
+        """
         if topics.find(self._check(topic)).type is not m.PoseInFrame:
             raise UserError(f"{self.reader.path}: {topic} carries {topics.find(topic).type_name}, not poses")
-        samples = [convert.pose_sample(message.body) for message in self.messages(topic)]
+        samples = [convert.pose_sample(message.body) for message in self.reader.in_frame(self.messages(topic))]
         n = len(samples)
         none = np.full((6, 6), np.nan)
         quaternion = np.array([s.quaternion for s in samples]).reshape(n, 4)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
+from ..convert import same_frame
 from ..errors import UserError
 from ..node import Message
 from ..voices import FIXED, VERDICT, RecordedVoices
@@ -31,6 +32,7 @@ from .index import CHANNEL_METADATA, Channel, Index, Recorded
 from .ranges import Ranged, open_ranged
 from .remote import RemoteFile, RemotePath, path_of
 
+_PROJECT = FIXED[0]
 #: Rows of the index that are looked up together.
 _TOGETHER = 8192
 #: Records that the index is made of; the others repeat it for readers that take the file as whole.
@@ -79,6 +81,7 @@ class RecordingReader:
         self.damage: list[scan.Damage] = []
         self.complete = False
         self.library = ""
+        self._frame_begins_ns: int | None = None
         self.problems: Counter[str] = Counter()
         self.last_problem = ""
         self._schemas: dict[int, tuple[int, str]] = {}
@@ -400,9 +403,25 @@ class RecordingReader:
         if topic in FIXED and len(numbers) > 1:
             bodies = [message.body for message in self.decode(numbers)]
             if any(body != bodies[0] for body in bodies):
-                return self._last_used(topic)
+                return self._last_used(topic)[0]
         message = next(iter(self.decode(numbers[::-1])), None)
         return None if message is None else message.body
+
+    def frame_begins_ns(self) -> int:
+        """Stamp from which on results are in the local frame of the project; 0 where it has been the same all along.
+
+        Another project that an operator lets in in flight may have another origin or CRS.
+        """
+        if self._frame_begins_ns is None:
+            bodies = [message.body for message in self.sorted_messages([_PROJECT])]
+            changes = any(not same_frame(body, bodies[0]) for body in bodies)
+            self._frame_begins_ns = self._last_used(_PROJECT)[1] if changes else 0
+        return self._frame_begins_ns
+
+    def in_frame(self, messages: Iterable[Message]) -> Iterator[Message]:
+        """Those of results that are in the local frame of the project."""
+        begin_ns = self.frame_begins_ns()
+        return (message for message in messages if message.stamp_ns >= begin_ns)
 
     def first_flown(self) -> NDArray[np.int64]:
         """Numbers of the first message of each channel that tells that a flight has begun."""
@@ -410,10 +429,13 @@ class RecordingReader:
         numbers = np.flatnonzero(np.isin(self.channel_of, flown))
         return numbers[np.unique(self.channel_of[numbers], return_index=True)[1]]
 
-    def _last_used(self, topic: str) -> Any | None:
-        voices, body = RecordedVoices(), None
+    def _last_used(self, topic: str) -> tuple[Any | None, int]:
+        """The last project or camera that nodes use; and when the local frame of a project was last given up, ns."""
+        voices, body, given_up_ns = RecordedVoices(), None, 0
         for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), self.first_flown()))):
             for used in voices.used(message):
                 if used.topic == topic:
+                    if topic == _PROJECT and body is not None and not same_frame(used.body, body):
+                        given_up_ns = used.stamp_ns
                     body = used.body
-        return body
+        return body, given_up_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from dataclasses import replace
@@ -11,7 +12,9 @@ import pytest
 from recording_file import write_recording
 from synthetic_flight import flight_messages
 
+from triline.nodes.batch.rectification import known_points
 from triline.nodes.cli import main, view
+from triline.nodes.convert import iso
 from triline.nodes.formats.block_recording import TOPICS, block_from_messages
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
@@ -79,6 +82,40 @@ def test_results_in_a_local_frame_that_was_given_up_are_left_out_and_told(messag
     assert block.strips[0].trajectory.start_s * SECOND + block.time_reference_ns > change
     (line,) = flight.not_used
     assert re.match(r"\d+ poses and object points of before the project got another origin or CRS", line)
+
+
+def test_exports_have_no_results_in_a_local_frame_that_was_given_up(messages, tmp_path, capsys):
+    """They would be drawn 11 km from where they are; what is left out is told."""
+    change = _said(messages, 16.0).stamp_ns
+    early = [x.topic == "point/object" and x.body.point < "P0050" for x in messages]
+    messages = [replace(x, stamp_ns=change - SECOND) if e else x for x, e in zip(messages, early, strict=True)]
+    path = write_recording(tmp_path / "said.mcap", [*messages, _moved(messages, 15.0), _said(messages, 16.0)])
+    after = {x.body.point for x in messages if x.topic == "point/object" and x.stamp_ns >= change}
+    assert after < {x.body.point for x in messages if x.topic == "point/object"}
+    told = f"before {iso(change)} poses and object points are in another local frame and left out"
+    for words in (["--points"], ["--per-line"], ["--topic", "trajectory/filtered", "--geojson"]):
+        target = tmp_path / "out"
+        assert main(["export", str(path), *words, str(target), "-q"]) == 0
+        assert told in capsys.readouterr().err
+        if words[-1] == "--geojson":
+            features = json.loads(target.read_text())["features"]
+            times = [f["properties"]["time_ns"] for f in features if f["geometry"]["type"] == "Point"]
+            assert len(times) > 100 and min(times) >= change
+            continue
+        rows = list(csv.DictReader(target.read_text().splitlines()))
+        if words[-1] == "--points":
+            assert {row["point"] for row in rows} == after
+        else:
+            assert min(float(row["time_s"]) for row in rows) * SECOND > change - 1000
+    assert Recording(path).poses("trajectory/filtered").time_ns.min() >= change
+    assert len(known_points(Recording(path))) < len(known_points(Recording(write_recording(tmp_path / "a", messages))))
+    # another project in the same frame changes nothing
+    same = _moved(messages, 15.0)
+    same.body.origin_latitude = _of(messages, "configuration/project").body.origin_latitude
+    same.body.image_sigma_px = 0.7
+    path = write_recording(tmp_path / "same.mcap", [*messages, same, _said(messages, 16.0)])
+    assert main(["export", str(path), "--points", str(tmp_path / "out"), "-q"]) == 0
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("undrawn")
