@@ -226,6 +226,7 @@ class _Watermark:
     lateness_ns: int
     grace_s: float
     on_events: bool
+    in_bursts: bool
     latest_ns: int
     heard_s: float
 
@@ -239,11 +240,12 @@ class Sequencer(Generic[T]):
     time, so that a machine that hesitates does not change the order. A topic on which something is said only now and
     then (control, strips) or in bursts holds nothing up while its publisher is heard on other topics: a session
     delivers in the order in which it was published, and the stamps of a source never go back from one of its topics to
-    the next. A topic without allowed lateness holds nothing up while nobody speaks on it: before it was heard, and
-    after its grace. What arrives after its place has passed leaves at once, and is called late. Observations may be
-    stamped ahead (when they are to be used), so they do not tell how far platform time is, unless nobody else does or a
-    steady stream has died. What only tells how far its publisher is is heard, and goes no further: who begins to speak
-    while others are already past what it says has told nothing wrong.
+    the next. A burst may go on with the stamp of what its publisher has said last on another topic. A topic without
+    allowed lateness holds nothing up while nobody speaks on it: before it was heard, and after its grace. What arrives
+    after its place has passed leaves at once, and is called late. Observations may be stamped ahead (when they are to
+    be used), so they do not tell how far platform time is, unless nobody else does or a steady stream has died. What
+    only tells how far its publisher is is heard, and goes no further: who begins to speak while others are already past
+    what it says has told nothing wrong.
 
     Parameters
     ----------
@@ -345,7 +347,7 @@ class Sequencer(Generic[T]):
             place = (topics.rank(topic), topic, envelope.source)
             lateness, grace_s = self._patience(row)
             on_events = row.in_bursts or row.rate_hz == 0
-            stream = _Watermark(place, lateness, grace_s, on_events, envelope.stamp_ns, now_s)
+            stream = _Watermark(place, lateness, grace_s, on_events, row.in_bursts, envelope.stamp_ns, now_s)
             self._streams[topic, envelope.source] = stream
         stream.latest_ns = max(stream.latest_ns, envelope.stamp_ns)
         said = envelope.stamp_ns, (topics.rank(topic), topic, envelope.source)
@@ -394,7 +396,9 @@ class Sequencer(Generic[T]):
                 continue
             bound = stream.latest_ns, stream.place
             if stream.on_events:
-                bound = max(bound, self._sources[stream.place[2]])
+                said = self._sources[stream.place[2]]
+                # two updates may have one stamp: the report of the first does not end the points of the second
+                bound = max(bound, min(said, (said[0], stream.place)) if stream.in_bursts else said)
             if silent:
                 bound = max(bound, ((newest_ns if stream.grace_s else time_ns) - stream.lateness_ns, stream.place))
             if bound < (stamp, place):

@@ -153,6 +153,25 @@ def test_reports_of_a_busy_adjuster_come_in_order_and_rare_ones_hold_nothing_up(
     assert max(w for (_, e), w in waited.items() if e.stamp_ns < begin + 2900 * MS) < 1600  # no longer than for live
 
 
+def test_two_updates_with_one_stamp_are_not_late():
+    """A strip is over, and the adjuster is silent on what is live; the second update's points come after the report of
+    the first."""
+    begin = 10**18
+    sequencer: Sequencer = Sequencer(Rectifier.inputs)
+    lines = [(t, "sensor/lines/N", Envelope(begin + t * MS, "s", t // 50)) for t in range(0, 6000, 50)]
+    told = [(t + 20, "orientation/live", Envelope(begin + t * MS, "a", t // 50)) for t in range(0, 1000, 50)]
+    for n, t in enumerate(range(0, 4000, 200)):
+        for k in (2 * n, 2 * n + 1):  # an update takes 70 ms; after the strip they come 1.5 s late
+            at = t + (20 if t < 1000 else 1500) + 70 * (k % 2)
+            told += [(at, name, Envelope(begin + t * MS, "a", k)) for name in ("point/object", "adjustment/report")]
+    late, out = [], []
+    for at, name, envelope in sorted(told + lines, key=lambda m: m[0]):
+        late += filter(None, [sequencer.push(name, envelope, (name, envelope), at * 1e-3)])
+        out += sequencer.pop(at * 1e-3)
+    assert not late and len(out) > 100
+    assert [envelope.stamp_ns for _, envelope in out] == sorted(envelope.stamp_ns for _, envelope in out)
+
+
 @pytest.mark.parametrize("topic", ["orientation/final", "point/object"])
 def test_the_orthoimage_may_get_the_end_of_a_strip_two_seconds_late(topic):
     """The adjuster has flown a strip and is silent on what is live; what became final at its end comes later."""
