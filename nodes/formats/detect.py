@@ -229,7 +229,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
-        if track.sigma_ned_m is None:
+        if not track.has_accuracies:
             notes.extend(_assumed(path, options.accuracy))
         strip = None
         if options.lines is not None:  # the images are the strip, not the poses

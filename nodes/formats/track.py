@@ -18,6 +18,7 @@ from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation, opk_cova
 from ...solver.geometry.rotation import (
     R_BC_NOMINAL,
     angles_from_matrix,
+    angles_jacobian,
     matrix_from_navigation,
     quaternion_from_matrix,
 )
@@ -76,10 +77,12 @@ class Accuracy:
         return np.diag(np.concatenate([self.position_m, np.radians(self.attitude_deg)])) ** 2
 
     def of_poses(self, covariance: Array | None, n: int) -> Array:
-        """(n, 6, 6) of n poses whose file gives covariances (n, 6, 6), or None; what is stated takes their place."""
+        """(n, 6, 6) of n poses whose file gives covariances (n, 6, 6), or None; what is stated takes their place, and
+        all of this that of those which are not known (NaN)."""
         if covariance is None:
             return np.broadcast_to(self.covariance, (n, 6, 6))
         out = covariance.copy()
+        out[~np.isfinite(covariance).all(axis=(1, 2))] = self.covariance
         for part, stated in ((slice(0, 3), self.position_stated), (slice(3, 6), self.attitude_stated)):
             if stated:
                 out[:, part, :] = out[:, :, part] = 0.0
@@ -98,6 +101,8 @@ class NavigationTrack:
     geodetic : (n, 3) latitude and longitude in degrees (WGS 84), height in metres
     rpy : (n, 3) roll, pitch, heading against true north, radians
     sigma_ned_m, sigma_rpy : (n, 3) or None; metres, radians
+    covariance_n : (n, 6, 6) or None, in their place: of the position along north, east and down, m, and of a small turn
+        about them, radians; NaN where it is not known
     line_rate_hz : image lines a second where each pose belongs to an image line, 0 otherwise
     notes : remarks of the reader
     """
@@ -110,9 +115,15 @@ class NavigationTrack:
     sigma_rpy: Array | None = field(default=None, repr=False)
     line_rate_hz: float = 0.0
     notes: tuple[str, ...] = ()
+    covariance_n: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    @property
+    def has_accuracies(self) -> bool:
+        """Whether the file says how good its poses are."""
+        return self.covariance_n is not None or (self.sigma_ned_m is not None and self.sigma_rpy is not None)
 
 
 def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
@@ -148,7 +159,7 @@ def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
         return _with_jumps(track, path)
     parts: dict[str, Any] = {
         name: None if getattr(track, name) is None else getattr(track, name)[rising]
-        for name in ("time_ns", "geodetic", "rpy", "sigma_ned_m", "sigma_rpy")
+        for name in ("time_ns", "geodetic", "rpy", "sigma_ned_m", "sigma_rpy", "covariance_n")
     }
     note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
     return _with_jumps(replace(track, **parts, notes=(*track.notes, note)), path)
@@ -219,6 +230,10 @@ def camera_poses(
     R_nb = matrix_from_navigation(*track.rpy.T)
     position = body_l + np.einsum("nij,njk,k->ni", R_ln, R_nb, np.asarray(mounting.lever_arm_m))
     R_lc = R_lc_from_navigation(frame, body_l, track.rpy, mounting.R_bc)
+    if track.covariance_n is not None:
+        T = np.zeros((len(track), 6, 6))
+        T[:, :3, :3], T[:, 3:, 3:] = R_ln, angles_jacobian(angles_from_matrix(R_lc)) @ R_ln
+        return position, R_lc, T @ track.covariance_n @ np.swapaxes(T, 1, 2)
     if track.sigma_ned_m is None or track.sigma_rpy is None:
         return position, R_lc, None
     covariance = np.zeros((len(track), 6, 6))

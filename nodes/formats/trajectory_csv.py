@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...solver.geometry.frames import CrsError, LocalFrame, navigation_from_R_lc
-from ...solver.geometry.rotation import matrix_from_angles
+from ...solver.geometry.rotation import angles_jacobian, matrix_from_angles
 from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column
 from .plausible import check_units
@@ -33,6 +33,7 @@ _OPK = ("omega_deg", "phi_deg", "kappa_deg")
 _PHOTOGRAMMETRIC = (*(place_column(name) for name in PLACE), *(Column(name) for name in _OPK))
 _NED = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
 _RPY = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
+_XYZ_OPK = tuple(f"sigma_{name}" for name in (*PLACE, *_OPK))
 _UNITS = {"deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad", "m": "m"}
 
 
@@ -55,7 +56,8 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
 
     Columns are ``lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg`` (or ``lat_rad``, ``Roll [rad]``: names state
     the unit) with optional sigmas as ``triline navigate`` writes them, or ``X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg``
-    in the CRS given, where its units may stand in the names (``X_deg``).
+    in the CRS given, where its units may stand in the names (``X_deg``), with optional sigmas along its axes as tables
+    of refined orientation have them (``sigma_X_m`` .. ``sigma_kappa_deg``, empty where they are not known).
 
     Parameters
     ----------
@@ -77,23 +79,30 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
     columns = [*time, *wanted]
     sigmas = (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
-    columns += [Column(name, low=0.0) for name in sigmas if name in header]
+    sigmas = _XYZ_OPK if photogrammetric else sigmas
+    columns += [Column(name, low=0.0, blank=photogrammetric) for name in sigmas if name in header]
     table = read_table(path, columns, notes)
+    missing = [name for name in sigmas if name not in table]
+    given = not missing
+    if 0 < len(missing) < len(sigmas):
+        notes.append(f"{path.name}: no column {', '.join(missing)}: the other sigmas do not count")
     time_ns = times_of(table, time, day, notes)
     late = np.concatenate([[False], np.diff(time_ns) <= 0])
     seconds = time_ns * 1e-9
     shown = (lambda i: table["time_s"][i]) if "time_s" in table else (lambda i: seconds[i])
     table.refuse(late, time[0].name, lambda i: f"{shown(i):.6f} does not come after {shown(i - 1):.6f}")
     if photogrammetric:
-        geodetic, rpy = _from_crs(path, table, crs)
+        geodetic, rpy, covariance = _from_crs(path, table, crs, notes)
         sigma_m = sigma_rpy = None
     else:
         geodetic = np.column_stack([_in_degrees(table, names[q]) for q in ("lat", "lon", "height")])
         rpy = np.radians(np.column_stack([_in_degrees(table, names[q]) for q in ("roll", "pitch", "heading")]))
-        given = all(name in table for name in sigmas)
+        covariance = None
         sigma_m = table.stack(*sigmas[:3]) if given else None
         sigma_rpy = np.radians(table.stack(*sigmas[3:])) if given else None
-    track = NavigationTrack(path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes))
+    track = NavigationTrack(
+        path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes), covariance_n=covariance
+    )
     return check_units(checked(track, path), path, names)
 
 
@@ -164,16 +173,36 @@ def _in_degrees(table: Table, name: str) -> np.ndarray:
     return np.degrees(values)
 
 
-def _from_crs(path: Path, table: Table, crs: str | None) -> tuple[np.ndarray, np.ndarray]:
+def _from_crs(
+    path: Path, table: Table, crs: str | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Latitude, longitude and height (n, 3), roll, pitch and heading (n, 3), and covariances as of a track, or None."""
     if not crs or crs == "local":
         raise UserError(f"{path}: X_m, Y_m, Z_m of an unknown CRS, wanted --crs (for example EPSG:32632)")
     refuse_missing_grids(crs, path)
-    xyz = table.stack(*PLACE)
+    xyz, angles = table.stack(*PLACE), np.radians(table.stack(*_OPK))
     try:
         frame = LocalFrame.around(xyz, crs)
         check_place_units(path, table.headed, frame)
         position = frame.from_crs(xyz)
-        R_lc = frame.R_l_crs(xyz) @ matrix_from_angles(*np.radians(table.stack(*_OPK)).T)
+        R_l_crs = frame.R_l_crs(xyz)
     except CrsError as error:
         raise UserError(f"{path}: {error}") from None
-    return frame.to_geodetic(position), navigation_from_R_lc(frame, position, R_lc)
+    geodetic, rpy = (
+        frame.to_geodetic(position),
+        navigation_from_R_lc(frame, position, R_l_crs @ matrix_from_angles(*angles.T)),
+    )
+    if not all(name in table for name in _XYZ_OPK):
+        return geodetic, rpy, None
+    sigma = table.stack(*_XYZ_OPK)
+    unknown = np.isnan(sigma).any(axis=1)
+    if unknown.all():
+        return geodetic, rpy, None
+    if unknown.any():
+        what = "they get the accuracies of poses that have none (--position-sigma, --attitude-sigma)"
+        notes.append(f"{path.name}: {int(unknown.sum())} poses without sigmas: {what}")
+    R_n_crs = np.swapaxes(frame.R_ln(position), 1, 2) @ R_l_crs
+    T = np.zeros((len(xyz), 6, 6))
+    T[:, :3, :3], T[:, 3:, 3:] = R_n_crs, R_n_crs @ np.linalg.inv(angles_jacobian(angles))
+    sigma[:, 3:] = np.radians(sigma[:, 3:])
+    return geodetic, rpy, T @ (np.square(sigma)[:, :, None] * np.swapaxes(T, 1, 2))

@@ -7,13 +7,17 @@ from datetime import date
 from math import radians
 
 import numpy as np
+import pyproj
 import pytest
 from tracks import ns
 
+from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
 from triline.nodes.formats.frame_json import read_frame
 from triline.nodes.formats.projection import missing_grids
+from triline.nodes.formats.track import Accuracy
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles
 
 START = "2020-06-01T12:00:00"  # a Monday; GPS week 2108, second 129618
 N = 6
@@ -92,6 +96,52 @@ def test_decimal_commas_and_sigmas_as_navigate_writes_them(tmp_path):
 
 
 UNIX = TIMES["Unix"][1]
+
+
+def test_sigmas_along_the_axes_of_a_crs_as_adjust_and_export_write_them(tmp_path):
+    """Of a camera turned by 33 degrees near the edge of a zone, against the definition of the angles."""
+    crs, kappa = "EPSG:32632", 33.0
+    to_lonlat = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    names = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+    sigma = np.array([0.1, 0.4, 0.2, 0.01, 0.03, 0.05])
+    head = ",".join(("time_s", *names, *(f"sigma_{name}" for name in names)))
+    rows = [[1591012800 + i, 750000 + 70 * i, 5400000 + 70 * i, 2000, 2.0, -3.0, kappa, *sigma] for i in range(N)]
+    texts = [",".join(map(str, row)) for row in rows]
+    texts[2] = ",".join(map(str, rows[2][:-6])) + "," * 6  # a pose whose sigmas are not known
+    path, some = tmp_path / "p.csv", tmp_path / "some.csv"
+    path.write_text("\n".join([head, *texts]) + "\n")
+    imported = read_any(path, "csv", Options(crs=crs))
+    messages = list(imported.messages)
+    assert imported.notes == [
+        "p.csv: 1 poses without sigmas: they get the accuracies of poses that have none "
+        "(--position-sigma, --attitude-sigma)"
+    ]
+    poses = [pose_sample(message.body) for message in messages if message.topic == "trajectory/smoothed"]
+
+    lon, lat = to_lonlat.transform(*np.transpose([row[1:3] for row in rows]))
+    grid = np.radians(pyproj.Proj(crs).get_factors(lon.mean(), lat.mean()).meridian_convergence)
+    turn = np.array([[np.cos(grid), -np.sin(grid), 0], [np.sin(grid), np.cos(grid), 0], [0, 0, 1]]).T  # grid to east
+    angles, s = np.radians([2.0, -3.0, kappa]), np.array([*sigma[:3], *np.radians(sigma[3:])])
+    J = np.empty((3, 3))
+    for k in range(3):
+        d = 1e-6 * np.eye(3)[k]
+        up, down = (angles_from_matrix(turn @ matrix_from_angles(*(angles + x))) for x in (d, -d))
+        J[:, k] = (up - down) / 2e-6
+    wanted = np.zeros((6, 6))
+    wanted[:3, :3], wanted[3:, 3:] = turn @ np.diag(s[:3] ** 2) @ turn.T, J @ np.diag(s[3:] ** 2) @ J.T
+    scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    for i in (0, 1, 3, 4, 5):
+        np.testing.assert_allclose(poses[i].covariance / scale, wanted / scale, atol=2e-4)
+    np.testing.assert_allclose(np.sqrt(np.diag(poses[2].covariance)), np.diag(Accuracy().covariance) ** 0.5)
+    project = messages[0].body
+    np.testing.assert_allclose(project.offset_sigma_m, np.sqrt(np.diag(wanted))[:3], rtol=1e-3)
+
+    some.write_text("\n".join(",".join(row.split(",")[:-1]) for row in (head, *texts)) + "\n")
+    notes = read_any(some, "csv", Options(crs=crs)).notes
+    assert notes[0] == "some.csv: no column sigma_kappa_deg: the other sigmas do not count"
+    assert "some.csv: no accuracies of the poses" in notes[1]
+
+
 BARE = COLUMNS.replace("roll_deg", "roll")
 BAD = {
     "no unit": ("time_s", UNIX, BARE, TAIL, None, "p.csv:1: roll: the unit is not stated, wanted roll_deg or roll_rad"),
