@@ -23,6 +23,8 @@ DATUMS = "ellipsoid, a vertical CRS (EPSG:5773), a raster of geoid heights, or t
 SAME_PLANET = 1e-3
 #: The range of heights is looked up in at most so many values a side; then it is widened by so much, metres. Tuned.
 MOST_SIDE, THIN_SLACK_M = 3000, 100.0
+#: Places that are beyond the outer values by less, cells, are so by rounding alone.
+EDGE_CELLS = 1e-6
 
 
 class RasterFile:
@@ -186,10 +188,26 @@ class HeightRaster:
         return (y - t.f) / t.e - 0.5, (x - t.c) / t.a - 0.5
 
     def undulation(self, lat: Array, lon: Array) -> Array:
-        """See `Terrain.undulation`."""
+        """See `Terrain.undulation`; NaN beyond the raster where nobody knows it.
+
+        Raises
+        ------
+        UserError : it is not known where the raster has a height
+        """
         if self._above is None:
             return np.zeros(np.shape(lat))
-        return self._above(np.degrees(lat), np.degrees(lon))
+        N = self._above(np.degrees(lat), np.degrees(lon))
+        unknown = ~np.isfinite(N)
+        if not unknown.any():
+            return N
+        row, column = self.place(lat, lon)
+        for at, count in ((row, self.rows), (column, self.columns)):
+            unknown &= (at > EDGE_CELLS) & (at < count - 1 - EDGE_CELLS)
+        if unknown.any():
+            k = int(np.argmax(np.ravel(unknown)))
+            where = f"{np.degrees(np.ravel(lat)[k]):.4f} N, {np.degrees(np.ravel(lon)[k]):.4f} E"
+            raise UserError(f"{self.name}: {self.datum.removeprefix('above ')}: no geoid height at {where}")
+        return np.where(np.isfinite(N), N, np.nan)
 
     def heights(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.float32]:
         """See `Terrain.heights`."""
@@ -232,12 +250,21 @@ class HeightRaster:
         if low > high:
             return None
         low, high = low - slack, high + slack
-        N = self.undulation(lat, lon)
+        N = self.undulation(*self._nearest(row, column))
         return low + float(np.nanmin(N)), high + float(np.nanmax(N))
+
+    def _nearest(self, row: Array, column: Array) -> tuple[Array, Array]:
+        """Latitudes and longitudes (n,), radians, of the places of the raster that are nearest to some."""
+        t = self._t
+        x = t.c + t.a * (np.clip(column, 0, self.columns - 1) + 0.5)
+        y = t.f + t.e * (np.clip(row, 0, self.rows - 1) + 0.5)
+        lon, lat = self._to_flat.transform(x, y, direction="INVERSE")
+        return np.radians(lat), np.radians(lon)
 
     def at(self, lat: Array, lon: Array) -> Array:
         """Heights above the ellipsoid (n,) at latitudes and longitudes (n,), radians, by one window."""
         row, column = self.place(lat, lon)
+        row, column = _within_edge(row, self.rows), _within_edge(column, self.columns)
         known = np.isfinite(row) & np.isfinite(column)
         out = np.full(np.shape(lat), np.nan)
         if not known.any():
@@ -273,22 +300,21 @@ def _read(file: RasterFile, row: int, column: int, rows: int, columns: int, thin
     return known_heights(source, band, np.float32)
 
 
+def _within_edge(at: Array, count: int) -> Array:
+    """Places (n,) among so many values, where those beside the first or the last one by rounding alone are on it."""
+    inside = np.clip(at, 0, count - 1)
+    return np.where(np.abs(at - inside) < EDGE_CELLS, inside, at)
+
+
 class _GeoidRaster:
-    """Geoid heights out of a raster, bilinear."""
+    """Geoid heights out of a raster, bilinear; NaN beside it."""
 
     def __init__(self, path: Path, ellipsoid: Ellipsoid):
         self._raster = HeightRaster([path], None, "ellipsoid", ellipsoid)
-        self._path = path
 
     def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
         shape = np.shape(lat_deg)
-        N = self._raster.at(np.radians(np.ravel(lat_deg)), np.radians(np.ravel(lon_deg)))
-        if np.isnan(N).any():
-            k = int(np.argmax(np.isnan(N)))
-            raise UserError(
-                f"{self._path}: no geoid height at {np.ravel(lat_deg)[k]:.4f} N, {np.ravel(lon_deg)[k]:.4f} E"
-            )
-        return N.reshape(shape)
+        return self._raster.at(np.radians(np.ravel(lat_deg)), np.radians(np.ravel(lon_deg))).reshape(shape)
 
 
 def _crs(file: RasterFile, wanted: str | None) -> Any:
@@ -338,7 +364,9 @@ def _vertical(name: str) -> tuple[Any, float]:
 
 
 def _proj_geoid(path: Path, vertical: Any, lat_deg: Array, lon_deg: Array) -> Any:
-    """Geoid heights by PROJ; its grid has to be installed, and to reach to a place in the raster."""
+    """Geoid heights by PROJ, not finite beyond its grid, which has to be installed and to reach to a place in the
+    raster.
+    """
     import pyproj
     from pyproj.crs import CompoundCRS
     from pyproj.exceptions import ProjError
@@ -355,13 +383,8 @@ def _proj_geoid(path: Path, vertical: Any, lat_deg: Array, lon_deg: Array) -> An
         raise missing from None
 
     def above(lat_deg: Array, lon_deg: Array) -> Array:
-        try:
-            N = np.asarray(transformer.transform(lon_deg, lat_deg, np.zeros(np.shape(lat_deg)), errcheck=True)[2])
-        except ProjError:
-            raise missing from None
-        if not np.isfinite(N).all():
-            raise missing
-        return N
+        return np.asarray(transformer.transform(lon_deg, lat_deg, np.zeros(np.shape(lat_deg)))[2])
 
-    above(lat_deg, lon_deg)
+    if not np.isfinite(above(lat_deg, lon_deg)).all():
+        raise missing
     return above

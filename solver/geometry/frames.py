@@ -93,8 +93,12 @@ class LocalFrame:
             raise CrsError(f"coordinates outside the area of {self.crs!r}")
         return out
 
-    def to_crs(self, position_l: ArrayLike) -> Array:
+    def to_crs(self, position_l: ArrayLike, *, may_lie_outside: bool = False) -> Array:
         """Project CRS coordinates of local points (n, 3); NaN of those that are not known.
+
+        Parameters
+        ----------
+        may_lie_outside : NaN, too, of points outside the area of the CRS
 
         Raises
         ------
@@ -106,9 +110,9 @@ class LocalFrame:
         g = self.to_geodetic(position_l)
         out = np.stack(self._to_wgs84.transform(g[..., 1], g[..., 0], g[..., 2], direction="INVERSE"), axis=-1)
         known = np.isfinite(position_l).all(axis=-1)
-        if not np.isfinite(out[known]).all():
+        if not (may_lie_outside or np.isfinite(out[known]).all()):
             raise CrsError(f"coordinates outside the area of {self.crs!r}")
-        out[~known] = np.nan
+        out[~(known & np.isfinite(out).all(axis=-1))] = np.nan
         return out
 
     def R_l_crs(self, xyz: ArrayLike) -> Array:

@@ -149,7 +149,7 @@ def heights_in_frame(
     for i in range(ny):
         point = np.stack([x_l, np.full(nx, bottom + step_m * i), np.full(nx, start_m)], axis=1)
         for _ in range(3):  # the place in the CRS hardly depends on the height
-            place = other.to_crs(point)
+            place = other.to_crs(point, may_lie_outside=True)  # the field reaches beyond the given heights
             h = given.height((place[:, 0] - x0) / dx, (place[:, 1] - y0) / dy)
             known = np.isfinite(h)
             point[:, 2] += np.where(known, unit_m * (h - place[:, 2]), 0.0)

@@ -132,7 +132,13 @@ def heights_of_tile(tile: Tile, where: CellPlaces, terrain: Terrain, reach: floa
     if not np.isfinite(values).any():
         return None
     at_row, at_column = over_tile(y - top, tile.rows, tile.columns), over_tile(x - left, tile.rows, tile.columns)
-    N = over_tile(terrain.undulation(lat, lon).reshape(column.shape), tile.rows, tile.columns)
+    N = terrain.undulation(lat, lon).reshape(column.shape)
+    if np.isfinite(N).all():
+        N = over_tile(N, tile.rows, tile.columns)
+    else:  # what lies beyond the raster would spoil the polynomial
+        every = np.meshgrid(tile.column + np.arange(tile.columns), tile.row + np.arange(tile.rows))
+        lat, lon = where(*(np.ravel(a).astype(float) for a in every))
+        N = terrain.undulation(lat, lon).reshape(tile.rows, tile.columns).astype(np.float32)
     z = bilinear(values, at_row, at_column)
     z += N
     return HeightsOfTile(z, at_row, at_column, values, N) if np.isfinite(z).any() else None

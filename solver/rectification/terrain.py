@@ -25,7 +25,7 @@ class Terrain(Protocol):
         ...
 
     def undulation(self, lat: Array, lon: Array) -> Array:
-        """Height (...) of the zero of the raster's heights above the ellipsoid, metres."""
+        """Height (...) of the zero of the raster's heights above the ellipsoid, metres; NaN where unknown."""
         ...
 
     def heights(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.float32]:

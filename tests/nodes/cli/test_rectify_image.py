@@ -482,6 +482,25 @@ def test_geoid_heights_by_number_and_by_raster(scene, tmp_path):
     assert number.shape != ellipsoid.shape or np.abs(number - ellipsoid).max() > 0.3
 
 
+def test_a_geoid_as_large_as_heights_that_cover_a_part(scene, tmp_path, capsys):
+    """Where nobody knows the ground, nobody has to know the geoid; where it is known, a hole would be silent."""
+    _, path, _, relief, _, image = scene
+    part, whole = replace(relief, rows=80, columns=50), replace(relief)
+    part.z, whole.z = relief.z[:80, :50], relief.z
+    dem = part.write(tmp_path / "part.tif")
+    geoid = replace(part, low_m=40.0, high_m=40.0).write(tmp_path / "geoid.tif")
+    wider = replace(whole, low_m=40.0, high_m=40.0).write(tmp_path / "wider.tif")
+    smaller = replace(part, columns=30, low_m=40.0, high_m=40.0).write(tmp_path / "smaller.tif")
+    args = ("--dem", dem, "--gsd", 10, "--dem-datum")
+    wanted = rectify(tmp_path, image, path, *args, wider, name="w.tif").read()
+    for datum in (geoid, 40.0):
+        found = rectify(tmp_path, image, path, *args, datum, name="f.tif").read()
+        assert found.shape == wanted.shape and np.abs(found - wanted).max() < 1e-3
+    assert (wanted == -1.0).mean() > 0.2 and (wanted > 0.0).mean() > 0.2
+    error = refused(capsys, image, "--sensor", path, "-o", tmp_path / "o.tif", *args, smaller)
+    assert "smaller.tif: no geoid height at " in error
+
+
 def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys):
     _, path, _, relief, dem, image = scene
     half = tmp_path / "tiles"

@@ -530,6 +530,25 @@ def test_a_geoid_of_one_country(whole, tmp_path):
         assert HeightRaster([path], None, datum).at(np.radians(y), np.radians(x)) == pytest.approx(547.0)
 
 
+@pytest.mark.parametrize("cells", [0, 1, 10])
+def test_heights_as_far_as_the_grid_of_their_geoid(cells, tmp_path):
+    """The field in the local frame reaches beyond its raster, and beyond the geoid: the raster was refused for that."""
+    grid, path = tmp_path / "geoid.gtx", tmp_path / "flat.tif"
+    head = struct.pack(">4d2i", 47.0, 10.0, 0.01, 0.01, 101, 101)
+    grid.write_bytes(head + np.full(101 * 101, 47.0, dtype=">f4").tobytes())
+    n = 101 - 2 * cells
+    place = rasterio.Affine(0.01, 0.0, 9.995 + 0.01 * cells, 0.0, -0.01, 48.005 - 0.01 * cells)
+    shape = {"driver": "GTiff", "width": n, "height": n, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", crs="EPSG:4326", transform=place, **shape) as target:
+        target.write(np.full((1, n, n), 500.0, dtype=np.float32))
+    frame = LocalFrame(47.5, 10.5, 0.0)
+    field = dem_in_frame(path, frame, f"+proj=longlat +datum=WGS84 +geoidgrids={grid} +type=crs")
+    edge = 0.01 * cells + 0.02
+    lat, lon = np.array([47.5, 47.0 + edge, 48.0 - edge]), np.array([10.5, 10.0 + edge, 11.0 - edge])
+    wanted = frame.from_geodetic(lat, lon, 547.0)
+    np.testing.assert_allclose(field.height(wanted[:, 0], wanted[:, 1]), wanted[:, 2], atol=0.05)
+
+
 def test_relief_is_of_points_with_a_height(tmp_path):
     with RecordingWriter(tmp_path / "control.mcap") as writer:
         for k, role in enumerate(("control", "planimetric", "height", "check")):
