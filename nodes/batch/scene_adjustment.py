@@ -556,11 +556,11 @@ def _write_rpcs(a: SceneAdjustment, folder: Path) -> list[str]:
     heights = a.problem.block.ellipsoid.geodetic(a.solution.state.position_e[a.solution.determined])[:, 2]
     low, high = float(heights.min()) - _BEYOND_M, float(heights.max()) + _BEYOND_M
     notes = []
+    of_name: dict[str, str] = {}  # file -> image
     for k, (entry, image) in enumerate(zip(a.data.images, a.problem.block.images, strict=True)):
         if entry.size_px is None:
             notes.append(f"image {entry.name}: no RPC written: its metadata do not say how large it is")
             continue
-        name = entry.name.replace("/", "_")
         located: Any = image.located(a.values_of(k))
         try:
             fit = fit_to_model(located, low, high)
@@ -568,7 +568,15 @@ def _write_rpcs(a: SceneAdjustment, folder: Path) -> list[str]:
             notes.append(f"image {entry.name}: no RPC written: {error}")
             continue
         folder.mkdir(exist_ok=True)
+        first = name = entry.name.replace("/", "_")
+        number = 1
+        while name in of_name:  # a/F and a_F
+            number += 1
+            name = f"{first}_{number}"
+        of_name[name] = entry.name
         write_rpb(folder / f"{name}.RPB", fit.rpc)
+        if name != first:
+            notes.append(f"image {entry.name}: its RPC is {name}.RPB, beside that of image {of_name[first]}")
         if fit.max_px > 0.05:
             notes.append(f"image {entry.name}: its RPC differs from the adjusted model by up to {fit.max_px:.2g} px")
     return notes

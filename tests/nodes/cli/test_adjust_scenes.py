@@ -80,6 +80,27 @@ def test_result_and_tables(block, tmp_path, capsys):
     assert {row["ccd"] for row in residuals} == {"F", "B"}
 
 
+def test_images_whose_names_differ_by_a_slash_alone_have_polynomials_of_their_own(block, tmp_path, capsys):
+    """The second of a_b/F and a/b/F was written over the first."""
+    project, image_points = block / "project.toml", block / "image_points.csv"
+    head = project.read_text().split("[scenes")[0]
+    scenes = [f'[scenes."{name}"]\nmetadata = "spot5-hrs"\n' for name in ("a_b", "a/b")]
+    project.write_text(head + "".join(scenes))
+    text = image_points.read_text()
+    first, second = text.replace(",scene,", ",a_b,"), text.replace(",scene,", ",a/b,").partition("\n")[2]
+    image_points.write_text(first + second)
+    out = tmp_path / "result"
+    assert main(["adjust", str(block), "-o", str(out), "--json"]) == 0
+    assert [path.name for path in sorted((out / "rpc").iterdir())] == [
+        "a_b_B.RPB",
+        "a_b_B_2.RPB",
+        "a_b_F.RPB",
+        "a_b_F_2.RPB",
+    ]
+    told = [note for note in json.loads(capsys.readouterr().out)["notes"] if "RPC is" in note]
+    assert told == [f"image a/b/{ccd}: its RPC is a_b_{ccd}_2.RPB, beside that of image a_b/{ccd}" for ccd in "FB"]
+
+
 def test_a_full_disk_leaves_whole_tables_and_no_result(block, tmp_path, capsys):
     out, table = tmp_path / "result", tmp_path / "result" / "residuals.csv"
     assert main(["adjust", str(block), "-q", "-o", str(out)]) == 0
