@@ -68,7 +68,7 @@ class SceneJob:
     free : additional parameters without a-priori weight
     sets : a correction set for each "lens", or for each "scene" with all its lenses
     snoop, critical : data snooping, and its critical value
-    iterations : at most
+    iterations : of an adjustment, at most
     """
 
     model: str = "dgr"
@@ -149,7 +149,7 @@ def _stage(
     solution = adjust(problem, max_iterations=job.iterations)
     if not job.snoop:
         return problem, solution, None
-    found = snoop(solution, job.critical)
+    found = snoop(solution, job.critical, job.iterations)
     return problem, found.solution, found
 
 
@@ -245,7 +245,7 @@ def scene_result(a: SceneAdjustment) -> dict[str, Any]:
         "redundancy": s.redundancy,
         "n_image_points": len(seen),
         "n_points": len(data.point_ids),
-        "iterations": s.iterations,
+        "iterations": s.iterations + (a.before[1].iterations if a.before else 0),
         "converged": s.converged,
         "seconds": a.seconds,
         "strips": strips,
@@ -438,6 +438,8 @@ def _notes(a: SceneAdjustment) -> list[str]:
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
     if not a.problem.given.any():
         notes.append("no control: position and attitude of the block come from the a-priori sigmas of its orbits")
+    if a.before is not None and not a.before[1].converged:
+        notes.append(f"the first of two steps has not converged after {a.before[1].iterations} iterations")
     if not s.converged:
         notes.append(f"not converged after {s.iterations} iterations")
     if s.redundancy <= 0:

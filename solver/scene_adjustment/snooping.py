@@ -7,7 +7,7 @@ image points fit. Where too many image points would go, model or sigmas are wron
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from ..adjustment.snooping import (
     failing_w,
     largest_of_group,
 )
-from .solution import SceneSolution, adjust
+from .solution import MOST_ITERATIONS, SceneSolution, adjust
 
 Array = NDArray[np.floating]
 
@@ -33,7 +33,7 @@ class SceneSnooping:
 
     Attributes
     ----------
-    solution : without what was left out
+    solution : without what was left out; its iterations are those of all adjustments together
     rays : (k,) image points left out, in order of their test values, the largest first
     w : (k,) their normalised residuals, the larger of line and sample: against the final adjustment without them; when
         they were left out where nothing controls them now
@@ -50,8 +50,16 @@ class SceneSnooping:
     given_up: float = 0.0
 
 
-def snoop(solution: SceneSolution, critical: float = CRITICAL_W) -> SceneSnooping:
+def snoop(
+    solution: SceneSolution, critical: float = CRITICAL_W, max_iterations: int = MOST_ITERATIONS
+) -> SceneSnooping:
     """Leave out image points and control coordinates that contradict the rest.
+
+    Parameters
+    ----------
+    solution : start
+    critical : of ``|w|``
+    max_iterations : of each adjustment in between
 
     Raises
     ------
@@ -63,7 +71,7 @@ def snoop(solution: SceneSolution, critical: float = CRITICAL_W) -> SceneSnoopin
     use, given = np.ones(len(point), dtype=bool), solution.given.copy()
     returned = np.zeros(len(point), dtype=bool)
     returned_given: set[tuple[int, int]] = set()
-    rounds, w_then = 0, np.zeros(len(point))
+    rounds, w_then, taken = 0, np.zeros(len(point)), solution.iterations
     for rounds in range(1, MOST_ROUNDS + 1):
         before = use.copy(), given.copy()
         _leave_out(solution, critical, use, given)
@@ -75,13 +83,16 @@ def snoop(solution: SceneSolution, critical: float = CRITICAL_W) -> SceneSnoopin
             break
         share = float((~use).sum()) / len(use)
         if share > MOST_LEFT_OUT:
+            beginning = replace(beginning, iterations=taken)
             return SceneSnooping(beginning, np.empty(0, dtype=np.int64), np.empty(0), (), rounds, share)
-        solution = adjust(solution.problem, solution.state, use, given)
+        solution = adjust(solution.problem, solution.state, use, given, max_iterations)
+        taken += solution.iterations
     out = np.flatnonzero(~use)
     w = _larger(solution.test)
     w = np.where(w != 0.0, w, w_then)
     out = out[np.argsort(-np.abs(w[out]), kind="stable")]
     p, axis = np.nonzero(beginning.given & ~given)
+    solution = replace(solution, iterations=taken)
     return SceneSnooping(solution, out, w[out], tuple(zip(p.tolist(), axis.tolist(), strict=True)), rounds)
 
 

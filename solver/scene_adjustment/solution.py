@@ -22,6 +22,8 @@ Array = NDArray[np.floating]
 
 #: Gauss-Newton ends when no residual changes by more, in units of its sigma.
 _CONVERGED = 1e-7
+#: Steps of Gauss-Newton, at most, where nobody says otherwise.
+MOST_ITERATIONS = 20
 #: A point is determined if the smallest eigenvalue of its scaled normal equations is above this. Derived: rays that
 #: meet at an angle of 1e-3 give 1e-6.
 _POINT_RANK = 1e-9
@@ -351,7 +353,7 @@ def adjust(
     state: State | None = None,
     use: NDArray[np.bool_] | None = None,
     given: NDArray[np.bool_] | None = None,
-    max_iterations: int = 20,
+    max_iterations: int = MOST_ITERATIONS,
 ) -> SceneSolution:
     """Adjust a block.
 

@@ -80,6 +80,23 @@ def test_result_and_tables(block, tmp_path, capsys):
     assert {row["ccd"] for row in residuals} == {"F", "B"}
 
 
+def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
+    """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
+
+    def adjusted(*options):
+        assert main(["adjust", str(block), "--json", *options]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    alone, snooped = adjusted(), adjusted("--snoop")
+    assert snooped["rejected"] and snooped["iterations"] > alone["iterations"] > 1
+    one = adjusted("--snoop", "--iterations", "1")
+    assert one["iterations"] < snooped["iterations"] and not one["converged"]
+    assert f"not converged after {one['iterations']} iterations" in one["notes"]
+    both = adjusted("--model", "dgr", "--then", "dgr", "--iterations", "1")
+    assert both["iterations"] == 2
+    assert "the first of two steps has not converged after 1 iterations" in both["notes"]
+
+
 def test_images_whose_names_differ_by_a_slash_alone_have_polynomials_of_their_own(block, tmp_path, capsys):
     """The second of a_b/F and a/b/F was written over the first."""
     project, image_points = block / "project.toml", block / "image_points.csv"
