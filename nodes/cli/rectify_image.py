@@ -39,6 +39,8 @@ Array = NDArray[np.floating]
 
 #: Sigma of heights and places of control, m, where ``--height-sigma`` states none: a hand-held receiver.
 GROUND_SIGMA_M = 15.0
+#: Sigma of line and sample of control, px, where ``--pixel-sigma`` states none.
+CONTROL_SIGMA_PX = 0.5
 _CONTROL = (
     Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0), Column("height_m"), Column("column"), Column("row"),
 )  # fmt: skip
@@ -224,6 +226,8 @@ def _check(args: argparse.Namespace) -> None:
         if value is not None and args.sigma is None and not (counts and name in ("pixel_sigma", "height_sigma")):
             more = {"pixel_sigma": " or --control", "height_sigma": " or --correction camera"}.get(name, "")
             raise UserError(f"--{name.replace('_', '-')}: goes with --sigma FILE{more}, for which it counts")
+    if args.control is not None and args.pixel_sigma == 0:
+        raise UserError("--pixel-sigma 0: wanted more than 0 with --control, whose pixels are measured")
     if args.plain and args.compress is not None:
         raise UserError("--plain and --compress: wanted one of them")
     if args.workers is not None and args.workers < 1:
@@ -315,10 +319,10 @@ def _camera_by_control(args: argparse.Namespace, path: Path, model: Any, image: 
     control = FrameControl(
         table["row"], table["column"], np.radians(table["lat_deg"]), np.radians(table["lon_deg"]), table["height_m"]
     )
-    height_m = args.height_sigma or GROUND_SIGMA_M
+    height_m = GROUND_SIGMA_M if args.height_sigma is None else args.height_sigma
     try:
         return fit_frame(
-            model, control, TWELVE, pixel_sigma=args.pixel_sigma or 0.5, height_sigma_m=height_m,
+            model, control, TWELVE, pixel_sigma=args.pixel_sigma or CONTROL_SIGMA_PX, height_sigma_m=height_m,
             ground_sigma_m=height_m, prior_sigma=prior_sigmas(len(TWELVE)),
         )  # fmt: skip
     except ValueError as error:
@@ -329,7 +333,7 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
     table = _control(path, image)
     u, v = table["row"], table["column"]
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
-    sigma = args.pixel_sigma or 0.5
+    sigma = args.pixel_sigma or CONTROL_SIGMA_PX
     try:
         # the image may be off by more than its size: the model alone says where a point would appear
         return fit_bias(

@@ -363,6 +363,11 @@ def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
     assert abs(np.degrees(omega["change"]) + 0.02) < 3.5 * np.degrees(omega["sigma"])
     assert [p["point"] for p in found["corrections"]] == [k for k in range(1, 17) if k != 5]
     assert all(0 < p["row_px"]["sigma"] < 0.2 for p in found["corrections"])
+    # control without errors on the ground is held: 15 m were taken
+    assert main([*args, "--height-sigma", "0", "--json"]) == 0
+    exact = json.loads(capsys.readouterr().out)["control"]
+    places = [p[name] for p in exact["corrections"] for name in ("height_m", "east_m", "north_m")]
+    assert places and all(p == {"correction": 0.0, "sigma": 0.0} for p in places)
     assert main([*args, "--sigma", str(tmp_path / "s.tif")]) == 1
     assert "--sigma: goes with --correction shift or affine" in capsys.readouterr().err
     capsys.readouterr()
@@ -565,6 +570,8 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     control.write_text(head + f"{lon + 40},{lat},0,5,5\n" * 3)
     assert "not in the image" in refused(capsys, *base, "--control", control)
     assert "--correction affine: goes with --control" in refused(capsys, *base, "--correction", "affine")
+    error = refused(capsys, *base, "--control", control, "--pixel-sigma", 0)
+    assert "--pixel-sigma 0: wanted more than 0 with --control" in error
     for name in ("pixel", "height"):
         assert f"--{name}-sigma: goes with --sigma FILE or" in refused(capsys, *base, f"--{name}-sigma", 0.3)
     assert "--attitude-sigma: goes with --sigma FILE" in refused(capsys, *base, "--attitude-sigma", 1, 1, 1)
