@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 WEEK_S = 604_800
 DAY_S = 86_400
+#: Satellites send the week in 10 bits, and some receivers pass it on so.
+WEEK_ROLLOVER = 1024
 #: Start of GPS time, in seconds since the Unix epoch.
 GPS_EPOCH_S = 315_964_800
 #: First day (UTC) from which GPS time is ahead of UTC by 1, 2, 3, ... seconds (IERS Bulletin C).

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..convert import LATEST_S, SECOND_NS
 from ..errors import UserError
-from .gps_time import DAY_S, WEEK_S, unwrap_weeks, utc_ns_from_gps
+from .gps_time import DAY_S, WEEK_ROLLOVER, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps
 from .table import Column, Table
 from .track import times_from_gps
 
@@ -141,8 +141,19 @@ def _from_gps(
         week = table[columns[1].name]
         bad = ~(seconds < WEEK_S)
         table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, wanted seconds of the week, 0 to {WEEK_S}")
+        week = week + WEEK_ROLLOVER * np.concatenate([[0], np.cumsum(np.diff(week) < -WEEK_ROLLOVER / 2)])
         first = int(week[0])
-        return utc_ns_from_gps(first, seconds + (week - first) * WEEK_S), True
+        turns = 0 if day is None else max(round((gps_week(day)[0] - first) / WEEK_ROLLOVER), 0)
+        if turns and first < WEEK_ROLLOVER:
+            week, first = week + turns * WEEK_ROLLOVER, first + turns * WEEK_ROLLOVER
+            what = f"counts modulo {WEEK_ROLLOVER}: week {first} by the day given"
+            notes.append(f"{table.path.name}: {columns[1].name} {what}")
+        time_ns = utc_ns_from_gps(first, seconds + (week - first) * WEEK_S)
+        if day is None and first < WEEK_ROLLOVER:
+            own = datetime.fromtimestamp(int(time_ns[0]) // SECOND_NS, UTC).date()
+            what = f"if it counts modulo {WEEK_ROLLOVER}, wanted the day of the flight (--date)"
+            notes.append(f"{table.path.name}: {columns[1].name} {first} is that of {own}; {what}")
+        return time_ns, True
     if (seconds >= 2 * WEEK_S).any():
         low, high = 20 * 365 * DAY_S, (2100 - 1980) * 366 * DAY_S
         bad = ~((seconds >= low) & (seconds < high))

@@ -62,6 +62,28 @@ def test_over_the_end_of_a_week(tmp_path):
     assert np.diff(track.time_ns).tolist() == [10**9] * (N - 1)
 
 
+def test_weeks_modulo_1024(tmp_path):
+    """As satellites send them: week 2108 is 60, which is 39 years before without a word."""
+    path = write(tmp_path / "p.csv", "week,gps_s", [f"60,{129618 + i}" for i in range(N)])
+    track = read_track(path, "csv", Options(day=date(2020, 6, 1)))
+    assert track.time_ns.tolist() == [ns(START) + i * 10**9 for i in range(N)]
+    assert track.notes == ("p.csv: week counts modulo 1024: week 2108 by the day given",)
+    track = read_track(path, "csv", Options())
+    said = "p.csv: week 60 is that of 1981-03-02; if it counts modulo 1024, wanted the day of the flight (--date)"
+    assert track.notes == (said,) and track.time_ns[0] < ns("1981-03-03T00:00:00")
+    for day in (date(2020, 6, 10), date(1981, 4, 1)):
+        with pytest.raises(UserError, match=f"--date {day}, but its times begin on"):
+            read_track(path, "csv", Options(day=day))
+    # the end of the count falls into the flight, on 2019-04-06; an old flight with its day, a new one with whole weeks
+    times = ["1023,604798", "1023,604799", *(f"0,{i}" for i in range(N - 2))]
+    track = read_track(write(path, "gps_week,tow_s", times), "csv", Options(day=date(2019, 4, 7)))
+    assert track.time_ns[0] == ns("2019-04-06T23:59:40") and np.diff(track.time_ns).tolist() == [10**9] * (N - 1)
+    for week, day in ((900, date(1997, 4, 7)), (2108, date(2020, 6, 1))):
+        path = write(path, "week,gps_s", [f"{week},{129618 + i}" for i in range(N)])
+        track = read_track(path, "csv", Options(day=day))
+        assert not track.notes and track.time_ns[0] // 86_400_000_000_000 == (day - date(1970, 1, 1)).days
+
+
 @pytest.mark.parametrize(
     "columns",
     [
