@@ -587,13 +587,14 @@ def put_together(
             virtual = folder / f"whole.{end.removesuffix('tif')}vrt"
             write_virtual(virtual, about, tiles)
             cloud_optimised(path, virtual, compress, overview)
-    seams = write_line_features(outputs.seams, _features(told, layers, settings))
+    lines = _features(told, layers, settings)
+    seams = write_line_features(outputs.seams, lines, geographic=settings.crs is not None)
     return {"rows": rows, "columns": columns, "row": row, "column": column, "seams": seams, **_summary(told, layers)}
 
 
 def _features(
     told: dict[Key, Any], layers: list[Layer], settings: MosaicSettings
-) -> Iterator[tuple[list[list[float]], dict[str, Any]]]:
+) -> Iterator[tuple[NDArray[np.float64], dict[str, Any]]]:
     to_map = None if settings.crs is None else transformer_to(settings.crs)
     for key, t in told.items():
         for seam in t["seams"]:
@@ -601,9 +602,7 @@ def _features(
             x, y = corners[:, 1] * settings.gsd, -corners[:, 0] * settings.gsd
             if to_map is not None:
                 x, y = to_map.transform(x, y, direction="INVERSE")
-            places = [
-                [round(a, 9), round(b, 9)] for a, b in zip(np.asarray(x).tolist(), np.asarray(y).tolist(), strict=True)
-            ]
+            places = np.column_stack([x, y]).astype(float)
             a, b = seam["layers"]
             n = max(seam["nodes"], 1)
             steps = {f"step_{name}": round(seam[name][1] / n, 4) for name in ("raw", "balanced")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,29 @@ def answers(topic: str, messages: Iterable[Message]) -> list[Message]:
             found[message.body.point] = message
         return list(found.values())
     return list(messages)
+
+
+def parts_of_line(places: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """A line (n, 2 or more) of longitude, latitude, degrees, and more, cut at the date line.
+
+    A step of more than half the Earth goes the other way round. As RFC 7946 asks for (3.1.9), no part crosses the date
+    line; parts end and begin on it, at 180 or -180 degrees.
+    """
+    parts: list[list[NDArray[np.float64]]] = [[places[0]]]
+    for a, b in pairwise(places):
+        if abs(b[0] - a[0]) > 180.0:
+            side = 180.0 if a[0] > b[0] else -180.0  # where the line leaves
+            goal = b.copy()
+            goal[0] += 2.0 * side
+            share = (side - a[0]) / (goal[0] - a[0])
+            end = a + share * (goal - a)
+            end[0] = side
+            parts[-1] += [end] if share > 0.0 else []
+            begin = end.copy()
+            begin[0] = -side
+            parts.append([begin] if share < 1.0 else [])
+        parts[-1].append(b)
+    return [np.array(part) for part in parts if len(part) > 1]
 
 
 def topics_with_places() -> tuple[str, ...]:
@@ -161,4 +185,6 @@ def _fixes(topic: str, messages: Iterable[Message]) -> Features:
     names = ("sigma_E_m", "sigma_N_m", "sigma_U_m")
     properties |= _sigmas([body.position_covariance for body in bodies], 3, names)
     place = np.array([(body.longitude, body.latitude, body.altitude) for body in bodies])
+    beyond = np.abs(place[:, 0]) > 180.0  # counted from 0 to 360
+    place[beyond, 0] = (place[beyond, 0] + 180.0) % 360.0 - 180.0
     return Features(place, properties, {"gnss": list(range(len(bodies)))} if len(bodies) > 1 else {})

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .features import Features
+from .features import Features, parts_of_line
 
 APPLICATION_ID = 0x47504B47  # "GPKG"
 VERSION = 10300
@@ -39,7 +39,8 @@ CREATE TABLE gpkg_geometry_columns (
 
 
 def write_geopackage(path: Path, name: str, features: Features) -> int:
-    """Write features as a new GeoPackage; returns the number of features.
+    """Write features as a new GeoPackage; returns the number of features, of which a line across the date line is one,
+    in two rows.
 
     Parameters
     ----------
@@ -60,10 +61,13 @@ def write_geopackage(path: Path, name: str, features: Features) -> int:
             database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", _reference_systems())
             points = [_point(place) for place in features.lon_lat_height]
             _add_table(database, table, "POINT", points, features.properties, features.lon_lat_height)
-            lines = [_line(features.lon_lat_height[rows]) for rows in features.lines.values()]
+            lines = {name: parts_of_line(features.lon_lat_height[rows]) for name, rows in features.lines.items()}
             if lines:
-                names = {"line": list(features.lines), "points": [len(rows) for rows in features.lines.values()]}
-                _add_table(database, f"{table}_lines", "LINESTRING", lines, names, features.lon_lat_height)
+                parts = [(name, part) for name, cut in lines.items() for part in cut]
+                names = {"line": [name for name, _ in parts], "points": [len(part) for _, part in parts]}
+                blobs = [_line(part) for _, part in parts]
+                places = np.concatenate([part for _, part in parts])
+                _add_table(database, f"{table}_lines", "LINESTRING", blobs, names, places)
             return len(points) + len(lines)
     except sqlite3.Error as error:
         raise OSError(errno.EIO, str(error), str(path)) from None

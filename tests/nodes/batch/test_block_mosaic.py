@@ -167,6 +167,31 @@ def test_stac_item_across_the_date_line_does_not_go_round_the_world(tmp_path):
     assert widths == pytest.approx([400.0, 200.0], abs=40.0)  # meridians are not parallel to the grid
 
 
+def test_seam_lines_across_the_date_line_are_cut_there(tmp_path):
+    """As RFC 7946 asks for; they went round the world from 179.999 to -179.999 degrees."""
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs("EPSG:4326", "EPSG:32601", always_xy=True).transform(180.0, 48.0)
+    shape = {"driver": "GTiff", "height": 200, "width": 300, "count": 1, "dtype": "uint16", "crs": "EPSG:32601"}
+    paths, rng = [], np.random.default_rng(1)
+    for k in range(2):  # one to the north of the other, with half of it in common
+        place = rasterio.Affine(2, 0, round(x / 2) * 2 - 400, 0, -2, round(y / 2) * 2 - 200 * k)
+        paths.append(tmp_path / f"ortho{k}.tif")
+        with rasterio.open(paths[-1], "w", transform=place, nodata=0, **shape) as target:
+            target.write(rng.integers(900, 1100, (1, 200, 300), dtype=np.uint16))
+    words = ["rectify", *paths, "--mosaic", "--tile", 512, "-o", tmp_path / "m.tif", "--workers", 1, "-q"]
+    assert main([*map(str, words)]) == 0
+    features = json.loads((tmp_path / "m.seams.geojson").read_text())["features"]
+    cut = [f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "MultiLineString"]
+    assert len(cut) == 1
+    for parts in (*cut, *([f["geometry"]["coordinates"]] for f in features if f["geometry"]["type"] == "LineString")):
+        assert all(np.ptp(np.array(part)[:, 0]) < 0.01 for part in parts)
+    (west, east) = sorted(cut[0], key=lambda part: -part[0][0])
+    ends = {part[k][0]: part[k][1] for part in (west, east) for k in (0, -1) if abs(part[k][0]) == 180.0}
+    assert set(ends) == {-180.0, 180.0} and ends[180.0] == ends[-180.0] == pytest.approx(47.9975, abs=0.001)
+    assert sum(np.ptp(np.array(part)[:, 0]) for part in (west, east)) * 74500.0 == pytest.approx(600.0, abs=20.0)
+
+
 def test_workers_and_a_run_that_goes_on_give_the_same_bytes(block, made, tmp_path):
     other = tmp_path / "block.tif"
     assert main(_mosaic(block, other, "--workers", "2", "-q")) == 0

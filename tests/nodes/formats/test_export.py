@@ -257,6 +257,33 @@ def test_geojson(recording, tmp_path):
     assert points[3]["properties"]["sigma_kappa_deg"] == pytest.approx(np.degrees(3e-4))
 
 
+def test_lines_across_the_date_line_are_cut_there(tmp_path):
+    """As RFC 7946 asks for: over 179.98, 179.99, -179.99 .. they went round the world. 180.01 is -179.99."""
+    lon = [179.98, 179.99, 190.0 - 10.01 + 0.02, -179.98, -180.0, 179.98]
+    messages = [
+        Message("sensor/gnss", START + i, gnss_message(START + i, [10.0 + i, x, 500.0 + i], [1.0, 1.0, 1.0]), "gps")
+        for i, x in enumerate(lon)
+    ]
+    path, target = write_recording(tmp_path / "a.mcap", messages), tmp_path / "f.geojson"
+    assert main(["export", str(path), "--topic", "sensor/gnss", "--geojson", str(target), "-q"]) == 0
+    line, *points = json.loads(target.read_text())["features"]
+    wanted = [
+        [[179.98, 10.0, 500.0], [179.99, 11.0, 501.0], [180.0, 11.5, 501.5]],
+        [[-180.0, 11.5, 501.5], [-179.99, 12.0, 502.0], [-179.98, 13.0, 503.0], [-180.0, 14.0, 504.0]],
+        [[180.0, 14.0, 504.0], [179.98, 15.0, 505.0]],
+    ]
+    assert line["geometry"]["type"] == "MultiLineString" and line["properties"] == {"line": "gnss", "points": 6}
+    for part, want in zip(line["geometry"]["coordinates"], wanted, strict=True):
+        np.testing.assert_allclose(part, want, atol=1e-9)
+    assert points[2]["geometry"]["coordinates"][0] == pytest.approx(-179.99, abs=1e-9)
+    assert main(["export", str(path), "--topic", "sensor/gnss", "--gpkg", str(tmp_path / "f.gpkg"), "-q"]) == 0
+    database = sqlite3.connect(tmp_path / "f.gpkg")
+    rows = database.execute("SELECT geom FROM sensor_gnss_lines ORDER BY fid").fetchall()
+    for (blob,), want in zip(rows, wanted, strict=True):
+        np.testing.assert_allclose(_geometry(blob)[1], want, atol=1e-9)
+    database.close()
+
+
 def test_object_points_count_once_with_their_last_state(recording, tmp_path):
     target = tmp_path / "p.geojson"
     assert main(["export", str(recording), "--topic", "point/object", "--geojson", str(target), "-q"]) == 0
