@@ -33,6 +33,9 @@ MEAN_OFFSET_SIGMA = 0.05
 GAIN_SIGMA, OFFSET_SIGMA, FALL_OFF_SIGMA = 0.5, 0.5, 0.5
 #: Places worse than so many sigmas count less, and than so many not at all. Statistical levels (1 %, 0.001 %).
 DOUBTED, REFUSED = 2.58, 4.4
+#: Grey values are not taken for better than this share of the mean one, else places that agree to the last bit (parts
+#: of one image, water of one grey) would leave nothing of the sigmas a priori. Derived: a part of the step of 8 bits.
+FINEST = 1e-4
 #: With fewer groups of places an orthoimage than this the covariance is that of independent, equal errors.
 FEWEST_GROUPS = 6
 #: Rounds of the iteration, at most, and the change of a gain that ends it.
@@ -175,7 +178,7 @@ def balance(samples: ToneSamples, camera: IntArray, fall_off: Mask) -> ToneBalan
         residual = x - b[i] - slope * L
         free = np.maximum(seen - 1, 1)
         misfit = np.sqrt((of_place @ residual**2) / free)
-        scale = max(1.4826 * float(np.median(misfit)), 1e-9 * max(level, 1.0))
+        scale = max(1.4826 * float(np.median(misfit)), FINEST * max(level, 1.0))
         worth = misfit / scale
         weight = np.where(worth > REFUSED, 0.0, np.where(worth > DOUBTED, DOUBTED / np.maximum(worth, 1e-12), 1.0))
         if moved < ENOUGH:

@@ -65,3 +65,17 @@ def test_no_overlap_is_refused():
     empty = np.zeros(0, dtype=int)
     with pytest.raises(ValueError, match="no place is shown by two"):
         balance(ToneSamples(empty, empty, np.zeros(0), np.zeros(0), empty), np.zeros(2, dtype=int), np.array([False]))
+
+
+@pytest.mark.parametrize("places", [200, 20_000])
+@pytest.mark.parametrize("low", [1000.0, 900.0])
+def test_orthoimages_that_agree_to_the_last_bit(places, low):
+    """Water of one grey in two parts of one image: sigmas a priori were lost in rounding, and the matrix singular."""
+    value = np.repeat(np.where(np.arange(places) % 2 > 0, low, 1000.0), 2)
+    place, layer = np.repeat(np.arange(places), 2), np.tile([0, 1], places)
+    samples = ToneSamples(place, layer, value, np.zeros(2 * places), np.zeros(places, dtype=np.int64))
+    found = balance(samples, np.array([0, 0]), np.array([False]))
+    np.testing.assert_allclose(found.gain, 1.0, atol=1e-9)
+    np.testing.assert_allclose(found.offset, 0.0, atol=1e-6)
+    one_grey = low == 1000.0  # gain and offset cannot be told apart, but by what is known beforehand
+    np.testing.assert_allclose(found.gain_sigma, 0.25 if one_grey else 0.0, atol=1e-3)
