@@ -23,6 +23,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.trajectory import sample_before
 from .base import (
     COMPONENTS,
     CorrectionModel,
@@ -144,7 +145,7 @@ class Wander(CorrectionModel):
         the first of both."""
         t = np.asarray(time_s, dtype=float)
         place = np.floor((t - self.borders[0]) / self.step_s)
-        k = [np.minimum(np.maximum(used.searchsorted(place, side="right") - 1, 0), len(used) - 2) for used in self._use]
+        k = [sample_before(used, place) for used in self._use]
         begin = np.stack([used[i] for used, i in zip(self._use, k, strict=True)], axis=1)
         end = np.stack([used[i + 1] for used, i in zip(self._use, k, strict=True)], axis=1)
         inside = np.minimum(np.maximum(t[:, None] - self.borders[begin], 0.0), self.step_s * (end - begin))
