@@ -31,7 +31,8 @@ from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
 from .scene_images import with_scene_images
 from .scene_recording import local_block
-from .sensor_recording import sensor_extent, sensor_messages
+from .sensor_folder import SensorFolder, read_sensor_folder
+from .sensor_recording import sensor_extent, sensor_fixes, sensor_messages
 from .tie_points import statistics, tie_point_messages
 from .tiff_image import is_tiff
 from .time_columns import same_day
@@ -78,6 +79,7 @@ class Options:
     without_images : images of a bag are left alone
     poses_only : poses that belong to image lines make no strip
     grade : of the inertial unit of a sensor folder, in place of its platform.toml
+    folder : the tables of a sensor folder, where they have been read
     """
 
     day: date | None = None
@@ -92,6 +94,7 @@ class Options:
     poses_only: bool = False
     without_images: bool = False
     grade: InertialGrade | None = None
+    folder: SensorFolder | None = None
 
 
 @dataclass(frozen=True)
@@ -211,21 +214,23 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     notes: list[str] = []
     if kind in ("sensors", "ros2") or (kind == "gpx" and not has_attitudes(path)):
         topics = _image_topics(options) if kind == "ros2" else None
+        folder = options.folder
         if kind == "gpx":
             positions = read_positions(path, options.day)
             notes.extend(positions.notes)
             messages = position_messages(positions, options.accuracy, notes, "import")
         elif topics is None:
-            messages = sensor_messages(path, notes, grade=options.grade)
+            folder = folder or read_sensor_folder(path)
+            messages = sensor_messages(folder, notes, grade=options.grade)
         else:
             messages = ros2_messages(path, notes, given=topics)
         messages = _on_day(path, messages, options.day)
         if options.ground.stated:
-            messages = _at_height(path, kind, messages, options, notes)
+            messages = _at_height(path, kind, messages, options, notes, folder)
         images = options.lines is not None and options.lines.files and (topics is None or topics.topics is None)
         strip = _strip_of(options, options.lines) if images and options.lines is not None else None
-        if strip is not None and kind == "sensors":
-            strip = within(strip, *sensor_extent(path)[0], "sensors")
+        if strip is not None and folder is not None:
+            strip = within(strip, *sensor_extent(folder)[0], "sensors")
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
@@ -341,11 +346,13 @@ def _on_day(path: Path, messages: Iterable[Message], day: date | None) -> Iterat
 
 
 def _at_height(
-    path: Path, kind: str, messages: Iterable[Message], options: Options, notes: list[str]
+    path: Path, kind: str, messages: Iterable[Message], options: Options, notes: list[str], folder: SensorFolder | None
 ) -> Iterator[Message]:
     """The messages, with the origin of the local frame on the ground (of sensors: they are not in the local frame)."""
     fixes = np.empty((0, 3))
-    if options.ground.height_m is None:
+    if options.ground.height_m is None and folder is not None:
+        fixes = sensor_fixes(folder)
+    elif options.ground.height_m is None:
         found = read_any(path, kind, Options(options.day, grade=options.grade, without_images=True)).messages
         places = [m.body for m in found if m.topic == "sensor/gnss"]
         fixes = np.array([(b.latitude, b.longitude, b.altitude) for b in places]).reshape(-1, 3)

@@ -37,7 +37,7 @@ from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
 from .projection import missing_grids, unknown_heights
-from .sensor_folder import read_grade, refuse_mounting
+from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
 from .track import Accuracy, Mounting, NavigationTrack
@@ -109,6 +109,7 @@ class Flight:
     mounting : of the camera on the body
     navigation, kind, day : file of poses or sensors, one of `NAVIGATION`, and the day of the flight
     track : the poses, where the file has poses and not sensors
+    tables : of a sensor folder, as they were read
     places_deg : (n, 2) latitude and longitude of some places that were flown over; None where they are not known
     span_ns : UTC of the first and the last pose, or of sensors that make poses; None where it is not known
     sigmas : slow errors, named as in `configuration/project`
@@ -136,6 +137,7 @@ class Flight:
     kind: str = ""
     day: date | None = None
     track: NavigationTrack | None = None
+    tables: SensorFolder | None = None
     places_deg: Array | None = None
     span_ns: tuple[int, int] | None = None
     sigmas: dict[str, Any] = field(default_factory=dict)
@@ -264,6 +266,7 @@ def flight_messages(folder: Path) -> tuple[Imported, str]:
         ground=flight.ground if flight.ground.stated else GroundGiven(flight.ground_height_m),
         poses_only=bool(flight.strips),
         grade=flight.grade,
+        folder=flight.tables,
     )
     imported = read_any(flight.navigation, flight.kind, options)
     notes = imported.notes
@@ -439,9 +442,11 @@ def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
         flight.problems.extend(f"{keys.path}: {key}: goes with a ROS 2 bag, not with {KINDS[kind]}" for key in of_bag)
     options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
     if kind in ("sensors", "ros2"):
-        next(iter(read_any(path, kind, options).messages), None)
         if kind == "sensors":
-            flight.span_ns, flight.places_deg = sensor_extent(path)
+            flight.tables = read_sensor_folder(path)
+        next(iter(read_any(path, kind, replace(options, folder=flight.tables)).messages), None)
+        if flight.tables is not None:
+            flight.span_ns, flight.places_deg = sensor_extent(flight.tables)
     else:
         track = flight.track = read_track(path, kind, options)
         flight.span_ns, flight.places_deg = (int(track.time_ns[0]), int(track.time_ns[-1])), some(track.geodetic[:, :2])

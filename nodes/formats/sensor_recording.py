@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +19,17 @@ from ...solver.navigation.inertial_data import InertialData, InertialGrade
 from ..convert import SECOND_NS, attitude_message, gnss_message
 from ..errors import UserError
 from ..node import Message
-from .sensor_folder import SensorFolder, read_sensor_folder
+from .sensor_folder import SensorFolder
 
 #: Places of a flight that are enough to tell where it was.
 SOME = 300
 
 
 def sensor_messages(
-    path: Path, notes: list[str], source: str = "import", grade: InertialGrade | None = None
+    folder: SensorFolder, notes: list[str], source: str = "import", grade: InertialGrade | None = None
 ) -> Iterator[Message]:
-    """``configuration/project``, ``sensor/imu``, ``sensor/gnss`` and ``sensor/attitude``, sorted by stamp and rank.
+    """``configuration/project``, ``sensor/imu``, ``sensor/gnss`` and ``sensor/attitude`` of a folder that was read,
+    sorted by stamp and rank.
 
     Times in the files count from the Unix epoch. Increments are divided by their interval. Each sample carries
     the noise of the inertial unit as its sigma; messages have no field for its biases, the initial attitude, and where
@@ -40,7 +40,7 @@ def sensor_messages(
     ------
     UserError : ``file:line: column: what is wrong``, or nothing usable in the folder
     """
-    folder = read_sensor_folder(path)
+    path = folder.path
     if grade is not None:
         folder = replace(folder, platform=replace(folder.platform, grade=grade))
     notes.extend(note for note in folder.notes if grade is None or not note.startswith("platform.toml"))
@@ -71,23 +71,36 @@ def sensor_messages(
     yield from messages
 
 
-def sensor_extent(path: Path) -> tuple[tuple[int, int], Array]:
+def sensor_extent(folder: SensorFolder) -> tuple[tuple[int, int], Array]:
     """UTC of the first and the last moment at which a sensor folder has GNSS and, where it has any, inertial data or
     attitudes; (n, 2) latitude and longitude of some of its fixes, degrees.
 
     Raises
     ------
-    UserError : as `sensor_messages`; no GNSS
+    UserError : no GNSS
     """
-    folder = read_sensor_folder(path)
     if folder.gnss is None:
-        raise UserError(f"{path / 'gnss.csv'}: no such file, wanted GNSS positions")
+        raise UserError(f"{folder.path / 'gnss.csv'}: no such file, wanted GNSS positions")
     times = [folder.gnss.time_s]
     times += [folder.time_s] if folder.time_s is not None else []
     times += [folder.attitude.time_s] if folder.attitude is not None and folder.time_s is None else []
     begin, end = _ns(np.array([max(np.nanmin(t) for t in times), min(np.nanmax(t) for t in times)]))
     places = np.degrees(np.column_stack([folder.gnss.lat, folder.gnss.lon]))
     return (begin, end), some(places[np.isfinite(places).all(axis=1)])
+
+
+def sensor_fixes(folder: SensorFolder) -> Array:
+    """Latitude and longitude, degrees, and height (n, 3) of the fixes that `sensor_messages` makes messages of.
+
+    Raises
+    ------
+    UserError : fixes of which nothing can be made
+    """
+    if folder.gnss is None:
+        return np.empty((0, 3))
+    gnss, findings = clean_gnss(folder.gnss)
+    _told(folder, findings, [])
+    return np.column_stack([np.degrees(gnss.lat), np.degrees(gnss.lon), gnss.height_m])
 
 
 def some(places: Array) -> Array:

@@ -17,6 +17,7 @@ from triline.nodes.convert import local_frame, pose_sample
 from triline.nodes.formats.block_folder import read_ground_points
 from triline.nodes.formats.flight_folder import read_flight
 from triline.nodes.formats.geotiff import Heights, write_heights
+from triline.nodes.formats.table import read_table
 from triline.nodes.recording.reader import RecordingReader
 
 START = "2020-06-01T12:00:00"
@@ -179,6 +180,34 @@ def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
     assert next(iter(reader.messages(["configuration/project"]))).body.origin_height == GROUND
     imu = next(iter(reader.messages(["sensor/imu"]))).body
     assert imu.rate_sigma == pytest.approx(np.radians(0.06) / 60 / np.sqrt(imu.interval_ns * 1e-9), rel=1e-6)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_tables_of_sensors_are_read_once(whole, folder, tmp_path, monkeypatch):
+    """With images and a height above the ground they were read three times, four times of a flight folder."""
+    at, out = folder / "sensors", tmp_path / "o.mcap"
+    at.mkdir()
+    rows = [f"{1591012800 + 0.01 * i:.2f},0,0,-9.81,0,0,0" for i in range(500)]
+    (at / "imu.csv").write_text("time_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s\n" + "\n".join(rows) + "\n")
+    fixes = [f"{1591012800 + i},{LAT},{LON},{2000 + i},0.1,0.1,0.2" for i in range(6)]
+    head = "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n"
+    (at / "gnss.csv").write_text(head + "\n".join(fixes) + "\n")
+    text = TOML.replace('"poses.csv"', '"sensors"').replace("[camera]", "above_ground_m = 1400.0\n[camera]", 1)
+    (folder / "flight.toml").write_text(text)
+    read = []
+
+    def counted(path, *more, **others):
+        read.append(path.name)
+        return read_table(path, *more, **others)
+
+    monkeypatch.setattr("triline.nodes.formats.sensor_folder.read_table", counted)
+    more = ["--lines", f"N={folder / 'nadir.img'}", "--first-time", f"{START}Z", "--line-rate", "50"]
+    words = [str(folder)] if whole else [str(at), *more, "--above-ground", "1400"]
+    assert main(["import", *words, "-o", str(out), "-q"]) == 0
+    assert sorted(read) == ["gnss.csv", "imu.csv"]
+    reader = RecordingReader(out)
+    assert next(iter(reader.messages(["configuration/project"]))).body.origin_height == 602.5  # 2002.5 less 1400
+    assert len(list(reader.messages(["sensor/gnss"]))) == 6
 
 
 def test_lines_and_sensors_of_different_times_are_told(folder, tmp_path, capsys):

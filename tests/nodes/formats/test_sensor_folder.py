@@ -333,7 +333,7 @@ def test_a_flight_across_the_date_line_has_its_origin_there(tmp_path):
     table[:, 2] = (table[:, 2] + 180.0) % 360.0 - 180.0
     assert np.ptp(table[:, 2]) > 359.0
     np.savetxt(folder / "gnss.csv", table, "%.14g", ",", header=GNSS, comments="")
-    project = next(sensor_messages(folder, [])).body
+    project = next(sensor_messages(read_sensor_folder(folder), [])).body
     assert abs(project.origin_longitude) > 179.9
 
 
