@@ -300,7 +300,7 @@ def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
     out = [f'<VRTDataset rasterXSize="{raster.columns}" rasterYSize="{raster.rows}">']
     if raster.crs:
         wkt = CRS.from_user_input(raster.crs).to_wkt()
-        out.append(f'<SRS dataAxisToSRSAxisMapping="1,2">{escape(wkt)}</SRS>')
+        out.append(f"<SRS>{escape(wkt)}</SRS>")  # columns go east, whatever axis of the CRS is the first
     transform = (raster.left, raster.gsd, 0.0, raster.top, 0.0, -raster.gsd)
     out.append("<GeoTransform>" + ", ".join(map(repr, transform)) + "</GeoTransform>")
     if raster.tags:

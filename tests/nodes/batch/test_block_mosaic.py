@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -12,6 +13,7 @@ from block_of_orthoimages import GSD, LEFT, TOP, make_block
 from rio_cogeo.cogeo import cog_validate
 
 from triline.nodes.cli import main
+from triline.nodes.formats.geotiff import Raster, TilePlace, write_tile, write_virtual
 
 ENDS = ("tif", "source.tif", "seams.geojson", "sigma.tif")
 
@@ -238,6 +240,23 @@ def test_each_raster_is_what_its_ending_says(block, made, tmp_path, capsys, endi
             assert raster.driver == ("VRT" if virtual else "GTiff")
             np.testing.assert_array_equal(raster.read(1), whole.read(1))
     assert told["source"] == str(tmp_path / ("source.vrt" if ending == "tif" else "block.source.vrt"))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:3035", "EPSG:2193", "EPSG:32632", "EPSG:25832+7837"])
+def test_virtual_mosaics_have_their_axes_as_gdal_writes_them(crs, tmp_path):
+    """Where the first axis of a CRS goes north, other programs took the columns for it: of Europe in the Atlantic."""
+    import rasterio.shutil
+
+    raster = Raster(crs, 4_000_000.0, 3_000_000.0, 10.0, 20, 30, 1, "uint8", 0)
+    write_tile(tmp_path / "tile.tif", raster, np.ones((1, 20, 30), dtype=np.uint8))
+    write_virtual(tmp_path / "own.vrt", raster, [TilePlace(tmp_path / "tile.tif", 0, 0, 20, 30)])
+    axes = []
+    for name in ("tile.tif", "own.vrt"):  # as GDAL itself has them in its own words
+        rasterio.shutil.copy(tmp_path / name, tmp_path / "gdal.vrt", driver="VRT")
+        axes.append(re.findall('dataAxisToSRSAxisMapping="([^"]*)"', (tmp_path / "gdal.vrt").read_text()))
+    own = re.findall('dataAxisToSRSAxisMapping="([^"]*)"', (tmp_path / "own.vrt").read_text())
+    assert axes[0] == axes[1] and own in ([], axes[0])
+    assert axes[0][0].startswith("2,1" if crs in ("EPSG:3035", "EPSG:2193") else "1,2")
 
 
 @pytest.mark.parametrize(
