@@ -222,6 +222,8 @@ def layer_of_orthoimage(
         ):  # fmt: skip
             raise UserError(f"{sigma}: its cells are not those of {path}")
     dtype = np.dtype(source.dtype)
+    if dtype.kind == "c":
+        raise UserError(f"{path}: complex numbers, wanted grey values")
     nodata = source.source.nodata
     if nodata is None:
         nodata = float("nan") if dtype.kind == "f" else 0.0

@@ -295,8 +295,9 @@ def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
 
     from rasterio.crs import CRS
 
-    kinds = {"uint8": "Byte", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32", "int32": "Int32",
-             "float32": "Float32", "float64": "Float64"}  # fmt: skip
+    kinds = {"uint8": "Byte", "int8": "Int8", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32",
+             "int32": "Int32", "uint64": "UInt64", "int64": "Int64", "float32": "Float32",
+             "float64": "Float64"}  # fmt: skip
     out = [f'<VRTDataset rasterXSize="{raster.columns}" rasterYSize="{raster.rows}">']
     if raster.crs:
         wkt = CRS.from_user_input(raster.crs).to_wkt()

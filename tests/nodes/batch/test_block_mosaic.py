@@ -242,6 +242,26 @@ def test_each_raster_is_what_its_ending_says(block, made, tmp_path, capsys, endi
     assert told["source"] == str(tmp_path / ("source.vrt" if ending == "tif" else "block.source.vrt"))
 
 
+@pytest.mark.parametrize("dtype", ["int8", "int64", "uint64", "complex64"])
+def test_orthoimages_of_every_whole_number(dtype, tmp_path, capsys):
+    """Those of 8 bits with a sign and of 64 bits ended in a fault, as complex numbers did, which are refused."""
+    values = np.random.default_rng(1).integers(60, 120, (1, 200, 300)).astype(dtype)
+    paths = []
+    for k in range(2):  # two parts of one image
+        place = rasterio.Affine(2, 0, 500_000 + 200 * k, 0, -2, 5_000_000)
+        shape = {"driver": "GTiff", "height": 200, "width": 200, "count": 1, "dtype": dtype, "crs": "EPSG:32632"}
+        paths.append(tmp_path / f"ortho{k}.tif")
+        with rasterio.open(paths[-1], "w", transform=place, nodata=0, **shape) as target:
+            target.write(values[:, :, 100 * k : 100 * k + 200])
+    for out in (tmp_path / "m.tif", tmp_path / "m.vrt"):
+        code = main(["rectify", *map(str, paths), "--mosaic", "-o", str(out), "--workers", "1", "-q"])
+        if dtype == "complex64":
+            assert code == 1 and "ortho0.tif: complex numbers, wanted grey values" in capsys.readouterr().err
+            continue
+        with rasterio.open(out) as mosaic:
+            assert code == 0 and mosaic.dtypes == (dtype,) and (mosaic.read() == values).all()
+
+
 @pytest.mark.parametrize("crs", ["EPSG:3035", "EPSG:2193", "EPSG:32632", "EPSG:25832+7837"])
 def test_virtual_mosaics_have_their_axes_as_gdal_writes_them(crs, tmp_path):
     """Where the first axis of a CRS goes north, other programs took the columns for it: of Europe in the Atlantic."""
