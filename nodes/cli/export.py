@@ -29,7 +29,7 @@ from ..batch.rectification import (
 from ..convert import R_bc_of, local_frame, pose_sample
 from ..errors import UserError
 from ..formats.camera_json import write_camera
-from ..formats.features import Features, answers, features_of
+from ..formats.features import NOT_PLACED, Features, answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
 from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
@@ -314,6 +314,8 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
         raise UserError(
             f"{reader.path}: no message on configuration/project: the place of the local frame is not known"
         )
+    if not frame.is_placed:
+        raise UserError(f"{reader.path}: {NOT_PLACED}")
     samples = []
     for message in _answers(reader, args):
         try:

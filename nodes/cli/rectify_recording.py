@@ -150,7 +150,7 @@ def check_strips(recording: Recording, wanted: list[str] | None) -> None:
 def _crs(frame: LocalFrame) -> str:
     """The horizontal CRS of the project, or its UTM zone; local where the place of the project is not known."""
     if frame.crs == "local":
-        return "local" if frame.lat_deg == frame.lon_deg == frame.height_m == 0 else utm_of(frame)
+        return utm_of(frame) if frame.is_placed else "local"
     import pyproj
 
     crs = pyproj.CRS.from_user_input(frame.crs)

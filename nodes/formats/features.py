@@ -16,6 +16,9 @@ from ..convert import SECOND_NS, given_of
 from ..errors import UserError
 from ..node import Message
 
+#: Said of a project in local coordinates without an origin; on a map it would lie in the Gulf of Guinea.
+NOT_PLACED = "configuration/project has local coordinates and no origin: the place of the local frame is not known"
+
 
 @dataclass(frozen=True)
 class Features:
@@ -48,7 +51,7 @@ def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | Non
 
     Raises
     ------
-    UserError : a topic without places, nothing on it, or no project in the recording
+    UserError : a topic without places, nothing on it, no project in the recording, or one whose place nobody knows
     """
     kind = topics.find(topic).type_name
     if kind not in ("foxglove.PoseInFrame", "foxglove.LocationFix", "triline.ObjectPoint", "triline.GroundPoint"):
@@ -57,6 +60,8 @@ def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | Non
         return _fixes(topic, messages)
     if frame is None:
         raise UserError("no message on configuration/project: the place of the local frame is not known")
+    if not frame.is_placed:
+        raise UserError(NOT_PLACED)
     return _poses(topic, messages, frame) if kind == "foxglove.PoseInFrame" else _points(topic, messages, frame)
 
 

@@ -61,7 +61,7 @@ def write_oriented_lines(
     ----------
     R_bc : image to body
     """
-    placed = _placed(frame)
+    placed = frame.is_placed
     names = ("strip", "line", "time_s", *place_columns(frame.units), *_ANGLES, *_SIGMAS, *(_GEODETIC if placed else ()))
     count = 0
     with open(path, "w", encoding="utf-8", newline="") as file:
@@ -105,7 +105,7 @@ def write_sbet_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFra
     ------
     UserError : the place of the local frame is not known; no line
     """
-    if not _placed(frame):
+    if not frame.is_placed:
         raise UserError(
             "SBET has latitude and longitude, wanted the origin of the local frame in configuration/project"
         )
@@ -122,11 +122,6 @@ def write_sbet_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFra
     position, R, velocity = (np.concatenate(some)[first] for some in (positions, rotations, velocities))
     write_sbet_poses(path, time_ns, position, R, velocity, frame, R_bc)
     return len(time_ns)
-
-
-def _placed(frame: LocalFrame) -> bool:
-    """Whether it is known where on the Earth the local frame lies."""
-    return not frame.lat_deg == frame.lon_deg == frame.height_m == 0.0
 
 
 def _in_crs(position_l: Array, R_lc: Array, frame: LocalFrame) -> tuple[Array, Array]:

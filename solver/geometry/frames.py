@@ -131,6 +131,11 @@ class LocalFrame:
         return U @ Vt
 
     @property
+    def is_placed(self) -> bool:
+        """Whether it is known where on the Earth the frame lies; a project in local coordinates may have no origin."""
+        return not self.lat_deg == self.lon_deg == self.height_m == 0.0
+
+    @property
     def is_geographic(self) -> bool:
         return self.crs != "local" and self._crs.is_geographic
 

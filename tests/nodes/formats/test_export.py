@@ -257,6 +257,19 @@ def test_geojson(recording, tmp_path):
     assert points[3]["properties"]["sigma_kappa_deg"] == pytest.approx(np.degrees(3e-4))
 
 
+@pytest.mark.parametrize("target", ["--geojson", "--gpkg", "--sbet"])
+def test_a_project_without_a_place_is_on_no_map(target, tmp_path, capsys):
+    """Of a block in local coordinates; points and poses were at 0 N 0 E without a word."""
+    poses = [
+        Message("orientation/final", START + i, pose_message(START + i, [10.0 * i, 5.0, 900.0], [0.0, 0.0, 0.1]), "a")
+        for i in range(3)
+    ]
+    project = Message("configuration/project", START, m.Project(name="p", crs="local"), "test")
+    path = write_recording(tmp_path / "a.mcap", [project, *poses])
+    assert main(["export", str(path), "--topic", "orientation/final", target, str(tmp_path / "out"), "-q"]) == 1
+    assert "local coordinates and no origin" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 def test_lines_across_the_date_line_are_cut_there(tmp_path):
     """As RFC 7946 asks for: over 179.98, 179.99, -179.99 .. they went round the world. 180.01 is -179.99."""
     lon = [179.98, 179.99, 190.0 - 10.01 + 0.02, -179.98, -180.0, 179.98]
