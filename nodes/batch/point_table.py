@@ -11,6 +11,7 @@ from ...schemas import messages as m
 from ...schemas.units import place_columns
 from .. import convert
 from ..errors import UserError
+from ..formats.table import csv_field
 from ..recording.reader import RecordingReader
 
 _SIGMAS = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
@@ -61,7 +62,7 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
             values += ["" if np.isnan(s) else f"{s:.4f}" for s in sigma[i]]
             if covariance:
                 values += ["" if np.isnan(c) else f"{c:.6e}" for c in C[i][[0, 0, 1], [1, 2, 2]]]
-            name = f'"{p.point}"' if set(p.point) & set(',"\n') else p.point
             status = convert.enum_name(m.ObjectPoint.Status, p.status)
-            file.write(",".join([name, *values, str(p.rays), p.role, status, p.checked]) + "\n")
+            words = [csv_field(p.point), *values, str(p.rays), csv_field(p.role), status, csv_field(p.checked)]
+            file.write(",".join(words) + "\n")
     return len(best)

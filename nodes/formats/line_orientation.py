@@ -15,6 +15,7 @@ from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
 from ...solver.geometry.rotation import R_BC_NOMINAL, angles_from_matrix, angles_jacobian
 from ..errors import UserError
 from .sbet import write_sbet_poses
+from .table import csv_field
 
 Array = NDArray[np.floating]
 
@@ -79,13 +80,22 @@ def write_patb_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFra
     A row is ``id X Y Z r11 r12 r13 r21 r22 r23 r31 r32 r33`` between blanks, without a header: ``id`` is strip and
     line (``S1_120``, blanks of the strip as ``_``), X, Y, Z the perspective centre in the project's CRS, ``r`` the
     matrix from the image frame (x along flight, y to the left, z up) to the axes of the CRS, row by row.
+
+    Raises
+    ------
+    UserError : strips whose names are the same with ``_``
     """
-    count = 0
+    count, of_name = 0, dict[str, str]()
     flat = "%.9f" if frame.is_geographic else "%.4f"
     form = " ".join([flat, flat, "%.4f", *["%.12f"] * 9]) + "\n"
     with open(path, "w", encoding="utf-8", newline="") as file:
         for part in parts:
             strip = "_".join(part.strip.split())
+            other = of_name.setdefault(strip, part.strip)
+            if other != part.strip:
+                raise UserError(
+                    f"strips {other!r} and {part.strip!r} have the same name in PATB, {strip}: wanted --format csv"
+                )
             for i in range(0, len(part.line), CHUNK):
                 place, R = _in_crs(part.position_l[i : i + CHUNK], part.R_lc[i : i + CHUNK], frame)
                 values = np.concatenate([place, R.reshape(-1, 9)], axis=1).tolist()
@@ -171,7 +181,8 @@ def _rows(file: TextIO, part: OrientedLines, rows: slice, frame: LocalFrame, R_b
         columns += [frame.to_geodetic(position), rpy]
         formats += ["%.10f", "%.10f", "%.4f", *["%.7f"] * 3]
     form = ",".join(formats) + "\n"
-    stamps = (f"{part.strip},{n},{t // 10**9}.{t % 10**9:09d}," for n, t in zip(
+    strip = csv_field(part.strip)
+    stamps = (f"{strip},{n},{t // 10**9}.{t % 10**9:09d}," for n, t in zip(
         part.line[rows].tolist(), part.time_ns[rows].tolist(), strict=True))  # fmt: skip
     table = np.concatenate(columns, axis=1)
     text = [start + form % tuple(row) for start, row in zip(stamps, table.tolist(), strict=True)]

@@ -217,6 +217,11 @@ def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]],
         writer.writerows(zip(*cells, strict=True))
 
 
+def csv_field(text: str) -> str:
+    """A text as it stands in a CSV file: between quotes, with those in it doubled, where it would end the field."""
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
+
+
 def _open(path: Path):
     return open(path, newline="", encoding="utf-8-sig", errors="replace")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import sqlite3
 import struct
@@ -16,9 +17,11 @@ from small_block import simulated_block
 
 from triline.nodes.cli import main, process
 from triline.nodes.convert import camera_message, gnss_message, ground_point_message, pose_message
+from triline.nodes.errors import UserError
 from triline.nodes.formats.block_messages import block_messages
 from triline.nodes.formats.camera_json import write_camera
 from triline.nodes.formats.detect import Options, read_any
+from triline.nodes.formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines
 from triline.nodes.formats.rows import ElementLayout, RowLayout, repeated_messages
 from triline.nodes.formats.track import Mounting, NavigationTrack, track_messages
 from triline.nodes.node import Message
@@ -255,6 +258,38 @@ def test_geojson(recording, tmp_path):
     assert points[0]["properties"]["sigma_X_m"] is None
     assert points[3]["properties"]["sigma_Y_m"] == pytest.approx(0.2)
     assert points[3]["properties"]["sigma_kappa_deg"] == pytest.approx(np.degrees(3e-4))
+
+
+def _lines(strip: str) -> OrientedLines:
+    n = 3
+    times = START + np.arange(n, dtype=np.int64) * 10**7
+    C = np.broadcast_to(np.diag([0.01, 0.04, 0.09, 1e-8, 1e-8, 1e-8]), (n, 6, 6))
+    return OrientedLines(strip, np.arange(n), times, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)), C)
+
+
+def test_names_with_quotes_and_commas_stay_in_their_column(tmp_path):
+    """As RFC 4180 has it; a strip a,b moved all columns, and a point with a quote its own."""
+    names = ['S,"1"', "S2", 'S"3']
+    assert write_oriented_lines(tmp_path / "lines.csv", map(_lines, names), FRAME) == 9
+    with open(tmp_path / "lines.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["strip"] for row in rows] == np.repeat(names, 3).tolist()
+    assert all(row["line"] == str(i % 3) and float(row["sigma_Z_m"]) == 0.3 for i, row in enumerate(rows))
+    points = [m.ObjectPoint(point=name, x=1.0, y=2.0, z=3.0, role="tie") for name in names]
+    messages = [_project(), *(Message("point/object", START + k, point, "adjuster") for k, point in enumerate(points))]
+    path = write_recording(tmp_path / "a.mcap", messages)
+    assert main(["export", str(path), "--points", str(tmp_path / "points.csv"), "-q"]) == 0
+    with open(tmp_path / "points.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["point"], row["Z_m"], row["role"]) for row in rows] == [(name, "3.0000", "tie") for name in names]
+
+
+def test_photos_of_two_strips_with_one_name_in_patb_are_refused(tmp_path):
+    """Blanks become _ there: lines of S 1 and of S_1 had the same ids."""
+    path = tmp_path / "lines.ori"
+    assert write_patb_lines(path, map(_lines, ["S 1", "S 2", "S 1"]), FRAME) == 9
+    with pytest.raises(UserError, match="strips 'S 1' and 'S_1' have the same name in PATB, S_1"):
+        write_patb_lines(path, map(_lines, ["S 1", "S_1"]), FRAME)
 
 
 @pytest.mark.parametrize("target", ["--geojson", "--gpkg", "--sbet"])
