@@ -58,14 +58,16 @@ def write_stac_item(
     lon, lat = transformer_to(crs).transform(x, y, direction="INVERSE")
     geometry, bbox = _footprint(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    epsg = pyproj.CRS.from_user_input(crs).to_epsg()
+    of_cells = pyproj.CRS.from_user_input(crs)
+    epsg = of_cells.to_epsg()
     item = {
         "type": "Feature", "stac_version": "1.0.0", "id": mosaic.stem,
         "stac_extensions": ["https://stac-extensions.github.io/projection/v1.1.0/schema.json"],
         "geometry": geometry, "bbox": bbox,
         "properties": {
             **_times(result["layers"], made), "created": made, "gsd": _metres(crs, left, right, bottom, top, gsd),
-            "proj:epsg": epsg, "proj:shape": [done["rows"], done["columns"]],
+            "proj:epsg": epsg, **({} if epsg is not None else {"proj:wkt2": of_cells.to_wkt("WKT2_2019")}),
+            "proj:shape": [done["rows"], done["columns"]],
             "proj:transform": [gsd, 0.0, left, 0.0, -gsd, top],
             "triline:layers": [layer["name"] for layer in result["layers"]],
             "triline:step_across_seams": result["step_across_seams"],

@@ -169,6 +169,28 @@ def test_stac_item_across_the_date_line_does_not_go_round_the_world(tmp_path):
     assert widths == pytest.approx([400.0, 200.0], abs=40.0)  # meridians are not parallel to the grid
 
 
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832+7837", "ESRI:102013"])
+def test_stac_item_says_which_crs_its_cells_are_in(crs, tmp_path):
+    """Without an EPSG number by its words; shape and transform were left without any system."""
+    import pyproj
+
+    ortho, item = tmp_path / "ortho.tif", tmp_path / "item.json"
+    shape = {"driver": "GTiff", "height": 200, "width": 300, "count": 1, "dtype": "uint16", "crs": crs}
+    with rasterio.open(ortho, "w", transform=rasterio.Affine(2, 0, 5e5, 0, -2, 1e6), nodata=0, **shape) as target:
+        target.write(np.full((1, 200, 300), 1000, dtype=np.uint16))
+    out = tmp_path / "m.tif"
+    words = ["rectify", ortho, "--mosaic", "-o", out, "--stac", item, "--workers", 1, "-q"]
+    assert main([*map(str, words)]) == 0
+    told = json.loads(item.read_text())["properties"]
+    assert told["proj:epsg"] == (32632 if crs == "EPSG:32632" else None) and ("proj:wkt2" in told) == (
+        crs[-5:] != "32632"
+    )
+    said = pyproj.CRS.from_user_input(told.get("proj:wkt2") or told["proj:epsg"])
+    with rasterio.open(out) as mosaic:
+        assert said.equals(pyproj.CRS.from_user_input(crs), ignore_axis_order=True)
+        assert told["proj:transform"] == list(mosaic.transform)[:6] and told["proj:shape"] == list(mosaic.shape)
+
+
 def test_seam_lines_across_the_date_line_are_cut_there(tmp_path):
     """As RFC 7946 asks for; they went round the world from 179.999 to -179.999 degrees."""
     from pyproj import Transformer
