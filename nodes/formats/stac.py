@@ -55,8 +55,12 @@ def write_stac_item(
     y = np.concatenate(
         [np.full(len(s), bottom), bottom + s * (top - bottom), np.full(len(s), top), top - s * (top - bottom)]
     )
-    lon, lat = transformer_to(crs).transform(x, y, direction="INVERSE")
-    geometry, bbox = _footprint(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
+    to_map = transformer_to(crs)
+    lon, lat = to_map.transform(x, y, direction="INVERSE")
+    poles = [(pole, *to_map.transform(0.0, pole)) for pole in (-90.0, 90.0)]
+    inside = [pole for pole, x, y in poles if left < x < right and bottom < y < top]
+    outline = np.column_stack([lon, lat])
+    geometry, bbox = _round_pole(outline, inside[0]) if inside else _footprint(*outline.T)
     made = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     of_cells = pyproj.CRS.from_user_input(crs)
     epsg = of_cells.to_epsg()
@@ -98,6 +102,18 @@ def _footprint(lon: Array, lat: Array) -> tuple[dict[str, Any], list[float]]:
     if across:
         return {"type": "MultiPolygon", "coordinates": [[ring] for ring in rings]}, bounds
     return {"type": "Polygon", "coordinates": rings}, bounds
+
+
+def _round_pole(outline: Array, pole: float) -> tuple[dict[str, Any], list[float]]:
+    """Geometry and bounds of what an outline (n, 2) round a pole, at latitude -90 or 90, has inside: all longitudes."""
+    lon, lat = outline[np.argsort(outline[:, 0])].T
+    at_date_line = float(np.interp(180.0, [lon[-1], lon[0] + 360.0], [lat[-1], lat[0]]))
+    edge = np.column_stack([[-180.0, *lon, 180.0], [at_date_line, *lat, at_date_line]]).tolist()
+    ring = [*edge, [180.0, pole], [-180.0, pole], edge[0]]
+    ring = ring if pole > 0.0 else ring[::-1]  # counterclockwise
+    south, north = (float(lat.min()), pole) if pole > 0.0 else (pole, float(lat.max()))
+    bounds = [-180.0, round(south, 8), 180.0, round(north, 8)]
+    return {"type": "Polygon", "coordinates": [[[round(a, 8), round(b, 8)] for a, b in ring]]}, bounds
 
 
 def _cut(outline: Array, side: float) -> Array:

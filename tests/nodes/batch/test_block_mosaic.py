@@ -169,6 +169,32 @@ def test_stac_item_across_the_date_line_does_not_go_round_the_world(tmp_path):
     assert widths == pytest.approx([400.0, 200.0], abs=40.0)  # meridians are not parallel to the grid
 
 
+@pytest.mark.parametrize(("crs", "pole"), [("EPSG:3031", -90.0), ("EPSG:3413", 90.0)])
+def test_stac_item_round_a_pole(crs, pole, tmp_path):
+    """All longitudes, up to the pole: it had two polygons without the pole, and bounds from 0 to -20 degrees."""
+    from pyproj import Transformer
+
+    ortho, item = tmp_path / "ortho.tif", tmp_path / "item.json"
+    shape = {"driver": "GTiff", "height": 200, "width": 300, "count": 1, "dtype": "uint16", "crs": crs}
+    with rasterio.open(ortho, "w", transform=rasterio.Affine(2, 0, -300, 0, -2, 200), nodata=0, **shape) as target:
+        target.write(np.full((1, 200, 300), 1000, dtype=np.uint16))
+    words = ["rectify", ortho, "--mosaic", "-o", tmp_path / "m.tif", "--stac", item, "--workers", 1, "-q"]
+    assert main([*map(str, words)]) == 0
+    told = json.loads(item.read_text())
+    west, south, east, north = told["bbox"]
+    assert (west, east) == (-180.0, 180.0) and pole in (south, north) and abs(south) > 89.995 and abs(north) > 89.995
+    (ring,) = told["geometry"]["coordinates"]
+    lon, lat = np.array(ring).T
+    assert told["geometry"]["type"] == "Polygon" and ring[0] == ring[-1]
+    area = 0.5 * np.sum(lon[:-1] * lat[1:] - lon[1:] * lat[:-1])  # counterclockwise; sum of the strips to the pole
+    inner = np.abs(lat) < 90.0
+    order = np.argsort(lon[inner])
+    assert area == pytest.approx(np.trapezoid(90.0 - np.abs(lat[inner][order]), lon[inner][order]), rel=1e-6)
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon[inner], lat[inner])
+    on_edge = np.minimum(np.minimum(abs(x + 300), abs(x - 300)), np.minimum(abs(y - 200), abs(y + 200)))
+    assert np.sort(on_edge)[-4:-3] < 0.01 and on_edge.max() < 20.0  # between places the edge is a straight line
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832+7837", "ESRI:102013"])
 def test_stac_item_says_which_crs_its_cells_are_in(crs, tmp_path):
     """Without an EPSG number by its words; shape and transform were left without any system."""
