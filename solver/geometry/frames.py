@@ -139,6 +139,14 @@ class LocalFrame:
     def is_geographic(self) -> bool:
         return self.crs != "local" and self._crs.is_geographic
 
+    def near(self, x: ArrayLike, middle: float) -> Array:
+        """X coordinates (...) in the CRS, longitudes counted so that they lie within half a turn of a middle."""
+        x = np.asarray(x, dtype=float)
+        if not self.is_geographic:
+            return x
+        circle = _circle(self._crs)
+        return x - circle * np.round((x - middle) / circle)
+
     @property
     def units(self) -> tuple[str, str, str]:
         """Units of the coordinates in the project CRS: m, deg, grad, ft, ft_us; crs_unit for all others."""
@@ -162,7 +170,7 @@ class LocalFrame:
             return cls(0.0, 0.0, 0.0)
         xyz, parsed = np.array(np.atleast_2d(xyz), dtype=float), known_crs(crs)
         if parsed.is_geographic:
-            circle = 2.0 * np.pi / parsed.axis_info[0].unit_conversion_factor
+            circle = _circle(parsed)
             if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
                 xyz[:, 0] %= circle
         lon, lat, _ = _transformer(parsed).transform(*np.mean(xyz, axis=0))
@@ -241,6 +249,11 @@ def known_crs(crs: str, *, geocentric: bool = True):
         return known
     kind = "a geocentric" if known.is_geocentric else "a vertical" if known.is_vertical else "another"
     raise CrsError(f"crs {crs!r}: {kind} system, wanted a projected or geographic one (with heights)")
+
+
+def _circle(crs) -> float:
+    """The longitude once round the Earth in the units of a geographic CRS."""
+    return 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor
 
 
 def _transformer(crs):

@@ -150,7 +150,8 @@ def heights_in_frame(
         point = np.stack([x_l, np.full(nx, bottom + step_m * i), np.full(nx, start_m)], axis=1)
         for _ in range(3):  # the place in the CRS hardly depends on the height
             place = other.to_crs(point, may_lie_outside=True)  # the field reaches beyond the given heights
-            h = given.height((place[:, 0] - x0) / dx, (place[:, 1] - y0) / dy)
+            x = other.near(place[:, 0], x0 + 0.5 * dx * (columns - 1))  # across the date line, or from 0 to 360
+            h = given.height((x - x0) / dx, (place[:, 1] - y0) / dy)
             known = np.isfinite(h)
             point[:, 2] += np.where(known, unit_m * (h - place[:, 2]), 0.0)
             field[i] = np.where(known, point[:, 2], np.nan)

@@ -549,6 +549,20 @@ def test_heights_as_far_as_the_grid_of_their_geoid(cells, tmp_path):
     np.testing.assert_allclose(field.height(wanted[:, 0], wanted[:, 1]), wanted[:, 2], atol=0.05)
 
 
+@pytest.mark.parametrize(("west", "lon"), [(179.8, 180.0), (179.8, -179.9), (-180.2, 180.0), (259.8, -100.0)])
+def test_heights_across_the_date_line_and_longitudes_to_360(west, lon, tmp_path):
+    """Half of such a raster was a hole without a word, and one from 0 to 360 degrees had no height at all."""
+    path, place = tmp_path / "dem.tif", rasterio.Affine(0.01, 0.0, west - 0.005, 0.0, -0.01, 48.205)
+    shape = {"driver": "GTiff", "width": 41, "height": 41, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(path, "w", transform=place, **shape) as target:
+        target.write(np.tile(np.arange(41, dtype=np.float32), (1, 41, 1)))
+    frame = LocalFrame(48.0, lon, 0.0)
+    field = dem_in_frame(path, frame, "ellipsoid")
+    east = np.array([0.05, 0.15, 0.25, 0.35])
+    wanted = frame.from_geodetic(np.full(4, 48.0), west + east, 100.0 * east)
+    np.testing.assert_allclose(field.height(wanted[:, 0], wanted[:, 1]), wanted[:, 2], atol=0.05)
+
+
 def test_relief_is_of_points_with_a_height(tmp_path):
     with RecordingWriter(tmp_path / "control.mcap") as writer:
         for k, role in enumerate(("control", "planimetric", "height", "check")):
