@@ -89,12 +89,12 @@ class HeightRaster:
             self._check_file(file, first, crs is not None)
         t = first.transform
         self._t = t
+        self._geographic = bool(flat.is_geographic)
         self._rows, self._columns = self._offsets()
         self.rows = max(row + file.rows for row, file in zip(self._rows, self._files, strict=True))
         self.columns = max(column + file.columns for column, file in zip(self._columns, self._files, strict=True))
         from pyproj import Transformer
 
-        self._geographic = bool(flat.is_geographic)
         base = flat.geodetic_crs if ellipsoid != WGS84 else "EPSG:4326"
         self._to_flat = Transformer.from_crs(base, flat, always_xy=True)
         width = abs(t.a), abs(t.e)
@@ -133,11 +133,17 @@ class HeightRaster:
             raise UserError(f"{path}: another CRS or cell size than {first.path.name}, wanted rasters of one grid")
 
     def _offsets(self) -> tuple[list[int], list[int]]:
-        """First row and column of every raster, counted from the first raster's upper left after shifting to 0."""
+        """First row and column of every raster, counted from the first raster's upper left after shifting to 0.
+
+        Tiles in degrees on both sides of the date line are neighbours.
+        """
         t = self._t
         rows, columns = [], []
         for file in self._files:
-            row, column = (file.transform.f - t.f) / t.e, (file.transform.c - t.c) / t.a
+            east = file.transform.c - t.c
+            if self._geographic:
+                east -= 360.0 * round(east / 360.0)
+            row, column = (file.transform.f - t.f) / t.e, east / t.a
             if abs(row - round(row)) > 0.01 or abs(column - round(column)) > 0.01:
                 raise UserError(f"{file.path}: lies between the cells of {self._files[0].path.name}")
             rows.append(round(row))

@@ -549,6 +549,22 @@ def test_heights_as_far_as_the_grid_of_their_geoid(cells, tmp_path):
     np.testing.assert_allclose(field.height(wanted[:, 0], wanted[:, 1]), wanted[:, 2], atol=0.05)
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_tiles_of_heights_on_both_sides_of_the_date_line_are_neighbours(first, tmp_path):
+    """A raster round the Earth was made of them, whose windows no memory holds, with a gap along the date line."""
+    paths, shape = [], {"driver": "GTiff", "width": 100, "height": 100, "count": 1, "dtype": "float32"}
+    for k, west in enumerate((179.0, -180.0)):
+        paths.append(tmp_path / f"{k}.tif")
+        place = rasterio.Affine(0.01, 0.0, west, 0.0, -0.01, 49.0)
+        with rasterio.open(paths[-1], "w", crs="EPSG:4326", transform=place, **shape) as target:
+            target.write(np.tile(np.arange(100, dtype=np.float32) + 100 * k, (1, 100, 1)))
+    raster = HeightRaster([paths[first], paths[1 - first]], None, "ellipsoid")
+    assert (raster.rows, raster.columns) == (100, 200)
+    lon = np.array([179.5, 179.999, 180.0, -179.999, -179.5])
+    wanted = (lon % 360.0 - 179.005) * 100.0
+    np.testing.assert_allclose(raster.at(np.radians(np.full(5, 48.5)), np.radians(lon)), wanted, atol=1e-4)
+
+
 @pytest.mark.parametrize(("west", "lon"), [(179.8, 180.0), (179.8, -179.9), (-180.2, 180.0), (259.8, -100.0)])
 def test_heights_across_the_date_line_and_longitudes_to_360(west, lon, tmp_path):
     """Half of such a raster was a hole without a word, and one from 0 to 360 degrees had no height at all."""
