@@ -125,7 +125,8 @@ class Layout:
 
     def corrections(self, theta: Array, rays: slice = slice(None)) -> Array:
         """Orientation corrections (6, n) of the rays, or of a range of them."""
-        padded = np.append(theta[: self.n_model], 0.0)
+        padded = np.zeros(self.n_model + 1)  # at the end what does not act
+        padded[:-1] = theta[: self.n_model]
         if not padded.any():
             return np.zeros((6, self.columns[:, rays].shape[1]))
         coefficients = self.coefficients[:, rays]

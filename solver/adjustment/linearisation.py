@@ -169,10 +169,12 @@ def linearise_and_weigh(
     whitening : weights to be kept
     """
     n, kept = len(rays), whitening is not None
-    layout = fit_rays(rays, layout, theta, points_l)
+    # of few rays they are computed once for both
+    correction = layout.corrections(theta) if layout.camera is not None and n <= CHUNK else None
+    layout = fit_rays(rays, layout, theta, points_l, correction)
     whitening = whitening or Whitening(np.empty((3, n)))
     result = _not_filled(layout, n)
-    for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l):
+    for part, own, residual, d_orientation, d_point, _ in _by_chunks(rays, layout, theta, points_l, correction):
         if not kept:
             whitening.g[:, part] = whiten(residual_covariance(own, d_orientation)).g
         g = whitening.g[:, part]
@@ -184,7 +186,7 @@ def linearise_and_weigh(
     return Weighed(whitening, result, layout)
 
 
-def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layout:
+def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array, correction: Array | None = None) -> Layout:
     """The layout with every ray where it is by what is known of it: line, sample and orientation less their residuals.
 
     What is linearised at measured values has their noise in its derivatives as well as in its residuals, and the
@@ -196,13 +198,18 @@ def fit_rays(rays: Rays, layout: Layout, theta: Array, points_l: Array) -> Layou
     A residual ``r`` of covariance ``C`` is made up of ``S J^T C^-1 r`` of observations of covariance ``S`` that act on
     it by ``J``: lines and samples, and the orientation where its noise is known.
 
+    Parameters
+    ----------
+    rays, layout, theta, points_l : as in `linearise`
+    correction : (6, n) of the orientation at these values, where it has been computed already
+
     Source: A. J. Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972.
     """
     if layout.camera is None:
         return layout
     n = len(rays)
     fitted, moved, image = np.empty((2, n)), np.empty((n, 6)), np.empty((2, n))
-    for part, own, residual, d_orientation, _, _ in _by_chunks(rays, layout, theta, points_l):
+    for part, own, residual, d_orientation, _, _ in _by_chunks(rays, layout, theta, points_l, correction):
         rates = _rates(own)
         motion, pitch = _image_motion(d_orientation, rates), own.pitch_mm.T
         white = whiten(residual_covariance(own, d_orientation, motion))
@@ -236,9 +243,10 @@ def _image_motion(d_orientation: Array, rates: Array) -> Array:
 
 
 def _by_chunks(
-    rays: Rays, layout: Layout, theta: Array, points_l: Array
+    rays: Rays, layout: Layout, theta: Array, points_l: Array, correction: Array | None = None
 ) -> Iterator[tuple[slice, Rays, Array, Array, Array, Array]]:
-    """Range, rays, residual in mm, derivatives and depth of one chunk after the other."""
+    """Range, rays, residual in mm, derivatives and depth of one chunk after the other; corrections (6, n) of all rays
+    may be given."""
     for low in range(0, len(rays), CHUNK):
         part = slice(low, min(low + CHUNK, len(rays)))
         own = rays if len(rays) <= CHUNK else rays.part(part)
@@ -247,13 +255,13 @@ def _by_chunks(
             position_l = own.position_l + layout.shift.orientation[part, :3]
             angles = own.angles + layout.shift.orientation[part, 3:]
             own, xy_mm = replace(own, position_l=position_l, angles=angles), xy_mm + layout.shift.image_mm[:, part]
-        correction = layout.corrections(theta, part)
-        position, angles = corrected(own, layout, correction)
+        change = layout.corrections(theta, part) if correction is None else correction[:, part]
+        position, angles = corrected(own, layout, change)
         xy, d_orientation, d_point, depth = collinearity(
             position, angles, points_l.take(own.point, axis=0).T, own.focal_length_mm
         )
         if layout.heading:  # kappa's correction has turned the tilt
-            omega, phi = angles[:2] - correction[3:5]
+            omega, phi = angles[:2] - change[3:5]
             d_orientation[:, 5] += omega * d_orientation[:, 4] - phi * d_orientation[:, 3]
         residual = xy_mm - layout.displacement(theta, part) - xy
         yield part, own, residual, d_orientation, d_point, depth

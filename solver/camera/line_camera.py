@@ -114,13 +114,20 @@ class LineCamera:
         sample : (n,) pixels
         """
         line = np.asarray(line)
-        sample = np.asarray(sample, dtype=float)
-        xy = np.empty((len(sample), 2))
-        pitch = np.empty((len(sample), 2))
-        for k in np.unique(line):
-            mine = line == k
-            xy[mine], pitch[mine] = self.lines[k].image_coordinates(sample[mine])
-        return xy - self.principal_point_mm[line], pitch
+        v = np.asarray(sample, dtype=float)
+        xy_mm, first, last = self._pixels
+        i = np.minimum(np.maximum(np.floor(v).astype(int), 0), last[line])
+        of_pixel = first[line] + i
+        begin = xy_mm[of_pixel]
+        pitch = xy_mm[of_pixel + 1] - begin
+        return begin + (v - i)[:, None] * pitch - self.principal_point_mm[line], pitch
+
+    @cached_property
+    def _pixels(self) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
+        """Pixel centres of all lines one after the other (k, 2), where each line begins there, and the last pixel but
+        one of each (lines,)."""
+        count = np.array([line.pixels for line in self.lines], dtype=int)
+        return np.concatenate([line.xy_mm for line in self.lines]), np.cumsum(count) - count, count - 2
 
 
 def finest_pixel(camera: LineCamera) -> float:

@@ -90,13 +90,15 @@ class CameraDesign:
 
     def evaluate(self, values: Array, rays: slice = slice(None)) -> Array:
         """Image displacement D (2, n) in mm for parameter values (n_unknowns,), of all rays or a range of them."""
-        if not np.any(values):
+        if not values.any():
             return np.zeros(self.xy_mm[:, rays].shape)
         return np.einsum("csn,sn->cn", self.coefficients(rays), self.values_of(values, rays))
 
     def values_of(self, values: Array, rays: slice = slice(None)) -> Array:
         """Those of the parameter values (n_unknowns,) that act on each ray: (slots, n)."""
-        of_slot = np.ascontiguousarray(np.append(values, 0.0)[self.columns].T)  # (slots, patterns)
+        padded = np.zeros(len(values) + 1)  # at the end what does not act
+        padded[:-1] = values
+        of_slot = np.ascontiguousarray(padded[self.columns].T)  # (slots, patterns)
         return of_slot.take(self.pattern[rays], axis=1)
 
     def coefficients(self, rays: slice = slice(None)) -> Array:

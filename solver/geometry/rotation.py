@@ -61,8 +61,11 @@ def corrected_angles(measured: Array, correction: Array) -> Array:
     The heading of an inertial system is wrong about the vertical, so that its omega and phi, right about level axes,
     are told in axes that are turned: kappa's correction turns the measured tilt, and then all three are added.
     """
-    omega, phi = turned_tilt(measured[:, 0], measured[:, 1], correction[:, 2])
-    return np.stack([omega, phi, measured[:, 2]], axis=1) + correction
+    angles = np.empty(measured.shape)
+    angles[:, 0], angles[:, 1] = turned_tilt(measured[:, 0], measured[:, 1], correction[:, 2])
+    angles[:, 2] = measured[:, 2]
+    angles += correction
+    return angles
 
 
 def measured_angles(true: Array, error: Array) -> Array:

@@ -28,6 +28,7 @@ DECISIVE = 10.8
 LEFT_OUT = 1e10
 #: Ratio of its two variances below which a covariance of line and sample is singular. Numerical: far above rounding.
 SINGULAR = 1e-6
+_UNIT = np.eye(3)
 
 
 def entry_weight(
@@ -145,8 +146,8 @@ class EntryEquations:
         out = np.where(np.repeat(active, 2, axis=1), 0.0, LEFT_OUT)
         W = np.linalg.inv(self.covariance + out[:, :, None] * np.eye(2 * k))
         WJ = W @ self.point
-        N = np.swapaxes(self.point, 1, 2) @ WJ + control[:, :, None] * np.eye(3)
-        N += 1e-9 * np.einsum("pii->p", N)[:, None, None] * np.eye(3)
+        N = np.swapaxes(self.point, 1, 2) @ WJ + control[:, :, None] * _UNIT
+        N += 1e-9 * np.einsum("pii->p", N)[:, None, None] * _UNIT
         rhs = np.einsum("pik,pi->pk", WJ, self.residual) + control * self.off
         shift = np.linalg.solve(N, rhs[:, :, None])[:, :, 0]
         rest = self.residual - np.einsum("pik,pk->pi", self.point, shift)

@@ -111,9 +111,17 @@ def test_a_command_that_is_told_to_end_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+#: `triline` whose nodes are never through: the second process stays at work, and the first one waits for it.
+NEVER_THROUGH = """import sys, time
+from triline.nodes.cli import main
+from triline.nodes.recording import runner
+runner._Line.finish = lambda line: time.sleep(3600)
+sys.exit(main())"""
+
+
 def test_process_that_is_told_to_end_takes_its_second_process_along(tmp_path):
     flight = simulated_flight(60)
-    command = [sys.executable, "-m", "triline.nodes.cli", "process", str(flight), "-o", "out.mcap", "--processes", "2"]
+    command = [sys.executable, "-c", NEVER_THROUGH, "process", str(flight), "-o", "out.mcap", "--processes", "2"]
     program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
     wait_for(lambda: len(list(tmp_path.glob("*.part"))) == 1, 20, "the beginning of the output")
     program.send_signal(signal.SIGTERM)
