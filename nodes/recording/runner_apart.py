@@ -22,6 +22,8 @@ T = TypeVar("T")
 
 #: Items of a batch, and batches that wait before the process ahead waits.
 BATCH, WAITING = 2000, 24
+#: What tells a program to end.
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Ahead(Generic[T]):
@@ -38,7 +40,11 @@ class Ahead(Generic[T]):
         self._connection, there = context.Pipe(duplex=False)
         self._name = name
         self._process = context.Process(target=_work, args=(there, self._connection, make), daemon=True)
-        self._process.start()
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # whoever is ended in between would leave it behind
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
         there.close()
 
     @staticmethod
@@ -76,6 +82,7 @@ def _work(connection: Connection, other: Connection, make: Callable[[], Iterable
     """The process ahead: makes batches, which a thread of it sends, so that making does not wait for sending."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     other.close()
     made: queue.Queue[list[T] | UserError | None] = queue.Queue(WAITING)
     sender = threading.Thread(target=_send, args=(connection, made), daemon=True)

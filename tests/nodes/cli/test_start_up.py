@@ -112,19 +112,29 @@ def test_a_command_that_is_told_to_end_leaves_nothing(tmp_path):
 
 
 #: `triline` whose nodes are never through: the second process stays at work, and the first one waits for it.
-NEVER_THROUGH = """import sys, time
+NEVER_THROUGH = """import os, signal, sys, time
+from multiprocessing.popen_fork import Popen
 from triline.nodes.cli import main
 from triline.nodes.recording import runner
 runner._Line.finish = lambda line: time.sleep(3600)
+launch = Popen._launch
+def told_to_end_then(self, process):
+    launch(self, process)
+    os.kill(os.getpid(), signal.SIGTERM)
+if sys.argv.pop(1) == "as it begins":
+    Popen._launch = told_to_end_then
 sys.exit(main())"""
 
 
-def test_process_that_is_told_to_end_takes_its_second_process_along(tmp_path):
+@pytest.mark.parametrize("when", ["as it begins", "at work"])
+def test_process_that_is_told_to_end_takes_its_second_process_along(tmp_path, when):
     flight = simulated_flight(60)
-    command = [sys.executable, "-c", NEVER_THROUGH, "process", str(flight), "-o", "out.mcap", "--processes", "2"]
+    words = ["process", str(flight), "-o", "out.mcap", "--processes", "2"]
+    command = [sys.executable, "-c", NEVER_THROUGH, when, *words]
     program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    wait_for(lambda: len(list(tmp_path.glob("*.part"))) == 1, 20, "the beginning of the output")
-    program.send_signal(signal.SIGTERM)
+    if when == "at work":
+        wait_for(lambda: len(list(tmp_path.glob("*.part"))) == 1, 20, "the beginning of the output")
+        program.send_signal(signal.SIGTERM)
     _, err = program.communicate(timeout=20)
     assert program.returncode == 143 and err.splitlines()[-1] == "triline process: ended by SIGTERM"
     assert not list(tmp_path.iterdir())
