@@ -261,13 +261,14 @@ class Adjuster(Node):
         return []
 
     def _configure(self, topic: str, body: Any, stamp_ns: int) -> list[Message]:
-        another_frame = False
+        another_frame, given_up = False, 0
         if topic == "configuration/project":
             if body == self._project:
                 return []
             convert.slow_errors_of(body)
             another_frame = self._project is not None and not convert.same_frame(body, self._project)
             self._project = body
+            given_up = self._control.forget() if another_frame else 0
         else:
             if body == self._camera:
                 return []
@@ -302,6 +303,8 @@ class Adjuster(Node):
                 "; its local frame has another origin or CRS than before, so results from now on do not go with those "
                 "before, and control has to be stated in it"
             )
+            if given_up:
+                words += f" ({given_up} ground points do not count until they are stated again)"
         return [*told, self._log(words, warning=True)]
 
     def _surface(self) -> tuple[SurfaceControl | None, list[Message]]:

@@ -29,6 +29,15 @@ class StatedControl:
     def __contains__(self, name: str) -> bool:
         return name in self.bodies
 
+    def forget(self) -> int:
+        """Forget all points, whose coordinates are in a local frame that was given up; returns how many there were.
+
+        What a surveyor said of them stays.
+        """
+        n = len(self.bodies)
+        self.bodies.clear()
+        return n
+
     def take(self, body: Any, window: Window | None) -> None:
         """Keep a ground point, and hand it to the window if there is one.
 

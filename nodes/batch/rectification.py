@@ -258,15 +258,17 @@ def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrient
 
 def _ground_with_height(recording: Recording) -> dict[str, Any]:
     """Ground control with a height that counts, by name: not what nodes or an operator refused in flight, nor points of
-    which the adjuster left a coordinate out."""
+    which the adjuster left a coordinate out, nor what was stated in a local frame that was given up."""
     points: dict[str, Any] = {}
     refused: set[str] = set()
     left_out: set[tuple[str, str]] = set()
+    begin_ns = recording.reader.frame_begins_ns()
     messages = recording.messages("observation/control", VERDICT, "adjustment/report")
     for message in RecordedVoices().all_used(messages):
         body = message.body
         if message.topic == "observation/control":
-            points[body.point] = body
+            if message.stamp_ns >= begin_ns:
+                points[body.point] = body
         elif message.topic == "adjustment/report":
             left_out |= {(r.point, r.coordinate) for r in body.rejected if r.coordinate}
             left_out -= {(r.point, r.coordinate) for r in body.returned}

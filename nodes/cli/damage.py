@@ -20,5 +20,5 @@ def tell_other_frame(command: str, reader: RecordingReader) -> None:
     """The same where results are in another local frame than that of the project."""
     begin_ns = reader.frame_begins_ns()
     if begin_ns:
-        what = "poses and object points are in another local frame and left out: the project became another one then"
+        what = "poses and points are in another local frame and left out: the project became another one then"
         print(f"triline {command}: {reader.path}: before {iso(begin_ns)} {what}", file=sys.stderr)

@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
         **({"beside": beside} if beside else {}), "skipped": skipped, "damaged_stretches": len(reader.damage),
         "damage": damage_lines(reader),
     }  # fmt: skip
-    if kind not in _TABLES and _is_result(args.topic):
+    if kind not in _TABLES and _is_local(args.topic):
         tell_other_frame("export", reader)
     if args.json:
         print(json.dumps(result, indent=2))
@@ -216,12 +216,12 @@ def _answers(reader: RecordingReader, args: argparse.Namespace) -> list[Message]
     """Every N-th of the messages that no other one about the same time or point replaces, in the local frame of the
     project."""
     messages = reader.sorted_messages([args.topic])
-    return answers(args.topic, reader.in_frame(messages) if _is_result(args.topic) else messages)[:: args.every]
+    return answers(args.topic, reader.in_frame(messages) if _is_local(args.topic) else messages)[:: args.every]
 
 
-def _is_result(topic: str) -> bool:
-    """Whether a topic carries poses or points that nodes computed in the local frame."""
-    return topics.find(topic).family is topics.Family.RESULT
+def _is_local(topic: str) -> bool:
+    """Whether a topic carries poses or points in the local frame: results of nodes, or ground points."""
+    return topics.find(topic).family is topics.Family.RESULT or topic == "observation/control"
 
 
 def _layout(args: argparse.Namespace) -> RowLayout:

@@ -49,6 +49,7 @@ class _Collected:
         if message.topic == "configuration/project":
             if self.project is not None and not same_frame(body, self.project):
                 self.poses.clear()  # those are in another local frame
+                self.ground.clear()
             self.project = body
         elif message.topic == "configuration/camera":
             self.camera = body

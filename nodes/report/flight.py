@@ -200,7 +200,7 @@ def collect(messages: Iterable[Message]) -> Flight:
     Of configuration, sensors and control those count that nodes use, see `RecordedVoices`.
     """
     flight, voices = Flight(), RecordedVoices()
-    before = 0  # poses and points of a local frame that has been given up
+    before, stated = 0, 0  # poses and points of a local frame that has been given up, and its ground points
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
@@ -217,6 +217,8 @@ def collect(messages: Iterable[Message]) -> Flight:
         for used in voices.used(message):
             if used.topic == "configuration/project" and _is_another_frame(flight, used.body):
                 before += _forget_results(flight, rows)
+                stated += len(flight.ground)
+                flight.ground.clear()
             try:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
                 if used.topic == "sensor/gnss":
@@ -231,6 +233,9 @@ def collect(messages: Iterable[Message]) -> Flight:
     if before:
         what = "poses and object points of before the project got another origin or CRS"
         flight.not_used.append(f"{before} {what}: they are in another local frame")
+    if stated:
+        what = "ground points stated before the project got another origin or CRS"
+        flight.not_used.append(f"{stated} {what}: they count where they were stated again")
     flight.not_used += [
         f"ground point {point}: its coordinates do not count, as an operator said in flight"
         for point in sorted(flight.refused_ground & flight.ground.keys())

@@ -373,6 +373,8 @@ def test_another_project_in_flight_starts_the_window_again_and_live_orientation_
     assert len(after) > 300 and all(p.valid for p in after)
     (told,) = [p.message for p in bodies(outputs, "event/log") if "the window starts again" in p.message]
     assert ("another origin or CRS" in told) == (another == "origin_latitude")
+    assert ("ground points do not count" in told) == (another == "origin_latitude")
+    assert bool(node._control.bodies) == (another != "origin_latitude")  # stated in the frame before
     assert node.counters["another local frame"] == (another == "origin_latitude")
     early = node.query("orientation", {"t": str(EPOCH + 10 * 10**9)})
     assert (early is None) == (another == "origin_latitude")  # in the frame before

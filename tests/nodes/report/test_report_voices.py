@@ -80,7 +80,7 @@ def test_results_in_a_local_frame_that_was_given_up_are_left_out_and_told(messag
     assert len(flight.poses["filtered"]) == len(kept) < sum(x.topic == "trajectory/filtered" for x in messages)
     block = block_from_messages(RecordedVoices().all_used(RecordingReader(path).sorted_messages(TOPICS)), "flight")
     assert block.strips[0].trajectory.start_s * SECOND + block.time_reference_ns > change
-    (line,) = flight.not_used
+    line = flight.not_used[0]
     assert re.match(r"\d+ poses and object points of before the project got another origin or CRS", line)
 
 
@@ -92,7 +92,7 @@ def test_exports_have_no_results_in_a_local_frame_that_was_given_up(messages, tm
     path = write_recording(tmp_path / "said.mcap", [*messages, _moved(messages, 15.0), _said(messages, 16.0)])
     after = {x.body.point for x in messages if x.topic == "point/object" and x.stamp_ns >= change}
     assert after < {x.body.point for x in messages if x.topic == "point/object"}
-    told = f"before {iso(change)} poses and object points are in another local frame and left out"
+    told = f"before {iso(change)} poses and points are in another local frame and left out"
     for words in (["--points"], ["--per-line"], ["--topic", "trajectory/filtered", "--geojson"]):
         target = tmp_path / "out"
         assert main(["export", str(path), *words, str(target), "-q"]) == 0
@@ -200,3 +200,26 @@ def test_adjust_takes_no_coordinates_that_an_operator_refused(messages):
     assert any(name in note and "an operator said" in note for note in block.notes)
     accepted = replace(spoilt[-1], body=m.Verdict(point=name, accepted=True))
     assert name in block_from_messages([*spoilt, accepted], "flight").ground.id
+
+
+def test_control_in_a_local_frame_that_was_given_up_does_not_count_until_it_is_stated_again(messages, tmp_path, capsys):
+    """Its coordinates would be 11 km away in the new one."""
+    stated = {x.body.point: x for x in messages if x.topic == "observation/control"}
+    name, was = next((k, x) for k, x in stated.items() if x.body.role != m.GroundPoint.PLANIMETRIC)
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.y -= 11_000.0
+    again = replace(was, body=body, stamp_ns=_said(messages, 17.0).stamp_ns, sequence=was.sequence + 1)
+    change = [_moved(messages, 15.0), _said(messages, 16.0)]
+    for more, left in (([], set()), ([again], {name})):
+        path = write_recording(tmp_path / "said.mcap", [*messages, *change, *more])
+        flight = collect(RecordingReader(path).sorted_messages())
+        assert set(flight.ground) == left and len(stated) > 1
+        assert any(line.startswith(f"{len(stated)} ground points stated before") for line in flight.not_used)
+        block = block_from_messages(RecordedVoices().all_used(RecordingReader(path).sorted_messages(TOPICS)), "flight")
+        assert set(block.ground.id) == left
+        no_points = [x for x in [*messages, *change, *more] if x.topic != "point/object"]
+        assert len(known_points(Recording(write_recording(tmp_path / "control.mcap", no_points)))) == len(left)
+    target = tmp_path / "control"
+    assert main(["export", str(path), "--topic", "observation/control", "--geojson", str(target), "-q"]) == 0
+    assert "another local frame" in capsys.readouterr().err
+    assert [f["properties"]["point"] for f in json.loads(target.read_text())["features"]] == [name]
