@@ -220,8 +220,9 @@ def _answers(reader: RecordingReader, args: argparse.Namespace) -> list[Message]
 
 
 def _is_local(topic: str) -> bool:
-    """Whether a topic carries poses or points in the local frame: results of nodes, or ground points."""
-    return topics.find(topic).family is topics.Family.RESULT or topic == "observation/control"
+    """Whether a topic carries poses or points in the local frame: results of nodes, ground points, or truth."""
+    family = topics.find(topic).family
+    return family in (topics.Family.RESULT, topics.Family.TRUTH) or topic == "observation/control"
 
 
 def _layout(args: argparse.Namespace) -> RowLayout:

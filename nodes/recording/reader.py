@@ -26,6 +26,7 @@ from ...schemas.envelope import Envelope, RawMessage
 from ..convert import same_frame
 from ..errors import UserError
 from ..node import Message
+from ..truth_frames import TruthFrames
 from ..voices import FIXED, VERDICT, RecordedVoices
 from . import mcap_scan as scan
 from .index import CHANNEL_METADATA, Channel, Index, Recorded
@@ -419,9 +420,16 @@ class RecordingReader:
         return self._frame_begins_ns
 
     def in_frame(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """Those of results that are in the local frame of the project."""
+        """Those of results that are in the local frame of the project; of truth, those whose source had it."""
         begin_ns = self.frame_begins_ns()
-        return (message for message in messages if message.stamp_ns >= begin_ns)
+        if not begin_ns:
+            return iter(messages)
+        # of each source the project that it had since then: a change of it would be another begin
+        project, frames = None, TruthFrames()
+        for used in self._all_used(_PROJECT):
+            project = used.body
+            frames.note(used)
+        return (x for x in messages if x.stamp_ns >= begin_ns and not frames.is_elsewhere(x, project))
 
     def first_flown(self) -> NDArray[np.int64]:
         """Numbers of the first message of each channel that tells that a flight has begun."""
@@ -431,11 +439,15 @@ class RecordingReader:
 
     def _last_used(self, topic: str) -> tuple[Any | None, int]:
         """The last project or camera that nodes use; and when the local frame of a project was last given up, ns."""
-        voices, body, given_up_ns = RecordedVoices(), None, 0
-        for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), self.first_flown()))):
-            for used in voices.used(message):
-                if used.topic == topic:
-                    if topic == _PROJECT and body is not None and not same_frame(used.body, body):
-                        given_up_ns = used.stamp_ns
-                    body = used.body
+        body, given_up_ns = None, 0
+        for used in self._all_used(topic):
+            if topic == _PROJECT and body is not None and not same_frame(used.body, body):
+                given_up_ns = used.stamp_ns
+            body = used.body
         return body, given_up_ns
+
+    def _all_used(self, topic: str) -> Iterator[Message]:
+        """The projects or cameras that nodes use, in order of time."""
+        voices = RecordedVoices()
+        for message in self.decode(self.sort(np.union1d(self.select([topic, VERDICT]), self.first_flown()))):
+            yield from (used for used in voices.used(message) if used.topic == topic)

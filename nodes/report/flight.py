@@ -16,6 +16,7 @@ from ...solver.geometry.trajectory import Trajectory
 from .. import convert
 from ..formats.recorded_sensors import added_to_times
 from ..node import Message
+from ..truth_frames import TruthFrames
 from ..voices import VERDICT, RecordedVoices
 
 Array = NDArray[np.floating]
@@ -201,6 +202,7 @@ def collect(messages: Iterable[Message]) -> Flight:
     """
     flight, voices = Flight(), RecordedVoices()
     before, stated = 0, 0  # poses and points of a local frame that has been given up, and its ground points
+    truth_frames, truth_elsewhere = TruthFrames(), 0
     rows: dict[str, list[Any]] = {name: [] for name in POSE_TOPICS.values()}
     rejected: dict[Any, Any] = {}
     configured_ns: list[int] = []
@@ -214,11 +216,17 @@ def collect(messages: Iterable[Message]) -> Flight:
         else:
             flight.start_ns = min(flight.start_ns or stamp, stamp)
             flight.end_ns = max(flight.end_ns, stamp)
+        if truth_frames.is_elsewhere(message, flight.project):
+            truth_elsewhere += topic != "truth/world"
+            continue
         for used in voices.used(message):
+            truth_frames.note(used)
             if used.topic == "configuration/project" and _is_another_frame(flight, used.body):
                 before += _forget_results(flight, rows)
                 stated += len(flight.ground)
                 flight.ground.clear()
+                truth_elsewhere += len(flight.truth_points)
+                flight.truth_points.clear()
             try:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
                 if used.topic == "sensor/gnss":
@@ -233,6 +241,9 @@ def collect(messages: Iterable[Message]) -> Flight:
     if before:
         what = "poses and object points of before the project got another origin or CRS"
         flight.not_used.append(f"{before} {what}: they are in another local frame")
+    if truth_elsewhere:
+        what = "true poses and points are in another local frame than the project's"
+        flight.not_used.append(f"{truth_elsewhere} {what}: nothing is compared with them")
     if stated:
         what = "ground points stated before the project got another origin or CRS"
         flight.not_used.append(f"{stated} {what}: they count where they were stated again")

@@ -223,3 +223,19 @@ def test_control_in_a_local_frame_that_was_given_up_does_not_count_until_it_is_s
     assert main(["export", str(path), "--topic", "observation/control", "--geojson", str(target), "-q"]) == 0
     assert "another local frame" in capsys.readouterr().err
     assert [f["properties"]["point"] for f in json.loads(target.read_text())["features"]] == [name]
+
+
+def test_truth_in_a_local_frame_that_was_given_up_is_not_compared(messages, tmp_path, capsys):
+    """A simulator goes on with the origin that it has; the other one lies 11 km away."""
+    change = [_moved(messages, 15.0, source="surveyor"), _said(messages, 16.0)]
+    path = write_recording(tmp_path / "said.mcap", [*messages, *change])
+    flight = collect(RecordingReader(path).sorted_messages())
+    assert "truth" not in flight.poses and not flight.truth_points
+    assert any("true poses and points are in another local frame" in line for line in flight.not_used)
+    rows = evaluate_flight(flight)["orientation"]
+    assert not rows
+    assert not len(Recording(path).poses("truth/trajectory").time_ns)
+    own = [_moved(messages, 15.0), _said(messages, 16.0)]  # of the simulator itself: it has that origin from then on
+    path = write_recording(tmp_path / "own.mcap", [*messages, *own])
+    assert len(collect(RecordingReader(path).sorted_messages()).poses["truth"]) > 10
+    assert len(Recording(path).poses("truth/trajectory").time_ns) > 10
