@@ -298,11 +298,17 @@ def _features(reader: RecordingReader, args: argparse.Namespace) -> Features:
 
 
 def _write_geojson(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    return {"features": write_geojson(target, _features(reader, args))}
+    features = _features(reader, args)
+    return {"features": write_geojson(target, features)} | _not_valid(features)
 
 
 def _write_gpkg(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
-    return {"features": write_geopackage(target, args.topic, _features(reader, args))}
+    features = _features(reader, args)
+    return {"features": write_geopackage(target, args.topic, features)} | _not_valid(features)
+
+
+def _not_valid(features: Features) -> dict[str, int]:
+    return {"poses not valid and on no line": features.not_valid} if features.not_valid else {}
 
 
 def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:

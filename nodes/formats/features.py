@@ -28,12 +28,14 @@ class Features:
     ----------
     lon_lat_height : (n, 3) degrees, degrees, metres above the ellipsoid
     properties : columns (n,) of the points
-    lines : name of a line -> rows of its points, in order of time
+    lines : name of a line -> its pieces, each the rows of its points in order of time
+    not_valid : how many points are poses that are not valid, and so on no line
     """
 
     lon_lat_height: NDArray[np.float64] = field(repr=False)
     properties: dict[str, list[Any]] = field(repr=False)
-    lines: dict[str, list[int]] = field(default_factory=dict, repr=False)
+    lines: dict[str, list[list[int]]] = field(default_factory=dict, repr=False)
+    not_valid: int = 0
 
     def __len__(self) -> int:
         return len(self.lon_lat_height)
@@ -42,7 +44,7 @@ class Features:
 def features_of(topic: str, messages: Iterable[Message], frame: LocalFrame | None) -> Features:
     """Features of a topic with places: poses, object points, ground points, GNSS fixes.
 
-    Poses are joined to one line a strip.
+    Poses are joined to one line a strip, which is cut where they are not valid.
 
     Parameters
     ----------
@@ -151,11 +153,17 @@ def _poses(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Featur
     for name in names[3:]:
         sigmas[name] = [None if v is None else float(np.degrees(v)) for v in sigmas[name]]
     properties |= sigmas
-    lines: dict[str, list[int]] = {}
+    pieces: dict[str, list[list[int]]] = {}
     for i, body in enumerate(bodies):
-        lines.setdefault(body.strip, []).append(i)
+        of_strip = pieces.setdefault(body.strip, [[]])
+        if body.valid:
+            of_strip[-1].append(i)
+        elif of_strip[-1]:
+            of_strip.append([])
+    lines = {strip: [piece for piece in of if len(piece) > 1] for strip, of in pieces.items()}
     position = [(p.x, p.y, p.z) for p in place]
-    return Features(_on_globe(frame, position), properties, {k: v for k, v in lines.items() if len(v) > 1})
+    not_valid = sum(not body.valid for body in bodies)
+    return Features(_on_globe(frame, position), properties, {k: v for k, v in lines.items() if v}, not_valid)
 
 
 def _points(topic: str, messages: Iterable[Message], frame: LocalFrame) -> Features:
@@ -192,4 +200,4 @@ def _fixes(topic: str, messages: Iterable[Message]) -> Features:
     place = np.array([(body.longitude, body.latitude, body.altitude) for body in bodies])
     beyond = np.abs(place[:, 0]) > 180.0  # counted from 0 to 360
     place[beyond, 0] = (place[beyond, 0] + 180.0) % 360.0 - 180.0
-    return Features(place, properties, {"gnss": list(range(len(bodies)))} if len(bodies) > 1 else {})
+    return Features(place, properties, {"gnss": [list(range(len(bodies)))]} if len(bodies) > 1 else {})

@@ -22,8 +22,9 @@ def write_geojson(path: Path, features: Features) -> int:
     count = 0
     with open(path, "w", encoding="utf-8") as file:
         file.write('{"type": "FeatureCollection", "features": [')
-        for name, rows in features.lines.items():
-            _write(file, _line(features.lon_lat_height[rows]), {"line": name, "points": len(rows)}, count)
+        for name, pieces in features.lines.items():
+            places = [features.lon_lat_height[rows] for rows in pieces]
+            _write(file, _line(*places), {"line": name, "points": sum(map(len, pieces))}, count)
             count += 1
         for i, values in enumerate(zip(*columns, strict=True)):
             _write(file, {"type": "Point", "coordinates": place[i]}, dict(zip(names, values, strict=True)), count)
@@ -37,9 +38,9 @@ def _place(row: list[float]) -> list[float]:
     return [round(value, 4 if k == 2 else 9) for k, value in enumerate(row)]
 
 
-def _line(places: NDArray[np.float64]) -> dict[str, Any]:
-    """Geometry of a line (n, 2 or 3) of longitude, latitude, height."""
-    parts = [[_place(row) for row in part.tolist()] for part in parts_of_line(places)]
+def _line(*pieces: NDArray[np.float64]) -> dict[str, Any]:
+    """Geometry of a line, in pieces (n, 2 or 3) of longitude, latitude, height."""
+    parts = [[_place(row) for row in part.tolist()] for piece in pieces for part in parts_of_line(piece)]
     if len(parts) == 1:
         return {"type": "LineString", "coordinates": parts[0]}
     return {"type": "MultiLineString", "coordinates": parts}

@@ -61,7 +61,10 @@ def write_geopackage(path: Path, name: str, features: Features) -> int:
             database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", _reference_systems())
             points = [_point(place) for place in features.lon_lat_height]
             _add_table(database, table, "POINT", points, features.properties, features.lon_lat_height)
-            lines = {name: parts_of_line(features.lon_lat_height[rows]) for name, rows in features.lines.items()}
+            lines = {
+                name: [part for rows in pieces for part in parts_of_line(features.lon_lat_height[rows])]
+                for name, pieces in features.lines.items()
+            }
             if lines:
                 parts = [(name, part) for name, cut in lines.items() for part in cut]
                 names = {"line": [name for name, _ in parts], "points": [len(part) for _, part in parts]}

@@ -260,6 +260,26 @@ def test_geojson(recording, tmp_path):
     assert points[3]["properties"]["sigma_kappa_deg"] == pytest.approx(np.degrees(3e-4))
 
 
+def test_lines_on_maps_are_cut_where_poses_are_not_valid(tmp_path, capsys):
+    """Their places say nothing; the points have a column that says so, a line has none."""
+    messages = [_project()]
+    for i in range(10):
+        pose = pose_message(START + i * 10**8, [10.0 * i, 5000.0 if 4 <= i < 7 else 5.0, 1000.0], [0.0, 0.0, 0.1])
+        pose.valid, pose.strip = not 4 <= i < 7, "S1"
+        messages.append(Message("orientation/final", START + i * 10**8, pose, "adjuster"))
+    path, target = write_recording(tmp_path / "a.mcap", messages), tmp_path / "o.geojson"
+    words = ["export", str(path), "--topic", "orientation/final"]
+    assert main([*words, "--geojson", str(target)]) == 0
+    assert "11 features, 3 poses not valid and on no line" in capsys.readouterr().out
+    line, *points = json.loads(target.read_text())["features"]
+    assert line["geometry"]["type"] == "MultiLineString"
+    assert [len(part) for part in line["geometry"]["coordinates"]] == [4, 3] and line["properties"]["points"] == 7
+    assert sum(not point["properties"]["valid"] for point in points) == 3 and len(points) == 10
+    assert main([*words, "--gpkg", str(tmp_path / "o.gpkg"), "-q"]) == 0
+    with sqlite3.connect(tmp_path / "o.gpkg") as database:
+        assert len(database.execute('SELECT * FROM "orientation_final_lines"').fetchall()) == 2
+
+
 def _lines(strip: str) -> OrientedLines:
     n = 3
     times = START + np.arange(n, dtype=np.int64) * 10**7
