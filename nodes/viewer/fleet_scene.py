@@ -231,8 +231,8 @@ class FleetScene:
         aircraft.tiles.clear()
 
     def _geodetic(self, places: Array) -> Array | None:
-        if self._frame is None or self._origin is None:
-            return None
+        if self._frame is None or self._origin is None or not self._frame.is_placed:
+            return None  # nobody knows where on the Earth it lies
         return np.array([self._frame.to_geodetic(place + self._origin)[:2] for place in places])
 
     def _map(self, aircraft: _Aircraft, kind: str, pieces: list[Array], color: Color) -> None:

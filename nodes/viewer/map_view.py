@@ -35,17 +35,18 @@ class MapPart(Part):
 
     def pose(self, topic: str, sample: PoseSample) -> None:
         before_ns = self._last.get(topic, sample.time_ns)
-        if topic == "orientation/final" and self.state.frame is not None and self._due(topic, sample.time_ns):
+        frame = self.state.placed
+        if topic == "orientation/final" and frame is not None and self._due(topic, sample.time_ns):
             if sample.time_ns - before_ns > LARGEST_GAP_NS:  # what was flown from strip to strip is not known
                 self._final.cut()
-            self._final.add(self.state.frame.to_geodetic(sample.position_l)[:2])
+            self._final.add(frame.to_geodetic(sample.position_l)[:2])
 
     def take(self, message: Message) -> None:
         body = message.body
         if message.topic == "sensor/gnss" and self._due(message.topic, message.stamp_ns):
             self._gnss.add(np.array([body.latitude, body.longitude]))
-        elif message.topic == "observation/control" and self.state.frame is not None:
-            place = self.state.frame.to_geodetic(np.array([body.x, body.y, body.z]))[:2]
+        elif message.topic == "observation/control" and self.state.placed is not None:
+            place = self.state.placed.to_geodetic(np.array([body.x, body.y, body.z]))[:2]
             self._ground.add((place, CHECK if convert.role_of(body) == "check" else CONTROL))
 
     def draw(self, canvas: Canvas) -> None:

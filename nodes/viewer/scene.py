@@ -177,7 +177,7 @@ class Scene:
             s.camera is not None,
             has,
             tuple(s.units),
-            s.frame is not None,
+            s.placed is not None,
             s.bar_px,
             s.window_s,
             s.strip_s,
@@ -190,8 +190,8 @@ class Scene:
         first = next(iter(s.extent.values()))
         along = (first[1] - first[0]) / max(float(np.linalg.norm(first[1] - first[0])), 1.0)
         middle = None
-        if s.frame is not None:
-            place = s.frame.to_geodetic(centre + s.origin)
+        if s.placed is not None:
+            place = s.placed.to_geodetic(centre + s.origin)
             middle = float(place[0]), float(place[1])
         layout = ViewLayout(
             title=f"Deviations from {s.measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}",

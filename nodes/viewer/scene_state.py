@@ -179,6 +179,11 @@ class SceneState:
 
     # ---- asking
 
+    @property
+    def placed(self) -> LocalFrame | None:
+        """The local frame where it is known where on the Earth it lies, for maps."""
+        return self.frame if self.frame is not None and self.frame.is_placed else None
+
     def seconds(self, stamp_ns: int) -> float:
         """Seconds since the start."""
         return (stamp_ns - (self.start_ns or stamp_ns)) / convert.SECOND_NS

@@ -169,6 +169,23 @@ def test_the_map_shows_where_it_is(notes):
     assert np.abs(track - [47.0, 8.0]).max() < 0.1 and np.ptp(track[:, 0]) > 0.005
 
 
+def test_a_project_without_a_place_is_on_no_map(messages):
+    """It was at 0 N 0 E."""
+    canvas = Notebook()
+    nowhere = []
+    for x in messages:
+        if x.topic == "configuration/project":
+            body = type(x.body).FromString(x.body.SerializeToString())
+            body.origin_latitude = body.origin_longitude = body.origin_height = 0.0
+            x = replace(x, body=body)
+        if x.topic != "sensor/gnss":
+            nowhere.append(x)
+    show(nowhere, canvas)
+    assert canvas.layouts[-1].geographic_centre is None
+    assert not [entity for entity in canvas.drawn if entity.startswith("map/")]
+    assert canvas.pieces("flight/final")
+
+
 def test_the_map_draws_no_final_track_from_strip_to_strip(messages):
     final = [m for m in messages if m.topic == "orientation/final"]
     begin, end = (convert.time_ns(final[len(final) * k // 6].body.timestamp) for k in (2, 3))
