@@ -110,6 +110,8 @@ class Matcher(Node):
         self._governor = Governor(PARTS)
         self._ground_m = ground_m
         self._heights: dict[str, tuple[float, float, float]] = {}  # control and check points with a height
+        self._refused: set[str] = set()  # of which an operator said that they do not count
+        self._frame_of: Any = None  # the project whose local frame control is in
         self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._ground_unknown = False  # when they were counted
@@ -181,6 +183,10 @@ class Matcher(Node):
     def _take(self, message: Message) -> list[Message]:
         topic, body = message.topic, message.body
         if topic == "configuration/project":
+            if self._frame_of is not None and not convert.same_frame(body, self._frame_of):
+                self._heights.clear()  # they have to be stated again in the new frame
+                self._set_ground()
+            self._frame_of = body
             if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
                 self._origin_m = float(body.origin_height)
                 self._set_ground()
@@ -209,7 +215,12 @@ class Matcher(Node):
                 self._set_ground()
         elif topic == "observation/verdict":
             # those about who speaks on a topic, or its clock, are not the matcher's
-            return [] if body.topic else self._targets.verdict(body, self._observed_ns)
+            if body.topic:
+                return []
+            (self._refused.discard if body.accepted else self._refused.add)(body.point)
+            if body.point in self._heights:
+                self._set_ground()
+            return self._targets.verdict(body, self._observed_ns)
         return []
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -234,8 +245,8 @@ class Matcher(Node):
         self._matcher.search_ground(LOWEST_GROUND_M - self._origin_m)
         if self._ground_m is not None:
             self._matcher.set_mean_height(self._ground_m)
-        elif self._heights:
-            known = np.array(list(self._heights.values()))
+        elif counting := [xyz for name, xyz in self._heights.items() if name not in self._refused]:
+            known = np.array(counting)
             round_earth = isinstance(self._matcher, StripMatcher)
             heights = [above_sphere(xyz) for xyz in known] if round_earth else known[:, 2]
             self._matcher.set_mean_height(float(np.median(heights)))

@@ -281,3 +281,28 @@ def test_where_nothing_matches_a_line_says_what_to_give(tmp_path, short, ground_
 def test_a_ground_that_is_no_height_is_refused():
     with pytest.raises(ValueError, match="ground_m: wanted a height"):
         Matcher(ground_m=float("nan"))
+
+
+def test_control_that_does_not_count_tells_no_height_of_the_ground(short):
+    """What an operator refused, and what is in a local frame that was given up."""
+
+    def ground_m(*more):
+        matcher = Matcher()
+        begin = [x for x in short if x.topic.startswith("configuration/") and "strip" not in x.topic]
+        for x in [*begin, *(Message("observation/control", EPOCH_NS, body) for body in points), *more]:
+            list(matcher.step(x))
+        assert matcher._matcher is not None
+        return matcher._matcher.ground_m
+
+    high = [m.GroundPoint(point=f"H{k}", z=900.0, covariance=[1.0] * 9) for k in range(3)]
+    points = [*high, m.GroundPoint(point="G", z=100.0, covariance=[1.0] * 9)]
+    assert ground_m() == 900.0
+    refused = [Message("observation/verdict", EPOCH_NS, m.Verdict(point=p.point, by="Ann")) for p in high]
+    assert ground_m(*refused) == 100.0
+    again = [Message("observation/verdict", EPOCH_NS, m.Verdict(point=p.point, accepted=True)) for p in high]
+    assert ground_m(*refused, *again) == 900.0
+    project = next(x for x in short if x.topic == "configuration/project")
+    body = type(project.body).FromString(project.body.SerializeToString())
+    body.origin_latitude += 0.1
+    stated = Message("observation/control", EPOCH_NS, points[-1])
+    assert ground_m(replace(project, body=body), stated) == 100.0
