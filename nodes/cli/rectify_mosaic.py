@@ -43,7 +43,9 @@ from ..formats.height_raster import RasterFile
 from ..formats.new_file import refuse_unless_file
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
+from ..recording.reader import RecordingReader
 from . import rectify_image
+from .damage import tell_damage, tell_other_frame
 from .outputs import refuse_over_files
 from .progress import progress
 from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
@@ -132,6 +134,10 @@ def run(args: argparse.Namespace) -> int:
         remove_parts(folder)
     result["seconds"] = round(time.perf_counter() - begun, 3)
     _tell(result, args)
+    for path in [path for kind, path, _ in kinds if kind == "recording"]:
+        reader = RecordingReader(path)
+        tell_other_frame("rectify", reader)
+        tell_damage("rectify", reader)
     return 0
 
 

@@ -397,6 +397,29 @@ def test_cells_in_feet_are_as_large_as_those_in_metres(flown, folder, capsys):
     assert " ft_us in +proj=utm" in capsys.readouterr().out
 
 
+def test_a_mosaic_says_what_of_a_recording_is_left_out(flown, folder, tmp_path, capsys):
+    """A project with another origin in mid-flight, and the end of the file lost."""
+    messages = list(RecordingReader(flown).sorted_messages())
+    was = next(x for x in messages if x.topic == "configuration/project")
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.origin_height += 10.0
+    poses = [x.stamp_ns for x in messages if x.topic == "trajectory/filtered"]
+    middle = poses[len(poses) // 3]
+    said = m.Verdict(topic="configuration/project", accepted=True, by="Ann")
+    other = replace(was, body=body, stamp_ns=middle - 1000, sequence=was.sequence + 1)
+    messages += [other, Message("observation/verdict", middle, said, "desk")]
+    with RecordingWriter(tmp_path / "two.mcap") as writer:
+        for x in sorted(messages, key=lambda x: x.stamp_ns):
+            writer.write(x)
+    words = ["--mosaic", "--height", 0, "--gsd", 20, "--workers", 1, "--orientation", "measured", "-q"]
+    assert main(["rectify", str(tmp_path / "two.mcap"), "-o", str(tmp_path / "two.tif"), *map(str, words)]) == 0
+    assert "poses and points are in another local frame and left out" in capsys.readouterr().err
+    whole = flown.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) - 2000])
+    assert main(["rectify", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "cut.tif"), *map(str, words)]) == 0
+    assert "cut.mcap: " in capsys.readouterr().err
+
+
 def test_stac_item_tells_when_lines_were_taken_and_cells_in_metres(flown, folder, capsys):
     crs, target = "+proj=utm +zone=32 +datum=WGS84 +units=us-ft +type=crs", folder / "mosaic.tiff"
     words = ["--mosaic", "--height", 0, "--crs", crs, "--gsd", 20, "--workers", 1, "--stac", folder / "item.json"]
