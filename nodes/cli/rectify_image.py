@@ -439,6 +439,11 @@ def _grid(args: argparse.Namespace, sensor: _Sensor, ground: Ground, lat: Array,
         x, y = unit.map(lat[seen], lon[seen])
     except ValueError as error:
         raise UserError(f"--crs: {error}") from None
+    if args.bounds is None and _is_over_the_date_line(unit, x, middle[0], lon[seen] - middle[1]):
+        raise UserError(
+            f"--crs {crs}: the image lies across the date line, the two sides of which are the two ends of that CRS; "
+            f"wanted another one such as {default_crs(*middle, sensor.ellipsoid)}, or --bounds of one side"
+        )
     model = sensor.model
     h = np.array([0.5 * (ground.low_m + ground.high_m)])
     centre = SomeCells(np.zeros((1, 2)), np.array([0.5 * (model.lines - 1)]), np.array([0.5 * (model.samples - 1)]), h)
@@ -461,6 +466,16 @@ def _grid(args: argparse.Namespace, sensor: _Sensor, ground: Ground, lat: Array,
     if max(grid.rows, grid.columns) > MOST_SIDE:
         raise UserError(f"--gsd {gsd:g}: {grid.columns:.3g} x {grid.rows:.3g} cells are too many, wanted a larger one")
     return grid, pixel_m
+
+
+def _is_over_the_date_line(grid: MapGrid, x: Array, lat: float, from_middle: Array) -> bool:
+    """Whether places (n,) near each other, by longitudes from their middle, are at both ends of a CRS; rad."""
+    near = (from_middle + np.pi) % (2.0 * np.pi) - np.pi
+    if np.ptp(near) > 0.5 * np.pi:  # round a pole, or half of a planet
+        return False
+    sides, _ = grid.map(np.full(2, lat), np.pi * np.array([-1.0, 1.0]) * (1.0 - 1e-9))
+    jump, wide = abs(float(sides[1] - sides[0])), float(np.nanmax(x) - np.nanmin(x))
+    return 0.01 * wide < jump < 2.0 * wide
 
 
 def _metres(grid: MapGrid, lat: Array, lon: Array) -> float:

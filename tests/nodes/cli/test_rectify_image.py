@@ -257,6 +257,24 @@ def test_degrees_bounds_and_larger_cells(scene, tmp_path):
     assert values[:, row, column] - 10.0 == pytest.approx(true, abs=0.02)
 
 
+def test_an_image_across_the_date_line(scene, tmp_path, capsys):
+    """In degrees its two sides are 360 degrees apart; other systems have it in one piece."""
+    _, _, model, _, _, image = scene
+    lon = np.degrees(model.direct(np.array([200.0]), np.array([150.0]), np.array([0.0]))[0, 1])
+    path = write_dimap2(tmp_path / "east.xml", replace(TRUTH, node_deg=TRUTH.node_deg + 180.0 - lon))
+    words = [image, "--sensor", path, "--height", 0, "-o", tmp_path / "out.tif"]
+    for gsd in ([], ["--gsd", 0.01]):
+        told = refused(capsys, *words, "--crs", "EPSG:4326", *gsd)
+        assert "lies across the date line" in told and "--bounds" in told
+    for crs in ("EPSG:32601", "EPSG:3832"):
+        out = rectify(tmp_path, image, path, "--height", 0, "--crs", crs, "--gsd", 40)
+        assert out.width < 2000 and (out.read(1) > 0).mean() > 0.4
+    low = np.degrees(model.direct(np.array([200.0]), np.array([150.0]), np.array([0.0]))[0, 0])
+    bounds = [179.9, low - 0.1, 180.0, low + 0.1]
+    half = rectify(tmp_path, image, path, "--height", 0, "--crs", "EPSG:4326", "--gsd", 0.0005, "--bounds", *bounds)
+    assert (half.read(1) > 0).sum() > 0
+
+
 def test_a_part_of_a_scene_by_its_first_pixel_or_geotransform(scene, tmp_path):
     _, path, _, _, _, image = scene
     whole = rectify(tmp_path, image, path, "--height", 100, "--gsd", 20)
