@@ -19,6 +19,8 @@ from .table import Column, Table, read_table, separator_of
 from .time_columns import WANTED, time_columns, times_of
 from .track import NavigationTrack, checked
 
+#: Poses of one time that differ by no more are the same one, written twice.
+SAME_M, SAME_RAD = 1e-3, 1e-6
 #: Quantity -> how files call it, without unit.
 _NAMES = {
     "lat": ("lat", "latitude"),
@@ -113,18 +115,26 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Raises
     ------
-    UserError : ``file:line: column: what is wrong``
+    UserError : ``file:line: column: what is wrong``, two poses at one time
     """
     notes: list[str] = []
     time = time_columns(_header(path))
     if not time:
         raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
     table = read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC)], notes)
-    time_ns, first = np.unique(times_of(table, time, None, notes), return_index=True)
+    time_ns, first, of = np.unique(times_of(table, time, None, notes), return_index=True, return_inverse=True)
     if len(time_ns) < 2:
         raise UserError(f"{path}: {len(time_ns)} poses, wanted at least 2")
-    R = matrix_from_angles(*np.radians(table.stack(*_OPK)).T)
-    return table.stack(*PLACE)[first], R[first], time_ns
+    position, R = table.stack(*PLACE), matrix_from_angles(*np.radians(table.stack(*_OPK)).T)
+    kept = first[of]
+    other = (np.abs(position - position[kept]) > SAME_M).any(axis=1) | (np.abs(R - R[kept]) > SAME_RAD).any(axis=(1, 2))
+    shown = (lambda i: f"{table['time_s'][i]:.6f}") if "time_s" in table else (lambda i: f"{time_ns[of[i]] * 1e-9:.6f}")
+    table.refuse(
+        other,
+        time[0].name,
+        lambda i: f"{shown(i)} comes twice with two poses, wanted those of one lens or strip a time",
+    )
+    return position[first], R[first], time_ns
 
 
 def _header(path: Path) -> list[str]:

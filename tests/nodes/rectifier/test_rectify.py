@@ -24,6 +24,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.dem import dem_in_frame, read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
 from triline.nodes.formats.height_raster import HeightRaster
+from triline.nodes.formats.trajectory_csv import read_local_poses
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
@@ -787,3 +788,19 @@ def test_scene_lays_tiles_on_the_ground():
     tile.data = b"123"
     with pytest.raises(ValueError, match="3 bytes"):
         scene.take(Message("orthoimage/final", messages[-1].stamp_ns, tile))
+
+
+def test_poses_of_two_lenses_at_one_time_are_refused(tmp_path):
+    """Of a table in the local frame the first one was taken without a word; a row that comes twice is one pose."""
+    rows = [f"{100 + 0.1 * k:.6f},{7.0 * k:.4f},0.0000,1000.0000,0.0,0.0,0.0" for k in range(10)]
+    head = "time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg"
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([head, *rows, rows[3], ""]))
+    assert len(read_local_poses(path)[2]) == 10
+    for other in (
+        "100.300000,21.0000,0.5000,1000.0000,0.0,0.0,0.0",
+        "100.300000,21.0000,0.0000,1000.0000,0.0,14.0,0.0",
+    ):
+        path.write_text("\n".join([head, *rows, other, ""]))
+        with pytest.raises(UserError, match=r"poses\.csv:12: time_s: 100\.300000 comes twice with two poses"):
+            read_local_poses(path)
