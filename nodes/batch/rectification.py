@@ -270,6 +270,8 @@ def _ground_with_height(recording: Recording) -> dict[str, Any]:
             if message.stamp_ns >= begin_ns:
                 points[body.point] = body
         elif message.topic == "adjustment/report":
+            if message.stamp_ns < begin_ns:  # of coordinates in the frame before
+                continue
             left_out |= {(r.point, r.coordinate) for r in body.rejected if r.coordinate}
             left_out -= {(r.point, r.coordinate) for r in body.returned}
         elif not body.topic:

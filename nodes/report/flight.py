@@ -225,6 +225,8 @@ def collect(messages: Iterable[Message]) -> Flight:
                 before += _forget_results(flight, rows)
                 stated += len(flight.ground)
                 flight.ground.clear()
+                for key in [key for key, one in rejected.items() if one.coordinate]:  # of coordinates in that frame
+                    del rejected[key]
                 truth_elsewhere += len(flight.truth_points)
                 flight.truth_points.clear()
             try:

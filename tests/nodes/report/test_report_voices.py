@@ -239,3 +239,21 @@ def test_truth_in_a_local_frame_that_was_given_up_is_not_compared(messages, tmp_
     path = write_recording(tmp_path / "own.mcap", [*messages, *own])
     assert len(collect(RecordingReader(path).sorted_messages()).poses["truth"]) > 10
     assert len(Recording(path).poses("truth/trajectory").time_ns) > 10
+
+
+def test_a_point_that_is_stated_again_in_another_frame_was_not_left_out_in_it(messages, tmp_path):
+    """What the adjuster left out were its coordinates in the frame before."""
+    was = next(x for x in messages if x.topic == "observation/control" and x.body.role == m.GroundPoint.CONTROL)
+    body = type(was.body).FromString(was.body.SerializeToString())
+    body.y -= 11_000.0
+    again = replace(was, body=body, stamp_ns=_said(messages, 17.0).stamp_ns, sequence=was.sequence + 1)
+    out = m.AdjustmentReport(rejected=[m.RejectedObservation(point=body.point, coordinate=axis) for axis in "XYZ"])
+    rest = [x for x in messages if x.topic not in ("adjustment/report", "point/object")]
+    for second, wanted in ((10.0, True), (20.0, False)):
+        report = Message("adjustment/report", _said(messages, second).stamp_ns, out, "adjuster", 10**6)
+        path = write_recording(
+            tmp_path / "said.mcap", [*rest, _moved(messages, 15.0), _said(messages, 16.0), again, report]
+        )
+        flight = collect(RecordingReader(path).sorted_messages())
+        assert np.isfinite(flight.given(body.point)).all() == wanted
+        assert len(known_points(Recording(path))) == wanted
