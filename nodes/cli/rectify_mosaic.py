@@ -155,6 +155,13 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
         refuse_unless_file(path)
         if not path.parent.is_dir():
             raise UserError(f"{path}: no folder {path.parent}")
+    if args.stac is not None:
+        for path in (p for p in _assets(outputs).values() if p is not None):
+            seen = os.path.relpath(path, args.stac.parent)
+            if "#" in seen or "?" in seen:
+                raise UserError(
+                    f"--stac: {seen} has # or ? in it, where an address ends: programs would look for another file"
+                )
     if len({str(p.resolve()) for p in named}) < len(named):
         raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
     for name in _NOT_OF_MOSAIC:

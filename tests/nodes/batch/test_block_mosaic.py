@@ -402,3 +402,11 @@ def test_a_tile_in_which_two_strips_share_no_whole_place(tmp_path):
     assert main(["rectify", *map(str, block.files), "--mosaic", "--tile", "128", "-o", str(target), "-q"]) == 0
     with rasterio.open(target) as image:
         assert (image.read(1) > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["mosaic#1.tif", "what?.tif"])
+def test_stac_items_want_names_that_are_addresses(name, block, tmp_path, capsys):
+    """pystac 1.15 looks for `mosaic` where an href is `mosaic#1.tif`, and takes %23 in a path as it stands."""
+    words = ["rectify", *map(str, block.files), "--mosaic", "-o", str(tmp_path / name), "--stac"]
+    assert main([*words, str(tmp_path / "item.json")]) == 1
+    assert f"--stac: {name} has # or ? in it" in capsys.readouterr().err
