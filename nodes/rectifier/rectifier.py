@@ -136,7 +136,11 @@ class Rectifier(Node):
     def _take(self, message: Message) -> None:
         topic, body = message.topic, message.body
         if topic == "configuration/project":
-            self._project, self._frame = body, convert.local_frame(body)
+            before, self._project, self._frame = self._project, body, convert.local_frame(body)
+            if before is not None and not convert.same_frame(before, body):
+                refused = self._refused
+                self._begin_again()  # poses, points and control so far are in the local frame before
+                self._refused = refused
         elif topic == "configuration/camera":
             self._configure(body, message.stamp_ns)
         elif topic == "configuration/strip":

@@ -718,6 +718,26 @@ def test_node_draws_with_the_camera_that_goes_with_the_orientations(flown):
     assert max((tiles["stated"][key] != tiles["reported"][key]).mean() for key in common) > 0.3
 
 
+def test_node_begins_again_in_another_local_frame(flown):
+    """Lines, poses and heights of before would lie in its orthoimage 11 km from where they are."""
+    reader, node, tiles = RecordingReader(flown), Rectifier(), []
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 12 * 10**9
+    project = None
+    for message in reader.sorted_messages([*node.inputs]):
+        if message.stamp_ns > end_ns:
+            break
+        project = message if message.topic == "configuration/project" else project
+        tiles += node.step(message)
+    assert project is not None and tiles and node._control
+    list(node.step(replace(project, stamp_ns=end_ns)))  # said again
+    assert node._control and node.images["live"].grid is not None
+    body = type(project.body).FromString(project.body.SerializeToString())
+    body.origin_latitude += 0.1
+    list(node.step(replace(project, body=body, stamp_ns=end_ns)))
+    assert not node._control and not node._heights
+    assert not list(node.finish())
+
+
 def test_node_draws_no_lines_by_poses_that_are_not_valid(flown):
     reader, node = RecordingReader(flown), Rectifier()
     begin = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9
