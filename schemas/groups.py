@@ -14,10 +14,9 @@ from google.protobuf import descriptor_pb2
 
 from . import messages as m
 
-#: Messages of a group: what is kept for the sake of one of them stays small.
-TOGETHER = 100
-#: Longer payloads are not read into a group, bytes.
-LONG = 4096
+#: Messages of a group, and bytes of the longest payload that is read into one: for the sake of a message that is kept
+#: long no more than 100 KiB stay.
+TOGETHER, LONG = 100, 1024
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _makers: dict[Any, Grouped] = {}
 
