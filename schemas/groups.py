@@ -2,8 +2,9 @@
 
 The protobuf library gives each message memory of its own, and once for every 10 000 pieces of it that are let go it
 asks the C library to hand all memory that is free back to the system, whoever it belonged to; the arrays of an
-adjustment then get theirs again page by page. That took a seventh of the time of a process that adjusts a recorded
-flight (``bench/messages.py``). The messages of a group let go of theirs together, when the last of them is gone.
+adjustment then get theirs again page by page. In `triline process` that was a seventh of the processor time;
+``bench/messages.py`` shows what it costs each message. The messages of a group let go of their memory together, when
+the last of them is gone.
 """
 
 from __future__ import annotations
