@@ -51,7 +51,7 @@ docs: $(VENV)/.docs
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/basedpyright --level error
+	$(BIN)/basedpyright --level error --threads 2
 	rm -rf build
 	$(BIN)/python -m pip install --quiet --no-deps --target build/contract .
 	cd build/contract && ../../$(BIN)/lint-imports --config ../../pyproject.toml --no-cache
