@@ -25,10 +25,14 @@ _SLOPE_NOISE = 5.0
 
 
 class GrowingTrajectory(Trajectory):
-    """A trajectory to which samples are added, and whose old ones are dropped, at constant cost per sample."""
+    """A trajectory to which samples are added, and whose old ones are dropped, at constant cost per sample.
+
+    Slopes of new samples are computed when a pose is asked for: samples come one by one and poses are asked for less
+    often, and twenty slopes take hardly longer than one.
+    """
 
     def __init__(self) -> None:
-        self._size = self._start = 0
+        self._size = self._start = self._sloped = 0
         self._buffer = {
             "time_s": np.empty(64),
             "position_l": np.empty((64, 3)),
@@ -56,9 +60,25 @@ class GrowingTrajectory(Trajectory):
         b = self._buffer
         b["time_s"][new], b["position_l"][new], b["covariance"][new] = time_s, position_l, covariance
         b["quaternion"][new] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-        # the slope at the last old sample changes with its new neighbour
-        first = max(self._size - 2, self._start)
         self._size += n
+        self._view()
+
+    def at(self, time_s: ArrayLike) -> Poses:
+        self._slope()
+        return super().at(time_s)
+
+    def angles_at(self, time_s: ArrayLike) -> Array:
+        self._slope()
+        return super().angles_at(time_s)
+
+    def _slope(self) -> None:
+        """Slopes at the samples that have come since the last time."""
+        if self._sloped == self._size:
+            return
+        b = self._buffer
+        # the slope at the last sample of before changes with its new neighbour
+        first = max(self._sloped - 2, self._start)
+        self._sloped = self._size
         q = b["quaternion"][first : self._size]
         if len(q) >= 2:
             turn = vector_from_quaternion(quaternion_multiply(quaternion_conjugate(q[:-1]), q[1:]))
@@ -77,6 +97,7 @@ class GrowingTrajectory(Trajectory):
         There the slope at the last sample is a guess, a parabola through the last three: what it lacks is taken as
         large as it was lately, less what the noise of the samples explains.
         """
+        self._slope()
         variance = np.zeros((len(time_s), 6))
         inside = time_s > self.time_s[-2]
         n = min(len(self), LIVELY_SAMPLES)
@@ -95,10 +116,12 @@ class GrowingTrajectory(Trajectory):
 
     def forget(self, before_s: float) -> None:
         """Drop samples older than a time, but for two."""
+        self._slope()
         self._start += max(int(np.searchsorted(self.time_s, before_s)) - 2, 0)
         self._view()
 
     def _make_room(self, n: int) -> None:
+        self._slope()
         used = slice(self._start, self._size)
         size = max(2 * (self._size - self._start + n), 64)
         for name, old in self._buffer.items():
@@ -106,6 +129,7 @@ class GrowingTrajectory(Trajectory):
             fresh[: self._size - self._start] = old[used]
             self._buffer[name] = fresh
         self._start, self._size = 0, self._size - self._start
+        self._sloped = self._size
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ Array = NDArray[np.floating]
 KNOT_S = 1.0
 #: Poses and corrections older than this are forgotten, s.
 KEPT_S = 120.0
+#: Poses are taken when orientation is asked for, or when so many have come.
+MOST_NEW = 64
 #: A correction that changes by more than this share of its sigma within so long, s, has been found anew, as when the
 #: first control is met: slow errors change far less. What was told of earlier times was wrong by as much.
 JUMP_SHARE, JUMP_S = 0.2, 0.5
@@ -25,8 +27,9 @@ class CurrentOrientation:
     """Measured poses and the corrections that an adjustment has found so far."""
 
     def __init__(self) -> None:
-        self._poses = GrowingTrajectory()
+        self._trajectory = GrowingTrajectory()
         self._smoother, self._steady = PoseSmoother(), SteadyPositions()
+        self._new: list[tuple[float, Array, Array, Array]] = []
         self._last_s = -np.inf
         self._closed = False
         self._knots: dict[int, list[Array | int]] = {}
@@ -41,6 +44,7 @@ class CurrentOrientation:
     @property
     def noise_left(self) -> Array:
         """(6,) variance of what is left of the poses' white noise: X, Y, Z, m^2, about x, y, z of the camera, rad^2."""
+        self._smooth()
         return self._smoother.noise_left
 
     @property
@@ -53,18 +57,32 @@ class CurrentOrientation:
             return False
         self._last_s = time_s
         self._steady.add(time_s, position_l)
-        known = self._smoother.push(time_s, position_l, quaternion, covariance)
-        if known is None:
-            return True
-        self._poses.append(np.array([known[0]]), known[1][None], known[2][None], known[3][None])
-        if len(self._poses) > 4096 and self._poses.start_s < time_s - 2 * KEPT_S:
-            self._poses.forget(time_s - KEPT_S)
+        self._new.append((time_s, position_l, quaternion, covariance))
+        if len(self._new) >= MOST_NEW:
+            self._smooth()
         return True
+
+    @property
+    def _poses(self) -> GrowingTrajectory:
+        """With all that has come."""
+        self._smooth()
+        return self._trajectory
+
+    def _smooth(self) -> None:
+        """Take the poses that have come since orientation was asked for last; twenty take hardly longer than one."""
+        if not self._new:
+            return
+        time_s, position_l, quaternion, covariance = (np.array(column) for column in zip(*self._new, strict=True))
+        self._new.clear()
+        self._trajectory.append(*self._smoother.push(time_s, position_l, quaternion, covariance))
+        newest_s = float(time_s[-1])
+        if len(self._trajectory) > 4096 and self._trajectory.start_s < newest_s - 2 * KEPT_S:
+            self._trajectory.forget(newest_s - KEPT_S)
 
     def close(self) -> None:
         """No more poses come: those that wait for neighbours are taken as they are."""
-        for time_s, position_l, quaternion, covariance in self._smoother.rest():
-            self._poses.append(np.array([time_s]), position_l[None], quaternion[None], covariance[None])
+        self._smooth()
+        self._trajectory.append(*self._smoother.rest())
         self._closed = True
 
     def add_correction(self, time_s: float, correction: Array, covariance: Array) -> None:

@@ -104,26 +104,42 @@ def test_poses_lose_their_noise_and_keep_their_motion():
     noisy = quaternion_multiply(true, quaternion_from_vector(noise))
     position = np.column_stack([70 * time_s, np.sin(time_s), 1500 + 0 * time_s])
     measured = position + 0.01 * rng.standard_normal(position.shape)
-    smoother, out = PoseSmoother(), []
-    for i in range(len(time_s)):
-        pose = smoother.push(time_s[i], measured[i], noisy[i], np.eye(6))
-        if pose is not None:
-            out.append(pose)
-    assert smoother.reach == (8, 8) and len(out) == len(time_s) - 8
-    index = np.rint(np.array([pose[0] for pose in out]) / 0.005).astype(int)
-    left = vector_from_quaternion(
-        quaternion_multiply(quaternion_conjugate(true[index]), np.array([pose[2] for pose in out]))
-    )[200:]
+    smoother, covariance = PoseSmoother(), np.broadcast_to(np.eye(6), (len(time_s), 6, 6))
+    out_s, out_l, out_q, _ = smoother.push(time_s, measured, noisy, covariance)
+    assert smoother.reach == (8, 8) and len(out_s) == len(time_s) - 8
+    index = np.rint(out_s / 0.005).astype(int)
+    left = vector_from_quaternion(quaternion_multiply(quaternion_conjugate(true[index]), out_q))[200:]
     assert 0.3 < left.std() / 2e-5 < 0.5  # sqrt of the middle weight of 17 is 0.37
-    assert np.std((np.array([pose[1] for pose in out]) - position[index])[200:]) < 0.005
+    assert np.std((out_l - position[index])[200:]) < 0.005
     expected = np.repeat([0.01**2, 2e-5**2], 3) * 0.137
     np.testing.assert_allclose(smoother.noise_left, expected, rtol=0.4)
     # motion as fast as the poses is kept
     shaking = PoseSmoother()
-    for i in range(400):
-        shake = quaternion_from_vector(np.array([1e-3 * np.sin(2 * np.pi * 20 * time_s[i]), 0, 0]))
-        shaking.push(time_s[i], position[i], quaternion_multiply(noisy[i], shake), np.eye(6))
+    shake = quaternion_from_vector(1e-3 * np.sin(2 * np.pi * 20 * time_s[:400])[:, None] * [1.0, 0.0, 0.0])
+    shaking.push(time_s[:400], position[:400], quaternion_multiply(noisy[:400], shake), covariance[:400])
     assert shaking.reach[1] < 8
+
+
+def test_poses_come_out_the_same_however_many_come_at_once():
+    rng = np.random.default_rng(3)
+    n = 700
+    time_s = np.cumsum(np.where(rng.uniform(size=n) < 0.01, 0.02, 0.005))  # some are missing
+    position = np.column_stack([70 * time_s, 3 * np.sin(time_s), 1500 + rng.standard_normal(n) * 0.01])
+    turns = 0.02 * np.sin(time_s)[:, None] + 2e-5 * rng.standard_normal((n, 3))
+    rows = time_s, position, quaternion_from_vector(turns), np.broadcast_to(np.eye(6), (n, 6, 6))
+    found = []
+    for sizes in ([1] * n, [n], [5, 12, 40, 1, 200, n - 258]):
+        smoother, ends = PoseSmoother(), np.cumsum(sizes)
+        parts = [smoother.push(*(c[e - k : e] for c in rows)) for k, e in zip(sizes, ends, strict=True)]
+        parts.append(smoother.rest())
+        found.append(([np.concatenate(column) for column in zip(*parts, strict=True)], smoother.noise_left))
+    (alone, noise), *others = found
+    np.testing.assert_array_equal(alone[0], time_s)
+    assert 0.001 < np.abs(alone[1] - position).max() < 0.1
+    for columns, other_noise in others:
+        np.testing.assert_array_equal(other_noise, noise)
+        for one, other in zip(alone, columns, strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_least_squares_matching_finds_shifts():
