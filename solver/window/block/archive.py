@@ -26,7 +26,7 @@ from ..datum.drifts import MOST_GROUPS, Cell, Named, of_block
 from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, Update, WholeStrips, checks
 from ..state.batch import Batch
 from ..state.points import ControlPoint
-from ..state.strip import WindowStrip
+from ..state.strip import StatedConstants, WindowStrip
 from .backward import BlockSolution, LeftOrientation, LeftPoints
 from .points import KeptPoint, SingleLook, rows_of
 
@@ -54,12 +54,14 @@ class KeptStrip:
     numbers : of all its unknowns, consecutive
     entered : numbers of those that were ever needed; none until nothing of the strip is left in the window
     orientation : what became final of it
+    constants : what was known beforehand of its offset, shift and drift; None until nothing of it is left in the window
     """
 
     index: int
     numbers: IntArray
     entered: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     orientation: list[LeftOrientation] = field(default_factory=list)
+    constants: StatedConstants | None = None
 
 
 class Archive:
@@ -109,11 +111,24 @@ class Archive:
         """Nothing of a strip is left in the window: its unknowns, with their a-priori equations, are all known."""
         kept = self.strips.get(strip.id)
         if kept is not None:
-            kept.entered = strip.entered
+            kept.entered, kept.constants = strip.entered, strip.constants()
             columns, coefficients, value, sigma = strip.apriori()
             places = np.where(columns >= 0, np.searchsorted(kept.entered, columns), -1).astype(np.int32)
             prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(kept.entered))
             self.add(kept.entered, prior.normal.toarray(), prior.matrix.T @ prior.value)
+
+    def restate_constants(self, factor: Array) -> None:
+        """State offset, shift and drift of the strips that are over with factors (4,) that later ones have shown, where
+        these are larger than their own.
+
+        One strip alone often fits a boresight or a datum that is far beyond its sigma, and a later one with another
+        heading contradicts it. The earlier one was measured with the same instruments.
+        """
+        for kept in self.strips.values():
+            found = None if kept.constants is None else kept.constants.restated(factor)
+            if found is not None:
+                kept.constants, numbers, matrix, rhs = found
+                self.add(numbers, matrix, rhs)
 
     def leave(self, batch: Batch, left: LeftPoints, cell: Cell | None, update: Update) -> None:
         """A batch became final; single looks of earlier strips that count now are told.

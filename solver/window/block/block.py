@@ -178,6 +178,7 @@ class Block:
 
     def _begin_work(self, steps: list[Step], at_the_end: bool) -> None:
         self._restate_shared()
+        self._archive.restate_constants(self._network.sigmas.apriori)
         archive, over = self._archive, self._archive.over
         new, self._new = self._new, []
         alone = [id for id in new if id not in archive.strips]

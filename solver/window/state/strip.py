@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array, IntArray
 from ...geometry.trajectory import Poses
 from ...models import MODELS
-from ...models.base import WANDERS, CorrectionModel, Design, Extent, ModelOptions, PseudoObservations, error_groups
+from ...models.base import (
+    CONSTANT,
+    WANDERS,
+    CorrectionModel,
+    Design,
+    Extent,
+    ModelOptions,
+    PseudoObservations,
+    error_groups,
+)
 from ...models.dgr import DgrOptions
 from ...models.lim import LimOptions
 from ...models.ppm import PpmOptions
@@ -64,6 +75,45 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
 def _triple(values: ArrayLike) -> tuple[float, float, float]:
     a, b, c = np.maximum(values, NOTHING).tolist()
     return (a, b, c)
+
+
+@dataclass(frozen=True)
+class StatedConstants:
+    """What is known beforehand of offset, shift and drift of a strip.
+
+    Attributes
+    ----------
+    columns, coefficients, value, sigma : (m, t), (m, t), (m,), (m,) equations: numbers of unknowns, -1 for none; sigmas
+        as stated at first
+    group, factor : (m,) place in `ERROR_GROUPS`, and what the sigmas have been multiplied by
+    """
+
+    columns: NDArray[np.int32]
+    coefficients: Array
+    value: Array
+    sigma: Array
+    group: IntArray
+    factor: Array
+
+    def restated(self, factor: Array) -> tuple[StatedConstants, IntArray, Array, Array] | None:
+        """With factors (4,), where they are larger; None where none is.
+
+        Returns
+        -------
+        constants : what is known then
+        numbers, matrix, rhs : (u,), (u, u), (u,) how the normal equations change by it, and of which unknowns
+        """
+        larger = np.maximum(self.factor, factor[self.group])
+        rows = np.flatnonzero(larger > self.factor)
+        if not len(rows):
+            return None
+        change = (self.sigma * larger)[rows] ** -2.0 - (self.sigma * self.factor)[rows] ** -2.0
+        row, term = np.nonzero(self.columns[rows] >= 0)
+        numbers, place = np.unique(self.columns[rows][row, term], return_inverse=True)
+        design = np.zeros((len(rows), len(numbers)))
+        design[row, place] = self.coefficients[rows][row, term]
+        matrix, rhs = design.T @ (change[:, None] * design), design.T @ (change * self.value[rows])
+        return replace(self, factor=larger), numbers.astype(np.int64), matrix, rhs
 
 
 class WindowStrip:
@@ -189,6 +239,14 @@ class WindowStrip:
         """A-priori equations of these: columns (m, t) by number, -1 for none, coefficients, values, sigmas."""
         rows = np.flatnonzero(self._row_done & np.isfinite(self._prior.sigma))
         return self._rows(rows)
+
+    def constants(self) -> StatedConstants:
+        """Those of the a-priori equations that speak of offset, shift and drift."""
+        done = self._row_done & np.isfinite(self._prior.sigma)
+        rows = np.flatnonzero(done & np.isin(self._group, CONSTANT))
+        columns, coefficients, value, sigma = self._rows(rows)
+        scale = self._scale[rows]
+        return StatedConstants(columns, coefficients, value, sigma / scale, self._group[rows], scale)
 
     def _rows(self, rows: IntArray) -> tuple[NDArray[np.int32], Array, Array, Array]:
         p: PseudoObservations = self._prior

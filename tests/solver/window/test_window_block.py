@@ -82,6 +82,27 @@ def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one
     assert block.whole_points.keys() == chain.whole_points.keys()
 
 
+def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones_too(flight, online):
+    """As if they had been known from the start: all strips were measured with the same instruments."""
+    simulation, _ = flight
+
+    def whole(since_s):
+        def larger(now_s, window):
+            network = window.network
+            if now_s > since_s and network.sigmas.apriori.max() == 1.0:
+                network.sigmas.apriori = np.array([3.0, 4.0, 1.0, 1.0])
+                for strip in network.flown:
+                    strip.restate_sigmas(network.sigmas.apriori, network.state)
+
+        return adjust_online(*flight, OPTIONS, live=False, update_s=0.5, watch=larger).whole
+
+    (begin, _), (second, _), _ = simulation.flight.strip_times_s
+    from_the_start = whole(begin + 2.0)
+    difference, sigma = far_apart(whole(second + 5.0), from_the_start)
+    assert difference < 0.05 and sigma < 0.005
+    assert far_apart(online.whole, from_the_start)[1] > 0.2, "these are other sigmas"
+
+
 def test_a_later_strip_knows_what_the_earlier_ones_say_of_its_points(flight, online):
     """As the batch adjustment of what had arrived when a time became final; far better than alone."""
     simulation, poses = flight
