@@ -16,6 +16,7 @@ from ..errors import UserError
 from .new_file import new_file
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_DECIMAL_POINT = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 #: The search for problems of a file ends after so many.
 MOST_PROBLEMS = 10
 
@@ -121,7 +122,7 @@ class Table:
     def line_of(self, row: int) -> int:
         """Line number in the file (from 1) of a row (from 0)."""
         with _open(self.path) as file:
-            for place, (line, _) in enumerate(_rows(file, separator_of(self.path))):
+            for place, (line, _) in enumerate(_rows(file, separator_of(self.path)[0])):
                 if place == row + 1:
                     return line
         return row + 2
@@ -227,20 +228,27 @@ def _open(path: Path):
 
 
 def separator_of(path: Path) -> tuple[str, str]:
-    """What stands between the values, a comma or a semicolon, and the decimal sign, by the first two lines.
+    """What stands between the values, a comma or a semicolon, and the decimal sign.
 
-    A semicolon separates where the header has one and no comma; then a comma between digits is a decimal sign.
+    A semicolon separates where the header has one and no comma. The decimal sign is then that of the first row with a
+    number that is not whole: spreadsheets write whole numbers without one.
     """
     with _open(path) as file:
-        lines = [line for line in (file.readline(65536) for _ in range(8)) if line.strip()]
-    if not lines or ";" not in lines[0] or "," in lines[0]:
-        return ",", "."
-    return ";", "," if len(lines) > 1 and re.search(r"\d,\d", lines[1]) else "."
+        head = next((line for line in (file.readline(65536) for _ in range(8)) if line.strip()), "")
+        if ";" not in head or "," in head:
+            return ",", "."
+        for line in iter(lambda: file.readline(65536), ""):
+            fields = [text.strip().strip('"') for text in line.split(";")]
+            commas, points = (
+                sum(bool(sign.fullmatch(text)) for text in fields) for sign in (_DECIMAL_COMMA, _DECIMAL_POINT)
+            )
+            if commas or points:  # a name of a point may look like a number too
+                return ";", "," if commas >= points else "."
+    return ";", "."
 
 
-def _rows(file: Any, separator: tuple[str, str]):
-    """(line number, fields) of all lines that are not blank; numbers with a decimal point."""
-    delimiter, decimal = separator
+def _rows(file: Any, delimiter: str):
+    """(line number, fields) of all lines that are not blank."""
     reader = csv.reader(file, skipinitialspace=True, delimiter=delimiter)
     while True:
         try:
@@ -250,15 +258,12 @@ def _rows(file: Any, separator: tuple[str, str]):
         except csv.Error as error:
             raise UserError(f"{file.name}:{max(reader.line_num, 1)}: not a text table ({error})") from None
         if fields and any(text.strip() for text in fields):
-            texts = [text.strip() for text in fields]
-            if decimal == ",":
-                texts = [text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text for text in texts]
-            yield reader.line_num, texts
+            yield reader.line_num, [text.strip() for text in fields]
 
 
 def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str]:
     with _open(path) as file:
-        _, header = next(_rows(file, separator_of(path)), (0, []))
+        _, header = next(_rows(file, separator_of(path)[0]), (0, []))
     if not header:
         raise UserError(f"{path}: empty, wanted a header with {_names(columns)}")
     if any("\0" in name or "\ufffd" in name for name in header):
@@ -285,15 +290,22 @@ def _names(columns: Sequence[Column]) -> str:
 def _problems(path: Path, known: Mapping[str, Column]) -> list[str]:
     """Look at every value; used once something is known to be wrong."""
     found: list[str] = []
+    delimiter, decimal = separator_of(path)
     with _open(path) as file:
-        rows = _rows(file, separator_of(path))
+        rows = _rows(file, delimiter)
         _, header = next(rows)
         place = {name: header.index(name) for name in known}
         for line, fields in rows:
             if len(fields) > len(header) and any(fields[len(header) :]):
                 found.append(f"{path}:{line}: {header[-1]}: {len(fields)} values, wanted {len(header)}")
             for name, column in known.items():
-                what = column.problem(fields[place[name]] if place[name] < len(fields) else "")
+                text = fields[place[name]] if place[name] < len(fields) else ""
+                if decimal == "," and column.kind != "text":
+                    if _DECIMAL_POINT.fullmatch(text):
+                        found.append(f"{path}:{line}: {name}: {text}, wanted a decimal comma as other values have")
+                        continue
+                    text = text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text
+                what = column.problem(text)
                 if what:
                     found.append(f"{path}:{line}: {name}: {what}")
             if len(found) >= MOST_PROBLEMS:

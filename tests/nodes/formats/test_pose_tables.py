@@ -16,6 +16,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
 from triline.nodes.formats.frame_json import read_frame
 from triline.nodes.formats.projection import missing_grids
+from triline.nodes.formats.table import Column, read_table
 from triline.nodes.formats.track import Accuracy
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles
 
@@ -118,6 +119,28 @@ def test_decimal_commas_and_sigmas_as_navigate_writes_them(tmp_path):
 
 
 UNIX = TIMES["Unix"][1]
+
+
+def test_decimal_commas_below_a_row_of_whole_numbers(tmp_path):
+    """Spreadsheets write whole numbers without a decimal sign, so that the first row tells nothing."""
+    path = tmp_path / "p.csv"
+    rows = [f"{1591012800 + i};{47 + i};{9 + i};{2000 + i};0;0;{45 + i}" for i in range(2)]
+    rows += ["1591012802;49,5;11,25;2002,5;0,5;0;47"]
+    path.write_text("\n".join(["time_s;" + COLUMNS.replace(",", ";"), *rows]) + "\n")
+    track = read_track(path, "csv", Options())
+    np.testing.assert_allclose(track.geodetic[2], [49.5, 11.25, 2002.5])
+    points = path.read_text().replace("2002,5", "2002.5")
+    path.write_text(points)
+    with pytest.raises(UserError, match=r"p.csv:4: height_m: 2002.5, wanted a decimal comma as other values have$"):
+        read_track(path, "csv", Options())
+
+
+def test_names_that_look_like_numbers_do_not_tell_the_decimal_sign(tmp_path):
+    for name, text in (("1,2", "500.25"), ("1.2", "500,25")):
+        path = tmp_path / "control.csv"
+        path.write_text(f"point;X_m;Y_m;Z_m;role\n7;1;2;3;check\n{name};{text};{text};{text};check\n")
+        table = read_table(path, [Column("point", "text"), Column("X_m"), Column("Z_m")], [])
+        assert table["point"][1] == name and table["X_m"][1] == table["Z_m"][1] == 500.25
 
 
 def test_sigmas_along_the_axes_of_a_crs_as_adjust_and_export_write_them(tmp_path):
