@@ -22,7 +22,7 @@ from ..node import Message
 from .envi import header_of
 from .envi_image import TYPES, open_envi, open_raw
 from .grey_image import GreyImage, ImageFile
-from .table import Column, read_table, separator_of
+from .table import Column, column_names_of, read_table
 from .tiff_image import is_tiff, open_tiff
 from .time_columns import WANTED, instant_ns, time_columns, times_of
 
@@ -293,9 +293,7 @@ def line_times(path: Path, day: date | None, notes: list[str]) -> NDArray[np.int
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file, wanted a CSV with line and time")
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        header = [name.strip() for name in file.readline(4096).split(separator_of(path)[0])]
-    columns = time_columns(header)
+    columns = time_columns(column_names_of(path))
     if not columns:
         raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}")
     table = read_table(path, [Column("line", "integer", low=0), *columns], notes)

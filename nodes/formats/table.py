@@ -227,6 +227,17 @@ def _open(path: Path):
     return open(path, newline="", encoding="utf-8-sig", errors="replace")
 
 
+def column_names_of(path: Path) -> list[str]:
+    """The names of the columns; empty where the file is empty or no table. Between quotes or not, as values are."""
+    delimiter = separator_of(path)[0]
+    with _open(path) as file:
+        first = next((line for line in iter(lambda: file.readline(65536), "") if line.strip()), "")
+    try:
+        return [name.strip() for name in next(csv.reader([first], skipinitialspace=True, delimiter=delimiter), [])]
+    except csv.Error:
+        return []
+
+
 def separator_of(path: Path) -> tuple[str, str]:
     """What stands between the values, a comma or a semicolon, and the decimal sign.
 

@@ -15,7 +15,7 @@ from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column
 from .plausible import check_units
 from .projection import refuse_missing_grids
-from .table import Column, Table, read_table, separator_of
+from .table import Column, Table, column_names_of, read_table
 from .time_columns import WANTED, time_columns, times_of
 from .track import NavigationTrack, checked
 
@@ -41,7 +41,7 @@ _UNITS = {"deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian
 
 def is_trajectory_csv(path: Path) -> bool:
     """Whether the header of a CSV file has the columns of a trajectory."""
-    names = _header(path)
+    names = column_names_of(path)
     if not time_columns(names):
         return False
     return _is_photogrammetric(names) or {"lat", "lon", "roll"} <= {_quantity(name)[0] for name in names}
@@ -49,7 +49,7 @@ def is_trajectory_csv(path: Path) -> bool:
 
 def csv_has_latitudes(path: Path) -> bool:
     """Whether the header of a CSV file has latitude and longitude, and not coordinates in a CRS."""
-    names = _header(path)
+    names = column_names_of(path)
     return not _is_photogrammetric(names) and {"lat", "lon"} <= {_quantity(name)[0] for name in names}
 
 
@@ -72,7 +72,7 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     UserError : ``file:line: column: what is wrong``, angles that cannot be in the unit that the header states
     """
     notes: list[str] = []
-    header = _header(path)
+    header = column_names_of(path)
     time = time_columns(header)
     if not time:
         raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
@@ -118,7 +118,7 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     UserError : ``file:line: column: what is wrong``, two poses at one time
     """
     notes: list[str] = []
-    time = time_columns(_header(path))
+    time = time_columns(column_names_of(path))
     if not time:
         raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
     table = read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC)], notes)
@@ -135,11 +135,6 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         lambda i: f"{shown(i)} comes twice with two poses, wanted those of one lens or strip a time",
     )
     return position[first], R[first], time_ns
-
-
-def _header(path: Path) -> list[str]:
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        return [name.strip() for name in file.readline(4096).split(separator_of(path)[0])]
 
 
 def _is_photogrammetric(header: Sequence[str]) -> bool:

@@ -15,6 +15,7 @@ from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
 from triline.nodes.formats.frame_json import read_frame
+from triline.nodes.formats.image_lines import line_times
 from triline.nodes.formats.projection import missing_grids
 from triline.nodes.formats.table import Column, read_table
 from triline.nodes.formats.track import Accuracy
@@ -133,6 +134,20 @@ def test_decimal_commas_below_a_row_of_whole_numbers(tmp_path):
     path.write_text(points)
     with pytest.raises(UserError, match=r"p.csv:4: height_m: 2002.5, wanted a decimal comma as other values have$"):
         read_track(path, "csv", Options())
+
+
+@pytest.mark.parametrize("sep", [",", ";"])
+def test_names_and_values_between_quotes_below_a_blank_line(tmp_path, sep):
+    rows = [["time_s", *COLUMNS.split(",")]]
+    rows += [[f"{1591012800 + i}.5", f"{LAT[i]:.6f}", f"{LON[i]:.6f}", "2000", "1.5", "-2.5", "45"] for i in range(N)]
+    path, times = tmp_path / "p.csv", tmp_path / "times.csv"
+    path.write_text("\n" + "\n".join(sep.join(f'"{value}"' for value in row) for row in rows) + "\n")
+    assert kind_of_path(path) == "csv"
+    track = read_track(path, "csv", Options())
+    assert track.time_ns[0] == ns(START) + 500_000_000
+    np.testing.assert_allclose(track.geodetic[:, 1], LON, atol=1e-6)
+    times.write_text(f'"line"{sep}"time_s"\n"0"{sep}"1591012800.5"\n"1"{sep}"1591012800.75"\n')
+    assert line_times(times, None, []).tolist() == [ns(START) + 500_000_000, ns(START) + 750_000_000]
 
 
 def test_names_that_look_like_numbers_do_not_tell_the_decimal_sign(tmp_path):
