@@ -25,6 +25,8 @@ Array = NDArray[np.floating]
 GEOGRAPHIC = "geographic"
 #: No point lies deeper, m: coordinates of a map, taken for geocentric ones, lie about the centre of the Earth.
 DEEPEST_M = -1e5
+#: Axes X and Y that make a left-handed system with heights: it is a mirror image, and no angles turn an image to it.
+_LEFT_HANDED = (("south", "west"), ("west", "north"), ("east", "south"))
 _UNITS = {"metre": "m", "degree": "deg", "grad": "grad", "foot": "ft", "US survey foot": "ft_us"}
 
 
@@ -116,10 +118,16 @@ class LocalFrame:
         return out
 
     def R_l_crs(self, xyz: ArrayLike) -> Array:
-        """Rotation (n, 3, 3) from the CRS axes at points (n, 3) to the local frame: scale removed, convergence kept."""
+        """Rotation (n, 3, 3) from the CRS axes at points (n, 3) to the local frame: scale removed, convergence kept.
+
+        Raises
+        ------
+        CrsError : as of `from_crs`; left-handed axes, to which no rotation leads
+        """
         xyz = np.atleast_2d(np.asarray(xyz, dtype=float))
         if self.crs == "local":
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3)).copy()
+        _refuse_left_handed(self._crs, self.crs)
         step = 1e-5 if self.is_geographic else 1.0
         columns = []
         for axis in range(3):
@@ -165,10 +173,16 @@ class LocalFrame:
 
     @classmethod
     def around(cls, xyz: ArrayLike, crs: str) -> LocalFrame:
-        """Frame at the middle of points (n, 3) given in ``crs``, on the ellipsoid below them (height 0)."""
+        """Frame at the middle of points (n, 3) given in ``crs``, on the ellipsoid below them (height 0).
+
+        Raises
+        ------
+        CrsError : PROJ does not know the CRS, a point lies outside its area, or its axes are left-handed
+        """
         if crs == "local":
             return cls(0.0, 0.0, 0.0)
         xyz, parsed = np.array(np.atleast_2d(xyz), dtype=float), known_crs(crs)
+        _refuse_left_handed(parsed, crs)
         if parsed.is_geographic:
             circle = _circle(parsed)
             if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
@@ -249,6 +263,14 @@ def known_crs(crs: str, *, geocentric: bool = True):
         return known
     kind = "a geocentric" if known.is_geocentric else "a vertical" if known.is_vertical else "another"
     raise CrsError(f"crs {crs!r}: {kind} system, wanted a projected or geographic one (with heights)")
+
+
+def _refuse_left_handed(known, crs: str) -> None:
+    """Raise CrsError where an image has no omega, phi, kappa in the axes of a CRS."""
+    axes = tuple(axis.direction.lower() for axis in known.axis_info[:2])
+    if axes in _LEFT_HANDED:
+        what = f"its axes go {' and '.join(axes)}, and angles in a left-handed system are none"
+        raise CrsError(f"crs {crs!r}: {what}, wanted the one of the same map with axes to the east and north")
 
 
 def _circle(crs) -> float:

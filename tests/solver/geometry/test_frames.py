@@ -17,7 +17,7 @@ from triline.solver.geometry.frames import (
     navigation_from_R_lc,
     opk_covariance_from_navigation,
 )
-from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_navigation
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_navigation
 
 RNG = np.random.default_rng(11)
 LAT, LON, H = RNG.uniform(-89, 89, 60), RNG.uniform(-180, 180, 60), RNG.uniform(-100, 12000, 60)
@@ -89,6 +89,25 @@ def test_a_frame_across_the_date_line():
     np.testing.assert_allclose(frame.to_crs(local), xyz, atol=1e-9)
     grad = LocalFrame.around([[199.9, 50.0, 0.0], [-199.9, 50.0, 0.0]], "EPSG:4807")  # Paris, in grad
     assert abs(grad.lon_deg) == pytest.approx(177.66, abs=0.02)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:5513", "EPSG:2065", "EPSG:5513+EPSG:5773"])
+def test_left_handed_axes_have_no_angles(crs):
+    """Krovak's south and west: the angles of an image there, read again, were those of another attitude."""
+    with pytest.raises(CrsError, match="its axes go south and west, and angles in a left-handed system are none"):
+        LocalFrame.around(np.array([[1_058_147.0, 703_011.0, 300.0]]), crs)
+
+
+@pytest.mark.parametrize(
+    "crs, place", [("EPSG:5514", (50.0, 15.0)), ("EPSG:2053", (-26.0, 29.2)), ("EPSG:2193", (-40, 175))]
+)
+def test_angles_in_axes_to_the_south_or_with_the_northing_first(crs, place):
+    frame = LocalFrame(*place, 0.0, crs)
+    R_l_crs = frame.R_l_crs(frame.to_crs(np.zeros((1, 3))))
+    R_lc = R_lc_from_navigation(frame, np.zeros((1, 3)), np.radians([[2.0, 1.0, 30.0]]))
+    angles = angles_from_matrix(np.swapaxes(R_l_crs, 1, 2) @ R_lc)
+    rpy = navigation_from_R_lc(frame, np.zeros((1, 3)), R_l_crs @ matrix_from_angles(*angles.T))
+    np.testing.assert_allclose(np.degrees(rpy), [[2.0, 1.0, 30.0]], atol=1e-9)
 
 
 def test_unknown_crs_is_named():
