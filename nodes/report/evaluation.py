@@ -59,7 +59,8 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
       points that were not given as control: ``n, rmse_m, mean_m, max_m, sigma_m, nees``; where there are both direct
       georeferencing and adjusted points, all rows count only points that both have;
     - ``check``, ``control``: the same rows against given coordinates of check points and (full) control points, without
-      those of which the adjuster or an operator left one out;
+      those of which the adjuster or an operator left one out. ``nees`` counts the stated errors of the survey too;
+      there is none of what was estimated from the control itself;
     - ``improvement``: RMSE of direct georeferencing (filtered) / triangulated: ``points`` (3), ``of`` (the row of
       TRIANGULATED that is meant), ``orientation`` (6, of "final");
     - ``ended_early``: strips whose end the recording does not reach: ``strip, flown_s, planned_s``;
@@ -80,12 +81,16 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     check, control = _given(flight, "check"), _given(flight, "control")
     given = {id for id, g in flight.ground.items() if convert.role_of(g) != "check"} - flight.refused_ground
     truth = {id: xyz for id, xyz in flight.truth_points.items() if id not in given}  # given coordinates are no result
+    surveyed = {id: _survey(g) for id, g in flight.ground.items()}
     for target, known in (("points", truth), ("check", check), ("control", control)):
         known = {id: xyz for id, xyz in known.items() if shared is None or id in shared}
         for name, (ids, xyz, covariance) in rows.items():
-            row = _point_row(ids, xyz, covariance, known)
+            row = _point_row(ids, xyz, covariance, known, {} if target == "points" else surveyed)
             if row is not None:
                 result[target][name] = row
+    for name, row in result["control"].items():
+        if name != "direct_georeferencing":  # control took part in all others
+            row.pop("nees", None)
     _improvement(result, flight.measured)
     result["ended_early"] = ended_early(flight)
     result.update(_totals(flight))
@@ -393,12 +398,24 @@ def _given(flight: Flight, role: str) -> dict[str, Array]:
     return {id: xyz for id, xyz in of_role.items() if np.isfinite(xyz).all()}
 
 
-def _point_row(ids: list[str], xyz: Array, covariance: Array, known: dict[str, Array]) -> dict[str, Any] | None:
+def _survey(point: Any) -> Array:
+    """(3, 3) covariance of the given coordinates of a ground point; zero where none is stated."""
+    stated = np.array(point.covariance, dtype=float)
+    return stated.reshape(3, 3) if len(stated) == 9 and np.isfinite(stated).all() else np.zeros((3, 3))
+
+
+def _point_row(
+    ids: list[str], xyz: Array, covariance: Array, known: dict[str, Array], surveyed: dict[str, Array]
+) -> dict[str, Any] | None:
+    """Points against known ones, whose covariances are ``surveyed``; those that are not there have no error."""
     both = [i for i, id in enumerate(ids) if id in known]
     if not both:
         return None
     error = xyz[both] - np.array([known[ids[i]] for i in both])
-    return _row(accuracy(error, covariance[both]), "m")
+    row = _row(accuracy(error, covariance[both]), "m")
+    if "nees" in row and surveyed:
+        row["nees"] = accuracy(error, covariance[both] + np.array([surveyed[ids[i]] for i in both])).nees
+    return row
 
 
 def _row(a: Accuracy, unit: str, scale: float = 1.0, part: slice = slice(None)) -> dict[str, Any]:

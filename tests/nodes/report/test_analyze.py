@@ -92,6 +92,10 @@ def test_point_errors_equal_an_independent_computation(messages, recording):
         [[p.x - check[p.point].x, p.y - check[p.point].y, p.z - check[p.point].z] for p in final if p.point in check]
     )
     np.testing.assert_allclose(result["check"]["adjusted"]["mean_m"], rows.mean(axis=0))
+    both = [np.add(p.covariance, check[p.point].covariance).reshape(3, 3) for p in final if p.point in check]
+    nees = np.mean([e @ np.linalg.solve(C, e) for e, C in zip(rows, both, strict=True)]) / 3
+    assert result["check"]["adjusted"]["nees"] == pytest.approx(nees)  # given coordinates have errors of their own
+    assert [name for name, row in result["control"].items() if "nees" in row] == ["direct_georeferencing"]
     ratio = np.divide(result["points"]["direct_georeferencing"]["rmse_m"], result["points"]["adjusted"]["rmse_m"])
     assert result["improvement"]["of"] == "adjusted"
     np.testing.assert_allclose(result["improvement"]["points"], ratio)
