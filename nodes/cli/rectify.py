@@ -12,10 +12,11 @@ import numpy as np
 
 from ...solver.orthoimage.resampling import TAPS
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
-from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks
+from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
 from ..errors import UserError
 from ..formats.geotiff import write_orthoimage
 from ..formats.new_file import refuse_unless_file
+from ..formats.projection import notes_of_map
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
 from .damage import tell_damage, tell_other_frame
@@ -119,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
         "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "poses_not_valid": of.orientation.not_valid,
+        "notes": notes_of_map(grid.frame.crs, project_frame(recording).crs),
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args, grid.frame.units[0])
@@ -187,3 +189,6 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace, uni
         print(f"  {result['poses_not_valid']} poses are not valid and give no orientation")
     if done.missed_rays:
         print(f"  {done.missed_rays} rays did not meet the ground")
+    if not args.quiet:
+        for note in result["notes"]:
+            print(f"  note: {note}")

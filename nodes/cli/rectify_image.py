@@ -29,6 +29,7 @@ from ..errors import UserError
 from ..formats.frame_json import is_frame_json, read_frame
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import refuse_unless_file
+from ..formats.projection import notes_of_map
 from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, read_table
 from .locate import with_refraction
@@ -444,6 +445,7 @@ def _grid(args: argparse.Namespace, sensor: _Sensor, ground: Ground, lat: Array,
             f"--crs {crs}: the image lies across the date line, the two sides of which are the two ends of that CRS; "
             f"wanted another one such as {default_crs(*middle, sensor.ellipsoid)}, or --bounds of one side"
         )
+    sensor.notes.extend(notes_of_map(crs))
     model = sensor.model
     h = np.array([0.5 * (ground.low_m + ground.high_m)])
     centre = SomeCells(np.zeros((1, 2)), np.array([0.5 * (model.lines - 1)]), np.array([0.5 * (model.samples - 1)]), h)

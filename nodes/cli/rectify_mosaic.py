@@ -36,11 +36,12 @@ from ..batch.mosaic_layers import (
     layer_of_mosaic,
     layer_of_orthoimage,
 )
-from ..batch.rectification import Rectification, line_blocks
+from ..batch.rectification import Rectification, line_blocks, project_frame
 from ..errors import UserError
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
 from ..formats.new_file import refuse_unless_file
+from ..formats.projection import notes_of_map
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
@@ -127,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
     done = put_together(folder, layers, settings, outputs, tags, args.compress or "deflate")
     forget_files()
     result = _result(args, outputs, settings, layers, folder, done)
+    result["notes"] = _notes(kinds, crs)
     result["continued"] = before + counts["done before"] if continued else 0
     if args.stac is not None:
         write_stac_item(args.stac, outputs.mosaic, crs, gsd, done, result, _assets(outputs))
@@ -266,6 +268,14 @@ def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) 
         crs, gsd = crs or found[0], gsd or found[1]
     assert crs is not None and gsd is not None
     return crs, float(gsd)
+
+
+def _notes(kinds: list[tuple[str, Path, str | None]], crs: str) -> list[str]:
+    """What is to be said of the CRS; finished orthoimages were made in it before."""
+    given = {"image": lambda _: "local", "recording": lambda path: project_frame(Recording(path)).crs}
+    return list(dict.fromkeys(
+        note for kind, path, _ in kinds if kind in given for note in notes_of_map(crs, given[kind](path))
+    ))  # fmt: skip
 
 
 def _plan(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]], settings: MosaicSettings) -> dict:
@@ -528,6 +538,9 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
             print(f"  left out of {layer['name']}: {lines} lines {why}")
         if layer.get("poses_not_valid"):
             print(f"  {layer['name']}: {layer['poses_not_valid']} poses are not valid and give no orientation")
+    if not args.quiet:
+        for note in result["notes"]:
+            print(f"  note: {note}")
     for name in result["empty"]:
         print(f"  nothing of {name}")
     rest = [result[name] for name in ("source", "seams", "sigma", "stac") if result[name]]

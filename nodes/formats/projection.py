@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import CrsError, known_crs
 from ..errors import UserError
 
@@ -110,6 +111,40 @@ def notes_of_heights(crs: str) -> list[str]:
     if name := unknown_heights(crs):
         return [f"PROJ knows no geoid of {name!r}: heights count as ellipsoidal ones and may be off by it, all alike"]
     return []
+
+
+def notes_of_map(crs: str, given: str = "local") -> list[str]:
+    """What is to be said of a map in a CRS to which PROJ knows a better way from WGS 84 than it has grids for.
+
+    Parameters
+    ----------
+    crs : of the map; nothing is said of one in the local frame or of another planet
+    given : of the control that places rest on: what it is off by, the way back to the same CRS takes off again
+
+    Raises
+    ------
+    CrsError : as of `known_crs`
+    """
+    if crs == "local":
+        return []
+    flat = _horizontal(crs)
+    ellipsoid = flat.ellipsoid
+    if ellipsoid is None or abs(ellipsoid.semi_major_metre / WGS84.semi_major_m - 1.0) > 1e-3:
+        return []
+    if given != "local" and flat == _horizontal(given):
+        return []
+    grids = missing_grids(flat.to_string())
+    what = "the map may be off by the datum shift, metres, all alike"
+    return [
+        f"PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what} (`projsync --file {grid}` fetches it)"
+        for grid in grids[:1]
+    ]
+
+
+def _horizontal(crs: str):
+    """The part of a CRS of pyproj without heights."""
+    known = known_crs(crs)
+    return known.sub_crs_list[0] if known.is_compound else known
 
 
 def refuse_missing_grids(crs: str, where: object) -> None:

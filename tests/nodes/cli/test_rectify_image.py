@@ -16,6 +16,7 @@ from satellite_scenes import Truth, write_dimap2
 
 from triline.nodes.cli import main
 from triline.nodes.formats.frame_json import read_frame
+from triline.nodes.formats.projection import missing_grids, notes_of_map
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
 from triline.solver.location.rpc_fit import fit_to_model
@@ -603,6 +604,21 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     assert "--mask: goes with an image" in refused(
         capsys, "recordings/strip.mcap", "-o", tmp_path / "o.tif", "--mask", tmp_path / "m.tif"
     )
+
+
+def test_a_map_whose_datum_shift_is_not_here(scene, tmp_path, capsys):
+    _, path, _, _, _, image = scene
+    if not missing_grids("EPSG:31467"):
+        pytest.skip("PROJ has the grid here")
+    out = tmp_path / "o.tif"
+    for crs, said in (("EPSG:31467", 1), ("EPSG:31467+EPSG:5773", 1), ("EPSG:3035", 0)):
+        args = ["--height", "0", "--crs", crs, "--json"]
+        assert main(["rectify", str(image), "--sensor", str(path), "-o", str(out), *args]) == 0
+        notes = [note for note in json.loads(capsys.readouterr().out)["notes"] if "datum shift" in note]
+        assert len(notes) == said and all("no grid de_adv_BETA2007.tif here" in note for note in notes)
+    # the way back to the CRS of the control has no error of its own
+    assert notes_of_map("EPSG:31467", "EPSG:31467+EPSG:5773") == notes_of_map("local", "EPSG:31467") == []
+    assert notes_of_map("EPSG:31467", "EPSG:25832") and not notes_of_map("+proj=longlat +a=1737400 +b=1737400")
 
 
 # -- real images ---------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.dem import dem_in_frame, read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
 from triline.nodes.formats.height_raster import HeightRaster
+from triline.nodes.formats.projection import missing_grids
 from triline.nodes.formats.trajectory_csv import read_local_poses
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
@@ -325,6 +326,16 @@ def test_refusals(flown, folder, capsys, options, text):
     assert main(["rectify", str(flown), "-o", str(target), *options]) == 1
     err = capsys.readouterr().err
     assert text in err and err.count("\n") == 1 and not target.exists()
+
+
+@pytest.mark.parametrize("mosaic", [[], ["--mosaic", "--workers", "1"]])
+def test_a_map_whose_datum_shift_is_not_here(flown, folder, capsys, mosaic):
+    if not missing_grids("EPSG:31467"):
+        pytest.skip("PROJ has the grid here")
+    for crs, said in (("EPSG:31467", 1), ("EPSG:32632", 0)):
+        words = ["--crs", crs, "--gsd", 20, "--height", 0, *mosaic]
+        notes = _rectify(capsys, flown, folder / "shifted.tif", *words)["notes"]
+        assert len(notes) == said and all("no grid de_adv_BETA2007.tif here" in note for note in notes)
 
 
 def test_recordings_that_cannot_be_rectified(flown, folder, capsys):
