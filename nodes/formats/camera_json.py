@@ -17,6 +17,8 @@ from .table import Column, read_table, write_table
 
 #: The most pixels of a CCD line, ten times those of the longest lines that are built.
 MOST_PIXELS = 1_000_000
+#: No pixel of a line camera looks farther off the axis of its lens, degrees: fish-eyes end here as well.
+FARTHEST_DEG = 80.0
 _TABLE = (Column("sample", "integer", low=0), Column("x_mm"), Column("y_mm"))
 
 
@@ -45,6 +47,7 @@ def read_camera(path: Path, notes: list[str] | None = None) -> LineCamera:
     lines: dict[str, CcdLine] = {}
     for keys in file.tables("lines"):
         line = _line(keys, lenses, notes)
+        _refuse_wide(keys, line, lenses[line.lens])
         if line.id in lines:
             raise keys.refuse("id", "an id that no other line has")
         lines[line.id] = line
@@ -123,6 +126,17 @@ def _line(keys: Keys, lenses: dict[str, Lens], notes: list[str]) -> CcdLine:
         float(np.radians(keys.number("inclination_deg", 0.0))),
         _chips(keys, pixels),
     )
+
+
+def _refuse_wide(keys: Keys, line: CcdLine, lens: Lens) -> None:
+    """Raise UserError where lengths of a lens and a line cannot be in one unit: micrometres, metres, pixels."""
+    farthest = float(np.linalg.norm(line.xy_mm - lens.principal_point_mm, axis=1).max())
+    angle = float(np.degrees(np.arctan2(farthest, lens.focal_length_mm)))
+    if not angle <= FARTHEST_DEG:
+        raise UserError(
+            f"{keys.path}: {keys.where}: pixels up to {farthest:.4g} mm off the axis of a lens with a focal length of "
+            f"{lens.focal_length_mm:g} mm, {angle:.1f} degrees, wanted {FARTHEST_DEG:g} at most; is all of it in mm?"
+        )
 
 
 def _chips(keys: Keys, pixels: int) -> tuple[int, ...]:

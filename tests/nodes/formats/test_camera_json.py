@@ -52,6 +52,23 @@ def test_distortion_goes_into_the_table(tmp_path, as_list):
     np.testing.assert_allclose(camera.lines[0].xy_mm, wanted, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c["lenses"][0].update(focal_length_mm=c["lenses"][0]["focal_length_mm"] / 1000),
+        lambda c: c["lines"][0].update(pixel_size_mm=10.0),
+        lambda c: c["lines"][0].update(center_mm=[30580.0, 0.0]),
+        lambda c: c["lenses"][0].update(distortion={"k1": 1e3}),
+    ],
+)
+def test_lengths_in_other_units_are_named(tmp_path, change):
+    """A focal length in metres gave a camera that looks along the horizon, and a flight without a tie point."""
+    with pytest.raises(
+        UserError, match=r"camera.json: lines\[0\]: pixels up to .* wanted 80 at most; is all of it in mm"
+    ):
+        read_camera(_write(tmp_path, change))
+
+
 def test_table_and_chips(tmp_path):
     def change(camera):
         camera["lines"][0] = {"id": "F", "lens": "L1", "table": "f.csv", "chips": [0, 2]}
