@@ -36,7 +36,7 @@ from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
-from .projection import missing_grids, unknown_heights
+from .projection import missing_grids, off_without_grids, unknown_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
@@ -347,8 +347,10 @@ def _general(flight: Flight, keys: Keys) -> None:
     grids = missing_grids(whole)
     flight.crs = whole
     if grids:
-        what = f"PROJ lacks the grid {', '.join(grids[:3])} for {whole!r}: heights would be off by the geoid"
-        flight.problems.append(f"{keys.path}: flight.vertical_datum: {what} (`projsync --file {grids[0]}` fetches it)")
+        off = off_without_grids(whole)
+        key = "vertical_datum" if "heights" in off else "crs"
+        what = f"PROJ lacks the grid {', '.join(grids[:3])} for {whole!r}: {off}"
+        flight.problems.append(f"{keys.path}: flight.{key}: {what} (`projsync --file {grids[0]}` fetches it)")
     elif unknown := unknown_heights(whole):
         what = f"PROJ knows no geoid of {unknown!r}: heights would be off by it, wanted a vertical CRS with a geoid"
         flight.problems.append(f"{keys.path}: flight.vertical_datum: {what}")

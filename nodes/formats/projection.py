@@ -65,6 +65,15 @@ def missing_grids(crs: str) -> list[str]:
     return sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available})
 
 
+def off_without_grids(crs: str) -> str:
+    """What would be off without the grids that `missing_grids` names, and by what; "" where it names none."""
+    grids = set(missing_grids(crs))
+    shifts = set(missing_grids(_horizontal(crs).to_string())) if grids else set()
+    parts = ["positions would be off by the datum shift"] * bool(grids & shifts)
+    parts += ["heights would be off by the geoid"] * bool(grids - shifts)
+    return ", ".join(parts)
+
+
 def unknown_heights(crs: str) -> str:
     """Name of the vertical part of a CRS, if PROJ knows no way from it to the ellipsoid, whatever grids there are.
 
@@ -159,7 +168,7 @@ def refuse_missing_grids(crs: str, where: object) -> None:
     if grids:
         name = known_crs(crs).name
         raise UserError(
-            f"{where}: PROJ lacks the grid {', '.join(grids[:3])} for {name!r}: heights would be off by the geoid "
+            f"{where}: PROJ lacks the grid {', '.join(grids[:3])} for {name!r}: {off_without_grids(crs)} "
             f"(`projsync --file {grids[0]}` fetches it)"
         )
     if unknown:

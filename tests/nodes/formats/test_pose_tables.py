@@ -16,7 +16,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, kind_of_path, read_any, read_track
 from triline.nodes.formats.frame_json import read_frame
 from triline.nodes.formats.image_lines import line_times
-from triline.nodes.formats.projection import missing_grids
+from triline.nodes.formats.projection import missing_grids, off_without_grids
 from triline.nodes.formats.table import Column, read_table
 from triline.nodes.formats.track import Accuracy
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles
@@ -422,6 +422,12 @@ def test_heights_above_a_geoid_that_is_not_here_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"poses.csv: PROJ lacks the grid us_nga.*heights would be off by the geoid"):
         read_any(path, options=Options(crs="EPSG:32632+EPSG:5773"))
     assert len(read_track(path, "csv", Options(crs="EPSG:32632"))) == 3
+    if missing_grids("EPSG:31467"):  # a datum shift is no geoid
+        with pytest.raises(
+            UserError, match=r"lacks the grid de_adv_BETA2007.tif .* positions would be off by the datum"
+        ):
+            read_any(path, options=Options(crs="EPSG:31467"))
+        assert off_without_grids("EPSG:31467+EPSG:5773").endswith("datum shift, heights would be off by the geoid")
     exterior = {"crs": "EPSG:32632+EPSG:5773", "position": [600000, 5300000, 1000], "omega_phi_kappa_deg": [0, 0, 90]}
     interior = {"focal_length_mm": 100, "pixel_size_mm": 0.01, "lines": 100, "samples": 100}
     frame = tmp_path / "frame.json"
