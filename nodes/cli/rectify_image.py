@@ -29,7 +29,7 @@ from ..errors import UserError
 from ..formats.frame_json import is_frame_json, read_frame
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import refuse_unless_file
-from ..formats.projection import notes_of_map
+from ..formats.projection import notes_of_map, unit_of
 from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, read_table
 from .locate import with_refraction
@@ -335,10 +335,14 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
     u, v = table["row"], table["column"]
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
     sigma = args.pixel_sigma or CONTROL_SIGMA_PX
+    # the image may be off by more than its size: the model alone says where a point would appear
+    wide = _Wide(image.lines, image.samples, model)
+    unseen = np.isnan(wide.inverse(lat, lon, table["height_m"])).any(axis=1)
+    place = "is not in the image, nor within its size of it; wanted longitude and latitude in degrees"
+    table.refuse(unseen, "lon_deg, lat_deg", lambda k: f"{table['lon_deg'][k]:g}, {table['lat_deg'][k]:g} {place}")
     try:
-        # the image may be off by more than its size: the model alone says where a point would appear
         return fit_bias(
-            _Wide(image.lines, image.samples, model),
+            wide,
             lat,
             lon,
             table["height_m"],
@@ -589,8 +593,8 @@ def _tell(
         print(json.dumps(result, indent=2))
         return
     print(
-        f"{args.output}: {grid.rows} x {grid.columns} cells of {grid.gsd:g} in {grid.crs}, {sensor.kind}, "
-        f"{ground.words}, {seconds:.1f} s"
+        f"{args.output}: {grid.rows} x {grid.columns} cells of {grid.gsd:g} {unit_of(grid.crs)} in {grid.crs}, "
+        f"{sensor.kind}, {ground.words}, {seconds:.1f} s"
     )
     missing = [f"{n} cells {name}" for name, n in cells.items() if n and name != "value"]
     print(f"  {cells['value']} cells with a value" + (", " + ", ".join(missing) if missing else ""))

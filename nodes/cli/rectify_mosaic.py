@@ -41,7 +41,7 @@ from ..errors import UserError
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
 from ..formats.new_file import refuse_unless_file
-from ..formats.projection import notes_of_map
+from ..formats.projection import notes_of_map, unit_of
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
@@ -500,10 +500,9 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
         print(json.dumps(result, indent=2))
         return
     again = f", {result['continued']} jobs were done already" if result["continued"] else ""
-    print(
-        f"{result['mosaic']}: {result['rows']} x {result['columns']} cells of {result['gsd']:g} in {result['crs']}, "
-        f"{len(result['layers'])} layers, {result['seconds']:.1f} s{again}"
-    )
+    cells = f"{result['rows']} x {result['columns']} cells of {result['gsd']:g} {unit_of(result['crs'])}"
+    layers = f"{len(result['layers'])} layers"
+    print(f"{result['mosaic']}: {cells} in {result['crs']}, {layers}, {result['seconds']:.1f} s{again}")
     band = result["bands"][0]
     width = max(len(layer["name"]) for layer in result["layers"])
     print(f"  {'layer':{width}}  {'cells shown':>12}" + ("" if result["balance"] == "none" else "  gain, offset"))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...solver.geometry.ellipsoid import WGS84
-from ...solver.geometry.frames import CrsError, known_crs
+from ...solver.geometry.frames import CrsError, LocalFrame, known_crs
 from ..errors import UserError
 
 
@@ -45,6 +45,11 @@ class Projection:
         import pyproj
 
         return pyproj.Transformer.from_crs(self._crs, "EPSG:4326", always_xy=True)
+
+
+def unit_of(crs: str) -> str:
+    """Unit of the coordinates of a map: m, ft, ft_us, deg, grad, or crs_unit."""
+    return LocalFrame(0.0, 0.0, 0.0, crs).units[0]
 
 
 def missing_grids(crs: str) -> list[str]:

@@ -586,8 +586,9 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     assert "1 control points, wanted at least 3" in refused(capsys, *base, "--control", control)
     control.write_text(head + f"{lon},{lat},0,5,500\n" * 3)
     assert "control.csv:2: row: 500: outside" in refused(capsys, *base, "--control", control)
-    control.write_text(head + f"{lon + 40},{lat},0,5,5\n" * 3)
-    assert "not in the image" in refused(capsys, *base, "--control", control)
+    control.write_text(head + f"{lon},{lat},0,5,5\n" * 2 + f"{lon + 40},{lat},0,5,5\n")
+    error = refused(capsys, *base, "--control", control)
+    assert f"control.csv:4: lon_deg, lat_deg: {lon + 40:g}, {lat:g} is not in the image" in error
     assert "--correction affine: goes with --control" in refused(capsys, *base, "--correction", "affine")
     error = refused(capsys, *base, "--control", control, "--pixel-sigma", 0)
     assert "--pixel-sigma 0: wanted more than 0 with --control" in error
@@ -604,6 +605,19 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     assert "--mask: goes with an image" in refused(
         capsys, "recordings/strip.mcap", "-o", tmp_path / "o.tif", "--mask", tmp_path / "m.tif"
     )
+
+
+@pytest.mark.parametrize("crs, unit", [("EPSG:3857", "m"), ("EPSG:2225", "ft_us"), ("EPSG:4326", "deg")])
+def test_cells_are_told_with_their_unit(scene, tmp_path, capsys, crs, unit):
+    _, path, _, _, _, image = scene
+    out = tmp_path / "o.tif"
+    for more in ([], ["--mosaic", "--workers", "1", "--balance", "none"]):
+        assert (
+            main(["rectify", str(image), "--sensor", str(path), "-o", str(out), "--height", "0", "--crs", crs, *more])
+            == 0
+        )
+        size = rasterio.open(out).transform.a
+        assert f"cells of {size:g} {unit} in {crs}, " in capsys.readouterr().out
 
 
 def test_a_map_whose_datum_shift_is_not_here(scene, tmp_path, capsys):
