@@ -52,8 +52,8 @@ def gps_from_utc_ns(utc_ns: ArrayLike) -> tuple[int, NDArray[np.float64]]:
     return week, (gps_s - week * WEEK_S) + rest * 1e-9
 
 
-def unwrap_weeks(seconds_of_week: ArrayLike) -> NDArray[np.float64]:
-    """Seconds (n,) that go on over the end of a week instead of starting again from 0."""
+def unwrap_weeks(seconds_of_week: ArrayLike, period_s: int = WEEK_S) -> NDArray[np.float64]:
+    """Seconds (n,) that go on over the end of a week (or of a day) instead of starting again from 0."""
     seconds = np.asarray(seconds_of_week, dtype=float)
-    turns = np.concatenate([[0], np.cumsum(np.diff(seconds) < -WEEK_S / 2)])
-    return seconds + turns * WEEK_S
+    turns = np.concatenate([[0], np.cumsum(np.diff(seconds) < -period_s / 2)])
+    return seconds + turns * period_s

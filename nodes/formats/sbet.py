@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +50,15 @@ def read_sbet(path: Path, day: date | None = None, *, seconds_of_day: bool | Non
     notes: list[str] = []
     of_day = seconds_of_day
     if of_day is None:
-        of_day = day is not None and float(column["time"].max()) < DAY_S and day.isoweekday() not in (7, 1)
+        below = day is not None and float(column["time"].max()) < DAY_S
+        of_day = day is not None and below and day.isoweekday() not in (7, 1)
         if of_day:
             notes.append(f"{path.name}: times below one day, taken as seconds of {day}")
+        elif day is not None and below and day.isoweekday() == 1:
+            what = f"taken as seconds of the week, of {day - timedelta(days=1)}, the day before --date"
+            notes.append(
+                f"{path.name}: times below one day, {what}; if they count from midnight, wanted --seconds-of-day"
+            )
     time = times_from_gps(path, column["time"], day, notes, of_day=of_day)
     with np.errstate(over="ignore"):  # a damaged file overflows here and is refused below
         lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))

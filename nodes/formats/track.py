@@ -195,7 +195,7 @@ def times_from_gps(
     if len(bad):
         what = f"{seconds[bad[0]]:.6g}, wanted GPS seconds of the week, 0 to {WEEK_S}"
         raise UserError(f"{path}: record {bad[0] + 1}: time: {what}")
-    seconds = unwrap_weeks(seconds)
+    seconds = unwrap_weeks(seconds, DAY_S if of_day else WEEK_S)
     if day is None:
         notes.append(f"{path.name}: the day of the flight is not known (--date); times count from 1980-01-06")
         return utc_ns_from_gps(0, seconds)

@@ -342,6 +342,22 @@ def test_sbet_wander_angle_and_seconds_of_day(tmp_path):
     assert read_sbet(path, date(2020, 6, 7)).time_ns[0] == ns("2020-06-07T00:01:22")  # Sunday: seconds of the week
     with pytest.raises(UserError, match="seconds of the week say Sunday"):
         read_sbet(path, date(2020, 6, 3), seconds_of_day=False)
+    monday = read_sbet(path, date(2020, 6, 8))  # its Sunday, or seconds of the day: nothing tells
+    assert monday.time_ns[0] == ns("2020-06-07T00:01:22")
+    assert (
+        "of 2020-06-07, the day before --date; if they count from midnight, wanted --seconds-of-day" in monday.notes[0]
+    )
+
+
+@pytest.mark.parametrize("said", [True, None])
+def test_sbet_with_seconds_of_the_day_over_midnight(tmp_path, said):
+    path = tmp_path / "flight.out"
+    values = np.zeros((4, 17))
+    values[:, 0] = [86399.0, 86399.5, 0.0, 0.5]
+    values[:, 1:4] = [0.8, 0.2, 1000.0]
+    values.tofile(path)
+    track = read_sbet(path, date(2020, 6, 3), seconds_of_day=said)
+    assert track.time_ns.tolist() == [ns("2020-06-03T23:59:41") + k * 500_000_000 for k in range(4)]
 
 
 def test_sbet_over_the_end_of_a_week(tmp_path):
