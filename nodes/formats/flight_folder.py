@@ -36,7 +36,7 @@ from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
-from .projection import missing_grids, off_without_grids, unknown_heights
+from .projection import missing_grids, off_without_grids, unknown_heights, with_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
@@ -45,6 +45,8 @@ from .track import Accuracy, Mounting, NavigationTrack
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
 FAR_M = 50e3
+#: A CRS of more characters is told by its name.
+LONGEST_CRS = 60
 #: Images of a strip that are named where they are missing.
 MISSING_SHOWN = 3
 #: What `navigation.file` may be.
@@ -333,13 +335,15 @@ def _general(flight: Flight, keys: Keys) -> None:
     datum = flight.attempt(lambda: _datum(keys))
     if not crs or not datum:
         return
-    whole = crs if datum == "ellipsoid" else f"{crs}+{datum}"
     if crs == "local":
         raise keys.refuse("crs", "one that PROJ understands, for example EPSG:32632: a real flight is on the Earth")
-    if "+" in crs and not crs.strip().startswith("+"):
+    if "+" in crs and "[" not in crs and not crs.strip().startswith("+"):
         raise keys.refuse("crs", "the horizontal part alone, the vertical one in vertical_datum")
+    whole = crs
     try:
-        known_crs(crs)
+        if known_crs(crs).is_compound:
+            raise keys.refuse("crs", "the horizontal part alone, the vertical one in vertical_datum")
+        whole = crs if datum == "ellipsoid" else with_heights(crs, datum)
         LocalFrame.around(np.zeros((1, 3)), whole)
     except CrsError as error:
         if "outside" not in str(error):  # the origin of the coordinates may lie there
@@ -349,7 +353,8 @@ def _general(flight: Flight, keys: Keys) -> None:
     if grids:
         off = off_without_grids(whole)
         key = "vertical_datum" if "heights" in off else "crs"
-        what = f"PROJ lacks the grid {', '.join(grids[:3])} for {whole!r}: {off}"
+        shown = whole if len(whole) < LONGEST_CRS else known_crs(whole).name
+        what = f"PROJ lacks the grid {', '.join(grids[:3])} for {shown!r}: {off}"
         flight.problems.append(f"{keys.path}: flight.{key}: {what} (`projsync --file {grids[0]}` fetches it)")
     elif unknown := unknown_heights(whole):
         what = f"PROJ knows no geoid of {unknown!r}: heights would be off by it, wanted a vertical CRS with a geoid"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from functools import cached_property
 
@@ -11,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import CrsError, LocalFrame, known_crs
 from ..errors import UserError
+
+#: A CRS by the code of an authority.
+_CODE = re.compile(r"[A-Za-z]+:\d+")
 
 
 class Projection:
@@ -45,6 +49,26 @@ class Projection:
         import pyproj
 
         return pyproj.Transformer.from_crs(self._crs, "EPSG:4326", always_xy=True)
+
+
+def with_heights(crs: str, datum: str) -> str:
+    """A horizontal and a vertical CRS as one: by their codes, or as WKT where one of them has none.
+
+    Raises
+    ------
+    CrsError : PROJ does not know one of them, or cannot put them together
+    """
+    codes = crs.strip(), datum.strip()
+    if all(_CODE.fullmatch(code) for code in codes):
+        return "+".join(codes)
+    from pyproj.crs import CRS, CompoundCRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        flat, heights = known_crs(crs), CRS.from_user_input(datum)
+        return CompoundCRS(f"{flat.name} + {heights.name}", [flat, heights]).to_wkt()
+    except CRSError as error:
+        raise CrsError(f"{crs!r} with heights in {datum!r}: {str(error).splitlines()[0]}") from None
 
 
 def unit_of(crs: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +28,8 @@ GEOGRAPHIC = "geographic"
 DEEPEST_M = -1e5
 #: Axes X and Y that make a left-handed system with heights: it is a mirror image, and no angles turn an image to it.
 _LEFT_HANDED = (("south", "west"), ("west", "north"), ("east", "south"))
+#: WKT or a PROJ string with the code of a vertical CRS behind it.
+_HEIGHTS_BEHIND = re.compile(r"(\]|\+proj=.*)\s*\+\s*[A-Za-z]+:\d+\s*$", re.DOTALL)
 _UNITS = {"metre": "m", "degree": "deg", "grad": "grad", "foot": "ft", "US survey foot": "ft_us"}
 
 
@@ -255,6 +258,9 @@ def known_crs(crs: str, *, geocentric: bool = True):
     """
     import pyproj.exceptions
 
+    # PROJ reads as far as the last bracket, and passes over words of a PROJ string that it does not know
+    if _HEIGHTS_BEHIND.search(crs):
+        raise CrsError(f"crs {crs!r}: a vertical CRS behind '+' goes with codes, wanted them as one compound WKT")
     try:
         known = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:

@@ -246,6 +246,30 @@ def test_a_vertical_datum_without_a_geoid_is_refused(folder):
     assert "flight.vertical_datum: PROJ knows no geoid of 'Baltic 1977 height': heights would be off by it" in problem
 
 
+@pytest.mark.parametrize(
+    "crs",
+    [
+        "WGS 84 / UTM zone 32N",
+        "+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs",
+        "+proj=utm +zone=32 +ellps=GRS80 +towgs84=0,0,0,0,0,0,0 +units=m +no_defs",
+        pyproj.CRS("EPSG:32632").to_wkt(),
+        pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL"),
+    ],
+)
+def test_heights_of_a_crs_that_is_no_code(folder, crs):
+    """PROJ passes over what stands behind WKT or a PROJ string: control counted as ellipsoidal, off by the geoid."""
+    toml = TOML.replace('"EPSG:32632"', f"'{crs}'").replace(
+        'vertical_datum = "ellipsoid"', 'vertical_datum = "EPSG:5705"'
+    )
+    (folder / "flight.toml").write_text(toml)
+    flight = read_flight(folder)
+    assert ["Baltic 1977 height" in problem for problem in flight.problems] == [True]
+    flat, heights = pyproj.CRS(flight.crs).sub_crs_list
+    assert flat.utm_zone == "32N" and heights.to_epsg() == 5705
+    (folder / "flight.toml").write_text(toml.replace("EPSG:5705", "ellipsoid"))
+    assert read_flight(folder).problems == []
+
+
 def test_control_far_from_the_flight_is_refused(folder):
     """Such as that of another UTM zone: the flight went on without a word, and found no tie points."""
     zone = next(text for text in ("EPSG:32632", "EPSG:32633") if text in TOML)

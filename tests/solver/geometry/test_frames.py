@@ -110,6 +110,19 @@ def test_angles_in_axes_to_the_south_or_with_the_northing_first(crs, place):
     np.testing.assert_allclose(np.degrees(rpy), [[2.0, 1.0, 30.0]], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "crs", [pyproj.CRS("EPSG:32632").to_wkt(), "+proj=utm +zone=32 +ellps=GRS80 +no_defs", "+proj=longlat"]
+)
+def test_the_code_of_a_vertical_crs_behind_anything_but_a_code(crs):
+    """PROJ does not read it, and heights above the geoid would be ellipsoidal ones."""
+    for more in ("+EPSG:5773", " + EPSG:5773"):
+        with pytest.raises(
+            CrsError, match="a vertical CRS behind '\\+' goes with codes, wanted them as one compound WKT"
+        ):
+            LocalFrame.around(np.array([[600000.0, 5300000.0, 500.0]]), crs + more)
+    assert LocalFrame(48.0, 11.0, 0.0, crs).units[2] == "m"
+
+
 def test_unknown_crs_is_named():
     with pytest.raises(CrsError, match="EPSG:999999"):
         LocalFrame(0, 0, 0, "EPSG:999999").from_crs(np.zeros((1, 3)))
