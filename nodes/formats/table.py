@@ -180,7 +180,9 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             **exact,
         )
     except (ValueError, pd.errors.ParserError):  # pandas does not say where, so every line is checked
-        raise UserError(one_line(_problems(path, known) or [f"{path}: cannot be read as CSV"])) from None
+        raise UserError(
+            one_line(_problems(path, known) or [_not_utf8(path) or f"{path}: cannot be read as CSV"])
+        ) from None
     # pandas ignores surplus fields of a row
     if path.read_bytes().count(separator.encode()) != (len(header) - 1) * (len(frame) + 1):
         problems = _problems(path, known)
@@ -278,7 +280,10 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
     if not header:
         raise UserError(f"{path}: empty, wanted a header with {_names(columns)}")
     if any("\0" in name or "\ufffd" in name for name in header):
-        raise UserError(f"{path}:1: not a text table, wanted a header with {_names(columns)}")
+        there = all(column.optional or set(column.names) & set(header) for column in columns)
+        raise UserError(
+            (there and _not_utf8(path)) or f"{path}:1: not a text table, wanted a header with {_names(columns)}"
+        )
     repeated = {name for name in header if header.count(name) > 1}
     if repeated:
         raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
@@ -296,6 +301,18 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
 
 def _names(columns: Sequence[Column]) -> str:
     return ",".join(column.name for column in columns if not column.optional)
+
+
+def _not_utf8(path: Path) -> str | None:
+    """Where a text is in another encoding, as spreadsheets write it; None of one that is UTF-8."""
+    with open(path, "rb") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                line.decode("utf-8")
+            except UnicodeDecodeError as error:
+                shown = line[error.start : error.start + 1].decode("cp1252", "replace")
+                return f"{path}:{number}: a letter that is not UTF-8 ({shown!r} in Windows-1252?), wanted UTF-8 text"
+    return None
 
 
 def _problems(path: Path, known: Mapping[str, Column]) -> list[str]:

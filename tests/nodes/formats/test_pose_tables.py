@@ -150,6 +150,18 @@ def test_names_and_values_between_quotes_below_a_blank_line(tmp_path, sep):
     assert line_times(times, None, []).tolist() == [ns(START) + 500_000_000, ns(START) + 750_000_000]
 
 
+@pytest.mark.parametrize("text, line", [("point,X_m,Höhe\nA,1,2\n", 1), ("point,X_m\nA,1\nMühle,2\n", 3)])
+def test_a_table_that_is_not_utf8_is_told_by_its_line(tmp_path, text, line):
+    """As German spreadsheets save a CSV unless they are told otherwise."""
+    path = tmp_path / "control.csv"
+    path.write_bytes(text.encode("cp1252"))
+    letter = "ö" if line == 1 else "ü"
+    with pytest.raises(
+        UserError, match=rf"control.csv:{line}: a letter that is not UTF-8 \('{letter}' in Windows-1252\?\)"
+    ):
+        read_table(path, [Column("point", "text"), Column("X_m")], [])
+
+
 def test_names_that_look_like_numbers_do_not_tell_the_decimal_sign(tmp_path):
     for name, text in (("1,2", "500.25"), ("1.2", "500,25")):
         path = tmp_path / "control.csv"
