@@ -593,6 +593,7 @@ def _strip(flight: Flight, keys: Keys) -> None:
     if keys.has("first_time") or keys.has("line_rate_hz"):
         value = keys.raw("first_time")
         text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
+        instant_ns(text, f"{keys.path}: {keys.name('first_time')}")  # an error names the key, not an option
         first = (text, keys.number("line_rate_hz", positive=True))
     span = keys.numbers("grey_range", 2) if keys.has("grey_range") else None
     if span is not None and span[0] >= span[1]:

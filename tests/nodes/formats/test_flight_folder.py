@@ -335,6 +335,11 @@ def test_new_check_import_of_an_empty_folder(tmp_path, capsys):
 
 
 WRONG = {
+    "time of the first line": (
+        "first_time = 2020-06-01T12:00:03Z",
+        'first_time = "1.6.2020 12:00:03"',
+        "flight.toml: strips[1].first_time: '1.6.2020 12:00:03', wanted an ISO 8601 time",
+    ),
     "vertical datum absent": (
         'vertical_datum = "ellipsoid"\n',
         "",
