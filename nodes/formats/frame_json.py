@@ -71,6 +71,13 @@ def read_frame(path: Path, notes: list[str]) -> tuple[FrameCamera, dict[str, tup
     return camera, {"position_m": (position[0], position[1], position[2]), "attitude_rad": (x, y, z)}
 
 
+def _within(keys: Keys, key: str, most: float) -> float:
+    value = keys.number(key)
+    if not abs(value) <= most:
+        raise keys.refuse(key, f"degrees from {-most:g} to {most:g}")
+    return value
+
+
 def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
     """Perspective centre and rotation from the image frame, Earth-fixed."""
     if exterior.has("position_e_m"):
@@ -98,7 +105,7 @@ def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
             return C, R_el @ R_axes @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
         lat, lon, _ = WGS84.geodetic(C)
     elif exterior.has("lat_deg"):
-        lat, lon = np.radians([exterior.number("lat_deg"), exterior.number("lon_deg")])
+        lat, lon = np.radians([_within(exterior, "lat_deg", 90.0), _within(exterior, "lon_deg", 360.0)])
         C = WGS84.cartesian(lat, lon, exterior.number("height_m"))
         if exterior.has("omega_phi_kappa_deg"):
             R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el

@@ -602,6 +602,10 @@ def test_sizes_control_and_options_that_do_not_fit(scene, tmp_path, capsys):
     assert "another planet" in refused(capsys, *base, "--crs", "+proj=longlat +a=1737400 +b=1737400")
     (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": {"lat_deg": 1.0, "lon_deg": 2.0}}))
     assert "height_m: missing" in refused(capsys, image, "--sensor", tmp_path / "f.json", "-o", tmp_path / "o.tif")
+    swapped = {"lat_deg": 139.6, "lon_deg": 36.0, "height_m": 1e5, "omega_phi_kappa_deg": [0, 0, 0]}
+    (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": swapped}))
+    error = refused(capsys, image, "--sensor", tmp_path / "f.json", "-o", tmp_path / "o.tif")
+    assert "f.json: exterior.lat_deg: 139.6, wanted degrees from -90 to 90" in error
     assert "--mask: goes with an image" in refused(
         capsys, "recordings/strip.mcap", "-o", tmp_path / "o.tif", "--mask", tmp_path / "m.tif"
     )
