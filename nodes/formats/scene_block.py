@@ -183,7 +183,8 @@ class SceneBlockData:
             affine = self.rpc.get("correction", "affine") == "affine"
             shift = float(str(self.rpc.get("shift_sigma_px", SHIFT_SIGMA_PX)))
             slope = float(str(self.rpc.get("slope_sigma_px", SLOPE_SIGMA_PX)))
-            return RpcImage(entry.name, entry.location, affine, shift, slope, entry.size_px, self.ellipsoid)
+            assumed = "shift_sigma_px" not in self.rpc, "slope_sigma_px" not in self.rpc
+            return RpcImage(entry.name, entry.location, affine, shift, slope, entry.size_px, self.ellipsoid, assumed)
         return ProjectiveImage(entry.name, entry.scene.model, entry.size_px, self.ellipsoid)
 
 
@@ -232,8 +233,9 @@ def _rpc_settings(table: Keys) -> dict[str, object]:
     settings: dict[str, object] = {"correction": table.text("correction", "affine")}
     if settings["correction"] not in ("affine", "shift"):
         raise table.refuse("correction", "affine or shift")
-    for key, default in (("shift_sigma_px", SHIFT_SIGMA_PX), ("slope_sigma_px", SLOPE_SIGMA_PX)):
-        settings[key] = table.number(key, default, positive=True)
+    for key in ("shift_sigma_px", "slope_sigma_px"):
+        if table.has(key):  # usual ones are no knowledge of the data
+            settings[key] = table.number(key, positive=True)
     return settings
 
 

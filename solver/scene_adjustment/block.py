@@ -185,3 +185,12 @@ class Layout:
         if not rows:
             return np.empty((0, self.n_unknowns)), np.empty(0)
         return np.concatenate(rows), np.concatenate(values)
+
+    def assumed(self) -> NDArray[np.bool_]:
+        """(m,) of the equations of `prior`, which nobody stated, see `UnknownGroup`."""
+        rows = [np.zeros(0, dtype=bool)]
+        for group in self.groups:
+            if group.prior is not None:
+                of_group = np.array(group.assumed or (False,) * len(group.prior), dtype=bool)
+                rows.append(of_group[np.isfinite(group.prior.sigma)])
+        return np.concatenate(rows)

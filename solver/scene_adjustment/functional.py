@@ -45,6 +45,7 @@ class RpcImage:
     rpc : its polynomials
     affine : False for a shift alone
     shift_sigma_px, slope_sigma_px : what is known of the correction
+    assumed : of these two, whether nobody stated it
     size_px : lines and samples, where the polynomials do not know them
     ellipsoid : of the heights
     """
@@ -61,6 +62,7 @@ class RpcImage:
         slope_sigma_px: float = SLOPE_SIGMA_PX,
         size_px: tuple[int, int] | None = None,
         ellipsoid: Ellipsoid = WGS84,
+        assumed: tuple[bool, bool] = (False, False),
     ):
         self.name, self.rpc, self.ellipsoid = name, rpc, ellipsoid
         lines, samples = size_px if size_px is not None else (rpc.lines, rpc.samples)
@@ -73,7 +75,8 @@ class RpcImage:
         names = [f"{what} of {name}" for what in (*_NAMES[: self._terms], *_NAMES[3 : 3 + self._terms])]
         sigma = np.array([shift_sigma_px, slope_sigma_px, slope_sigma_px])[: self._terms]
         prior = direct_observations(np.tile(sigma, 2), tuple(names))
-        self.groups = (UnknownGroup(name, IMAGE, tuple(names), prior),)
+        of_line = (assumed[0], assumed[1], assumed[1])[: self._terms]
+        self.groups = (UnknownGroup(name, IMAGE, tuple(names), prior, 2 * of_line),)
 
     def measured(self, line: Array, sample: Array) -> FunctionalRays:
         return FunctionalRays(self._computed, np.stack([line, sample], axis=1).astype(float), self.ellipsoid)

@@ -26,12 +26,15 @@ class UnknownGroup:
     kind : ORIENTATION (correction functions), CAMERA (additional parameters), IMAGE (coefficients of an image)
     names : (k,) in words
     prior : what is known beforehand of them; None where nothing is
+    assumed : of each of these, whether nobody stated its sigma, and it is wide so that the data decide; such a value
+        holds what nothing else determines, and is no observation that sigma0 could be judged by
     """
 
     key: str
     kind: str
     names: tuple[str, ...]
     prior: PseudoObservations | None
+    assumed: tuple[bool, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)

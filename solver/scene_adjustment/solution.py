@@ -104,7 +104,7 @@ class SceneSolution:
     test, joint : (n, 2) normalised residuals and (n,) joint test values; of rays left out against the adjustment
     given_test : (p, 3) normalised residuals of known coordinates; 0 where not given
     undetermined : words for unknowns without information
-    weighted_squares, n_observations, n_unknowns : of the adjustment
+    weighted_squares, n_observations, n_unknowns : of the adjustment; without assumed values that the data determine
     iterations, converged : of Gauss-Newton
     """
 
@@ -429,6 +429,7 @@ def _result(
     given_now = given & normals.determined[:, None]
     count = 2 * int(normals.seen.sum()) + len(problem.prior) + int(given_now.sum())
     unknowns = block.layout.n_unknowns - len(reduced.undetermined) + 3 * int(normals.determined.sum())
+    replaced, squares = _assumed(problem, state, Q)
     return SceneSolution(
         problem,
         state,
@@ -443,12 +444,25 @@ def _result(
         joint,
         _given_tests(problem, state, given_now, C_pp),
         _words(reduced.undetermined, block.layout.names),
-        normals.squares,
-        count,
+        normals.squares - squares,
+        count - replaced,
         unknowns,
         iterations,
         converged,
     )
+
+
+def _assumed(problem: Problem, state: State, Q: Array) -> tuple[int, float]:
+    """How many values that nobody stated the data determine by themselves, and the squares of the residuals of all.
+
+    Their wide sigmas say nothing of the data: counted as observations, which fit as if by a wonder, they made sigma0
+    too small.
+    """
+    mine = problem.block.layout.assumed()
+    A = problem.prior[mine]
+    away = problem.prior_value[mine] - A @ state.values
+    share = np.clip(1.0 - np.einsum("mu,uv,mv->m", A, Q, A), 0.0, 1.0)
+    return round(float(share.sum())), float(away @ away)
 
 
 def _tests(v: Array, Qv: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:

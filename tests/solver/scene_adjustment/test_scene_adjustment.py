@@ -167,6 +167,27 @@ def test_rigorous_rpc_and_dlt_images_in_one_block():
     assert all(np.isfinite(solution.residual_px).ravel())
 
 
+@pytest.mark.parametrize("assumed", [True, False])
+def test_corrections_of_an_rpc_that_nobody_stated_are_no_observations(assumed):
+    """Usual sigmas are wide, so that data decide; as observations that fit by a wonder they make sigma0 too small."""
+    tiny = DgrOptions((1e-3,) * 3, (1e-7,) * 3, (1e-9,) * 3)
+    squares = []
+    for seed in range(12):
+        simulation = simulated(points=14, model=tiny, seed=seed)
+        images = tuple(
+            RpcImage(image.name, fit_to_model(image.sensor, -500.0, 2500.0).rpc, assumed=(assumed, assumed))
+            for image in simulation.block.images
+        )
+        solution = adjust(prepare(replace(simulation.block, images=images)))
+        seen, given = int(solution.ray_weight.sum()), int(solution.given.sum())
+        own = 2 * seen + given - 3 * 14 - 18  # three images with six coefficients each
+        # nearly all of them the data determine by themselves
+        assert own <= solution.redundancy <= own + 2 if assumed else solution.redundancy == own + 18
+        squares.append(solution.sigma0**2)
+    found, expected = np.sqrt(np.mean(squares)), 1.0 if assumed else np.sqrt(own / (own + 18))
+    assert abs(found / expected - 1.0) < 0.08, found
+
+
 def test_affine_images_alone_take_their_start_from_control():
     simulation = simulated(points=60, seed=6)
     known = KnownGround(
