@@ -165,7 +165,8 @@ class RigorousImage:
         if calibration is not None:
             names = calibration.parameters.unknown_names
             prior = direct_observations(calibration.parameters.apriori_sigma, names)
-            groups.append(UnknownGroup(calibration.key, CAMERA, names, prior))
+            # nobody states them: they are those of a camera that was never calibrated
+            groups.append(UnknownGroup(calibration.key, CAMERA, names, prior, (True,) * len(names)))
         self.groups = tuple(groups)
 
     def measured(self, line: Array, sample: Array) -> RigorousRays:

@@ -74,7 +74,8 @@ def test_scipy_finds_the_same_with_numerical_derivatives_of_the_inverse_location
     x0 = np.random.default_rng(0).normal(0.0, 0.1, layout.n_unknowns + 3 * len(block.point_ids))
     found = least_squares(residuals, x0, jac=derivatives, xtol=1e-12, ftol=1e-12, gtol=1e-9, max_nfev=3)
     np.testing.assert_allclose(found.x, 0.0, atol=1e-4)
-    np.testing.assert_allclose(2.0 * found.cost, solution.weighted_squares, rtol=1e-6)
+    assumed = np.square((A @ solution.state.values - b)[layout.assumed()]).sum()  # have no part in sigma0
+    np.testing.assert_allclose(2.0 * found.cost, solution.weighted_squares + assumed, rtol=1e-6)
     # its sigmas, too, which are 1 in units of ours
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 1.0, rtol=2e-3)
@@ -186,6 +187,17 @@ def test_corrections_of_an_rpc_that_nobody_stated_are_no_observations(assumed):
         squares.append(solution.sigma0**2)
     found, expected = np.sqrt(np.mean(squares)), 1.0 if assumed else np.sqrt(own / (own + 18))
     assert abs(found / expected - 1.0) < 0.08, found
+
+
+def test_a_camera_without_errors_does_not_lower_sigma0():
+    """Its parameters come out near nothing beside their a-priori sigmas, which say nothing of the image points."""
+    plain, with_lenses = [], []
+    for seed in range(10):
+        block = simulated("spot5-hrs", 40, seed=seed).block
+        images = rigorous_images([overpass(ORBITAL_SENSORS["spot5-hrs"], 36.0, 139.6)], DGR, lens)
+        plain.append(adjust(prepare(block)).sigma0 ** 2)
+        with_lenses.append(adjust(prepare(replace(block, images=images))).sigma0 ** 2)
+    assert np.mean(with_lenses) == pytest.approx(np.mean(plain), rel=0.1)
 
 
 def test_affine_images_alone_take_their_start_from_control():
