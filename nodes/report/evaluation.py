@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.accuracy import Accuracy, accuracy, angle_difference
+from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import R_lc_from_navigation, opk_covariance_from_navigation
 from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_matrix
 from ...solver.geometry.space_intersection import ImageRays, Intersection, intersect
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
 from .accuracy_table import NO_TIES
-from .flight import Flight, PoseSeries, collect, in_gap, rejected_key
+from .flight import Flight, Look, PoseSeries, collect, in_gap, rejected_key
 
 Array = NDArray[np.floating]
 
@@ -170,7 +171,7 @@ def missing(flight: Flight) -> list[str]:
 def measured_poses(flight: Flight) -> PoseSeries | None:
     """Orientation from the sensors alone: INS attitude, GNSS positions interpolated and reduced by the lever arm.
 
-    The clock of GNSS is as an operator corrected it in flight.
+    The clock of GNSS is as an operator corrected it in flight; lever arm and boresight are those that held then.
     """
     if flight.project is None or len(flight.gnss) < 2 or not flight.attitude:
         return None
@@ -192,9 +193,13 @@ def measured_poses(flight: Flight) -> PoseSeries | None:
     position = np.stack([np.interp(time, fix_ns, antenna[:, i]) for i in range(3)], axis=1)
     spread = np.stack([np.interp(time, fix_ns, variance[:, i]) for i in range(3)], axis=1)
     R_ln = frame.R_ln(position)
-    lever_l = np.einsum("nij,njk,k->ni", R_ln, matrix_from_navigation(*rpy.T), convert.lever_arm_of(flight.project))
-    position = position - lever_l
-    R_lc = R_lc_from_navigation(frame, position, rpy, convert.R_bc_of(flight.project))
+    R_lc = np.empty((len(time), 3, 3))
+    for then, project in flight.projects_at(time):
+        if not then.any():
+            continue
+        R_nb, lever_arm_b = matrix_from_navigation(*rpy[then].T), convert.lever_arm_of(project)
+        position[then] -= np.einsum("nij,njk,k->ni", R_ln[then], R_nb, lever_arm_b)
+        R_lc[then] = R_lc_from_navigation(frame, position[then], rpy[then], convert.R_bc_of(project))
     covariance = np.zeros((len(time), 6, 6))
     covariance[:, :3, :3] = spread[:, :, None] * np.eye(3)
     covariance[:, 3:, 3:] = opk_covariance_from_navigation(rpy, R_lc, R_ln, cov_rpy)
@@ -259,52 +264,77 @@ def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Arr
 def usable_rays(flight: Flight) -> tuple[list[str], ImageRays, ImageRays] | None:
     """Point ids and rays with the filtered orientation, without those the adjustment rejected; None without any.
 
-    The rays are first those of the camera as it is stated, then those of the camera as it was estimated last.
+    The rays are first those of the camera as it was stated when they were taken, then those of that camera as it was
+    estimated last.
     """
-    filtered, camera = flight.poses.get(flight.measured), flight.camera
-    if filtered is None or camera is None:
+    filtered = flight.poses.get(flight.measured)
+    if filtered is None or flight.camera is None:
         return None
     bad = {rejected_key(r) for r in flight.rejected}
     path = filtered.trajectory(flight.start_ns)
-    default = (flight.project.image_sigma_px if flight.project is not None else 0.0) or _IMAGE_SIGMA_PX
-    kept, rows, seen = [], [], set()
     number = {id: i for i, id in enumerate(flight.strips)}
+    looks, rows, seen = [], [], set()
     for look in flight.looks:
-        strip, ccd = flight.strips.get(look.strip), camera.line_index.get(look.ccd)
-        if strip is None or not strip.line_rate_hz > 0 or ccd is None or look.key in bad or look.key in seen:
+        strip = flight.strips.get(look.strip)
+        if strip is None or not strip.line_rate_hz > 0 or look.key in bad or look.key in seen:
             continue
         seen.add(look.key)
         time = (strip.first_line_time_ns - flight.start_ns) / convert.SECOND_NS + look.line / strip.line_rate_hz
         inside = not strip.lines or -0.5 <= look.line <= strip.lines - 0.5
         inside = inside and bool(np.isfinite([look.sigma_line, look.sigma_sample]).all())
-        if inside and path.start_s <= time <= path.end_s and camera.lines[ccd].contains(look.sample):
-            kept.append(look.point)
-            sigmas = look.sigma_line or default, look.sigma_sample or default
-            rows.append((ccd, look.sample, time, 1.0 / strip.line_rate_hz, *sigmas, number[look.strip]))
+        if inside and path.start_s <= time <= path.end_s:
+            looks.append(look)
+            period = 1.0 / strip.line_rate_hz
+            rows.append((look.sample, time, period, look.sigma_line, look.sigma_sample, number[look.strip]))
     if not rows:
         return None
-    ids, point = np.unique(kept, return_inverse=True)
-    table = np.array(rows)
-    ccd = table[:, 0].astype(int)
-    xy, pitch = camera.image_coordinates(ccd, table[:, 1])
-    pose = path.at(table[:, 2])
-    nearest = np.clip(np.searchsorted(path.time_s, table[:, 2]), 0, len(path) - 1)
-    covariance = filtered.covariance[nearest]
+    sample, time, period, *sigmas, strips = np.array(rows).T
+    time_ns = flight.start_ns + np.rint(time * convert.SECOND_NS).astype(np.int64)
+    default = np.empty(len(rows))
+    for then, project in flight.projects_at(time_ns):
+        default[then] = (project.image_sigma_px if project is not None else 0.0) or _IMAGE_SIGMA_PX
+    stated = _in_camera(looks, sample, flight.cameras_at(time_ns))
+    with_told = zip(flight.cameras_at(time_ns), flight.parameters_at(time_ns), strict=True)
+    estimated = [
+        (then, None if camera is None else convert.estimated_camera(camera, told)[0])
+        for (then, camera), (_, told) in with_told
+    ]
+    use = np.flatnonzero(np.isfinite(stated[:, 4]))
+    if not len(use):
+        return None
+    ids, point = np.unique([looks[i].point for i in use], return_inverse=True)
+    pose = path.at(time[use])
+    nearest = np.clip(np.searchsorted(path.time_s, time[use]), 0, len(path) - 1)
+    sigma_line, sigma_sample = (np.where(s == 0, default, s)[use] for s in sigmas)
     rays = ImageRays(
-        point.astype(np.int64), table[:, 2], table[:, 3], pose.position_l, pose.angles, pose.velocity_l,
-        pose.angle_rate, xy, pitch, camera.focal_length_mm[ccd], table[:, 4], table[:, 5], covariance,
-        table[:, 6].astype(np.int64),
+        point.astype(np.int64), time[use], period[use], pose.position_l, pose.angles, pose.velocity_l,
+        pose.angle_rate, stated[use, :2], stated[use, 2:4], stated[use, 4], sigma_line, sigma_sample,
+        filtered.covariance[nearest], strips[use].astype(np.int64),
     )  # fmt: skip
-    told = next((report.parameters for _, report in reversed(flight.reports) if report.parameters), ())
-    xy, pitch = convert.estimated_camera(camera, told)[0].image_coordinates(ccd, table[:, 1])
-    return [str(i) for i in ids], rays, replace(rays, xy_mm=xy, pitch_mm=pitch)
+    refined = _in_camera(looks, sample, estimated)[use]
+    return [str(i) for i in ids], rays, replace(rays, xy_mm=refined[:, :2], pitch_mm=refined[:, 2:4])
+
+
+def _in_camera(looks: list[Look], sample: Array, cameras: list[tuple[NDArray[np.bool_], LineCamera | None]]) -> Array:
+    """Image coordinates and their change per pixel, mm, and the focal length of looks (n, 5), each in the camera that
+    held then; NaN where that one has no such CCD line or pixel."""
+    found = np.full((len(looks), 5), np.nan)
+    for then, camera in cameras:
+        if camera is None:
+            continue
+        index = [camera.line_index.get(looks[i].ccd) if then[i] else None for i in range(len(looks))]
+        known = [i for i, ccd in enumerate(index) if ccd is not None and camera.lines[ccd].contains(sample[i])]
+        ccd = np.array([index[i] for i in known], dtype=int)
+        xy, pitch = camera.image_coordinates(ccd, sample[known])
+        found[known] = np.column_stack([xy, pitch, camera.focal_length_mm[ccd]])
+    return found
 
 
 def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
     """Point ids, coordinates (p, 3) and covariance (p, 3, 3) by space intersection, by name of INTERSECTED.
 
     All rows use the same rays: those that the final orientation covers, where there is one. The camera that was
-    estimated with refined orientation goes with it.
+    estimated with refined orientation goes with it. The correlation time of slow errors is that of the newest project.
     """
     usable = usable_rays(flight)
     if usable is None:

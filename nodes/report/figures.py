@@ -143,7 +143,7 @@ def residuals_by_ccd(flight: Flight) -> dict[str, Array]:
                 rows.setdefault(r.ccd, []).append((r.line, r.sample, r.v_line, r.v_sample, r.w, 0.0))
     for r in flight.rejected:
         rows.setdefault(r.ccd, []).append((r.line, r.sample, 0.0, 0.0, r.w, 1.0))
-    order = list(flight.camera.line_index) if flight.camera is not None else sorted(rows)
+    order = list(flight.ccds) or sorted(rows)
     arrays = {ccd: np.array(rows[ccd], dtype=float) for ccd in order if ccd in rows}
     finite = {ccd: values[np.isfinite(values).all(axis=1)] for ccd, values in arrays.items()}
     return {ccd: values for ccd, values in finite.items() if len(values)}
@@ -165,7 +165,7 @@ def residuals(flight: Flight) -> Figure | None:
     fig = figure(2.35 * len(by_ccd) + 0.3)
     axes = fig.subplots(len(by_ccd), 2, width_ratios=[2.6, 1], squeeze=False, sharex="col")
     longest = max(float(rows[:, 0].max()) for rows in by_ccd.values())
-    widest = max((line.pixels for line in flight.camera.lines), default=1) if flight.camera is not None else None
+    widest = max(flight.ccds.values(), default=None)
     for k, (ccd, rows) in enumerate(by_ccd.items()):
         _vectors(axes[k, 0], ccd, rows, CCDS[k % len(CCDS)], rms, longest, widest)
         _histogram(axes[k, 1], rows[rows[:, 5] == 0], rms, first=k == 0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,11 @@ from .. import convert
 from ..formats.recorded_sensors import added_to_times
 from ..node import Message
 from ..truth_frames import TruthFrames
-from ..voices import VERDICT, RecordedVoices
+from ..voices import FIXED, VERDICT, RecordedVoices
 
 Array = NDArray[np.floating]
 Key = tuple[str, str, str, int, int, str]
+T = TypeVar("T")
 SECOND_NS = convert.SECOND_NS
 
 #: Topics of poses, and the name a report gives them.
@@ -123,6 +125,8 @@ class Flight:
     Attributes
     ----------
     start_ns : stamp of the first message that is not configuration; times in seconds count from it
+    project, camera : the newest that nodes used; earlier_projects, earlier_cameras : those of before, each with the
+        stamp from which on it held no more
     poses : by name, see POSE_TOPICS; names without messages are absent
     gnss, attitude : messages as measured, in order of arrival
     gnss_ns : times of the fixes, UTC, as an operator corrected them in flight
@@ -141,6 +145,8 @@ class Flight:
     end_ns: int = 0
     project: Any = None
     camera: LineCamera | None = None
+    earlier_projects: list[tuple[int, Any]] = field(default_factory=list)
+    earlier_cameras: list[tuple[int, LineCamera]] = field(default_factory=list)
     strips: dict[str, Any] = field(default_factory=dict)
     poses: dict[str, PoseSeries] = field(default_factory=dict)
     gnss: list[Any] = field(default_factory=list)
@@ -170,6 +176,32 @@ class Flight:
         """Seconds since the start of the flight."""
         return (np.asarray(time_ns) - self.start_ns) / SECOND_NS
 
+    def projects_at(self, time_ns: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], Any]]:
+        """The projects that held at times (n,), each with the times (n,) at which it did."""
+        return _at(time_ns, self.earlier_projects, self.project)
+
+    def cameras_at(self, time_ns: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], LineCamera | None]]:
+        """The cameras that held at times (n,), each with the times (n,) at which it did."""
+        return _at(time_ns, self.earlier_cameras, self.camera)
+
+    @property
+    def ccds(self) -> dict[str, int]:
+        """Pixels of the CCD lines of all cameras by id, those of the newest one first."""
+        cameras = [self.camera, *(camera for _, camera in reversed(self.earlier_cameras))]
+        found: dict[str, int] = {}
+        for line in (line for camera in cameras if camera is not None for line in camera.lines):
+            found.setdefault(line.id, line.pixels)
+        return found
+
+    def parameters_at(self, time_ns: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], Any]]:
+        """What adjustment reports said last of parameters while a camera held, each with the times (n,) at which it
+        did."""
+        ends = [end for end, _ in self.earlier_cameras]
+        told: list[Any] = [()] * (len(ends) + 1)
+        for stamp, report in self.reports:
+            told[bisect_right(ends, stamp)] = report.parameters or told[bisect_right(ends, stamp)]
+        return _at(time_ns, list(zip(ends, told, strict=False)), told[-1])
+
     def given(self, point: str) -> Array:
         """(3,) coordinates of a ground point that count; NaN for those that are not given, or were left out."""
         xyz = convert.given_of(self.ground[point])
@@ -195,6 +227,12 @@ class Flight:
         return inside
 
 
+def _at(time_ns: NDArray[np.int64], earlier: Sequence[tuple[int, T]], newest: T) -> list[tuple[NDArray[np.bool_], T]]:
+    """What held at times: of things that held one after the other until a time each, and the newest."""
+    number = np.searchsorted([end for end, _ in earlier], time_ns, side="right")
+    return [(number == i, one) for i, one in enumerate([*(one for _, one in earlier), newest])]
+
+
 def collect(messages: Iterable[Message]) -> Flight:
     """Read the messages of a recording once; messages that cannot be used are counted and raise no error.
 
@@ -208,6 +246,7 @@ def collect(messages: Iterable[Message]) -> Flight:
     configured_ns: list[int] = []
     fixed_ns: list[int] = []  # stamps of the fixes
     clock: list[Message] = []  # what an operator said of it
+    held: dict[str, Any] = {}  # project and camera that nodes used last
     for message in messages:
         topic, stamp = message.topic, message.stamp_ns
         flight.counts[topic] += 1
@@ -229,9 +268,13 @@ def collect(messages: Iterable[Message]) -> Flight:
                     del rejected[key]
                 truth_elsewhere += len(flight.truth_points)
                 flight.truth_points.clear()
+            if used.topic in FIXED and held.get(used.topic) == used.body:
+                continue
             try:
                 _take(flight, rows, rejected, used.topic, used.stamp_ns, used.body)
-                if used.topic == "sensor/gnss":
+                if used.topic in FIXED:
+                    held[used.topic] = used.body
+                elif used.topic == "sensor/gnss":
                     fixed_ns.append(used.stamp_ns)
                 elif used.topic == VERDICT and used.body.topic == "sensor/gnss":  # others are the voices' own
                     clock.append(used)
@@ -337,9 +380,14 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         _finite(body, body.x, body.y, body.z)
         flight.truth_points[body.point] = np.array([body.x, body.y, body.z])
     elif topic == "configuration/project":
+        if flight.project is not None:
+            flight.earlier_projects.append((stamp, flight.project))
         flight.project = body
     elif topic == "configuration/camera":
-        flight.camera = convert.camera_from(body)
+        camera = convert.camera_from(body)
+        if flight.camera is not None:
+            flight.earlier_cameras.append((stamp, flight.camera))
+        flight.camera = camera
     elif topic == "configuration/strip":
         convert.check_strip(body, stamp)
         known = flight.strips.get(body.id)

@@ -19,7 +19,8 @@ from triline.nodes.formats.block_recording import TOPICS, block_from_messages
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.report.evaluation import evaluate, evaluate_flight
+from triline.nodes.report.evaluation import evaluate, evaluate_flight, orientation_errors, usable_rays
+from triline.nodes.report.figures import residuals_by_ccd
 from triline.nodes.report.flight import collect
 from triline.nodes.voices import RecordedVoices
 from triline.schemas import messages as m
@@ -257,3 +258,71 @@ def test_a_point_that_is_stated_again_in_another_frame_was_not_left_out_in_it(me
         flight = collect(RecordingReader(path).sorted_messages())
         assert np.isfinite(flight.given(body.point)).all() == wanted
         assert len(known_points(Recording(path))) == wanted
+
+
+def _changed(messages, stamp_ns: int) -> list[Message]:
+    """Another project and camera in the same local frame, each with an operator's word: lever arm, boresight and image
+    sigma; and lines that lie elsewhere."""
+    found = []
+    for topic in ("configuration/project", "configuration/camera"):
+        was = _of(messages, topic)
+        body = type(was.body).FromString(was.body.SerializeToString())
+        if topic == "configuration/project":
+            body.lever_arm_m[:] = [10.0, 0.0, 5.0]
+            body.boresight_deg[:] = [1.0, 0.0, 0.0]
+            body.image_sigma_px = 20.0
+        else:
+            for line in body.lines:
+                line.x_mm[:] = [x + 1.0 for x in line.x_mm]
+        said = m.Verdict(topic=topic, accepted=True, by="Ann")
+        found += [
+            replace(was, body=body, stamp_ns=stamp_ns, sequence=was.sequence + 1),
+            Message("observation/verdict", stamp_ns + 1, said, "surveyor", 0),
+        ]
+    return found
+
+
+def test_what_was_measured_before_a_change_is_computed_with_what_held_then(messages):
+    """A mounting and a camera that an operator lets in when the strip is over say nothing of the lines before."""
+    strip = _of(messages, "configuration/strip").body
+    over = strip.first_line_time_ns + round(strip.lines / strip.line_rate_hz * SECOND)
+    right = evaluate_flight(collect(messages))
+    order = sorted([*messages, *_changed(messages, over + SECOND)], key=lambda x: x.stamp_ns)
+    found = collect(order)
+    assert found.project.image_sigma_px == 20.0 and not found.not_used
+    found = evaluate_flight(found)
+    for rows in ("orientation", "points", "check", "control"):
+        assert found[rows] == right[rows]
+
+
+def test_what_is_measured_after_a_change_is_computed_with_what_holds_from_then_on(messages):
+    strip = _of(messages, "configuration/strip").body
+    half = strip.first_line_time_ns + round(0.5 * strip.lines / strip.line_rate_hz * SECOND)
+    begun = [replace(x, stamp_ns=_of(messages, x.topic).stamp_ns) for x in _changed(messages, half)[::2]]
+    other = [next((y for y in begun if y.topic == x.topic), x) for x in messages]
+    changed = sorted([*messages, *_changed(messages, half)], key=lambda x: x.stamp_ns)
+    before, after, found = (collect(told) for told in (messages, other, changed))
+    errors = [orientation_errors(flight)["measured"] for flight in (before, after, found)]
+    late = errors[2][0] > half
+    for got, first, then in zip(errors[2], errors[0], errors[1], strict=True):
+        np.testing.assert_array_equal(got[~late], first[~late])
+        np.testing.assert_array_equal(got[late], then[late])
+    assert late.any() and not late.all() and not np.allclose(errors[0][1], errors[1][1])
+    rays = [usable_rays(flight)[1] for flight in (before, after, found)]
+    late = rays[2].time_s > found.seconds(half)
+    for name in ("xy_mm", "focal_length_mm", "sigma_sample_px"):
+        got, first, then = (getattr(of, name) for of in (rays[2], rays[0], rays[1]))
+        np.testing.assert_array_equal(got[~late], first[~late])
+        np.testing.assert_array_equal(got[late], then[late])
+
+
+def test_lines_of_a_camera_that_was_replaced_have_their_residuals(messages):
+    strip = _of(messages, "configuration/strip").body
+    other = _changed(messages, strip.first_line_time_ns + 10 * SECOND)[2:]
+    for line in other[0].body.lines:
+        line.id += "2"
+    found = collect(sorted([*messages, *other], key=lambda x: x.stamp_ns))
+    right = residuals_by_ccd(collect(messages))
+    assert right and {ccd: len(rows) for ccd, rows in residuals_by_ccd(found).items()} == {
+        ccd: len(rows) for ccd, rows in right.items()
+    }
