@@ -85,6 +85,8 @@ class Rectifier(Node):
         self._camera: LineCamera | None = None
         self._frame: LocalFrame | None = None
         self._strips: dict[str, Any] = {}
+        self._control: dict[str, float] = {}
+        self._refused: set[str] = set()  # control that an operator refused
         self._unknown: deque[tuple[int, LineBlock]] = deque()
         self._stamp_ns = self._reference_ns = 0
         self._next_publish_ns = 0
@@ -96,8 +98,6 @@ class Rectifier(Node):
         self._next_line: dict[str, int] = {}
         self._rest: WaitingLines | None = None
         self._heights: dict[str, tuple[float, float, float]] = {}
-        self._control: dict[str, float] = {}
-        self._refused: set[str] = set()  # control that an operator refused
         self._next_relief_s = -np.inf
         self._surface: Surface | None = None
         self._mean_m = 0.0
@@ -138,9 +138,8 @@ class Rectifier(Node):
         if topic == "configuration/project":
             before, self._project, self._frame = self._project, body, convert.local_frame(body)
             if before is not None and not convert.same_frame(before, body):
-                refused = self._refused
                 self._begin_again()  # poses, points and control so far are in the local frame before
-                self._refused = refused
+                self._control.clear()
         elif topic == "configuration/camera":
             self._configure(body, message.stamp_ns)
         elif topic == "configuration/strip":

@@ -661,6 +661,31 @@ def test_node_takes_no_height_of_control_that_an_operator_refused(flown):
     assert heights == [{400.0}, {0.0}]
 
 
+def test_node_keeps_control_and_what_an_operator_said_of_it_with_another_camera(flown):
+    """Control that stands there before the first camera counts, too."""
+    reader = RecordingReader(flown)
+    begin_ns = reader.first("configuration/strip").first_line_time_ns
+    node, heights, camera, said = Rectifier(), [], None, False
+    for name, height in (("good", 250.0), ("wrong", 400.0)):
+        body = ground_point_message(name, (0.0, 0.0, height), np.eye(3), "control")
+        list(node.step(Message("observation/control", 0, body, "survey")))
+    list(node.step(Message("observation/verdict", 0, m.Verdict(point="wrong", accepted=False), "desk")))
+    for message in reader.sorted_messages([*node.inputs]):
+        if message.topic in ("point/object", "observation/control"):
+            continue
+        camera = message if message.topic == "configuration/camera" else camera
+        heights += [tile.body.z for tile in node.step(message) if tile.topic == "orthoimage/live"]
+        if not said and camera is not None and message.stamp_ns > begin_ns + 7 * 10**9:
+            assert heights and set(heights) == {250.0}
+            body = type(camera.body).FromString(camera.body.SerializeToString())
+            body.lenses[0].focal_length_mm += 0.1
+            list(node.step(replace(camera, body=body, stamp_ns=message.stamp_ns)))
+            said, heights = True, []
+        elif said and len(heights) > 3:
+            break
+    assert len(heights) > 3 and set(heights) == {250.0}
+
+
 # ---- the node
 
 
