@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from ...schemas import codec, topics
-from ...schemas.envelope import RawMessage
+from ...schemas.envelope import Envelope, RawMessage
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import Family
 from .. import registry
 from ..bus.pacing import SETTLE_S, Pacer
 from ..bus.program import ProgramOptions
 from ..errors import UserError
+from ..node import Message
 from ..recording.reader import RecordingReader
 from ..recording.runner import active_nodes, is_remade
 from ..voices import FIXED, VERDICT, RecordedVoices
@@ -26,6 +27,8 @@ from ..voices import FIXED, VERDICT, RecordedVoices
 SECOND_NS = 1_000_000_000
 #: Between the end of a recording and its next round, platform time.
 LOOP_PAUSE_NS = SECOND_NS
+#: Tells a message from all others: topic, source, start and sequence.
+_Key = tuple[str, str, int, int]
 
 
 @dataclass
@@ -86,7 +89,8 @@ def play(
     stop : ends it
     rate : speed, 0 = as fast as it goes
     from_ns, to_ns : platform time to play, ends included; of what was said before, what holds then is played always:
-        configuration, control, and an operator's verdicts
+        configuration, control, and an operator's verdicts; and a project or camera that waited for a verdict of the
+        part comes with it
     loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names
     everything : also what nodes make anew
     start : tells this run from others in the envelopes
@@ -101,7 +105,7 @@ def play(
     for id, count in zip(*np.unique(channel[left], return_counts=True), strict=True):
         result.left_out[reader.channels[int(id)].topic] += int(count)
     before, body = _split(reader, numbers[~left], from_ns, to_ns)
-    head = _holding(reader, before)
+    head, told = _holding(reader, before, body)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):
@@ -117,12 +121,12 @@ def play(
         times = reader.index.receive_ns[body]
         pacer = Pacer(rate, stop)
         for i, number in enumerate(body):
-            raw = reader.raw(int(number))
             if hold is not None:
                 pacer.postpone(hold())
             if not pacer.wait(float(times[i] - times[0]) / SECOND_NS):
                 break
-            _publish(raw, publish, starts, shift_ns, result)
+            for raw in told.get(int(number)) or (reader.raw(int(number)),):
+                _publish(raw, publish, starts, shift_ns, result)
             if progress is not None and i % 256 == 0:
                 progress(i / len(body))
         result.rounds += 1
@@ -152,26 +156,56 @@ def _split(reader: RecordingReader, numbers: Any, from_ns: int | None, to_ns: in
     return ordered[at_once], ordered[inside]
 
 
-def _holding(reader: RecordingReader, before: Any) -> list[RawMessage]:
-    """What nodes have to hear to begin with what was said before a flight's part.
+def _holding(reader: RecordingReader, before: Any, body: Any) -> tuple[list[RawMessage], dict[int, list[RawMessage]]]:
+    """What nodes have to hear to begin with what was said before a flight's part; and verdicts of the part, by number,
+    with what waited for them when it began.
 
-    Nodes that have not flown yet take any project and camera, so those that were refused in flight are left out; and
-    they do not know what a verdict on a topic was about, so it names the source that it let in.
+    Nodes that have not flown yet take any project and camera, so those that were refused in flight are left out, and
+    come with the verdict that lets them in; and they do not know what a verdict on a topic was about, so it names the
+    source that it let in.
     """
-    voices, used, named = RecordedVoices(), set(), {}
-    for message in reader.decode(reader.sort(np.union1d(before, reader.first_flown()))):
-        used |= {(one.topic, one.source, one.start, one.sequence) for one in voices.used(message)}
+    decisive = [id for id, channel in reader.channels.items() if channel.topic in (*FIXED, VERDICT)]
+    later = body[np.isin(reader.index.channel[body], decisive)]
+    raws = [reader.raw(int(number)) for number in before]
+    early = {_key(raw.topic, raw.envelope) for raw in raws}
+    voices = RecordedVoices()
+    used: set[_Key] = set()  # of what was said before, and counted then
+    named: dict[_Key, bytes] = {}  # verdicts with the source that they let in
+    let_in: dict[_Key, _Key] = {}  # projects and cameras by the verdict that did
+    heard = np.unique(np.concatenate([before, later, reader.first_flown()]))
+    for message in reader.decode(reader.sort(heard)):
+        key = _key(message.topic, message)
+        passed = [_key(one.topic, one) for one in voices.used(message) if one.topic in FIXED]
+        if key in early:
+            used.update(passed)
+        elif message.topic == VERDICT:
+            let_in.update((key, one) for one in passed)
         if message.topic == VERDICT and message.body.accepted and not message.body.HasField("clock_s"):
             message.body.publisher = message.body.publisher or voices.chosen(message.body.topic)
-            named[message.source, message.start, message.sequence] = codec.encode(message.body)
-    head = []
-    for number in before:
-        raw = reader.raw(int(number))
-        key = raw.envelope.source, raw.envelope.start, raw.envelope.sequence
-        if raw.topic in FIXED and (raw.topic, *key) not in used:
-            continue
-        head.append(raw._replace(data=named.get(key, raw.data)) if raw.topic == VERDICT else raw)
-    return head
+            named[key] = codec.encode(message.body)
+    head: list[RawMessage] = []
+    waits: dict[_Key, RawMessage] = {}
+    for raw in raws:
+        key = _key(raw.topic, raw.envelope)
+        if raw.topic in FIXED and key not in used:
+            waits[key] = raw
+        else:
+            head.append(raw._replace(data=named.get(key, raw.data)))
+    told: dict[int, list[RawMessage]] = {}
+    for number in later if waits else ():
+        verdict = reader.raw(int(number))
+        key = _key(verdict.topic, verdict.envelope)
+        if key in let_in:
+            told[int(number)] = [verdict._replace(data=named[key])]
+            held = waits.get(let_in[key])
+            if held is not None:
+                envelope = held.envelope._replace(stamp_ns=verdict.envelope.stamp_ns)  # of two with a stamp it is first
+                told[int(number)].insert(0, held._replace(envelope=envelope))
+    return head, told
+
+
+def _key(topic: str, said: Message | Envelope) -> _Key:
+    return topic, said.source, said.start, said.sequence
 
 
 class _Starts:
