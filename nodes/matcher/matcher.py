@@ -330,7 +330,7 @@ class Matcher(Node):
         if matcher.strip != strip.id:
             out += [self._log(text, warning=True) for text in self._strip_over()]
             first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
-            matcher.begin_strip(strip.id, first_s, strip.line_rate_hz)
+            matcher.begin_strip(strip.id, first_s, strip.line_rate_hz, int(block.first_line))
             self._targets.begin_strip(strip, first_s, matcher.orientation)
             self._failed, self._ground_unknown = 0, matcher.ground_m is None
         if self._pace.blind:

@@ -120,3 +120,12 @@ class MatchedTie:
     xyz_l: Array
     prediction_px: float
     again: bool = False
+
+
+def first_part_of_names(strip: str, first_line: int) -> str:
+    """What names of the tie points of a strip begin with.
+
+    A matcher that begins in mid-strip, because it or its camera is another one, does not give names again that the one
+    before has given.
+    """
+    return strip if first_line <= 0 else f"{strip}-L{first_line}"

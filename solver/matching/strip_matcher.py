@@ -24,7 +24,7 @@ from .line_intake import LineIntake
 from .line_scan import LineScan, View, view_of
 from .line_store import LineRing, LineStore
 from .looks import Looked, LookMatcher, Track
-from .options import MatchedRay, MatchedTie, MatchingOptions, Place
+from .options import MatchedRay, MatchedTie, MatchingOptions, Place, first_part_of_names
 from .places import PlaceChooser
 from .prediction import Prediction
 from .round_earth import RADIUS_M, RoundHeights, above_sphere
@@ -256,6 +256,7 @@ class StripMatcher:
         self._events: list[str] = []
         self._held, self._share = (0, 0), 1.0
         self._numbers: Counter[str] = Counter()
+        self._first_parts: dict[str, str] = {}  # of the names of points, by strip
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -318,8 +319,8 @@ class StripMatcher:
         known = self._strips.get(strip)
         return None if known is None else known.orientation
 
-    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float) -> None:
-        """Lines that follow belong to a strip, new or begun before.
+    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float, first_line: int = 0) -> None:
+        """Lines that follow, from ``first_line`` on, belong to a strip, new or begun before.
 
         Raises
         ------
@@ -329,6 +330,7 @@ class StripMatcher:
             raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip = strip
         if strip not in self._strips:
+            self._first_parts[strip] = first_part_of_names(strip, first_line)
             begun = self._strips[strip] = _Strip(strip, first_line_time_s, line_rate_hz)
             for pose in self._poses:
                 if pose[0] >= first_line_time_s - POSES_BEFORE_S:
@@ -452,7 +454,7 @@ class StripMatcher:
         if number not in master.names:
             strip = master.view.strip.id
             self._numbers[strip] += 1
-            master.names[number] = f"{strip}-M{self._numbers[strip]}"
+            master.names[number] = f"{self._first_parts[strip]}-M{self._numbers[strip]}"
         return master.names[number]
 
     def _look(self, master: _Master, view: _StripView, p: _PairPrediction) -> list[MatchedTie]:

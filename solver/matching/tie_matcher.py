@@ -17,7 +17,7 @@ from .line_intake import LineIntake
 from .line_scan import LineScan, view_of
 from .line_store import LineStore
 from .master_view import MasterView
-from .options import MatchedRay, MatchedTie, MatchingOptions
+from .options import MatchedRay, MatchedTie, MatchingOptions, first_part_of_names
 from .prediction import PAD, Prediction
 from .search import COARSEST, CORRELATION_HALF, REACH_PX, Image
 
@@ -52,7 +52,7 @@ class TieMatcher:
         self._lines = LineIntake({v.ccd: v.pixels for v in self.views}, o, self._make_store)
         # places are chosen in the last of these; what began in the others goes on
         self._at_work = [self._view(min(range(len(self.views)), key=self._tilt))]
-        self._strip = ""
+        self._strip = self._first_part = ""
         self._named: set[str] = set()
         self._next_number = 0
 
@@ -90,8 +90,9 @@ class TieMatcher:
         """The lines of the strip; None before the first poses."""
         return self._lines.store
 
-    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float) -> None:
-        """Lines that follow belong to a strip; lines of the last one are forgotten, patches about its points kept.
+    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float, first_line: int = 0) -> None:
+        """Lines that follow, from ``first_line`` on, belong to a strip; lines of the last one are forgotten, patches
+        about its points kept.
 
         Raises
         ------
@@ -99,7 +100,7 @@ class TieMatcher:
         """
         if not (np.isfinite(line_rate_hz) and line_rate_hz > 0 and np.isfinite(first_line_time_s)):
             raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
-        self._strip = strip
+        self._strip, self._first_part = strip, first_part_of_names(strip, first_line)
         self._next_number = 0
         self._named.clear()
         self._lines.begin_strip(line_rate_hz)
@@ -232,7 +233,7 @@ class TieMatcher:
 
     def _new_name(self) -> str:
         self._next_number += 1
-        return f"{self._strip}-M{self._next_number}"
+        return f"{self._first_part}-M{self._next_number}"
 
     # -- store and counters --------------------------------------------------------------------------------------------
 

@@ -306,3 +306,40 @@ def test_control_that_does_not_count_tells_no_height_of_the_ground(short):
     body.origin_latitude += 0.1
     stated = Message("observation/control", EPOCH_NS, points[-1])
     assert ground_m(replace(project, body=body), stated) == 100.0
+
+
+# ---- what changes in mid-flight
+
+
+@pytest.fixture(scope="module")
+def low():
+    """Flown so low that all looks at a point are there after 6 s."""
+    flight = simulated_flight({**SETTINGS, "height": 300.0, "seconds": 18.0})
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
+def _let_in(messages, topic, seconds, change):
+    """Another project or camera, so long after the first line, and an operator's word on it."""
+    was = next(x for x in messages if x.topic == topic)
+    first = next(x for x in messages if x.topic == "configuration/strip").body.first_line_time_ns
+    body = type(was.body).FromString(was.body.SerializeToString())
+    change(body)
+    stamp = first + round(seconds * 1e9)
+    said = m.Verdict(topic=topic, accepted=True, by="Ann")
+    other = replace(was, body=body, stamp_ns=stamp, sequence=100)
+    return [other, Message("observation/verdict", stamp + 1, said, "confirm")]
+
+
+def test_a_matcher_that_begins_in_mid_strip_gives_no_name_a_second_time(tmp_path, low):
+    """With another camera it begins again; its points are others than those of before."""
+
+    def renamed(camera):
+        camera.name += " calibrated"
+
+    more = _let_in(low, "configuration/camera", 9.0, renamed)
+    _, ties, told = run(tmp_path, sorted([*low, *more], key=lambda x: x.stamp_ns))
+    assert "configuration changed: matching starts again" in told
+    names = [tie.point for tie in ties]
+    assert len(set(names)) == len(names)
+    late = [name for name in names if not name.startswith("S1-M")]
+    assert 10 < len(late) < len(names) - 10 and all(name.startswith("S1-L8") for name in late), late
