@@ -111,7 +111,7 @@ class Matcher(Node):
         self._ground_m = ground_m
         self._heights: dict[str, tuple[float, float, float]] = {}  # control and check points with a height
         self._refused: set[str] = set()  # of which an operator said that they do not count
-        self._frame_of: Any = None  # the project whose local frame control is in
+        self._frame_of: Any = None  # the project whose local frame poses and control are in
         self._origin_m = 0.0  # height of the local frame's origin
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._ground_unknown = False  # when they were counted
@@ -183,14 +183,8 @@ class Matcher(Node):
     def _take(self, message: Message) -> list[Message]:
         topic, body = message.topic, message.body
         if topic == "configuration/project":
-            if self._frame_of is not None and not convert.same_frame(body, self._frame_of):
-                self._heights.clear()  # they have to be stated again in the new frame
-                self._set_ground()
-            self._frame_of = body
-            if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
-                self._origin_m = float(body.origin_height)
-                self._set_ground()
-        elif topic == "configuration/camera":
+            return self._project_came(body, message.stamp_ns)
+        if topic == "configuration/camera":
             return self._configure(body, message.stamp_ns)
         if topic == "configuration/strip":
             convert.check_strip(body, message.stamp_ns)
@@ -223,9 +217,23 @@ class Matcher(Node):
             return self._targets.verdict(body, self._observed_ns)
         return []
 
-    def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
-        if body == self._camera:
+    def _project_came(self, body: Any, stamp_ns: int) -> list[Message]:
+        another_frame = self._frame_of is not None and not convert.same_frame(body, self._frame_of)
+        self._frame_of = body
+        if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
+            self._origin_m = float(body.origin_height)
+            self._set_ground()
+        if not another_frame:
             return []
+        self._heights.clear()  # they have to be stated again in the new frame, and poses so far are not in it
+        self._targets.forget()
+        return [] if self._camera is None else self._begin(self._camera, stamp_ns)
+
+    def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
+        return [] if body == self._camera else self._begin(body, stamp_ns)
+
+    def _begin(self, body: Any, stamp_ns: int) -> list[Message]:
+        """Begin, or begin again, with a camera."""
         again = self._matcher is not None
         camera = convert.camera_from(body)
         self._camera, self._matcher = body, None

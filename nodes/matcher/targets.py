@@ -41,6 +41,10 @@ class DoubtfulTargets:
         for target in self._points.values():
             self._finder.set_target(target)
 
+    def forget(self) -> None:
+        """Forget all targets, whose coordinates are in a local frame that was given up; verdicts on them stay."""
+        self._points.clear()
+
     def ground_point(self, body: Any) -> None:
         """Take a ground point; those that are not signalised, or whose place is not known, do not matter here.
 

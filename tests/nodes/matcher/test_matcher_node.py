@@ -7,6 +7,7 @@ import pytest
 from recording_file import write_recording
 
 from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.convert import local_frame
 from triline.nodes.matcher.matcher import Matcher
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
@@ -343,3 +344,23 @@ def test_a_matcher_that_begins_in_mid_strip_gives_no_name_a_second_time(tmp_path
     assert len(set(names)) == len(names)
     late = [name for name in names if not name.startswith("S1-M")]
     assert 10 < len(late) < len(names) - 10 and all(name.startswith("S1-L8") for name in late), late
+
+
+def test_in_another_local_frame_matching_begins_again(tmp_path, low):
+    """Poses and targets of before are a kilometre from where they are in it; control that is stated in it counts."""
+
+    def moved(project):
+        project.origin_latitude += 0.01
+
+    more = _let_in(low, "configuration/project", 9.0, moved)
+    before, after = (local_frame(x.body) for x in (low[0], more[0]))
+    assert low[0].topic == "configuration/project"
+    for k, x in enumerate(x for x in low if x.topic == "observation/control"):
+        body = type(x.body).FromString(x.body.SerializeToString())
+        body.x, body.y, body.z = after.from_geodetic(*before.to_geodetic([body.x, body.y, body.z]))
+        more.append(replace(x, body=body, stamp_ns=more[0].stamp_ns + 2, sequence=1000 + k))
+    summary, ties, told = run(tmp_path, sorted([*low, *more], key=lambda x: x.stamp_ns))
+    counted = summary.counters["matcher"]
+    assert "configuration changed: matching starts again" in told
+    assert not [text for text in told if "poor likeness" in text or "at the end of the line" in text], told
+    assert sum(not tie.point.startswith("S1-M") for tie in ties) > 10 and counted["target measured"] > 60
