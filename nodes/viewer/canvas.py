@@ -125,6 +125,10 @@ class Canvas(Protocol):
 
     def document(self, entity: str, markdown: str) -> None: ...
 
+    def clear(self, entity: str) -> None:
+        """Take away an entity and all that is below it."""
+        ...
+
     def layout(self, layout: ViewLayout | FleetLayout) -> None: ...
 
     def close(self) -> None: ...
@@ -173,6 +177,9 @@ class NullCanvas:
         pass
 
     def document(self, entity: str, markdown: str) -> None:
+        pass
+
+    def clear(self, entity: str) -> None:
         pass
 
     def layout(self, layout: ViewLayout | FleetLayout) -> None:

@@ -15,6 +15,7 @@ from .trajectories import LARGEST_GAP_NS
 
 Array = NDArray[np.floating]
 _STEP_NS = convert.SECOND_NS
+_GROUND = "map/ground"
 
 
 class MapPart(Part):
@@ -24,7 +25,7 @@ class MapPart(Part):
         super().__init__(state)
         self._gnss = Pieces("map/gnss", 60)
         self._final = Pieces("map/final", 60, joined=True)
-        self._ground = Pieces("map/ground", 600)
+        self._ground = Pieces(_GROUND, 600)
         self._last: dict[str, int] = {}
 
     def _due(self, topic: str, time_ns: int) -> bool:
@@ -48,6 +49,11 @@ class MapPart(Part):
         elif message.topic == "observation/control" and self.state.placed is not None:
             place = self.state.placed.to_geodetic(np.array([body.x, body.y, body.z]))[:2]
             self._ground.add((place, CHECK if convert.role_of(body) == "check" else CONTROL))
+
+    def begin_again(self, canvas: Canvas) -> None:
+        canvas.clear(_GROUND)  # it counts no more; what was flown stays where it is on the Earth
+        self._ground = Pieces(_GROUND, 600)
+        self._final.cut()
 
     def draw(self, canvas: Canvas) -> None:
         def fixes(entity: str, rows: list[Array]) -> None:

@@ -26,6 +26,9 @@ class PointsPart(Part):
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
+        self._forget()
+
+    def _forget(self) -> None:
         self._live: dict[str, tuple[Array, Color]] = {}
         self._live_changed = False
         self._final = Pieces("points/final", 150)
@@ -100,6 +103,10 @@ class PointsPart(Part):
         origins = np.array([xyz for xyz, _, _ in rows]).reshape(-1, 3)
         arrows = np.array([vector for _, vector, _ in rows]).reshape(-1, 3)
         canvas.arrows("points/fresh", self.state.display(origins), arrows, [color for *_, color in rows], 0.9)
+
+    def begin_again(self, canvas: Canvas) -> None:
+        canvas.clear("points")
+        self._forget()
 
     def draw(self, canvas: Canvas) -> None:
         display = self.state.display

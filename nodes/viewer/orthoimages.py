@@ -25,6 +25,9 @@ class MosaicPart(Part):
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
+        self._forget()
+
+    def _forget(self) -> None:
         self._changed: dict[tuple[str, int, int], Any] = {}
         self._white = 0.0
 
@@ -56,6 +59,10 @@ class MosaicPart(Part):
             self._white = _HEADROOM * bright
         table = np.rint(255.0 * np.clip(np.arange(256) / self._white, 0.0, 1.0) ** _GAMMA).astype(np.uint8)
         return table[grey]
+
+    def begin_again(self, canvas: Canvas) -> None:
+        canvas.clear("mosaic")
+        self._forget()
 
     def draw(self, canvas: Canvas) -> None:
         if self.state.newest is None:  # the display frame is not known yet

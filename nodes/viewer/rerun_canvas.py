@@ -131,6 +131,9 @@ class RerunCanvas:
     def document(self, entity: str, markdown: str) -> None:
         self.stream.log(entity, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), static=True)
 
+    def clear(self, entity: str) -> None:
+        self.stream.log(entity, rr.Clear(recursive=True))
+
     def layout(self, layout: ViewLayout | FleetLayout) -> None:
         made = fleet_blueprint(layout) if isinstance(layout, FleetLayout) else blueprint(layout)
         self.stream.send_blueprint(made)

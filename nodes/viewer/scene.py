@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .. import convert
 from ..convert import PoseSample
 from ..node import Message
+from ..truth_frames import TruthFrames
 from .canvas import Canvas, ViewLayout
 from .curves import PlotsPart
 from .image_residuals import ImagePart
@@ -84,6 +85,7 @@ class Scene:
         self._held: list[tuple[str, PoseSample]] = []
         self._released = False
         self._waiting_truth: deque[PoseSample] = deque(maxlen=20_000)
+        self._truth_frames = TruthFrames()
 
     def take(self, message: Message) -> None:
         """Remember what a message says.
@@ -95,7 +97,13 @@ class Scene:
         topic, body = message.topic, message.body
         if not is_shown(topic):
             return
+        self._truth_frames.note(message)
+        if self._truth_frames.is_elsewhere(message, self.state.project):
+            return
+        before = self.state.project
         self.state.note(message)
+        if before is not None and not convert.same_frame(before, self.state.project):
+            self._begin_again()
         if topic.startswith("configuration/"):
             return
         if topic.startswith(("trajectory/", "orientation/", "truth/")):
@@ -103,6 +111,16 @@ class Scene:
             return
         for part in self.parts:
             part.take(message)
+
+    def _begin_again(self) -> None:
+        """Draw what comes from now on in the local frame of another project, and take away what is not in it."""
+        self.state.begin_again()
+        self._laid_out, self._released = None, False
+        self._held.clear()
+        self._waiting_truth.clear()
+        self.canvas.at(self.state.now_s)
+        for part in self.parts:
+            part.begin_again(self.canvas)
 
     def _take_pose(self, topic: str, sample: PoseSample) -> None:
         """Hand a pose to the parts; truth waits for the filtered pose it is compared with.

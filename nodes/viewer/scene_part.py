@@ -54,6 +54,9 @@ class Part:
     def take(self, message: Message) -> None:
         """Take any other message."""
 
+    def begin_again(self, canvas: Canvas) -> None:
+        """Local coordinates are in another frame from now on: take away what is in the one before."""
+
     def draw(self, canvas: Canvas) -> None:
         """Draw what has changed."""
 

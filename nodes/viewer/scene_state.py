@@ -107,6 +107,12 @@ class SceneState:
 
     # ---- taking
 
+    def begin_again(self) -> None:
+        """Local coordinates are in another frame from now on: forget those so far, and the display frame."""
+        self.origin, self.extent, self.newest = np.zeros(3), {}, None
+        self._control.clear()
+        self.trajectory, self.truth = PoseHistory(), PoseHistory()
+
     def note(self, message: Message) -> None:
         """Keep configuration, control and time."""
         topic, body = message.topic, message.body

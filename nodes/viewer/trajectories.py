@@ -30,6 +30,9 @@ class FlightPart(Part):
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
+        self._forget()
+
+    def _forget(self) -> None:
         self._lines = {topic: Pieces(style[0], 150, joined=True) for topic, style in _STYLE.items()}
         self._last: dict[str, tuple[int, str]] = {}
         self._head: dict[str, Array] = {}
@@ -78,6 +81,10 @@ class FlightPart(Part):
         self._last_ellipsoid = sample.time_ns
         half_axes, quaternion = ellipsoid(sample.covariance[:3, :3], _SIGMAS * self.state.exaggeration)
         self._ellipsoids.add((self._head["orientation/final"], half_axes, quaternion))
+
+    def begin_again(self, canvas: Canvas) -> None:
+        canvas.clear("flight")
+        self._forget()
 
     def draw(self, canvas: Canvas) -> None:
         for topic, (_, color, radius, _) in _STYLE.items():

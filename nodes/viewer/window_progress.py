@@ -65,6 +65,10 @@ class WindowPart(Part):
             self._whole += 1
         self._pending, self._track = self._track, []
 
+    def begin_again(self, canvas: Canvas) -> None:
+        canvas.clear("flight/window")
+        self._strip, self._track, self._pending, self._whole = "", [], [], 0
+
     def draw(self, canvas: Canvas) -> None:
         report = self._report
         if report is not None and report.light and (report.light, report.light_reason) != self._light:

@@ -63,6 +63,10 @@ class Notebook(NullCanvas):
     def event(self, entity, text, level):
         self.events.append((text, level))
 
+    def clear(self, entity):
+        for name in [name for name in self.drawn if name == entity or name.startswith(entity + "/")]:
+            del self.drawn[name]
+
     def layout(self, layout):
         self.layouts.append(layout)
 

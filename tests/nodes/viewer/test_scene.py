@@ -331,3 +331,31 @@ def test_the_window_is_shown_on_the_ground_and_the_light_beside_it(messages):
     assert lengths[0] > lengths[1] > 300.0
     assert len(canvas.drawn["points/fresh"][0]) > 20
     assert canvas.curves["plots/integrity/position/X_protection"][1][-1] == 1.0
+
+
+def test_in_another_local_frame_nothing_of_the_one_before_stays_drawn(messages):
+    """Control of before does not count, and all of it would stand 11 km from where it is."""
+    project = next(x for x in messages if x.topic == "configuration/project")
+    control = [x for x in messages if x.topic == "observation/control"]
+    change = START_NS + 17 * 10**9
+    body = type(project.body).FromString(project.body.SerializeToString())
+    body.origin_latitude += 0.1
+    stated = [replace(x, stamp_ns=change + 2) for x in control[:2]]
+    truth = [replace(x, source="simulator") for x in messages if x.topic.startswith("truth/")]
+    rest = [replace(x, source="simulator") if x is project else x for x in messages if not x.topic.startswith("truth/")]
+    said = [replace(project, source="desk", body=body, stamp_ns=change), *stated]
+    order = sorted([*rest, *truth, *said], key=lambda x: x.stamp_ns)
+    before, canvas = Notebook(), Notebook()
+    show([x for x in order if x.stamp_ns < change], before)
+    show(order, canvas)
+    given = [what for name, what in canvas.drawn.items() if name in ("points/control", "points/check")]
+    assert sum(len(what[0]) for what in given) == 2 == sum(map(len, canvas.pieces("map/ground")))
+    late = [x for x in messages if x.topic == "point/object" and x.stamp_ns > change and x.body.status == 1]
+    assert sum(map(len, canvas.pieces("points/final"))) == len({x.body.point for x in late})
+    assert before.pieces("flight/truth") and not canvas.pieces("flight/truth")
+    after = sum(len(line[0]) for line in canvas.pieces("flight/trajectory"))
+    assert 0 < after < sum(len(line[0]) for line in before.pieces("flight/trajectory")) + 30
+    assert len(canvas.layouts) > len(before.layouts)
+    lat = [layout.geographic_centre[0] for layout in (before.layouts[-1], canvas.layouts[-1])]
+    assert lat[1] - lat[0] == pytest.approx(0.1, abs=0.02)
+    assert len(canvas.pieces("map/final")) > len(before.pieces("map/final"))  # where it was flown
