@@ -27,6 +27,9 @@ MOST_OLD = 1024
 SAME_TIME_S = 1e-6
 #: A pose whose attitude is more uncertain than this, rad, is none: that of a filter which is still aligning.
 KNOWN_ATTITUDE_RAD = 0.2
+#: A filter that begins needs a fix before its poses are valid. For so long, s, its first poses do not say how good the
+#: trajectory of a strip is.
+FIRST_FIX_S = 3.0
 #: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
 LEARNT_SHARE = 0.02
 #: So many statements about slow errors are remembered.
@@ -97,7 +100,7 @@ class PoseBuffer:
     def __init__(self, known_only: bool = False, smoothed_only: bool = False) -> None:
         self._known_only, self._smoothed_only = known_only, smoothed_only
         self._latest: dict[bool, tuple[float, list[float]]] = {}
-        self._attitude_lost = False
+        self._attitude_lost = self._valid_seen = False
         self._left_out = (0.0, 0.0)
         self.filtered_seen = False
         self.first_known_s = np.inf
@@ -112,7 +115,8 @@ class PoseBuffer:
         self._latest.clear()
         self._seen = {False: ([], []), True: ([], [])}
         self._invalid = {False: [], True: []}
-        self._attitude_lost, self._left_out = False, (0.0, 0.0)
+        self._attitude_lost = self._valid_seen = False
+        self._left_out = (0.0, 0.0)
         self.first_known_s = np.inf
 
     def add(self, time_s: float, pose: convert.PlainPose, smoothed: bool, reason: str) -> None:
@@ -131,6 +135,7 @@ class PoseBuffer:
             self._attitude_lost |= not known
         if known:
             self.first_known_s = min(self.first_known_s, time_s)
+            self._valid_seen |= pose.valid
         if known or not self._known_only:
             self._waiting[smoothed].append((time_s, pose))
         if known and (smoothed not in self._latest or time_s >= self._latest[smoothed][0]):
@@ -146,10 +151,13 @@ class PoseBuffer:
             del times[:old], reasons[:old]
 
     def covariance_after(self, time_s: float) -> Array | None:
-        """Covariance (6, 6) of the newest pose with a known attitude, None if there is none after a time."""
+        """Covariance (6, 6) of the newest pose with a known attitude, None if there is none after a time, or the filter
+        has just begun and no pose is valid yet."""
         if not self._latest:
             return None
         newest_s, covariance = max(self._latest.values(), key=lambda latest: latest[0])
+        if not self._valid_seen and newest_s < self.first_known_s + FIRST_FIX_S:
+            return None
         return _matrix(covariance) if newest_s >= time_s else None
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -183,3 +185,29 @@ def test_a_segment_without_length_is_refused():
 def test_an_unknown_choice_is_refused():
     with pytest.raises(ValueError, match="apriori: 'pose' is not known, wanted one of trajectory, project"):
         Adjuster(apriori="pose")
+
+
+def test_a_navigator_that_has_no_fix_yet_does_not_say_how_good_the_trajectory_is():
+    """Another project in mid-strip: both begin again, and the first poses, without a fix, are known to 10 m."""
+    simulation = simulate(FlightPlan(strips=1, strip_s=18.0, lead_in_s=3.0), 5, ErrorModel(), ObservationPlan())
+    navigator, adjuster, live, project = Navigator(), adjuster_of(), [], None
+    for message in Simulator(simulation).messages(EPOCH):
+        given = [message]
+        if message.topic == "configuration/project":
+            project = message
+        elif project is not None and message.stamp_ns > EPOCH + 12 * 10**9:
+            other = type(project.body).FromString(project.body.SerializeToString())
+            other.image_sigma_px = 0.31
+            given, project = [replace(project, body=other, stamp_ns=message.stamp_ns), message], None
+        for one in given:
+            made = list(navigator.step(one)) if one.topic in navigator.inputs else []
+            for each in (one, *made):
+                if each.topic in adjuster.inputs:
+                    live += [x for x in adjuster.step(each) if x.topic == "orientation/live"]
+    sigma = {round(x.body.timestamp.nanos * 1e-9 + x.body.timestamp.seconds - EPOCH * 1e-9, 2): x for x in live}
+    before, after = (
+        np.array([np.sqrt(x.body.covariance[::7][:3]) for t, x in sigma.items() if a < t < b])
+        for a, b in ((3.5, 5.0), (14.5, 18.0))
+    )
+    assert len(before) > 10 and len(after) > 30
+    assert (after < 1.2 * before.max(axis=0)).all()
