@@ -22,3 +22,11 @@ def tell_other_frame(command: str, reader: RecordingReader) -> None:
     if begin_ns:
         what = "poses and points are in another local frame and left out: the project became another one then"
         print(f"triline {command}: {reader.path}: before {iso(begin_ns)} {what}", file=sys.stderr)
+
+
+def tell_other_camera(command: str, reader: RecordingReader) -> None:
+    """The same where an operator let in another camera in flight: there is one for all lines."""
+    begin_ns = reader.camera_begins_ns()
+    if begin_ns:
+        what = "nodes used another camera; lines of then are rectified with the same one as those after"
+        print(f"triline {command}: {reader.path}: before {iso(begin_ns)} {what}", file=sys.stderr)

@@ -19,7 +19,7 @@ from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
-from .damage import tell_damage, tell_other_frame
+from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .progress import progress
 from .rectify_recording import cells_of, prepared
 
@@ -126,6 +126,7 @@ def run(args: argparse.Namespace) -> int:
     _tell(result, done, args, grid.frame.units[0])
     tell_damage("rectify", recording.reader)
     tell_other_frame("rectify", recording.reader)
+    tell_other_camera("rectify", recording.reader)
     return 0
 
 

@@ -46,7 +46,7 @@ from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
 from . import rectify_image
-from .damage import tell_damage, tell_other_frame
+from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .outputs import refuse_over_files
 from .progress import progress
 from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
@@ -139,6 +139,7 @@ def run(args: argparse.Namespace) -> int:
     for path in [path for kind, path, _ in kinds if kind == "recording"]:
         reader = RecordingReader(path)
         tell_other_frame("rectify", reader)
+        tell_other_camera("rectify", reader)
         tell_damage("rectify", reader)
     return 0
 

@@ -16,7 +16,7 @@ from ...solver.geometry.frames import CrsError
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.slow_errors import SlowErrors
-from ..convert import SECOND_NS, camera_from, local_frame, role_of, same_frame, slow_errors_of
+from ..convert import SECOND_NS, camera_from, iso, local_frame, role_of, same_frame, slow_errors_of
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
@@ -38,6 +38,7 @@ class _Collected:
 
     project: Any = None
     camera: Any = None
+    camera_ns: int = 0  # since when, where there was another one before
     strips: dict[str, Any] = field(default_factory=dict)
     ground: dict[str, Any] = field(default_factory=dict)
     refused: set[str] = field(default_factory=set)
@@ -52,6 +53,8 @@ class _Collected:
                 self.ground.clear()
             self.project = body
         elif message.topic == "configuration/camera":
+            if self.camera is not None and body != self.camera:
+                self.camera_ns = message.stamp_ns
             self.camera = body
         elif message.topic == "configuration/strip":
             self.strips[body.id] = body
@@ -110,6 +113,11 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
     settings |= {key: getattr(project, key) for key in WANDER_TIMES if getattr(project, key)}
     apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings)
+    if poses[0][0] < found.camera_ns:
+        notes.append(
+            f"{name}: before {iso(found.camera_ns)} nodes used another camera; image points of then are adjusted with "
+            "the same one as those after"
+        )
     ground = _ground_of(found, notes)
     point_ids, image = _image_of(found, camera, strips, ground, apriori)
     frame = local_frame(project)

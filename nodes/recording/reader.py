@@ -11,6 +11,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from .index import CHANNEL_METADATA, Channel, Index, Recorded
 from .ranges import Ranged, open_ranged
 from .remote import RemoteFile, RemotePath, path_of
 
-_PROJECT = FIXED[0]
+_PROJECT, _CAMERA = FIXED
 #: Rows of the index that are looked up together.
 _TOGETHER = 8192
 #: Records that the index is made of; the others repeat it for readers that take the file as whole.
@@ -418,6 +419,15 @@ class RecordingReader:
             changes = any(not same_frame(body, bodies[0]) for body in bodies)
             self._frame_begins_ns = self._last_used(_PROJECT)[1] if changes else 0
         return self._frame_begins_ns
+
+    def camera_begins_ns(self) -> int:
+        """Stamp from which on nodes used the last camera; 0 where it was not let in in flight."""
+        used = list(self._all_used(_CAMERA)) if len(self.select([_CAMERA])) > 1 else []
+        changes = [other.stamp_ns for one, other in pairwise(used) if one.body != other.body]
+        if not changes:
+            return 0
+        flown_ns, _ = self.stamps(self.first_flown())
+        return changes[-1] if (flown_ns < changes[-1]).any() else 0
 
     def in_frame(self, messages: Iterable[Message]) -> Iterator[Message]:
         """Those of results that are in the local frame of the project; of truth, those whose source had it."""

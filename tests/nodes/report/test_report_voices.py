@@ -14,6 +14,7 @@ from synthetic_flight import flight_messages
 
 from triline.nodes.batch.rectification import known_points
 from triline.nodes.cli import main, view
+from triline.nodes.cli.damage import tell_other_camera
 from triline.nodes.convert import iso
 from triline.nodes.formats.block_recording import TOPICS, block_from_messages
 from triline.nodes.node import Message
@@ -326,3 +327,18 @@ def test_lines_of_a_camera_that_was_replaced_have_their_residuals(messages):
     assert right and {ccd: len(rows) for ccd, rows in residuals_by_ccd(found).items()} == {
         ccd: len(rows) for ccd, rows in right.items()
     }
+
+
+def test_who_has_one_camera_for_a_flight_with_two_says_so(messages, tmp_path, capsys):
+    """`rectify` and `adjust` take what was imaged before another camera was let in with that one."""
+    strip = _of(messages, "configuration/strip").body
+    half = strip.first_line_time_ns + 10 * SECOND
+    camera, said = _changed(messages, half)[2:]
+    early = replace(camera, stamp_ns=_of(messages, "configuration/camera").stamp_ns)
+    for k, (more, told) in enumerate((([], False), ([camera], False), ([early], False), ([camera, said], True))):
+        reader = RecordingReader(write_recording(tmp_path / f"{k}.mcap", [*messages, *more]))
+        tell_other_camera("rectify", reader)
+        words = f"before {iso(half + 1)} nodes used another camera"
+        assert (words in capsys.readouterr().err) == told
+        block = block_from_messages(RecordedVoices().all_used(reader.sorted_messages(TOPICS)), "flight")
+        assert any(words in note for note in block.notes) == told
