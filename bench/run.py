@@ -33,8 +33,8 @@ DOCS = ROOT / "docs"
 LONG_MIN = 30.0
 #: `make bench` measures speed, all of it in less than 25 minutes on two idle cores; the others are `make study`.
 SPEED = (
-    "latency", "tie-latency", "demo-cores", "window-peers", "hour", "bus-load", "recordings", "messages", "rotations",
-    "replay", "batch", "navigation", "matcher", "orthoimage", "rectification", "satellites",
+    "latency", "tie-latency", "demo-cores", "window-peers", "hour", "bus-load", "recordings", "messages", "poses",
+    "rotations", "replay", "batch", "navigation", "matcher", "orthoimage", "rectification", "satellites",
 )  # fmt: skip
 
 
@@ -291,6 +291,12 @@ BENCHMARKS = (
         "messages",
         "What do messages cost that share their memory in groups?",
         ("python bench/messages.py",),
+        1,
+    ),
+    Benchmark(
+        "poses",
+        "What does a pose cost a node that takes several at once?",
+        ("python bench/poses.py",),
         1,
     ),
     Benchmark(

@@ -28,7 +28,7 @@ SAME_TIME_S = 1e-6
 #: A pose whose attitude is more uncertain than this, rad, is none: that of a filter which is still aligning.
 KNOWN_ATTITUDE_RAD = 0.2
 #: A filter that begins needs a fix before its poses are valid. For so long, s, its first poses do not say how good the
-#: trajectory of a strip is.
+#: trajectory of a strip is. Tuned: a few fixes at 1 Hz; longer only delays strips that have no GNSS at all.
 FIRST_FIX_S = 3.0
 #: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
 LEARNT_SHARE = 0.02

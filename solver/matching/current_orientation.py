@@ -16,7 +16,8 @@ Array = NDArray[np.floating]
 KNOT_S = 1.0
 #: Poses and corrections older than this are forgotten, s.
 KEPT_S = 120.0
-#: Poses are taken when orientation is asked for, or when so many have come.
+#: Poses are taken when orientation is asked for, or when so many have come. Tuned: with many more there is nothing left
+#: to gain (bench/poses.py); the poses that come out are the same with any number.
 MOST_NEW = 64
 #: A correction that changes by more than this share of its sigma within so long, s, has been found anew, as when the
 #: first control is met: slow errors change far less. What was told of earlier times was wrong by as much.
