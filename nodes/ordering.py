@@ -29,6 +29,8 @@ MILLISECOND_NS = 1_000_000
 MAX_JUMP_NS = 60_000_000_000
 #: So many messages in a row on an earlier time base mean that a clock was set back.
 REBASE_AFTER = 5
+#: So many messages in a row of one stream, with none of another source between, mean that time has gone on so far.
+LEAPS_TO_CONFIRM = 3
 #: Missing sequence numbers that are remembered, to tell a message out of order from a duplicate.
 _REMEMBERED = 10_000
 #: A number that jumps ahead by more is believed when `REBASE_AFTER` messages in a row go on from it.
@@ -231,6 +233,70 @@ class _Watermark:
     heard_s: float
 
 
+class PlatformTime:
+    """How far platform time is, by all that has come, and which streams have another time than all others.
+
+    One clock that is an hour ahead is not the time of the platform; all of them are, after a pause. Another source
+    confirms a stamp far ahead of all that has come, or a third message of its stream with nothing between: two of them
+    come together where a clock has jumped, since `StreamCheck` holds the first one.
+
+    Attributes
+    ----------
+    newest_ns : newest stamp that has come; None before the first one
+    """
+
+    def __init__(self) -> None:
+        self.newest_ns: int | None = None
+        self._time_ns: int | None = None  # the same without observations
+        self._ahead: dict[tuple[str, str], int] = {}  # messages in a row that were far ahead, by topic and source
+        # since the last message that was not far ahead: of each stream how many were, and the last one's stamp
+        self._leapt: dict[tuple[str, str], tuple[int, int]] = {}
+
+    @property
+    def ns(self) -> int | None:
+        """Newest stamp that has come; observations count only where nothing else has."""
+        return self.newest_ns if self._time_ns is None else self._time_ns
+
+    def ahead(self, topic: str, envelope: Envelope) -> int:
+        """How many messages of a stream in a row, with this one, were far ahead of all others.
+
+        A message that is not tells how far time is.
+        """
+        stamp, key = envelope.stamp_ns, (topic, envelope.source)
+        if self._leaps(topic, envelope):
+            self._ahead[key] = self._ahead.get(key, 0) + 1
+            return self._ahead[key]
+        self._ahead.pop(key, None)
+        if self.newest_ns is None or stamp > self.newest_ns:
+            self.newest_ns = stamp
+        of_time = topics.find(topic).family is not Family.OBSERVATION
+        if of_time and (self._time_ns is None or stamp > self._time_ns):
+            self._time_ns = stamp
+        return 0
+
+    def own_clock(self, topic: str, envelope: Envelope) -> str:
+        """What is said of a stream that has a clock of its own."""
+        ahead_s = (envelope.stamp_ns - (self.ns or 0)) / 1e9
+        return (
+            f"{topic} of {envelope.source!r} is stamped {ahead_s:.1f} s ahead of everything else and is left out: "
+            "its clock is wrong, or all others are"
+        )
+
+    def _leaps(self, topic: str, envelope: Envelope) -> bool:
+        stamp, time_ns = envelope.stamp_ns, self.ns
+        if time_ns is None or stamp - time_ns <= MAX_JUMP_NS:
+            self._leapt.clear()
+            return False
+        key = topic, envelope.source
+        near = {of: n for of, (n, before) in self._leapt.items() if abs(stamp - before) <= MAX_JUMP_NS}
+        number = near.get(key, 0) + 1
+        self._leapt[key] = number, stamp
+        if number < LEAPS_TO_CONFIRM and all(source == envelope.source for _, source in near):
+            return True
+        self._leapt.clear()
+        return False
+
+
 class Sequencer(Generic[T]):
     """Merges streams into the order of `order_key`.
 
@@ -264,12 +330,9 @@ class Sequencer(Generic[T]):
         self._grace_s = grace_s
         self.ready = False
         self._arrivals = 0
-        self._newest_ns: int | None = None
-        self._time_ns: int | None = None  # the same without observations
+        self._time = PlatformTime()
         self._released: Key | None = None
         self._flushed = False  # since it was released
-        self._ahead: dict[tuple[str, str], int] = {}  # messages in a row that were far ahead, by topic and source
-        self._leapt_ns: int | None = None  # a stamp far ahead of all others that the next message has to confirm
         self._streams: dict[tuple[str, str], _Watermark] = {}
         self._sources: dict[str, tuple[int, tuple[int, str, str]]] = {}  # newest stamp of each, and its place
         self._unheard = {row.name: row for row in topics.TOPICS if row.name in set(inputs)}
@@ -281,25 +344,24 @@ class Sequencer(Generic[T]):
     @property
     def newest_ns(self) -> int | None:
         """Newest stamp that has arrived; observations count only where nothing else has."""
-        return self._newest_ns if self._time_ns is None else self._time_ns
+        return self._time.ns
 
     def push(self, topic: str, envelope: Envelope, item: T, now_s: float) -> T | None:
         """Take a message that arrived at waiting time ``now_s`` (any steady clock); returns it if it came late."""
         stamp = envelope.stamp_ns
         if self._started_s is None:
             self._started_s = now_s
-        if self._leaps(stamp):  # it waits for its place, and tells nothing about how far time is
-            if self._has_own_clock(topic, envelope):
-                return None
+        ahead = self._time.ahead(topic, envelope)
+        if ahead > REBASE_AFTER:
+            if ahead == REBASE_AFTER + 1:
+                self._leave_out(topic, envelope)
+            self._problem("clock", self._time.own_clock(topic, envelope))
+            return None
+        if ahead:  # it waits for its place, and tells nothing about how far time is
             self._arrivals += 1
             heapq.heappush(self._heap, (order_key(topic, envelope), self._arrivals, item))
             return None
-        self._ahead.pop((topic, envelope.source), None)
-        if self._newest_ns is None or stamp > self._newest_ns:
-            self._newest_ns = stamp
         row = topics.find(topic)
-        if row.family is not Family.OBSERVATION and (self._time_ns is None or stamp > self._time_ns):
-            self._time_ns = stamp
         self.hear(topic, envelope, now_s)
         if row.order_only:
             return None
@@ -310,33 +372,13 @@ class Sequencer(Generic[T]):
         heapq.heappush(self._heap, (key, self._arrivals, item))
         return None
 
-    def _leaps(self, stamp: int) -> bool:
-        """Whether a stamp is far ahead of all that has come, and the message before it was not there as well.
-
-        One clock that is an hour ahead is not the time of the platform; all of them are, after a pause.
-        """
-        newest_ns = self.newest_ns
-        if newest_ns is None or stamp - newest_ns <= MAX_JUMP_NS:
-            self._leapt_ns = None
-            return False
-        before, self._leapt_ns = self._leapt_ns, stamp
-        if before is None or abs(stamp - before) > MAX_JUMP_NS:
-            return True
-        self._leapt_ns = None
-        return False
-
-    def _has_own_clock(self, topic: str, envelope: Envelope) -> bool:
-        """Whether so many messages of a stream were far ahead of all others that it has another time than they."""
-        number = self._ahead[topic, envelope.source] = self._ahead.get((topic, envelope.source), 0) + 1
-        if number <= REBASE_AFTER:
-            return False
-        ahead_s = (envelope.stamp_ns - (self.newest_ns or 0)) / 1e9
-        self._problem(
-            "clock",
-            f"{topic} of {envelope.source!r} is stamped {ahead_s:.1f} s ahead of everything else and is left out: "
-            "its clock is wrong, or all others are",
-        )
-        return True
+    def _leave_out(self, topic: str, envelope: Envelope) -> None:
+        """Drop those messages of a stream that wait far ahead: it has a clock of its own."""
+        latest_ns, before = (self._time.newest_ns or 0) + MAX_JUMP_NS, len(self._heap)
+        self._heap = [x for x in self._heap if x[0][0] <= latest_ns or (x[0][2], x[0][3]) != (topic, envelope.source)]
+        heapq.heapify(self._heap)
+        for _ in range(before - len(self._heap)):
+            self._problem("clock", self._time.own_clock(topic, envelope))
 
     def hear(self, topic: str, envelope: Envelope, now_s: float) -> None:
         """Note who speaks on a topic, and how far they are; all there is to it for what is worked off elsewhere."""
@@ -385,7 +427,7 @@ class Sequencer(Generic[T]):
 
     def _may_leave(self, key: Key, now_s: float) -> bool:
         stamp, rank, topic, source = key[:4]
-        newest_ns, time_ns = self._newest_ns, self.newest_ns
+        newest_ns, time_ns = self._time.newest_ns, self._time.ns
         assert newest_ns is not None and time_ns is not None and self._started_s is not None
         place = (rank, topic, source)
         for stream in self._streams.values():

@@ -461,7 +461,33 @@ def test_a_stream_with_a_clock_of_its_own_is_left_out_and_named():
         messages.append(("sensor/attitude", "a", 0.005 * i))
         if i % 40 == 20:
             messages.append(("sensor/gnss", "receiver", 604_800.0 + 0.005 * i))
-    fed(sequencer, messages)
-    assert len(problems) == 10 - REBASE_AFTER
+    out = fed(sequencer, messages) + sequencer.flush()
+    assert len(problems) == 10 and {topic for topic, _ in out} == {"sensor/attitude"}
     kind, text = problems[-1]
     assert kind == "clock" and "sensor/gnss of 'receiver' is stamped 604800" in text
+
+
+@pytest.mark.parametrize("topics", [("sensor/gnss",), ("sensor/lines/B", "sensor/lines/F", "sensor/lines/N")])
+def test_a_clock_that_jumps_ahead_in_flight_does_not_take_the_time_of_the_platform_along(topics):
+    """The check of the stream hands on the first two of them together, which is no confirmation of one another."""
+    problems: list = []
+    check: StreamCheck = StreamCheck()
+    sequencer: Sequencer = Sequencer([*INPUTS, *topics], problem=lambda kind, text: problems.append((kind, text)))
+    out, number = [], dict.fromkeys(["sensor/attitude", *topics], 0)
+    for i in range(2000):
+        seconds = 0.005 * i
+        spoken = [("sensor/attitude", "a", seconds)]
+        if i % 40 == 20:
+            spoken += [(topic, "other", seconds + (3600.0 if seconds > 5 else 0.0)) for topic in topics]
+        for topic, source, stamped in spoken:
+            envelope = Envelope(10**18 + round(stamped * 1e9), source, number[topic])
+            number[topic] += 1
+            for passed in check.accept(topic, envelope, (topic, envelope)):
+                late = sequencer.push(*passed, (topic, stamped), seconds)
+                out += [] if late is None else [late]
+        out += sequencer.pop(seconds)
+    assert sequencer.newest_ns == 10**18 + round(0.005 * 1999 * 1e9)
+    assert len(problems) == len(topics) * 25
+    assert all(kind == "clock" and "'other' is stamped 3600" in text for kind, text in problems)
+    out += sequencer.flush()
+    assert max(seconds for _, seconds in out) < 10 and len(out) == 2000 + 25 * len(topics)
