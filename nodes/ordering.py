@@ -116,6 +116,14 @@ class StreamCheck(Generic[T]):
             return [item] if self._is_new(stream, sequence, counts, topic, envelope) else []
         return self._next(stream, envelope, item, counts, topic)
 
+    def end(self) -> None:
+        """Nothing more comes: what is held is dropped, since nothing has confirmed it."""
+        for (topic, source, _), stream in self._streams.items():
+            if stream.ahead:
+                self._drop_ahead(stream, self.counts[topic], topic, source, "nothing goes on from them")
+            if stream.held is not None:
+                self._drop_held(stream, self.counts[topic], topic, source)
+
     def last(self, topic: str, envelope: Envelope) -> int | None:
         """Newest number of the stream of a message; None before the first one."""
         stream = self._streams.get((topic, envelope.source, envelope.start))
@@ -156,11 +164,21 @@ class StreamCheck(Generic[T]):
         ahead, stream.ahead = stream.ahead, []
         return [out for e, held in ahead for out in self._next(stream, e, held, counts, topic)]
 
-    def _drop_ahead(self, stream: _Stream[T], counts: TopicCounts, topic: str, source: str) -> None:
-        jump = stream.ahead[0][0].sequence - stream.last
-        counts.malformed += len(stream.ahead)
+    def _drop_ahead(
+        self, stream: _Stream[T], counts: TopicCounts, topic: str, source: str, why: str = "others go on before it"
+    ) -> None:
+        jump, number = stream.ahead[0][0].sequence - stream.last, len(stream.ahead)
+        counts.malformed += number
         stream.ahead.clear()
-        self._problem("malformed", f"{topic} of {source!r}: numbers jump ahead by {jump}, and others go on before it")
+        for _ in range(number):
+            self._problem("malformed", f"{topic} of {source!r}: numbers jump ahead by {jump}, and {why}")
+
+    def _drop_held(self, stream: _Stream[T], counts: TopicCounts, topic: str, source: str) -> None:
+        assert stream.held is not None
+        ahead_s = (stream.held[0] - stream.last_stamp) / 1e9
+        stream.held = None
+        counts.malformed += 1
+        self._problem("malformed", f"{topic} of {source!r}: a stamp jumps ahead by {ahead_s:g} s")
 
     def _is_new(self, stream: _Stream[T], sequence: int, counts: TopicCounts, topic: str, envelope: Envelope) -> bool:
         """Whether a number below the newest is a message out of order and not a duplicate."""
@@ -189,8 +207,9 @@ class StreamCheck(Generic[T]):
         stream.base_count = stream.base_count + 1 if envelope.stamp_ns >= stream.base_stamp else 1
         stream.base_stamp = envelope.stamp_ns
         if stream.base_count >= REBASE_AFTER:
+            back_s = (stream.last_stamp - envelope.stamp_ns) / 1e9
             stream.base_count, stream.last_stamp = 0, envelope.stamp_ns
-            self._problem("clock", f"{topic} of {envelope.source!r}: the clock was set back to {envelope.stamp_ns}")
+            self._problem("clock", f"{topic} of {envelope.source!r}: the clock was set back by {back_s:g} s")
             return [item]
         counts.malformed += 1
         back = f"time goes back by {(stream.last_stamp - envelope.stamp_ns) / 1e9:g} s"
@@ -203,14 +222,11 @@ class StreamCheck(Generic[T]):
         out: list[T] = []
         if stream.held is not None:
             held_stamp, held = stream.held
-            stream.held = None
             if 0 <= stamp - held_stamp <= MAX_JUMP_NS:
                 out.append(held)
-                stream.last_stamp = held_stamp
+                stream.held, stream.last_stamp = None, held_stamp
             else:
-                counts.malformed += 1
-                ahead_s = (held_stamp - stream.last_stamp) / 1e9
-                self._problem("malformed", f"{topic} of {envelope.source!r}: a stamp jumps ahead by {ahead_s:g} s")
+                self._drop_held(stream, counts, topic, envelope.source)
                 if stamp < stream.last_stamp:
                     return self._earlier(stream, envelope, item, counts, topic)
         if stamp - stream.last_stamp > MAX_JUMP_NS:

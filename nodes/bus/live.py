@@ -200,6 +200,7 @@ class BusRunner:
         now = self._patience.now_s()
         for raw in self._inbox.take(0.0):
             self._arrive(raw, now)
+        self._check.end()
         for message, _ in self._sequencer.flush():
             self._work(message)
         with self._lock:

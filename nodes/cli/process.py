@@ -198,6 +198,7 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
         "outputs": dict(sorted(summary.outputs.items())),
         "replaced": dict(sorted(summary.replaced.items())),
         "dropped": dict(sorted(summary.dropped.items())),
+        "notes": summary.notes,
         "damage": [str(damage) for damage in reader.damage],
         "lost_bytes": sum(damage.length for damage in reader.damage),
         "counters": summary.counters,
@@ -219,6 +220,9 @@ def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
     if summary.dropped:
         counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
         lines.append(f"  left out: {counted}" + (f"; the last: {summary.last_problem}" if summary.last_problem else ""))
+    if summary.notes:
+        more = len(summary.notes) - 1
+        lines.append(f"  used all the same: {summary.notes[-1]}" + (f" (and {more} more)" if more else ""))
     for name, counters in summary.counters.items():
         if any(counters.values()):
             by_number = sorted(((n, kind) for kind, n in counters.items() if n), key=lambda c: (-c[0], c[1]))

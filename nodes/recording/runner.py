@@ -17,13 +17,14 @@ from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
 from ...schemas.topics import Family
 from ..node import Message, Node
-from ..ordering import Key, StreamCheck, is_orderly, order_key
+from ..ordering import Key, order_key
 from ..step_driver import StepDriver
 from ..voices import VERDICT
 from .index import Recorded
 from .reader import RecordingReader
 from .runner_apart import Ahead
 from .summary import time_span_ns
+from .usable import usable
 
 
 @dataclass
@@ -36,6 +37,7 @@ class ProcessSummary:
     inputs, outputs : messages by topic
     replaced : recorded messages by topic that the nodes made anew
     dropped : messages that were not usable, by kind
+    notes : what of the recording was used and should be known
     counters : per node, what it counted
     problems : per node, its last problem
     states : per node, what it said of itself at the end
@@ -47,6 +49,7 @@ class ProcessSummary:
     outputs: Counter[str] = field(default_factory=Counter)
     replaced: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
     last_problem: str = ""
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
@@ -147,8 +150,15 @@ def process(
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
     drivers = [StepDriver(node) for node in running]
-    recording = _Recorded(reader, instead or {})
-    numbers = _usable(reader, made, summary)
+    recording, listening = _Recorded(reader, instead or {}), _Listening(drivers)
+    found = usable(
+        reader, lambda channel: is_remade(channel.topic, channel.source, made, summary.nodes),
+        lambda topic: bool(listening[topic]),
+    )  # fmt: skip
+    numbers = found.numbers
+    summary.replaced, summary.dropped, summary.notes = found.replaced, found.left_out, found.notes
+    summary.last_problem = found.last_problem
+    summary.first_ns, summary.last_ns = time_span_ns(reader, numbers) or (0, 0)
     last = _begin_of_end(reader, numbers, drivers)
     told = _Progress(progress, len(numbers))
     if apart and Ahead.possible() and len(running) > 1 and not _feeds(running[-1], running[:-1]):
@@ -531,33 +541,3 @@ def _raw(recorded: Recorded) -> RawMessage:
 def _message(raw: RawMessage, body: Any) -> Message:
     e = raw.envelope
     return Message(raw.topic, e.stamp_ns, body, e.source, e.sequence, e.start)
-
-
-def _usable(reader: RecordingReader, made: set[str], summary: ProcessSummary) -> NDArray[np.int64]:
-    """Numbers of the inputs of a recording that are usable, in order."""
-    index, known = reader.index, reader.select()
-    streams: dict[tuple[str, str, int], list[NDArray[np.int64]]] = {}
-    for id in np.unique(index.channel[known]).tolist():
-        channel = reader.channels[id]
-        own = known[index.channel[known] == id]
-        if is_remade(channel.topic, channel.source, made, summary.nodes):
-            summary.replaced[channel.topic] += len(own)
-        else:
-            streams.setdefault((channel.topic, channel.source, channel.start), []).append(own)
-    foreign = len(index) - len(known)
-    if foreign:
-        summary.drop("foreign", f"{foreign} messages on topics of other programs", foreign)
-    kept, doubtful = [], []
-    for (topic, _, _), parts in streams.items():
-        own = np.sort(np.concatenate(parts))
-        (kept if is_orderly(topic, index.sequence[own], index.stamp_ns[own]) else doubtful).append(own)
-    check: StreamCheck[int] = StreamCheck(summary.drop)
-    for number in np.sort(np.concatenate([*doubtful, np.empty(0, dtype=np.int64)])).tolist():
-        channel = reader.channels[int(index.channel[number])]
-        stamp, sequence = int(index.stamp_ns[number]), int(index.sequence[number])
-        accepted = check.accept(channel.topic, Envelope(stamp, channel.source, sequence, channel.start), number)
-        kept.append(np.array(accepted, dtype=np.int64))
-    ordered = reader.sort(np.concatenate([*kept, np.empty(0, dtype=np.int64)]))
-    if len(ordered):
-        summary.first_ns, summary.last_ns = time_span_ns(reader) or (0, 0)
-    return ordered

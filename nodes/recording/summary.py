@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas import topics
 from ...schemas.topics import Family
@@ -80,14 +81,15 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
     return sorted(by_topic.values(), key=lambda row: (_place(row.topic), row.topic))
 
 
-def time_span_ns(reader: RecordingReader) -> tuple[int, int] | None:
-    """First and last stamp of what was measured and computed; None without any.
+def time_span_ns(reader: RecordingReader, among: NDArray[np.int64] | None = None) -> tuple[int, int] | None:
+    """First and last stamp of what was measured and computed, on request among some messages alone; None without any.
 
     What is handed to whoever joins later, such as given ground points, is known before a flight and does not count.
     """
     rows = {c.id: topics.find(c.topic) for c in reader.channels.values() if c.known}
     timed = [id for id, row in rows.items() if row.family in _TIMED and not row.latched]
-    chosen = np.flatnonzero(np.isin(reader.channel_of, timed))
+    numbers = np.arange(len(reader.channel_of)) if among is None else among
+    chosen = numbers[np.isin(reader.channel_of[numbers], timed)]
     if reader.by_ranges and len(chosen):  # the ends of each channel tell, see topic_summaries
         _, first = np.unique(reader.channel_of[chosen], return_index=True)
         _, last = np.unique(reader.channel_of[chosen][::-1], return_index=True)

@@ -1,0 +1,76 @@
+"""What of a recording is used: nothing is left out without being counted, and clocks that are wrong do no harm."""
+
+from __future__ import annotations
+
+import pytest
+import sample_messages as sample
+
+from triline.nodes.cli import main
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.summary import time_span_ns
+from triline.nodes.recording.usable import usable
+from triline.nodes.recording.writer import RecordingWriter
+from triline.schemas import codec
+from triline.schemas.envelope import Envelope, RawMessage
+
+BEGIN_NS = 10**18
+ATTITUDE, GNSS = "sensor/attitude", "sensor/gnss"
+
+
+def stream(topic, hz, seconds, stamped=lambda t: t, numbered=lambda i: i):
+    """Messages of a sensor in the order in which they came: (s of reception, topic, stamp in s, number)."""
+    return [(i / hz, topic, stamped(i / hz), numbered(i)) for i in range(round(seconds * hz))]
+
+
+def recording(path, *streams):
+    data = {topic: codec.encode(sample.body(topic)) for topic in (ATTITUDE, GNSS)}
+    with RecordingWriter(path) as writer:
+        for received, topic, stamp, number in sorted(row for rows in streams for row in rows):
+            envelope = Envelope(BEGIN_NS + round(stamp * 1e9), topic.split("/")[1], number)
+            writer.write_raw(RawMessage(topic, envelope, data[topic], BEGIN_NS + round(received * 1e9)))
+    return RecordingReader(path)
+
+
+def used(reader):
+    """What is used, by topic: stamps, s."""
+    found = usable(reader, lambda channel: False, lambda topic: True)
+    left_out = len(reader.index) - len(found.numbers)
+    assert found.left_out.total() == left_out
+    rows = [(reader.channels[int(reader.index.channel[n])].topic, int(reader.index.stamp_ns[n])) for n in found.numbers]
+    assert [stamp for _, stamp in rows] == sorted(stamp for _, stamp in rows)
+    return found, {of: [(stamp - BEGIN_NS) / 1e9 for topic, stamp in rows if topic == of] for of in (ATTITUDE, GNSS)}
+
+
+@pytest.mark.parametrize("last", [(3600.0, 24), (4.8, 50_000)], ids=["stamp", "number"])
+def test_what_jumps_ahead_at_the_very_end_is_counted(tmp_path, last):
+    """Nothing follows that could confirm it."""
+    gnss = stream(GNSS, 5.0, 5.0)
+    gnss[-1] = (gnss[-1][0], GNSS, *last)
+    reader = recording(tmp_path / "flight.mcap", stream(ATTITUDE, 100.0, 5.0), gnss)
+    found, stamps = used(reader)
+    assert found.left_out == {"malformed": 1} and "jump" in found.last_problem
+    assert time_span_ns(reader, found.numbers) == (BEGIN_NS, BEGIN_NS + 4_990_000_000)
+    assert len(stamps[GNSS]) == 24 and len(stamps[ATTITUDE]) == 500
+
+
+def test_one_stamp_that_is_ahead_costs_no_others_their_place(tmp_path):
+    """Those after it go on where all other sensors are."""
+    attitude = stream(ATTITUDE, 100.0, 12.0, lambda t: t + (20.0 if t == 6.0 else 0.0))
+    found, stamps = used(recording(tmp_path / "flight.mcap", attitude, stream(GNSS, 5.0, 12.0)))
+    assert found.left_out == {"malformed": 4} and len(stamps[ATTITUDE]) == 1196
+
+
+def test_process_tells_what_it_used_all_the_same_and_counts_only_what_it_left_out(tmp_path, capsys):
+    flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    messages = sample.flight(4.0)
+    with RecordingWriter(flight) as writer:
+        numbers: dict[str, int] = {}
+        for message in messages:
+            number = numbers[message.topic] = numbers.get(message.topic, -1) + 1
+            ahead = 20 * 10**9 if (message.topic, number) == (ATTITUDE, 300) else 0
+            envelope = Envelope(message.stamp_ns + ahead, message.source, number)
+            writer.write_raw(RawMessage(message.topic, envelope, codec.encode(message.body), message.stamp_ns))
+    assert main(["process", str(flight), "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "left out: 4 malformed" in said
+    assert "used all the same: sensor/attitude of 'test': the clock was set back by" in said
