@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ...schemas import topics
 from ...schemas.envelope import Envelope
-from ..ordering import StreamCheck, is_orderly
+from ...schemas.topics import Family
+from ..ordering import MAX_JUMP_NS, REBASE_AFTER, PlatformTime, StreamCheck, is_orderly
 from .index import Channel
 from .reader import RecordingReader
 
@@ -76,7 +78,9 @@ def usable(reader: RecordingReader, remade: Callable[[Channel], bool], heard: Ca
         channel = reader.channels[int(index.channel[number])]
         kept.append(np.array(check.accept(channel.topic, _envelope(reader, number), number), dtype=np.int64))
     check.end()
-    found.numbers = reader.sort(_joined(kept))
+    numbers = np.sort(_joined(kept))
+    numbers = _of_one_clock(reader, numbers, heard, found)
+    found.numbers = reader.sort(numbers)
     return found
 
 
@@ -88,3 +92,37 @@ def _envelope(reader: RecordingReader, number: int) -> Envelope:
     index = reader.index
     channel = reader.channels[int(index.channel[number])]
     return Envelope(int(index.stamp_ns[number]), channel.source, int(index.sequence[number]), channel.start)
+
+
+def _timed(reader: RecordingReader, numbers: NDArray[np.int64], heard: Callable[[str], bool]) -> NDArray[np.int64]:
+    """Those of messages, in file order, by whose stamps nodes see how far time is."""
+    families = (Family.SENSOR, Family.OBSERVATION, Family.RESULT)
+    ids = [
+        c.id
+        for c in reader.channels.values()
+        if c.known and topics.find(c.topic).family in families and not topics.find(c.topic).latched and heard(c.topic)
+    ]
+    return numbers[np.isin(reader.index.channel[numbers], ids)]
+
+
+def _of_one_clock(
+    reader: RecordingReader, numbers: NDArray[np.int64], heard: Callable[[str], bool], found: Usable
+) -> NDArray[np.int64]:
+    """The same without streams that are stamped far ahead of all others, as a `Sequencer` leaves them out."""
+    timed = _timed(reader, numbers, heard)
+    stamps = reader.index.stamp_ns[timed]
+    if not len(timed) or not (stamps[1:] - np.maximum.accumulate(stamps)[:-1] > MAX_JUMP_NS).any():
+        return numbers
+    time, waiting, left = PlatformTime(), dict[tuple[str, str], list[int]](), list[int]()
+    for number in timed.tolist():
+        topic, envelope = reader.channels[int(reader.index.channel[number])].topic, _envelope(reader, number)
+        ahead, key = time.ahead(topic, envelope), (topic, envelope.source)
+        if not ahead:
+            waiting.pop(key, None)
+            continue
+        waiting.setdefault(key, []).append(number)
+        if ahead > REBASE_AFTER:
+            found.drop("clock", time.own_clock(topic, envelope), len(waiting[key]))
+            left += waiting[key]
+            waiting[key].clear()
+    return np.setdiff1d(numbers, left)

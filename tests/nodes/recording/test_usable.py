@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import sample_messages as sample
 
@@ -51,6 +52,27 @@ def test_what_jumps_ahead_at_the_very_end_is_counted(tmp_path, last):
     assert found.left_out == {"malformed": 1} and "jump" in found.last_problem
     assert time_span_ns(reader, found.numbers) == (BEGIN_NS, BEGIN_NS + 4_990_000_000)
     assert len(stamps[GNSS]) == 24 and len(stamps[ATTITUDE]) == 500
+
+
+@pytest.mark.parametrize("since", [0.0, 2.5])
+def test_a_stream_that_is_an_hour_ahead_of_all_others_is_left_out(tmp_path, since):
+    gnss = stream(GNSS, 5.0, 5.0, lambda t: t + (3600.0 if t + 0.1 > since else 0.0))
+    reader = recording(tmp_path / "flight.mcap", stream(ATTITUDE, 100.0, 5.0), [(t + 0.1, *row) for t, *row in gnss])
+    found, stamps = used(reader)
+    assert found.left_out == {"clock": sum(stamp > 60 for _, _, stamp, _ in gnss)}
+    assert "sensor/gnss of 'gnss' is stamped 3599.9 s ahead of everything else" in found.last_problem
+    assert max(stamps[GNSS], default=0.0) < 5 and len(stamps[ATTITUDE]) == 500
+    assert np.subtract(*time_span_ns(reader, found.numbers)[::-1]) < 5e9
+    assert np.subtract(*time_span_ns(reader)[::-1]) > 3600e9
+
+
+def test_a_pause_of_an_hour_loses_nothing(tmp_path):
+    late = lambda t: t + (3600.0 if t > 2.5 else 0.0)  # noqa: E731
+    reader = recording(
+        tmp_path / "flight.mcap", stream(ATTITUDE, 100.0, 5.0, late), stream(GNSS, 5.0, 5.0, late)
+    )  # fmt: skip
+    found, stamps = used(reader)
+    assert not found.left_out and [len(times) for times in stamps.values()] == [500, 25]
 
 
 def test_one_stamp_that_is_ahead_costs_no_others_their_place(tmp_path):
