@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from ...schemas import topics
 from ...schemas.envelope import Envelope
 from ...schemas.topics import Family
-from ..ordering import MAX_JUMP_NS, REBASE_AFTER, PlatformTime, StreamCheck, is_orderly
+from ..ordering import MAX_JUMP_NS, MILLISECOND_NS, REBASE_AFTER, PlatformTime, StreamCheck, is_orderly
 from .index import Channel
 from .reader import RecordingReader
+
+#: Whose set-back the navigator sees by itself, and says so.
+_WATCHED = "sensor/gnss"
 
 
 @dataclass
@@ -80,6 +83,8 @@ def usable(reader: RecordingReader, remade: Callable[[Channel], bool], heard: Ca
     check.end()
     numbers = np.sort(_joined(kept))
     numbers = _of_one_clock(reader, numbers, heard, found)
+    if doubtful:
+        numbers = _not_set_back(reader, numbers, heard, found)
     found.numbers = reader.sort(numbers)
     return found
 
@@ -126,3 +131,37 @@ def _of_one_clock(
             left += waiting[key]
             waiting[key].clear()
     return np.setdiff1d(numbers, left)
+
+
+def _not_set_back(
+    reader: RecordingReader, numbers: NDArray[np.int64], heard: Callable[[str], bool], found: Usable
+) -> NDArray[np.int64]:
+    """The same without what a sensor said of times that had passed when its clock was set back.
+
+    On the bus it comes late, and the navigator takes no attitude and no inertial data out of order; sorted by their
+    stamps they would be mixed with those that were measured then.
+    """
+    index, timed = reader.index, _timed(reader, numbers, heard)
+    left = []
+    for id in np.unique(index.channel[timed]).tolist():
+        channel = reader.channels[id]
+        row = topics.find(channel.topic)
+        own = timed[index.channel[timed] == id]
+        stamps = index.stamp_ns[own]
+        passed = np.maximum.accumulate(stamps)
+        if row.family is not Family.SENSOR or channel.topic == _WATCHED or (passed == stamps).all():
+            continue
+        # how far the others were when it came
+        others = timed[index.channel[timed] != id]
+        newest = np.maximum.accumulate(np.append(0, index.stamp_ns[others]))[np.searchsorted(others, own)]
+        lateness_ns = round(row.allowed_lateness_ms * MILLISECOND_NS)
+        in_order = index.sequence[own] == np.maximum.accumulate(index.sequence[own])
+        late = in_order & (stamps < passed) & (stamps < newest - lateness_ns)
+        if late.any():
+            back_s = float((passed - stamps)[late].max()) / 1e9
+            text = (
+                f"{channel.topic} of {channel.source!r} told times again after its clock was set back by {back_s:g} s"
+            )
+            found.drop("late", text, int(late.sum()))
+            left.append(own[late])
+    return np.setdiff1d(numbers, _joined(left))

@@ -75,11 +75,30 @@ def test_a_pause_of_an_hour_loses_nothing(tmp_path):
     assert not found.left_out and [len(times) for times in stamps.values()] == [500, 25]
 
 
+def test_a_clock_that_was_set_back_tells_no_time_twice(tmp_path):
+    """Sorted by stamps, what came after would be mixed with what was measured then."""
+    attitude = stream(ATTITUDE, 100.0, 12.0, lambda t: t - (3.005 if t > 6 else 0.0))
+    found, stamps = used(recording(tmp_path / "flight.mcap", attitude, stream(GNSS, 5.0, 12.0)))
+    times = np.array(stamps[ATTITUDE])
+    np.testing.assert_allclose(times[times < 6.002], np.arange(601) / 100)
+    np.testing.assert_allclose(times[times > 6.002], 6.005 + np.arange(299) / 100)
+    assert set(found.left_out) == {"late", "malformed"} and found.left_out["malformed"] == 4
+    assert found.notes == ["sensor/attitude of 'attitude': the clock was set back by 2.955 s"]
+
+
 def test_one_stamp_that_is_ahead_costs_no_others_their_place(tmp_path):
     """Those after it go on where all other sensors are."""
     attitude = stream(ATTITUDE, 100.0, 12.0, lambda t: t + (20.0 if t == 6.0 else 0.0))
     found, stamps = used(recording(tmp_path / "flight.mcap", attitude, stream(GNSS, 5.0, 12.0)))
     assert found.left_out == {"malformed": 4} and len(stamps[ATTITUDE]) == 1196
+
+
+def test_messages_out_of_order_are_no_clock_that_was_set_back(tmp_path):
+    attitude = stream(ATTITUDE, 100.0, 5.0)
+    attitude = [row for i in range(0, 500, 10) for row in (*attitude[i + 5 : i + 10], *attitude[i : i + 5])]
+    attitude = [(i / 100, *row) for i, (_, *row) in enumerate(attitude)]
+    found, stamps = used(recording(tmp_path / "flight.mcap", attitude, stream(GNSS, 5.0, 5.0)))
+    assert not found.left_out and len(stamps[ATTITUDE]) == 500
 
 
 def test_process_tells_what_it_used_all_the_same_and_counts_only_what_it_left_out(tmp_path, capsys):
