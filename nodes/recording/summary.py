@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ...schemas import topics
 from ...schemas.topics import Family
 from .reader import RecordingReader
+from .usable import usable
 
 _NO_END = "the file has no end: it was cut off, or its writer was killed"
 #: Families whose stamps tell when a flight was.
@@ -151,7 +152,7 @@ def damage_lines(reader: RecordingReader) -> list[str]:
 def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:
     """What is wrong with a recording, one line each, the worst first; empty if it is whole.
 
-    ``decode`` looks into every message, ``outside`` at the bytes between chunks, too.
+    ``decode`` looks into every message and into what nodes would use, ``outside`` at the bytes between chunks, too.
     """
     found = [str(damage) for damage in reader.damage]
     wrong = reader.check_outside() if outside else None
@@ -174,6 +175,13 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
     if decode:
         for _ in reader.messages():
             pass
+        used = usable(reader, lambda channel: False, lambda topic: True)
+        number = used.left_out["malformed"] + used.left_out["late"] + used.left_out["clock"]
+        if number:
+            found.append(
+                f"{number} messages that nodes leave out for their stamps or numbers; the last: {used.last_problem}"
+            )
+        found += used.notes
         if reader.problems["malformed"]:
             number = reader.problems["malformed"]
             found.append(f"{number} messages that cannot be used; the last: {reader.last_problem}")

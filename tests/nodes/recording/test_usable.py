@@ -66,6 +66,19 @@ def test_a_stream_that_is_an_hour_ahead_of_all_others_is_left_out(tmp_path, sinc
     assert np.subtract(*time_span_ns(reader)[::-1]) > 3600e9
 
 
+@pytest.mark.parametrize("topic, last", [(GNSS, (3600.0, 24)), (ATTITUDE, (3600.0, 499))])
+def test_check_finds_a_stamp_that_no_node_would_use(tmp_path, capsys, topic, last):
+    """By its numbers such a recording is whole."""
+    streams = {ATTITUDE: stream(ATTITUDE, 100.0, 5.0), GNSS: stream(GNSS, 5.0, 5.0)}
+    recording(tmp_path / "good.mcap", *streams.values())
+    streams[topic][-1] = (streams[topic][-1][0], topic, *last)
+    recording(tmp_path / "flight.mcap", *streams.values())
+    assert main(["check", str(tmp_path / "good.mcap")]) == 0
+    assert main(["check", str(tmp_path / "flight.mcap")]) == 1
+    said = capsys.readouterr().err
+    assert "1 messages that nodes leave out for their stamps or numbers" in said and topic in said
+
+
 def test_a_pause_of_an_hour_loses_nothing(tmp_path):
     late = lambda t: t + (3600.0 if t > 2.5 else 0.0)  # noqa: E731
     reader = recording(
