@@ -67,14 +67,23 @@ class NoiseOfLooks:
         w = self.controlled()
         return float(np.median(w**2) / median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
 
+    def is_as_stated(self) -> bool:
+        """Whether no other noise is in force than what was stated at first."""
+        return self._network.sigmas.image == 1.0 and self._network.pose_noise.vibration == 0.0
+
+    def ratio_now(self) -> float:
+        """The same of the newest looks, judged by the solution as it is now; 1 where there are too few."""
+        judged = [b.judge(self._network.state)[1] for b in list(self._network.batches)[-MOST_JUDGED:]]
+        w = np.concatenate([s.w[s.redundancy > LEAST_CONTROLLED] for s in judged]) if judged else np.empty(0)
+        return float(np.median(w**2) / median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
+
     def residuals(self) -> Residuals | None:
         """Residuals of the looks in the window, where they ask for another noise than is stated; None where not."""
-        sigmas, noise, state = self._network.sigmas, self._network.pose_noise, self._network.state
+        sigmas, state = self._network.sigmas, self._network.state
         w = self.controlled()
         if len(w) < LEAST_LOOKS:
             return None
-        stated = sigmas.image == 1.0 and noise.vibration == 0.0
-        if stated and np.median(w**2) / median_square(1) < 1.0 + IMAGE_QUESTIONED * np.sqrt(2.0 / len(w)):
+        if self.is_as_stated() and np.median(w**2) / median_square(1) < 1.0 + IMAGE_QUESTIONED * np.sqrt(2.0 / len(w)):
             return None
         judged = [(b, b.judge(state)[1]) for b in list(self._network.batches)[-MOST_JUDGED:]]
         rays = [b.rays for b, _ in judged]

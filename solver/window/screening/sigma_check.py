@@ -35,7 +35,7 @@ from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.sigma_factors import CHANGED, LARGEST, MOST_UP, changed
 from ..state.strip import WindowStrip
-from .disagreement import Disagreement
+from .disagreement import CLEARLY, Disagreement
 from .likelihood import Likelihood, likely
 from .look_noise import LEAST_LOOKS, NoiseOfLooks
 
@@ -133,15 +133,23 @@ class SigmaCheck:
 
     def _question_camera(self, strip: WindowStrip) -> None:
         """State larger errors of the camera where its calibration is contradicted by more than looks disagree, and no
-        constant error of the trajectory makes the data as likely."""
+        constant error of the trajectory makes the data as likely.
+
+        It takes a while until all noise of looks has been found: so it is asked anew before the camera is blamed, and
+        more has to speak against the camera.
+        """
         calibration = self._network.calibration
         if not calibration.is_questioned or len(self._looks.controlled()) < LEAST_LOOKS:
             return  # few looks do not tell noise from anything else
         variance = max(self._network.sigmas.disagreement**2, self._looks.median_ratio(), 1.0)
         for _ in range(MOST_ROUNDS_OF_CAMERA):
-            if not calibration.is_contradicted(variance) or self._constants_instead(strip):
+            if not calibration.is_contradicted(variance):
                 break
-            calibration.state_larger(variance)
+            now = max(variance, self._looks.ratio_now())
+            as_stated = self._looks.is_as_stated() and now < CLEARLY
+            if not calibration.is_contradicted(now, as_stated) or self._constants_instead(strip):
+                break
+            calibration.state_larger(now)
             self._network.state.solve()
 
     def _constants_instead(self, strip: WindowStrip) -> bool:
