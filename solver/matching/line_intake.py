@@ -62,6 +62,7 @@ class LineIntake:
         self._events: list[str] = []
         self._told = 0
         self._silent_after = np.inf
+        self._first = 0
         self._ends: dict[str, int] = {}
         self._good_ends: dict[str, int] = {}
         self._silent: set[str] = set()
@@ -70,12 +71,13 @@ class LineIntake:
         self._faults: dict[tuple[str, str], tuple[int, int, int]] = {}
         self._told_of: set[str] = set()
 
-    def begin_strip(self, line_rate_hz: float) -> None:
-        """What is in store is forgotten."""
+    def begin_strip(self, line_rate_hz: float, first_line: int = 0) -> None:
+        """What is in store is forgotten; lines come from ``first_line`` on."""
         self.store = None
         self._silent_after = SILENT_S * line_rate_hz
-        self._ends = dict.fromkeys(self._samples, 0)
-        self._good_ends = dict.fromkeys(self._samples, 0)
+        self._first = first_line
+        self._ends = dict.fromkeys(self._samples, first_line)
+        self._good_ends = dict.fromkeys(self._samples, first_line)
         self._silent.clear()
         self.sees_from.clear()
         self._rate = line_rate_hz
@@ -163,7 +165,7 @@ class LineIntake:
         for other, at in self._ends.items():
             if other not in self._silent and end - at > self._silent_after:
                 self._silent.add(other)
-                self.tell(f"{other}: nothing has come" + (f" after line {at - 1}" if at else ""))
+                self.tell(f"{other}: nothing has come" + (f" after line {at - 1}" if at > self._first else ""))
 
     def _tell(self, ccd: str, first_line: int, verdict: NDArray[np.int8]) -> None:
         """Count bad lines; tell where bad ones begin and where they end."""

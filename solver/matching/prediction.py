@@ -22,6 +22,8 @@ PAD = 24
 WIDE = 7 * PAD
 #: Least reach once neighbours tell where to look, px; it doubles while more than a share is found to lie beyond.
 LEAST_REACH, MOST_BEYOND = 4.0, 0.25
+#: The way from one line to the next is the mean over so many lines before now. Tuned.
+TRAVEL_LINES = 20
 
 
 class Prediction:
@@ -65,12 +67,17 @@ class Prediction:
         """Lines before this one have their orientation."""
         return (self.orientation.end_s - self.first_s) * self.rate
 
+    @property
+    def knows_travel(self) -> bool:
+        """Whether poses reach back as far as `height_and_travel` looks."""
+        return self.orientation.start_s <= self.orientation.end_s - TRAVEL_LINES / self.rate
+
     def height_and_travel(self) -> tuple[float, float]:
         """Height above ground, and way from one line to the next, now; m."""
         t = self.orientation.end_s
         if t == self._told[0]:
             return self._told[1]
-        position, _ = self.orientation.at([t - 1.0 / self.rate * 20, t])
+        position, _ = self.orientation.at([t - 1.0 / self.rate * TRAVEL_LINES, t])
         above = above_sphere(position[1])
         self.heights.in_orbit = above > ORBIT_M
         if self.heights.in_orbit:  # the relief is small against it
@@ -78,7 +85,7 @@ class Prediction:
         else:
             self.nadir_m = float(self.heights.at(position[1:, :2])[0][0])
         height = float(position[1, 2]) - self.nadir_m
-        self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / 20, 1e-6))
+        self._told = t, (max(height, 1.0), max(float(np.linalg.norm(position[1] - position[0])) / TRAVEL_LINES, 1e-6))
         return self._told[1]
 
     @property

@@ -352,7 +352,7 @@ class StripMatcher:
         if ccd not in strip.views:
             samples = {ccd: self._views[ccd].pixels}
             lines = LineIntake(samples, self.options, lambda dtype: self._store(samples, dtype))
-            lines.begin_strip(strip.rate)
+            lines.begin_strip(strip.rate, first_line)
             strip.views[ccd] = _StripView(strip, self._views[ccd], lines)
         lines = strip.views[ccd].lines
         usable = lines.add(ccd, first_line, pixels)

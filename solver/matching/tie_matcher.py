@@ -103,7 +103,7 @@ class TieMatcher:
         self._strip, self._first_part = strip, first_part_of_names(strip, first_line)
         self._next_number = 0
         self._named.clear()
-        self._lines.begin_strip(line_rate_hz)
+        self._lines.begin_strip(line_rate_hz, first_line)
         self._at_work = [self._master]
         self.prediction.begin_strip(first_line_time_s, line_rate_hz)
         self._master.begin_strip(strip)
@@ -243,9 +243,9 @@ class TieMatcher:
 
     def _make_store(self, dtype: np.dtype) -> LineStore | None:
         """Rings as long as the looks need; made when the first poses tell how fast the ground goes by."""
-        if not np.isfinite(self.orientation.end_s):
-            return None
         p = self.prediction
+        if not p.knows_travel:
+            return None
         if p.heights.unknown:
             # room for ground lower than it is thought to be, where there is any
             store = self._sized(dtype, p.platform_m - p.heights.lowest_m)

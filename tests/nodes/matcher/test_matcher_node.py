@@ -338,8 +338,11 @@ def test_a_matcher_that_begins_in_mid_strip_gives_no_name_a_second_time(tmp_path
         camera.name += " calibrated"
 
     more = _let_in(low, "configuration/camera", 9.0, renamed)
-    _, ties, told = run(tmp_path, sorted([*low, *more], key=lambda x: x.stamp_ns))
+    summary, ties, told = run(tmp_path, sorted([*low, *more], key=lambda x: x.stamp_ns))
     assert "configuration changed: matching starts again" in told
+    # lines that come before poses are counted as such, and no CCD line is silent for not having been heard before
+    counters = summary.counters["matcher"]
+    assert counters["lines before poses"] > 0 and not counters.get("malformed") and "nothing has come" not in str(told)
     names = [tie.point for tie in ties]
     assert len(set(names)) == len(names)
     late = [name for name in names if not name.startswith("S1-M")]
