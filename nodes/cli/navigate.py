@@ -238,8 +238,8 @@ def _stretch(stretch: Navigated, gnss: GnssData, held_out: NDArray[np.bool_], of
     if lay.with_lever_arm:
         out["lever_arm_m"] = _rounded(e.lever_arm_b[middle])
         out["lever_arm_m_sigma"] = _rounded(sigma[middle, lay.lever_arm])
-    if held_out.any():
-        miss, s = held_out_misses(stretch.best, gnss, settings, held_out)
+    miss, s = held_out_misses(stretch.best, gnss, settings, held_out)
+    if len(miss):
         out["held_out"] = {
             "n": len(miss),
             "rms_m": _rounded(np.sqrt(np.mean(miss**2, axis=0))),

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from .error_state import ErrorStateFilter, Estimate, Innovation, NavigationSettings, Observation, Start
 from .inertial_data import GnssData, InertialData, cut
 from .observations import AntennaPosition, AntennaVelocity
-from .strapdown import integrate, without_errors
+from .strapdown import State, integrate, without_errors
 
 Array = NDArray[np.floating]
 
@@ -29,6 +29,7 @@ class Estimates:
     gyro: Array
     accel: Array
     lever_arm_b: Array
+    wander_e: Array
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -46,7 +47,14 @@ class Estimates:
             np.array([e.gyro for e in estimates]),
             np.array([e.accel for e in estimates]),
             np.array([e.lever_arm_b for e in estimates]),
+            np.array([e.wander_e for e in estimates]),
         )
+
+    def one(self, i: int) -> Estimate:
+        """The estimate of that number."""
+        state = State(self.r_e[i], self.v_e[i], self.R_eb[i])
+        arm, wander = self.lever_arm_b[i], self.wander_e[i]
+        return Estimate(float(self.time_s[i]), state, self.gyro[i], self.accel[i], arm, wander)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import earth
 from .alignment import AlignmentError, AttitudePrior, align
 from .carried import NavigationTrajectory
 from .error_state import Innovation, NavigationSettings, Observation, Start, sensor_covariance
@@ -16,7 +15,7 @@ from .filter_pass import FilterPass, run_filter
 from .inertial_checks import check
 from .inertial_cleaning import Finding, gap_findings, outage_findings
 from .inertial_data import GnssData, InertialData, InertialGrade
-from .observations import Heading, ZeroVelocity
+from .observations import AntennaPosition, Heading, ZeroVelocity
 from .smoother import smooth
 
 Array = NDArray[np.floating]
@@ -277,15 +276,21 @@ def held_out_misses(
 ) -> tuple[Array, Array]:
     """Fixes that were not used, less the antenna of a trajectory, north-east-down, and the standard deviations of that.
 
+    The antenna is where the lever arm, as it was estimated, has it; slow errors of fixes, where they are estimated, are
+    predicted with it.
+
     Returns
     -------
     miss, sigma : (k, 3) metres, for the fixes inside the trajectory
     """
     fixes = gnss[held_out & (gnss.time_s >= trajectory.start_s) & (gnss.time_s <= trajectory.end_s)]
-    states = trajectory.at(fixes.time_s)
-    arm = states.R_eb @ np.asarray(settings.lever_arm_b)
-    R_ne = np.swapaxes(earth.R_en(fixes.lat, fixes.lon), -1, -2)
-    miss = np.einsum("mij,mj->mi", R_ne, fixes.position_e - states.r_e - arm)
-    P = trajectory.covariance(fixes.time_s)[:, :3, :3]
-    own = np.einsum("mij,mjk,mik->mi", R_ne, P, R_ne)
-    return miss, np.sqrt(own + fixes.sigma_ned_m**2)
+    nodes, position, covariance = trajectory.nodes, fixes.position_e, fixes.covariance_e()
+    k = np.searchsorted(0.5 * (nodes.time_s[1:] + nodes.time_s[:-1]), fixes.time_s)  # each fix has a node of its own
+    miss, sigma = np.zeros((len(fixes), 3)), np.zeros((len(fixes), 3))
+    for i, node in enumerate(k.tolist()):
+        fix = AntennaPosition(position[i], covariance[i])
+        off, H, R = fix.linearise(nodes.one(node), settings.layout)
+        R_ne = fixes.R_en[i].T
+        miss[i] = R_ne @ off
+        sigma[i] = np.sqrt(np.diag(R_ne @ (H @ trajectory.P[node] @ H.T + R) @ R_ne.T))
+    return miss, sigma

@@ -70,7 +70,7 @@ def recurse(G: Array, P_posterior: Array, P_prior: Array, x: Array) -> tuple[Arr
 def corrected(estimates: Estimates, d: Array, layout: StateLayout) -> Estimates:
     """Estimates with errors (N, n) put in."""
     turn = matrix_from_quaternion(quaternion_from_vector(d[:, 6:9]))
-    arm = estimates.lever_arm_b
+    arm, wander = estimates.lever_arm_b, estimates.wander_e
     return Estimates(
         estimates.time_s,
         estimates.r_e + d[:, :3],
@@ -79,6 +79,7 @@ def corrected(estimates: Estimates, d: Array, layout: StateLayout) -> Estimates:
         estimates.gyro + d[:, layout.gyro],
         estimates.accel + d[:, layout.accel],
         arm + d[:, layout.lever_arm] if layout.with_lever_arm else arm,
+        wander + d[:, layout.wander] if layout.with_wander else wander,
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import inertial_flights as sim
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from triline.solver.geometry import earth
 from triline.solver.geometry.frames import LocalFrame
@@ -338,6 +339,26 @@ def test_held_out_fixes_are_predicted():
     miss, sigma = held_out_misses(r.smoothed, f.gnss, f.settings, out)
     assert len(miss) == out.sum()
     assert 0.75 < sim.rms(miss / sigma).mean() < 1.25
+
+
+def test_held_out_fixes_are_predicted_with_the_estimated_lever_arm_and_slow_errors():
+    f = sim.flight(duration_s=200.0, seed=12)
+    out = np.arange(len(f.gnss)) % 5 == 4
+    wrong = tuple(np.add(sim.ARM, (0.3, -0.3, 0.0)))
+    # slow errors as a spline through knots 30 s apart
+    knots = np.random.default_rng(3).normal(size=(8, 3)) * [0.5, 0.5, 0.8]
+    off = CubicSpline(30.0 * np.arange(8), knots)(f.gnss.time_s)
+    R_N, R_E = earth.curvature_radii(f.gnss.lat)
+    lon = f.gnss.lon + off[:, 1] / (R_E * np.cos(f.gnss.lat))
+    slow = replace(f.gnss, lat=f.gnss.lat + off[:, 0] / R_N, lon=lon, height_m=f.gnss.height_m - off[:, 2])
+    for gnss, settings in (
+        (f.gnss, replace(f.settings, lever_arm_b=wrong, lever_arm_sigma_m=0.3)),
+        (slow, replace(f.settings, wander_sigma_ned_m=(0.5, 0.5, 0.8), wander_time_s=30.0)),
+    ):
+        r = navigate(f.inertial, gnss, settings, held_out=out)[0]
+        miss, sigma = held_out_misses(r.smoothed, gnss, settings, out)
+        assert (sim.rms(miss) < [0.06, 0.06, 0.12]).all()
+        assert 0.75 < sim.rms(miss / sigma).mean() < 1.35
 
 
 def test_zero_velocity_and_heading_aids():
