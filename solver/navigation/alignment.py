@@ -300,7 +300,7 @@ def _course(gnss: GnssData) -> tuple[int, float] | None:
         return None
     R_N, R_E = earth.curvature_radii(gnss.lat)
     north = np.gradient(gnss.lat, gnss.time_s) * (R_N + gnss.height_m)
-    east = np.gradient(gnss.lon, gnss.time_s) * (R_E + gnss.height_m) * np.cos(gnss.lat)
+    east = np.gradient(np.unwrap(gnss.lon), gnss.time_s) * (R_E + gnss.height_m) * np.cos(gnss.lat)
     speed = np.hypot(north, east)
     i = 1 + int(np.argmax(speed[1:-1]))
     return (i, float(np.arctan2(east[i], north[i]))) if speed[i] > SLOWEST_COURSE_M_S else None

@@ -9,8 +9,10 @@ import pytest
 from triline.solver.geometry import earth
 from triline.solver.geometry.rotation import matrix_from_navigation, navigation_from_matrix
 from triline.solver.navigation.alignment import AlignmentError, AttitudePrior, align, static_attitude
+from triline.solver.navigation.error_state import NavigationSettings
 from triline.solver.navigation.inertial_data import MEMS, TACTICAL
 from triline.solver.navigation.post_processing import navigate
+from triline.solver.simulation.inertial import gnss_fixes, survey_flight, with_errors
 
 
 def off(f: sim.SimulatedFlight, start) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +111,24 @@ def test_course_stands_for_the_heading_where_nothing_else_shows_it():
     backwards = AttitudePrior(f.motion.at(0.5).angles[0] + np.radians([0, 0, 170.0]), np.radians([1.0, 1.0, 1.0]))
     start = align(f.inertial, f.gnss, f.settings, prior=backwards)
     assert abs(off(f, start)[0][2]) < 12.0 and "was not used" in start.notes[0]
+
+
+@pytest.mark.parametrize(("seed", "lon_deg"), [(2, 179.97), (4, -179.97)])
+def test_course_over_the_date_line(seed, lon_deg):
+    """Longitudes jump by 360 degrees in flight, to the west and to the east; the aircraft does not."""
+    rng = np.random.default_rng(seed)
+    start = (np.radians(-16.8), np.radians(lon_deg), 1500.0)
+    motion = survey_flight(200.0, rng, line_s=190.0, turbulence=0.0, start=start)
+    time_s = 0.5 + np.arange(199 * 50) / 50.0
+    inertial, _ = with_errors(motion.increments(time_s), MEMS, rng)
+    fixes = gnss_fixes(motion, np.arange(1.0, 198.0), (1.0, 1.0, 2.0), rng)
+    assert np.ptp(np.sign(fixes.lon)) == 2.0
+    found = align(inertial, fixes, NavigationSettings(MEMS))
+    assert found.how == "course"
+    R_ne = earth.R_en(fixes.lat[0], fixes.lon[0]).T
+    heading = navigation_from_matrix(R_ne @ found.estimate.state.R_eb)[2]
+    miss = (heading - motion.at([found.estimate.time_s]).angles[0, 2] + np.pi) % (2 * np.pi) - np.pi
+    assert abs(np.degrees(miss)) < 12.0
 
 
 def test_an_outlier_in_the_first_seconds_does_no_harm():
