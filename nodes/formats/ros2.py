@@ -8,7 +8,7 @@ file that was cut off, or one of another profile, and stops at the first damaged
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -24,6 +24,7 @@ from ...schemas import messages as m
 from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.geometry.rotation import R_ENU_NED, matrix_from_quaternion, navigation_from_matrix
+from ...solver.navigation.inertial_data import GAP_FACTOR
 from ..convert import attitude_message, check_angles, check_inertial, check_place, gnss_message
 from ..errors import UserError
 from ..node import Message
@@ -43,6 +44,9 @@ _FLU_FRD = np.array([1.0, -1.0, -1.0])
 _DIAGONAL = [0, 4, 8]
 #: Inertial samples that are converted at once.
 _BATCH = 4096
+#: So many steps between the newest inertial messages tell what is usual, as soon as there are the least of them; of
+#: these the longest may be where messages were lost.
+_STEPS, _LEAST_STEPS, _LOST_STEPS = 31, 16, 2
 
 
 class _McapBag:
@@ -187,14 +191,15 @@ def inertial_messages(
     """``sensor/imu`` and ``sensor/attitude`` of each Imu in CDR, so many ``at_once``.
 
     A covariance that begins with -1 marks values that a message lacks. ``left_out`` counts, as they come, messages that
-    cannot be used.
+    cannot be used. Messages do not say how long they measured: from the one before on, but not over lost ones.
     """
     left_out = Counter() if left_out is None else left_out
     samples = decoded(payloads, IMU, left_out)
-    last, nominal = None, 0
+    last, nominal, steps = None, 0, deque[int](maxlen=_STEPS)
     while batch := list(islice(samples, at_once)):
         time_ns = [time for time, _ in batch]
-        interval_ns = np.diff(time_ns, prepend=time_ns[0] if last is None else last).tolist()
+        step_ns = np.diff(time_ns, prepend=time_ns[0] if last is None else last).tolist()
+        interval_ns = [_interval_ns(step, steps) for step in step_ns]
         last = time_ns[-1]
         read = [sample for _, sample in batch]
         force = _FLU_FRD * [(v.x, v.y, v.z) for v in (s.linear_acceleration for s in read)]
@@ -226,6 +231,18 @@ def inertial_messages(
         east, _, heading = np.degrees(ATTITUDE_SIGMA_RAD)
         taken = f"{east:.1f} deg and {heading:.1f} deg in heading"
         notes.append(f"{topic}: orientations without covariance: {nominal}, taken with sigmas of {taken}")
+
+
+def _interval_ns(step_ns: int, steps: deque[int]) -> int:
+    """How long a sample measured, by its distance from the one before, which is added to those of ``steps``.
+
+    Where that is longer than they are, messages were lost, and what was measured then is not known. Distances of those
+    that come in bursts are not equal.
+    """
+    usual = sorted(steps)[:-_LOST_STEPS] if len(steps) >= _LEAST_STEPS else []
+    if step_ns > 0:  # the first sample has none
+        steps.append(step_ns)
+    return round(sum(usual) / len(usual)) if usual and step_ns > GAP_FACTOR * usual[-1] else step_ns
 
 
 def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:

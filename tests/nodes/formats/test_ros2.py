@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import kind_of_path, read_any
+from triline.nodes.formats.ros2 import inertial_messages
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.topics import rank
 
@@ -151,6 +152,30 @@ def test_intervals_go_on_over_batches_and_times_that_go_back_are_left_out(tmp_pa
     assert [i.interval_ns // STEP_NS for i in imus] == [0, 1, 1, 1, 1, 1, 1, 1, 2]
     assert "/imu: messages left out: 2 not later than the one before" in imported.notes
     assert any("no GNSS fix" in note for note in imported.notes)
+
+
+@pytest.mark.parametrize("at_once", [1, 4096])
+def test_an_interval_does_not_reach_over_lost_messages(at_once):
+    """Of what was lost nothing was measured: the navigator is to see a gap, and not a sample of 0.8 s."""
+    steady = np.full(60, STEP_NS)
+    lost = steady.copy()
+    lost[[20, 40, 41]] = [80 * STEP_NS, 2 * STEP_NS, 3 * STEP_NS]
+    bursts = np.tile([STEP_NS // 10, STEP_NS // 10, 28 * STEP_NS // 10], 20)  # of three, as over a slow port
+    torn = bursts.copy()
+    torn[29] = 60 * STEP_NS
+    slower = np.repeat([STEP_NS, 4 * STEP_NS], 30)  # by a setting
+    for steps, wanted in (
+        (steady, steady),
+        (lost, steady),
+        (bursts, bursts),
+        (torn, np.where(torn > 10 * STEP_NS, STEP_NS, torn)),
+        (slower, np.where(np.arange(60) < 33, STEP_NS, 4 * STEP_NS)),
+    ):
+        times = START_NS + np.concatenate([[0], np.cumsum(steps)])
+        payloads = [bytes(STORE.serialize_cdr(imu(t), IMU)) for t in times.tolist()]
+        found = inertial_messages(payloads, "/imu", [], "test", at_once=at_once)
+        intervals = np.array([m.body.interval_ns for m in found if m.topic == "sensor/imu"])
+        assert intervals[0] == 0 and np.abs(intervals[1:] - wanted).max() <= 0.25 * STEP_NS
 
 
 @pytest.mark.parametrize("huge", [1e200, np.inf, np.nan])
