@@ -1,7 +1,8 @@
 """NMEA 0183: GGA, RMC, ZDA, GST and HDT become ``sensor/gnss`` and, where it is wanted, ``sensor/attitude``.
 
-A fix goes out with its GGA. Its date is that of the last RMC or ZDA, its accuracy that of the last GST; without GST it
-follows from the quality and the HDOP of the GGA. Sentences are decoded by pynmeagps.
+A fix goes out with its GGA. Its date is that of the last RMC or ZDA, its accuracy that of the last GST, which may come
+before it or after it; without GST, or with one of another quality, it follows from the quality and the HDOP of the GGA.
+Sentences are decoded by pynmeagps.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ READ = ("GGA", "RMC", "ZDA", "GST", "HDT")
 #: Horizontal sigma, m, at HDOP 1, by the quality of a GGA (SPS, DGPS, PPS, RTK fixed, RTK float, simulator); usual
 #: figures of such solutions. Heights are taken to be twice as poor.
 QUALITY_SIGMA_M = {1: 2.5, 2: 1.0, 3: 2.5, 4: 0.02, 5: 0.3, 8: 2.5}
-#: A GST holds for fixes so long after it, s.
+#: A GST holds for fixes of the same quality so long after it, s.
 GST_HOLDS_S = 5.0
 #: A vertical velocity that no sentence tells is taken as 0 with this sigma, m/s.
 UNKNOWN_CLIMB_M_S = 20.0
@@ -97,6 +98,7 @@ class NmeaParser:
         self._last_ns = self._last_heading_ns = -1
         self._epoch_ns = -1  # of the newest GGA or RMC
         self._stated: tuple[int, tuple[float, float, float]] | None = None  # sigmas, of a GST
+        self._quality = self._stated_quality = 0  # of the newest GGA, and of the one a GST is about
         self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
 
     def feed(self, data: bytes) -> list[Message]:
@@ -156,11 +158,11 @@ class NmeaParser:
         utc_ns = self._utc(s.time)
         east, north, up = _number(s.stdLong), _number(s.stdLat), _number(s.stdAlt)
         if utc_ns is not None and min(east, north, up) > 0:
-            self._stated = utc_ns, (east, north, up)
+            self._stated, self._stated_quality = (utc_ns, (east, north, up)), self._quality
         return []
 
     def _gga(self, s: Any) -> list[Message]:
-        quality = int(s.quality)
+        quality = self._quality = int(s.quality)
         if quality not in QUALITY_SIGMA_M:
             self._problem("no fix", f"GGA of quality {quality}")
             return []
@@ -213,8 +215,12 @@ class NmeaParser:
 
     def _sigma(self, utc_ns: int, quality: int, hdop: Any) -> tuple[float, float, float]:
         """East, north, up, m."""
-        if self._stated is not None and 0 <= utc_ns - self._stated[0] <= GST_HOLDS_S * SECOND_NS:
-            return self._stated[1]
+        if self._stated is not None:
+            age_ns, sigma = utc_ns - self._stated[0], self._stated[1]
+            if age_ns == 0 or not self._stated_quality:
+                self._stated_quality = quality
+            if 0 <= age_ns <= GST_HOLDS_S * SECOND_NS and quality == self._stated_quality:
+                return sigma
         level = QUALITY_SIGMA_M[quality] * max(_number(hdop or 1.0), 0.5)
         return level, level, 2.0 * level
 

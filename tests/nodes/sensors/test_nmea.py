@@ -68,6 +68,29 @@ def test_without_gst_the_quality_says_how_good_a_fix_is(tmp_path):
     np.testing.assert_allclose(sigmas[1], [0.02, 0.02, 0.04])
 
 
+def gst(clock: str, sigma: float) -> bytes:
+    return sentence(f"GNGST,{clock},0.9,{sigma},{sigma},10.0,{sigma},{sigma},{2 * sigma}")
+
+
+@pytest.mark.parametrize("order", ["GGA first", "GST first", "GST of each third fix"])
+def test_a_gst_says_nothing_of_fixes_of_another_quality(tmp_path, order):
+    """RTK is lost at the fourth fix and back at the seventh: what a GST said of fixed ambiguities is over then."""
+    fixes = []
+    for i, quality in enumerate((4, 4, 4, 1, 1, 1, 4, 4)):
+        clock = f"09275{i}.00"
+        both = [gga(clock, quality, hdop="1.0"), gst(clock, 0.015 if quality == 4 else 1.8)]
+        if order == "GST first":
+            both.reverse()
+        fixes.append(b"".join(both if i % 3 == 0 or "third" not in order else both[:1]))
+    messages, _ = parse(tmp_path, RMC, *fixes)
+    sigma = np.sqrt(np.array([m.body.position_covariance[0] for m in messages]))
+    if order == "GST first":
+        wanted = [0.015] * 3 + [1.8] * 3 + [0.015] * 2
+    else:  # what a GST says of a fix comes after it
+        wanted = [0.02, 0.015, 0.015, 2.5, 1.8, 1.8, 0.02, 0.015]
+    np.testing.assert_allclose(sigma, wanted)
+
+
 def test_sentences_may_come_in_pieces(tmp_path):
     data = RMC + gga("092750.20") + gga("092750.40")
     messages, counts = parse(tmp_path, *(data[i : i + 7] for i in range(0, len(data), 7)))
