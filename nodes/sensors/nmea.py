@@ -148,6 +148,8 @@ class NmeaParser:
             if s.spd != "" and s.cog != "":
                 speed, course = _number(s.spd) * KNOT_M_S, np.radians(_number(s.cog))
                 self._motion = utc_ns, (float(speed * np.sin(course)), float(speed * np.cos(course)))
+                if self._settings.velocity_sigma_m_s and utc_ns == self._last_ns:  # the fix has gone out
+                    self._problem("RMC after its GGA", "velocities go with fixes whose RMC comes before the GGA")
         return []
 
     def _zda(self, s: Any) -> list[Message]:

@@ -150,6 +150,16 @@ def test_without_a_date_there_is_no_time(tmp_path):
     assert len(messages) == 1 and counts == {"no date yet": 1}
 
 
+def test_an_rmc_that_comes_too_late_for_its_velocity_is_counted(tmp_path):
+    fixes = [gga(f"09275{i}.00") + RMC.replace(b"092750.00", b"09275%d.00" % i) for i in range(1, 4)]
+    fixes = [b"".join(sentence(s[1:].split(b"*")[0].decode()) for s in fix.splitlines()) for fix in fixes]
+    messages, counts = parse(tmp_path, RMC, *fixes, velocity_sigma_m_s=0.1)
+    assert [len(m.body.velocity_covariance) for m in messages] == [0, 0, 0]
+    assert counts == {"RMC after its GGA": 3}
+    _, counts = parse(tmp_path, RMC, *fixes)  # velocities are not wanted
+    assert not counts
+
+
 def test_from_a_file_that_grows_and_from_a_connection_that_breaks(tmp_path):
     path = tmp_path / "gnss.nmea"
     path.write_bytes(RMC + gga("092750.20"))
