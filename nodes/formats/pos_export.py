@@ -17,6 +17,14 @@ from .track import NavigationTrack, checked, times_from_gps
 
 _NUMBER = r"([-+]?\d+(?:\.\d*)?)"
 _WANTED = ("TIME", "ROLL", "PITCH", "HEADING")
+#: Quantities of the remark about units that are used -> how their unit begins.
+_UNITS = {
+    "time": ("sec", "gps sec"),
+    "position": ("met",),
+    "long": ("deg",),
+    "orientation angles and sd": ("deg",),
+    "position sd": ("met",),
+}
 _SIGMAS = ("NORTH SD", "EAST SD", "HEIGHT SD", "ROLL SD", "PITCH SD", "HEADING SD")
 
 
@@ -31,7 +39,8 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
 
     Raises
     ------
-    UserError : a file without the header, a column that is missing, a value that is malformed (with line and column)
+    UserError : a file without the header, a column that is missing, a unit other than seconds, metres and degrees, a
+        value that is malformed (with line and column)
     """
     notes: list[str] = []
     text = path.read_text(encoding="latin-1").splitlines()
@@ -44,6 +53,7 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
             raise UserError(f"{path}:{place + 1}: {name}: column missing, wanted {', '.join(_WANTED)}")
     if "ELLIPSOID HEIGHT" not in names:
         raise UserError(f"{path}:{place + 1}: ELLIPSOID HEIGHT: column missing")
+    _check_units(path, text, place + 1)
     head = " ".join(line.strip() for line in text[:place])
     values = _values(path, text, place + 1, names)
     column = {name: values[:, names.index(name)] for name in names}
@@ -63,6 +73,18 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
         notes=tuple(notes),
     )
     return checked(track, path)
+
+
+def _check_units(path: Path, text: list[str], start: int) -> None:
+    """Raise UserError where the remark below the names, from line ``start`` (0-based) on, says another unit."""
+    for number, line in enumerate(text[start:], start + 1):
+        if re.match(r"\s*[-+.\d]", line):
+            return
+        for what, unit in re.findall(r"([\w ]+?)\s+in\s+([^,)]+)", line):
+            wanted = _UNITS.get(what.strip().lower(), ("",))
+            if not unit.strip().lower().startswith(wanted):
+                known = "seconds, metres and degrees"
+                raise UserError(f"{path}:{number}: {what.strip()} in {unit.strip()}, wanted an export in {known}")
 
 
 def _values(path: Path, text: list[str], start: int, names: list[str]) -> NDArray[np.float64]:

@@ -299,6 +299,26 @@ def test_pos_export_without_latitude(tmp_path):
 
 
 @needs_data
+@pytest.mark.parametrize(
+    ("units", "other", "wanted"),
+    [
+        ("position in Meters", "position in US Survey Feet", "position in US Survey Feet"),
+        ("lat, long in Degrees", "lat, long in Radians", "long in Radians"),
+        ("angles and SD in Degrees", "angles and SD in Radians", "orientation angles and SD in Radians"),
+        ("position SD in Meters", "position SD in Feet", "position SD in Feet"),
+        ("time in Sec", "time in UTC Sec", "time in UTC Sec"),
+    ],
+)
+def test_pos_export_in_other_units_is_refused(tmp_path, units, other, wanted):
+    path = tmp_path / "pos.txt"
+    path.write_text(POS.read_text().replace(units, other))
+    with pytest.raises(UserError, match=rf"pos.txt:23: {wanted}, wanted an export in seconds, metres and degrees"):
+        read_pos_export(path)
+    path.write_text(POS.read_text().replace("velocity in Meter/Sec", "velocity in Knots"))  # is not used
+    assert len(read_pos_export(path)) == 335
+
+
+@needs_data
 def test_pos_export_damaged(tmp_path):
     text = POS.read_text()
     rows = text.splitlines()
