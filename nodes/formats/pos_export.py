@@ -55,6 +55,10 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
         raise UserError(f"{path}:{place + 1}: ELLIPSOID HEIGHT: column missing")
     _check_units(path, text, place + 1)
     head = " ".join(line.strip() for line in text[:place])
+    own = _day(head)
+    if own is not None and day is not None and abs((own - day).days) > 1:  # they may differ by a night
+        raise UserError(f"{path}: --date {day}, but its mission began on {own}; wanted the same day, or no --date")
+    day = day or own
     values = _values(path, text, place + 1, names)
     column = {name: values[:, names.index(name)] for name in names}
     lat, lon = _lat_lon(path, head, column, notes)
@@ -73,6 +77,15 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
         notes=tuple(notes),
     )
     return checked(track, path)
+
+
+def _day(head: str) -> date | None:
+    """Day on which the mission began, where the header says it."""
+    said = re.search(r"Date of Mission:\s*(\d{4}-\d{2}-\d{2})", head)
+    try:
+        return None if said is None else date.fromisoformat(said.group(1))
+    except ValueError:
+        return None
 
 
 def _check_units(path: Path, text: list[str], start: int) -> None:

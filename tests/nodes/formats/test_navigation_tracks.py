@@ -299,6 +299,18 @@ def test_pos_export_without_latitude(tmp_path):
 
 
 @needs_data
+def test_pos_export_says_its_day(tmp_path):
+    path = tmp_path / "pos.txt"
+    start = " Mission Start Time:\n   Date of Mission: 2009-03-05\n   Start Time: 09:12:26\n Mapping frame datum"
+    path.write_text(POS.read_text().replace(" Mapping frame datum", start))
+    track = read_pos_export(path)
+    assert track.time_ns[0] == ns("2009-03-05T09:40:15") + 326_560_000 and not track.notes
+    np.testing.assert_array_equal(read_pos_export(path, date(2009, 3, 6)).time_ns, track.time_ns)
+    with pytest.raises(UserError, match="--date 2009-03-12, but its mission began on 2009-03-05"):
+        read_pos_export(path, date(2009, 3, 12))
+
+
+@needs_data
 @pytest.mark.parametrize(
     ("units", "other", "wanted"),
     [
