@@ -28,9 +28,11 @@ _ELEVATION: dict[str, tuple[str, Any, str]] = {
 
 
 def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
-    """The tables of a configuration file, none without a file; of a ``flight.toml`` those in ``[nodes]``, and the
-    elevation model of its ``[dem]`` as settings of the adjuster. A flight folder is of a real camera: where nothing
-    else is said the matcher has the floor of real pixels.
+    """The tables of a configuration file, none without a file.
+
+    Of a ``flight.toml`` those in ``[nodes]``, the elevation model of its ``[dem]`` as settings of the adjuster, and
+    ``camera_lever_arm_m`` of its ``[mounting]`` as one of the navigator. A flight folder is of a real camera: where
+    nothing else is said the matcher has the floor of real pixels.
 
     Parameters
     ----------
@@ -54,9 +56,13 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
         raise UserError(f"{path}: not a TOML file: {error}") from None
     if isinstance(tables.get("flight"), dict):  # the settings of nodes in a flight.toml
         dem = elevation(Path(path)) if "dem" in tables else {}
+        navigates = known is None or "navigator" in known
+        arm = _camera_lever_arm(Path(path), tables.get("mounting", {})) if navigates else {}
         tables = tables.get("nodes", {})
         if dem and isinstance(tables.get("adjuster", {}), dict):
             tables = tables | {"adjuster": dem | tables.get("adjuster", {})}
+        if arm and isinstance(tables.get("navigator", {}), dict):
+            tables = tables | {"navigator": arm | tables.get("navigator", {})}
         if isinstance(tables.get("matcher", {}), dict):
             tables = tables | {"matcher": {"image_sigma_px": REAL_FLOOR_PX} | tables.get("matcher", {})}
     for name, table in tables.items():
@@ -65,6 +71,15 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
         if known is not None and name not in known:
             raise UserError(f"{path}: table [{name}] is not known, wanted one of {', '.join(known)}")
     return tables
+
+
+def _camera_lever_arm(path: Path, mounting: Any) -> dict[str, Any]:
+    """Setting of the navigator that says what ``[mounting]`` of a ``flight.toml`` does; none where that is zero."""
+    key = "camera_lever_arm_m"
+    arm = mounting.get(key, [0.0]) if isinstance(mounting, dict) else None
+    if not (isinstance(arm, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in arm)):
+        raise UserError(f"{path}: mounting.{key} is {arm!r}, wanted 3 numbers: forward, right, down, m")
+    return {key: arm} if any(arm) else {}
 
 
 def elevation(path: Path, wanted: bool = False) -> dict[str, Any]:

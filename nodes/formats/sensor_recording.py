@@ -44,6 +44,9 @@ def sensor_messages(
     if grade is not None:
         folder = replace(folder, platform=replace(folder.platform, grade=grade))
     notes.extend(note for note in folder.notes if grade is None or not note.startswith("platform.toml"))
+    if grade is None and folder.time_s is not None and any(folder.platform.camera_lever_arm_m):
+        how = "the navigator gets it as camera_lever_arm_m of [navigator] (--config)"
+        notes.append(f"platform.toml: camera_lever_arm_m: a recording has no place for it; {how}")
     messages = [*_imu(folder, notes, source), *_gnss(folder, notes, source), *_attitude(folder, source)]
     if not messages:
         raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")

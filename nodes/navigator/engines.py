@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,15 +47,18 @@ def stated_noise(sample: Any) -> tuple[float, float, str]:
     return noise[0], noise[1], text
 
 
-def inertial_engine(project: Any, first_sample: Any, **options: float) -> InertialNavigator:
+def inertial_engine(
+    project: Any, first_sample: Any, camera_lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0), **options: float
+) -> InertialNavigator:
     """The engine for raw inertial data; its noise is what the first sample says, of a MEMS unit where it says nothing.
 
-    A project knows the antenna from the perspective centre, so the inertial sensor is taken to sit there. Slow errors
-    of GNSS positions, which no inertial data show, do not make a pose invalid.
+    A project knows the antenna from the perspective centre; where that is from the inertial sensor is told beside it.
+    Slow errors of GNSS positions, which no inertial data show, do not make a pose invalid.
     """
     slow = convert.slow_errors_of(project)
     east, north, up = slow.wander_m
-    forward, right, down = (float(v) for v in convert.lever_arm_of(project))
+    camera, antenna = np.asarray(camera_lever_arm_m, dtype=float), convert.lever_arm_of(project)
+    forward, right, down = (float(v) for v in camera + antenna)
     gyro_noise, accel_noise, _ = stated_noise(first_sample)
     settings = NavigationSettings(
         grade=InertialGrade.of_noise(gyro_noise, accel_noise),
@@ -62,7 +66,8 @@ def inertial_engine(project: Any, first_sample: Any, **options: float) -> Inerti
         wander_sigma_ned_m=(north, east, up),
         wander_time_s=slow.wander_time_s,
     )
-    mount = CameraMount(R_bc=convert.R_bc_of(project))
+    x, y, z = (float(v) for v in camera)
+    mount = CameraMount((x, y, z), convert.R_bc_of(project))
     limit = float(np.hypot(OnlineOptions.valid_position_m, slow.position_sigma.max()))
     answer = OnlineOptions(**{"offset_sigma_m": slow.offset_m, "valid_position_m": limit, **options})  # pyright: ignore
     return InertialNavigator(convert.local_frame(project), settings, mount, answer)

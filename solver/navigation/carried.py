@@ -192,6 +192,12 @@ class NavigationTrajectory:
         r_e, v_e, R_eb = self._carry(k, row[:, 0] + dt, R, v, p)
         return NavigationStates(t, r_e, v_e, R_eb)
 
+    def rates(self, time_s: ArrayLike) -> Array:
+        """Angular rate (m, 3) as measured, body axes, rad/s, of the pieces that times lie in."""
+        c = self._carried
+        rows = np.minimum(np.searchsorted(c.time_s, np.asarray(time_s) - 1e-7), len(c.time_s) - 1)
+        return c.phi[rows] / c.dt_s[rows, None]
+
     def at_rows(self, rows: NDArray[np.intp]) -> NavigationStates:
         """States at the ends of given pieces (rows of the integrals)."""
         c = self._carried

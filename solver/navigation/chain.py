@@ -245,14 +245,15 @@ class NavigationChain:
 
 
 def _carried(nodes: list[FilterNode]) -> Carried:
-    """Running integrals of the closed spans, a row for each chunk."""
-    ends, block, runs = [], [], []
+    """Running integrals of the closed spans, a row for each chunk with the last of its pieces."""
+    ends, block, runs, last = [], [], [], []
     for k, node in enumerate(nodes[:-1]):
         for chunk, running in zip(node.span.chunks, node.span.running, strict=True):
             ends.append(chunk.end_s)
             block.append(k)
             runs.append(running)
-    m = len(runs)
+            p = chunk.pieces
+            last.append((p.dt_s[-1], p.dtheta[-1], p.dv[-1]))
     return Carried(
         np.array(ends),
         np.array(block),
@@ -260,7 +261,5 @@ def _carried(nodes: list[FilterNode]) -> Carried:
         quaternion_from_matrix(np.array([r.R for r in runs])),
         np.array([r.v for r in runs]),
         np.array([r.p for r in runs]),
-        np.zeros(m),
-        np.zeros((m, 3)),
-        np.zeros((m, 3)),
+        *(np.array(column) for column in zip(*last, strict=True)),
     )

@@ -356,7 +356,8 @@ class InertialNavigator:
         if time_s <= self._published:
             return []
         self._published = time_s
-        return self._maker.poses(_states([time_s], [state]), P[None, :9, :9], smoothed=False)
+        th, _, dt_s = self._previous or ((0.0, 0.0, 0.0), None, 1.0)
+        return self._maker.poses(_states([time_s], [state]), P[None, :9, :9], np.array([th]) / dt_s, smoothed=False)
 
     def _smoothed(self, lag_s: float) -> list[NavigationPose]:
         """Poses that have become old enough."""
@@ -378,7 +379,7 @@ class InertialNavigator:
                 states, P = passed_over(*self._ahead, states, P, self._published_smooth, o.smooth_every_s)
             later = trajectory.at_rows(np.flatnonzero((ends > until + 1e-9) & (ends <= until + o.smooth_every_s + 0.1)))
             self._ahead = later, trajectory.covariance(later.time_s)
-            poses = self._maker.poses(states, P, smoothed=True)
+            poses = self._maker.poses(states, P, trajectory.rates(states.time_s), smoothed=True)
             self._published_smooth = float(ends[rows[-1]])
         chain.forget(min(self._published_smooth, end - o.rewind_s) - 2.0 * o.step_s)
         return poses

@@ -66,12 +66,15 @@ class PoseMaker:
     mount: CameraMount
     options: OnlineOptions
 
-    def poses(self, states: NavigationStates, P: Array, smoothed: bool) -> list[NavigationPose]:
-        """Poses from states at m times and the covariance (m, 9, 9) of ``dr, dv, psi``."""
+    def poses(self, states: NavigationStates, P: Array, rate_b: Array, smoothed: bool) -> list[NavigationPose]:
+        """Poses from states at m times, the covariance (m, 9, 9) of ``dr, dv, psi``, and the angular rate (m, 3)."""
         o, frame = self.options, self.frame
         poses = camera_poses(states, P, frame, self.mount)
         covariance = poses.covariance + np.diag([*np.square(o.offset_sigma_m), 0.0, 0.0, 0.0])
         velocity = states.v_e @ frame.R_el
+        if any(self.mount.lever_arm_b):  # the camera swings about the inertial sensor
+            swing = np.cross(rate_b, self.mount.lever_arm_b)
+            velocity = velocity + np.einsum("mij,mj->mi", states.R_eb, swing) @ frame.R_el
         q = quaternion_from_angles(poses.angles)
         limit = np.array([*(3 * [o.valid_position_m]), *(3 * [o.valid_attitude_rad])]) ** 2
         large = np.einsum("mii->mi", covariance) > limit

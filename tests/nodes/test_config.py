@@ -50,6 +50,25 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, text, what):
     assert "\n" not in str(caught.value)
 
 
+def test_a_flight_folder_tells_the_navigator_where_the_camera_is(tmp_path):
+    flight = '[flight]\nname = "x"\n[mounting]\ncamera_lever_arm_m = [0.1, 0.0, 0.3]\n'
+    tables = load(write(tmp_path / "flight.toml", flight))
+    assert tables["navigator"] == {"camera_lever_arm_m": [0.1, 0.0, 0.3]}
+    build(registry.node_class("navigator"), tables)
+    own = load(write(tmp_path / "flight.toml", flight + "[nodes.navigator]\ncamera_lever_arm_m = [0, 0, 1]\n"))
+    assert own["navigator"] == {"camera_lever_arm_m": [0, 0, 1]}
+    none = flight.replace("[0.1, 0.0, 0.3]", "[0, 0, 0]")
+    assert "navigator" not in load(write(tmp_path / "flight.toml", none))
+    for wrong in ("[0.1, 0.3]", "[0, 0, 300]", "[0, 0, nan]"):
+        tables = load(write(tmp_path / "flight.toml", flight.replace("[0.1, 0.0, 0.3]", wrong)))
+        with pytest.raises(
+            UserError, match=r"configuration \[navigator\]: camera_lever_arm_m is .* 3 numbers within 50 m"
+        ):
+            build(registry.node_class("navigator"), tables)
+    with pytest.raises(UserError, match=r"mounting.camera_lever_arm_m is '0.3', wanted 3 numbers"):
+        load(write(tmp_path / "flight.toml", flight.replace("[0.1, 0.0, 0.3]", "'0.3'")))
+
+
 def test_tables_and_keys_that_nobody_reads_are_refused(tmp_path, capsys):
     file = write(tmp_path / "a.toml", "[adjustor]\nmodel = 'ppm'\n")
     assert main(["node", "monitor", "--config", str(file)]) == 1

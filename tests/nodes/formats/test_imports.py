@@ -77,6 +77,7 @@ def test_sensor_folder_becomes_a_flight(tmp_path, increments):
     assert (fix.velocity_enu.x, fix.velocity_enu.y, fix.velocity_enu.z) == (2.0, 1.0, -3.0)
     attitude = [m.body for m in messages if m.topic == "sensor/attitude"]
     assert len(attitude) == 2 and np.degrees(attitude[0].heading) == pytest.approx(3.0)
+    assert any("camera_lever_arm_m: a recording has no place for it" in note for note in imported.notes)
 
 
 def test_sensor_folder_damaged(tmp_path):

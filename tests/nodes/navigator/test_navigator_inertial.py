@@ -6,6 +6,7 @@ import subprocess
 import time
 from pathlib import Path
 
+import inertial_flights as sim
 import numpy as np
 import pytest
 from bus_rig import ENVIRONMENT, TRILINE, free_port, triline, wait_for
@@ -20,6 +21,7 @@ from triline.nodes.simulator.simulator import Simulator
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.solver.accuracy import angle_difference
+from triline.solver.geometry.frames import LocalFrame
 from triline.solver.geometry.trajectory import Trajectory
 from triline.solver.navigation.inertial_data import MEMS, TACTICAL
 from triline.solver.navigation.inertial_navigator import InertialNavigator
@@ -315,3 +317,47 @@ def test_slow_gnss_errors_of_many_metres_do_not_make_every_pose_invalid():
     messages, _ = messages_of(5, seconds=40.0, offset_sigma_m=(8.0, 8.0, 12.0))  # pyright: ignore[reportArgumentType]
     poses = [o.body for o in run(Navigator(), messages) if o.topic == "trajectory/filtered"]
     assert poses[-1].valid and np.reshape(poses[-1].covariance, (6, 6))[2, 2] > 100.0
+
+
+def test_a_unit_that_does_not_sit_in_the_perspective_centre():
+    """The antenna is known from the camera; where the camera is from the unit is a setting. Poses are of the camera."""
+    f, camera = sim.flight(duration_s=100.0, rate_hz=50, seed=9, line_s=30.0), np.array([0.1, 0.0, 0.4])
+    lat, lon = np.degrees(f.gnss.lat[0]), np.degrees(f.gnss.lon[0])
+    frame = LocalFrame(lat, lon, 0.0)
+    project = m.Project(origin_latitude=lat, origin_longitude=lon, lever_arm_m=np.subtract(sim.ARM, camera))
+    root = np.sqrt(f.inertial.dt_s)
+    rate, force = f.inertial.dtheta / f.inertial.dt_s[:, None], f.inertial.dv / f.inertial.dt_s[:, None]
+    messages = []
+    for i, time_s in enumerate(f.inertial.time_s):
+        body = m.Imu(
+            time_ns=EPOCH + round(1e9 * time_s), interval_ns=round(1e9 * f.inertial.dt_s[i]),
+            **dict(zip(("force_x", "force_y", "force_z"), force[i], strict=True)),
+            **dict(zip(("rate_x", "rate_y", "rate_z"), rate[i], strict=True)),
+            rate_sigma=TACTICAL.gyro_noise / root[i], force_sigma=TACTICAL.accel_noise / root[i],
+        )  # fmt: skip
+        messages.append(Message("sensor/imu", body.time_ns, body))
+    for i, time_s in enumerate(f.gnss.time_s):
+        place = np.degrees(f.gnss.lat[i]), np.degrees(f.gnss.lon[i]), f.gnss.height_m[i]
+        stamp, sigma = EPOCH + round(1e9 * time_s), f.gnss.sigma_ned_m[i, [1, 0, 2]]
+        messages.append(Message("sensor/gnss", stamp, convert.gnss_message(stamp, place, sigma)))
+    messages.sort(key=lambda message: message.stamp_ns)
+    worst = {}
+    for arm in (camera, np.zeros(3)):
+        node = Navigator(camera_lever_arm_m=arm.tolist())
+        list(node.step(Message("configuration/project", EPOCH, project)))
+        out = [o for message in messages for o in node.step(message)]
+        for topic in TOPICS:
+            bodies = [o.body for o in out if o.topic == topic and o.body.valid]
+            time_s = np.array([(convert.time_ns(b.timestamp) - EPOCH) * 1e-9 for b in bodies])
+            bodies, time_s = [b for b, t in zip(bodies, time_s, strict=True) if t > 50.0], time_s[time_s > 50.0]
+            true = f.motion.at(time_s)
+            R_lb = frame.R_ln_at(np.degrees(true.lat), np.degrees(true.lon)) @ true.R_nb
+            at = frame.from_geodetic(np.degrees(true.lat), np.degrees(true.lon), true.height_m) + R_lb @ camera
+            swing = (R_lb @ np.cross(f.motion.felt(time_s)[0], camera)[..., None])[..., 0]
+            moves = (R_lb @ np.swapaxes(true.R_nb, 1, 2) @ true.velocity_n[..., None])[..., 0] + swing
+            found = np.array([(b.pose.position.x, b.pose.position.y, b.pose.position.z) for b in bodies])
+            speed = np.array([(b.velocity.x, b.velocity.y, b.velocity.z) for b in bodies])
+            worst[topic, bool(arm.any())] = np.abs(found - at).max(), np.abs(speed - moves).max()
+    for topic in TOPICS:
+        assert worst[topic, True][0] < 0.06 and worst[topic, True][1] < 0.03
+        assert worst[topic, False][0] > 0.15
