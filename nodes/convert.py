@@ -369,6 +369,14 @@ def gnss_message(
     return message
 
 
+def state_noise(body: Any, noise: tuple[float, float] | None) -> None:
+    """Give an inertial sample that states no sigma those of its unit, by its white noise: rad/sqrt(s), m/s/sqrt(s)."""
+    if noise is None or body.rate_sigma or body.force_sigma or body.interval_ns <= 0:
+        return
+    root_s = (body.interval_ns * 1e-9) ** 0.5
+    body.rate_sigma, body.force_sigma = noise[0] / root_s, noise[1] / root_s
+
+
 def attitude_message(time_ns: int, rpy: ArrayLike, sigma: ArrayLike) -> Any:
     """An Attitude message; roll, pitch, heading and their sigmas in radians."""
     roll, pitch, heading = np.asarray(rpy, dtype=float).tolist()

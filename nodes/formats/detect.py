@@ -12,7 +12,7 @@ import numpy as np
 
 from ...solver.camera.line_camera import LineCamera
 from ...solver.navigation.inertial_data import InertialGrade
-from ..convert import camera_message
+from ..convert import camera_message, state_noise
 from ..errors import UserError
 from ..node import Message
 from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
@@ -78,7 +78,7 @@ class Options:
     ground : where the origin of the local frame is to lie
     without_images : images of a bag are left alone
     poses_only : poses that belong to image lines make no strip
-    grade : of the inertial unit of a sensor folder, in place of its platform.toml
+    grade : of the inertial unit: of a sensor folder in place of its platform.toml, of a bag where it states no noise
     folder : the tables of a sensor folder, where they have been read
     """
 
@@ -223,7 +223,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             folder = folder or read_sensor_folder(path)
             messages = sensor_messages(folder, notes, grade=options.grade)
         else:
-            messages = ros2_messages(path, notes, given=topics)
+            messages = _with_noise(ros2_messages(path, notes, given=topics), options.grade)
         messages = _on_day(path, messages, options.day)
         if options.ground.stated:
             messages = _at_height(path, kind, messages, options, notes, folder)
@@ -360,6 +360,15 @@ def _at_height(
     for message in messages:
         if message.topic == "configuration/project":
             message.body.origin_height = height_m
+        yield message
+
+
+def _with_noise(messages: Iterable[Message], grade: InertialGrade | None) -> Iterator[Message]:
+    """The messages, with the noise of a unit in the inertial samples that do not state theirs."""
+    noise = None if grade is None else (grade.gyro_noise, grade.accel_noise)
+    for message in messages:
+        if message.topic == "sensor/imu":
+            state_noise(message.body, noise)
         yield message
 
 

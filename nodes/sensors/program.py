@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..bus.status import StatusPublisher
-from ..convert import CENTURY_S, SECOND_NS
+from ..convert import CENTURY_S, SECOND_NS, state_noise
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..node import Message, Node
@@ -97,14 +97,6 @@ def noise_of(keys: Keys) -> tuple[float, float] | None:
     return gyro, accel
 
 
-def _state_noise(body: Any, noise: tuple[float, float] | None) -> None:
-    """Give an inertial sample the sigmas of its unit where it has none."""
-    if noise is None or body.rate_sigma or body.force_sigma or body.interval_ns <= 0:
-        return
-    root_s = (body.interval_ns * 1e-9) ** 0.5
-    body.rate_sigma, body.force_sigma = noise[0] / root_s, noise[1] / root_s
-
-
 def refuse_unknown(keys: Keys, known: tuple[str, ...]) -> None:
     """Raise UserError for a key of a sensor table that is not known."""
     for key in keys.values:
@@ -125,7 +117,7 @@ def publish(options: ProgramOptions, sensor: Sensor) -> int:
         for message in sensor.messages(options.stop):
             if message is not None:
                 if message.topic == "sensor/imu":
-                    _state_noise(message.body, sensor.noise)
+                    state_noise(message.body, sensor.noise)
                 bus.publish(message)
                 sensor.published += 1
                 stamp_ns = message.stamp_ns

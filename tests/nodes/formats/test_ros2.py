@@ -13,10 +13,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
-from triline.nodes.formats.detect import kind_of_path, read_any
+from triline.nodes.formats.detect import Options, kind_of_path, read_any
 from triline.nodes.formats.ros2 import inertial_messages
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.topics import rank
+from triline.solver.navigation.inertial_data import TACTICAL
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
@@ -34,7 +35,7 @@ def _header(time_ns, frame):
     return _type("std_msgs/msg/Header", _type("builtin_interfaces/msg/Time", *divmod(time_ns, 10**9)), frame)
 
 
-def imu(time_ns, *, orientation_known=True, covariance_known=True, measured=True):
+def imu(time_ns, *, orientation_known=True, covariance_known=True, measured=True, noise_known=True):
     variance = np.diag([1e-4, 2e-4, 4e-4]) if covariance_known else np.zeros((3, 3))
     unknown = np.full(9, -1.0)
     return _type(
@@ -43,9 +44,9 @@ def imu(time_ns, *, orientation_known=True, covariance_known=True, measured=True
         _type("geometry_msgs/msg/Quaternion", 0.0, 0.0, np.sin(QUARTER), np.cos(QUARTER)),
         variance.ravel() if orientation_known else unknown,
         _type("geometry_msgs/msg/Vector3", 0.1, 0.2, 0.3),
-        np.eye(3).ravel() * 1e-6 if measured else unknown,
+        np.eye(3).ravel() * 1e-6 * noise_known if measured else unknown,
         _type("geometry_msgs/msg/Vector3", 1.0, 2.0, 9.81),
-        np.eye(3).ravel() * 1e-2 if measured else unknown,
+        np.eye(3).ravel() * 1e-2 * noise_known if measured else unknown,
     )
 
 
@@ -236,6 +237,20 @@ def test_what_a_message_does_not_know_is_left_out_or_assumed_with_a_note(tmp_pat
     notes = " | ".join(imported.notes)
     assert "/imu: orientations without covariance: 1, taken with sigmas of 0.6 deg and 1.7 deg in heading" in notes
     assert "/fix: fixes without covariance: 1, taken with sigmas of 5 m and 10 m in height" in notes
+
+
+@pytest.mark.parametrize("noise_known", [True, False])
+def test_samples_without_noise_get_that_of_the_unit_that_is_given(tmp_path, noise_known):
+    """As `triline fly` does; else the navigator would take any unit for a MEMS unit."""
+    times = [START_NS + i * STEP_NS for i in range(9)]
+    path = write_bag(tmp_path / "bag", [("/imu", t, imu(t, noise_known=noise_known)) for t in times])
+    bodies = [m.body for m in read_any(path, options=Options(grade=TACTICAL)).messages if m.topic == "sensor/imu"]
+    assert len(bodies) == 9
+    wanted = (1e-3, 0.1) if noise_known else (10 * TACTICAL.gyro_noise, 10 * TACTICAL.accel_noise)  # at 100 Hz
+    for body in bodies[1:]:
+        assert (body.rate_sigma, body.force_sigma) == pytest.approx(wanted)
+    plain = [m.body for m in read_any(path).messages if m.topic == "sensor/imu"]
+    assert all((body.rate_sigma > 0) == noise_known for body in plain)
 
 
 def test_an_mcap_file_that_was_cut_is_imported_as_far_as_it_is_whole(tmp_path):
