@@ -216,34 +216,58 @@ def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
     return findings
 
 
+#: How far before and after a time fixes tell the speed of a platform, s, the nearest that are enough.
+_AROUND_S = (1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 64.0)
+#: A platform stands where its speed is known to so many m/s, and is less than that much and three times its sigma.
+#: Tuned: a quiet aircraft is to be told from one that is parked.
+_SPEED_SIGMA_M_S, _STANDS_M_S = 0.05, 0.1
+
+
 def zero_velocities(inertial: InertialData, gnss: GnssData, sigma_m_s: float = 0.01) -> list[tuple[float, Observation]]:
     """Zero-velocity observations, one a second, where neither inertial nor GNSS data show a motion."""
     start = float(inertial.time_s[0] - inertial.dt_s[0])
     second = np.floor(inertial.time_s - start).astype(int)
     n = second[-1]
-    if n < 3 or len(gnss) < 2:
+    if n < 3:
         return []
 
-    def spread(x: Array) -> Array:
+    def moments(x: Array) -> tuple[Array, Array]:
+        """Of each second the mean and the spread, of the axis where they are largest."""
         rate = x / inertial.dt_s[:, None]
         count = np.maximum(np.bincount(second), 1)
         mean = np.stack([np.bincount(second, r) / count for r in rate.T], axis=1)
         square = np.stack([np.bincount(second, r * r) / count for r in rate.T], axis=1)
-        return np.sqrt(np.maximum(square - mean**2, 0.0)).max(axis=1)[:n]
+        spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+        return np.abs(mean).max(axis=1)[:n], spread.max(axis=1)[:n]
 
-    quiet = (spread(inertial.dtheta) < 0.02) & (spread(inertial.dv) < 0.5)
-    r = gnss.position_e
-    step = np.linalg.norm(np.diff(r, axis=0), axis=1)
-    limit = 0.1 * np.diff(gnss.time_s) + 4.0 * gnss.sigma_ned_m.max(axis=1)[1:]
-    rests = step < limit
-    k = np.searchsorted(gnss.time_s, start + np.arange(n) + 0.5)
-    inside = (k > 0) & (k < len(gnss))
-    k = np.clip(k, 1, len(gnss) - 1)
+    turning, shaking = moments(inertial.dtheta)
+    quiet = (turning < 0.02) & (shaking < 0.02) & (moments(inertial.dv)[1] < 0.5)
+    position, sigma = gnss.position_e, gnss.sigma_ned_m.max(axis=1)
     out: list[tuple[float, Observation]] = []
-    for i in np.flatnonzero(quiet & inside & rests[k - 1]):
-        if 0 < i < n - 1 and quiet[i - 1] and quiet[i + 1]:
-            out.append((start + i + 0.5, ZeroVelocity(sigma_m_s)))
+    for i in np.flatnonzero(quiet):
+        time_s = start + float(i) + 0.5
+        if 0 < i < n - 1 and quiet[i - 1] and quiet[i + 1] and _stands(gnss.time_s - time_s, position, sigma):
+            out.append((time_s, ZeroVelocity(sigma_m_s)))
     return out
+
+
+def _stands(time_s: Array, position: Array, sigma_m: Array) -> bool:
+    """Whether fixes (m,), (m, 3), (m,) about a time from which ``time_s`` counts show that the platform stands.
+
+    A flight in calm air is as quiet as a platform at rest. What two fixes say of it is less than their noise; so the
+    speed is that of as many as make it certain, and where none do, it is not known to stand.
+    """
+    for around_s in _AROUND_S:
+        first, last = np.searchsorted(time_s, (-around_s, around_s))
+        if last - first < 3:
+            continue
+        t = time_s[first:last] - time_s[first:last].mean()
+        square = float(t @ t)
+        sigma = float(np.sqrt(np.mean(sigma_m[first:last] ** 2) / square))
+        if sigma <= _SPEED_SIGMA_M_S:
+            speed = float(np.linalg.norm(t @ (position[first:last] - position[first]))) / square
+            return speed < _STANDS_M_S + 3.0 * sigma
+    return False
 
 
 def headings(time_s: Array, heading: Array, sigma: Array, step_s: float = 1.0) -> list[tuple[float, Observation]]:

@@ -32,6 +32,7 @@ from triline.solver.navigation.post_processing import (
 )
 from triline.solver.navigation.smoother import smooth
 from triline.solver.navigation.strapdown import State, rotation_matrix
+from triline.solver.simulation.inertial import gnss_fixes, survey_flight, with_errors
 
 SEEDS = (1, 2, 3)
 
@@ -359,6 +360,24 @@ def test_held_out_fixes_are_predicted_with_the_estimated_lever_arm_and_slow_erro
         miss, sigma = held_out_misses(r.smoothed, gnss, settings, out)
         assert (sim.rms(miss) < [0.06, 0.06, 0.12]).all()
         assert 0.75 < sim.rms(miss / sigma).mean() < 1.35
+
+
+@pytest.mark.parametrize(
+    ("speed", "interval_s", "sigma"),
+    [
+        (10.0, 4.0, (5.0, 5.0, 10.0)),
+        (5.0, 5.0, (2.5, 2.5, 5.0)),
+        (1.0, 0.1, (2.5, 2.5, 5.0)),
+        (3.0, 1.0, (5.0, 5.0, 10.0)),
+    ],
+)
+def test_an_aircraft_in_calm_air_does_not_stand(speed, interval_s, sigma):
+    """Though it moves less from fix to fix than these are uncertain."""
+    rng = np.random.default_rng(1)
+    motion = survey_flight(200.0, rng, line_s=80.0, turbulence=0.2, speed_m_s=speed, bank_deg=10.0)
+    inertial, _ = with_errors(motion.increments(0.5 + np.arange(199 * 50) / 50.0), TACTICAL, rng)
+    fixes = gnss_fixes(motion, np.arange(1.0, 198.0, interval_s), sigma, rng)
+    assert zero_velocities(inertial, fixes) == []
 
 
 def test_zero_velocity_and_heading_aids():
