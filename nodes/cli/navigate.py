@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
             held_out=held_out,
             aids=_aids(args, folder, inertial, gnss),
             checks=not args.no_checks,
+            offset_s=folder.offset_s,
         )
     except NavigationError as error:
         raise UserError(f"{source}: {folder.named(error.finding)}") from None

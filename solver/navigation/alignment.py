@@ -104,6 +104,7 @@ def align(
     start_s: float | None = None,
     prior: AttitudePrior | None = None,
     patience_s: float = 130.0,
+    offset_s: float = 0.0,
 ) -> Start:
     """Start of a navigation from the first stretch of data that shows the attitude.
 
@@ -115,6 +116,7 @@ def align(
     prior : attitude known beforehand; where the data contradict it, they win, and a note says so
     patience_s : after so much data without a clear heading, a prior is taken as it is, and without one the course
         stands for the heading; where data end before, they do so then, unless it is infinite
+    offset_s : added to the times that an error tells
 
     Raises
     ------
@@ -125,8 +127,8 @@ def align(
     inside = gnss[(gnss.time_s >= t0) & (gnss.time_s <= min(last, t0 + _WINDOWS_S[-1]))]
     if len(inside) < 4:
         raise AlignmentError(
-            f"alignment needs at least 4 GNSS fixes within the inertial data ({t0:.1f} to {last:.1f} s); "
-            f"{len(inside)} of {len(gnss)} are there"
+            "alignment needs at least 4 GNSS fixes within the inertial data "
+            f"({t0 + offset_s:.1f} to {last + offset_s:.1f} s); {len(inside)} of {len(gnss)} are there"
         )
     inside = _thinned(inside)
     data = inertial[(inertial.time_s > t0) & (inertial.time_s < inside.time_s[-1] + 1.0)]

@@ -31,12 +31,15 @@ _CLEARLY = 1.3
 _NAMES = ("forward", "right", "down")
 
 
-def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, *, increments: bool) -> list[Finding]:
+def check(
+    inertial: InertialData, gnss: GnssData, settings: NavigationSettings, *, increments: bool, offset_s: float = 0.0
+) -> list[Finding]:
     """Look for wrong units, axes and time scales.
 
     Parameters
     ----------
     increments : whether the data came as increments (else as rates)
+    offset_s : added to the times that are told
 
     Returns
     -------
@@ -44,10 +47,8 @@ def check(inertial: InertialData, gnss: GnssData, settings: NavigationSettings, 
     """
     overlap = min(inertial.time_s[-1], gnss.time_s[-1]) - max(inertial.time_s[0], gnss.time_s[0])
     if overlap <= 0:
-        text = (
-            f"times do not overlap: inertial data {inertial.time_s[0]:.1f} to {inertial.time_s[-1]:.1f} s, "
-            f"GNSS {gnss.time_s[0]:.1f} to {gnss.time_s[-1]:.1f} s (two time scales?)"
-        )
+        spans = [f"{t[0] + offset_s:.1f} to {t[-1] + offset_s:.1f} s" for t in (inertial.time_s, gnss.time_s)]
+        text = f"times do not overlap: inertial data {spans[0]}, GNSS {spans[1]} (two time scales?)"
         return [Finding("time scale", "gnss.time", text, True)]
     unit = _force_unit(inertial, increments)
     if unit is not None:

@@ -168,21 +168,21 @@ def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
     return replace(gnss, sigma_ned_m=sigma, velocity_n=velocity), findings
 
 
-def gap_findings(inertial: InertialData) -> list[Finding]:
-    """Gaps in the inertial data, by name where they are few."""
+def gap_findings(inertial: InertialData, offset_s: float = 0.0) -> list[Finding]:
+    """Gaps in the inertial data, by name where they are few; ``offset_s`` is added to the times that are told."""
     gaps = inertial.gaps()
     if not gaps:
         return []
     long = [g for g in gaps if g[1] - g[0] > max(5.0 * inertial.interval_s, 0.1)]
     lost = sum(max(1, round((b - a) / inertial.interval_s)) for a, b in gaps)
-    shown = ", ".join(f"{a:.2f}-{b:.2f}" for a, b in (long or gaps)[:5])
+    shown = ", ".join(f"{a + offset_s:.2f}-{b + offset_s:.2f}" for a, b in (long or gaps)[:5])
     more = f" and {len(long or gaps) - 5} more" if len(long or gaps) > 5 else ""
     text = f"{len(gaps)} gap(s), {lost} sample(s) lost ({shown} s{more}): bridged, with the noise that this costs"
     return [Finding("gap", "imu.time", text, False)]
 
 
-def outage_findings(gnss: GnssData, start_s: float, end_s: float) -> list[Finding]:
-    """Times without fixes that are much longer than the usual interval."""
+def outage_findings(gnss: GnssData, start_s: float, end_s: float, offset_s: float = 0.0) -> list[Finding]:
+    """Times without fixes that are much longer than the usual interval, told with ``offset_s`` added."""
     t = np.concatenate([[start_s], gnss.time_s[(gnss.time_s > start_s) & (gnss.time_s < end_s)], [end_s]])
     if len(t) < 4:
         return []
@@ -191,6 +191,6 @@ def outage_findings(gnss: GnssData, start_s: float, end_s: float) -> list[Findin
     long = np.flatnonzero(step > max(GAP_FACTOR * 1.5 * usual, usual + 1.0))
     if not len(long):
         return []
-    shown = ", ".join(f"{t[i]:.1f}-{t[i + 1]:.1f}" for i in long[:5])
+    shown = ", ".join(f"{t[i] + offset_s:.1f}-{t[i + 1] + offset_s:.1f}" for i in long[:5])
     more = f" and {len(long) - 5} more" if len(long) > 5 else ""
     return [Finding("outage", "gnss.time", f"{len(long)} outage(s) ({shown} s{more}): coasted", False)]

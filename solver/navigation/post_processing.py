@@ -65,6 +65,7 @@ def navigate(
     aids: list[tuple[float, Observation]] | None = None,
     checks: bool = True,
     tune: bool = True,
+    offset_s: float = 0.0,
 ) -> list[Navigated]:
     """Navigate a recording.
 
@@ -79,6 +80,7 @@ def navigate(
     aids : further observations (see `zero_velocities`, `headings`)
     checks : whether to look for wrong units, axes and time scales first
     tune : whether biases may be taken to change faster than the grade says, where innovations ask for it
+    offset_s : added to the times that findings tell
 
     Returns
     -------
@@ -90,7 +92,7 @@ def navigate(
     """
     common: list[Finding] = []
     if checks:
-        common = check(inertial, gnss, settings, increments=increments)
+        common = check(inertial, gnss, settings, increments=increments, offset_s=offset_s)
         for finding in (f for f in common if f.fatal):
             raise NavigationError(finding)
     withheld = np.zeros(len(gnss), dtype=bool) if held_out is None else held_out
@@ -99,7 +101,7 @@ def navigate(
     for i, stretch in enumerate(_stretches(inertial, settings.longest_gap_s)):
         used = gnss[~withheld]
         try:
-            start = align(stretch, used, settings, prior=prior if i == 0 else None)
+            start = align(stretch, used, settings, prior=prior if i == 0 else None, offset_s=offset_s)
         except AlignmentError as error:
             failed.append(Finding("alignment", "alignment", str(error), True))
             continue
@@ -113,10 +115,10 @@ def navigate(
 
             forward, tuned = _tuned(forward, again)
         smoothed = NavigationTrajectory.smoothed(forward, smooth(forward)) if smoothing else None
-        findings = [*common, *gap_findings(stretch), *tuned]
-        findings += outage_findings(gnss, start.estimate.time_s, float(stretch.time_s[-1]))
+        findings = [*common, *gap_findings(stretch, offset_s), *tuned]
+        findings += outage_findings(gnss, start.estimate.time_s, float(stretch.time_s[-1]), offset_s)
         findings += [Finding("alignment", "alignment", note, False) for note in start.notes]
-        findings += innovation_findings(forward.innovations)
+        findings += innovation_findings(forward.innovations, offset_s)
         out.append(Navigated(start, forward, NavigationTrajectory.filtered(forward), smoothed, findings))
         common = []
     if not out:
@@ -191,8 +193,8 @@ def _stretches(inertial: InertialData, longest_gap_s: float) -> list[InertialDat
     return [inertial[p[0] : p[-1] + 1] for p in parts if len(p) > 1]
 
 
-def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
-    """What the innovations say about the sigmas of the observations, and about outliers."""
+def innovation_findings(innovations: list[Innovation], offset_s: float = 0.0) -> list[Finding]:
+    """What the innovations say about the sigmas of the observations, and about outliers, with times of the user."""
     findings = []
     for kind in sorted({i.kind for i in innovations}):
         of_kind = [i for i in innovations if i.kind == kind]
@@ -210,7 +212,7 @@ def innovation_findings(innovations: list[Innovation]) -> list[Finding]:
             findings.append(Finding("outliers", source, text, False))
         restored = [i.time_s for i in of_kind if i.status == "restored"]
         if restored:
-            times = ", ".join(f"{t:.1f}" for t in restored[:5])
+            times = ", ".join(f"{t + offset_s:.1f}" for t in restored[:5])
             text = f"filter and {kind} disagreed for long, filter restored at {times} s"
             findings.append(Finding("restored", source, text, False))
     return findings

@@ -287,6 +287,24 @@ def test_navigate_over_a_recording(tmp_path, capsys):
     assert main(["navigate", str(tmp_path / "other.mcap")]) == 1
 
 
+def test_notes_of_a_recording_tell_the_times_of_its_trajectory(tmp_path, capsys):
+    folder = write(tmp_path / "sensors", keep=lambda t: (t < 50.0) | (t > 52.0))
+    for name in ("imu.csv", "gnss.csv"):
+        header, *rows = (folder / name).read_text().splitlines()
+        later = [f"{1.7e9 + float(t):.6f},{rest}" for t, _, rest in (row.partition(",") for row in rows)]
+        (folder / name).write_text("\n".join([header, *later]) + "\n")
+    recording = tmp_path / "flight.mcap"
+    assert main(["import", str(folder), "-o", str(recording), "-q"]) == 0
+    capsys.readouterr()
+    for source in (folder, recording):
+        out = tmp_path / f"{source.stem}_out"
+        assert main(["navigate", str(source), "-o", str(out), "--json", "--no-page", "--rate", "1"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        ((begin, end),) = result["stretches"][0]["gaps"]
+        assert begin > 1.7e9
+        assert any(f"({begin:.2f}-{end:.2f} s)" in note for note in result["notes"])
+
+
 def test_platform_keys_are_read(tmp_path):
     text = PLATFORM + (
         "bias_time_s = 900\ngyro_scale_ppm = 100\nunknown = 1\n[initial]\nheading_deg = 30\nsigma_heading_deg = 3\n"
