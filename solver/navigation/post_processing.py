@@ -249,7 +249,8 @@ def zero_velocities(inertial: InertialData, gnss: GnssData, sigma_m_s: float = 0
     for i in np.flatnonzero(quiet):
         time_s = start + float(i) + 0.5
         if 0 < i < n - 1 and quiet[i - 1] and quiet[i + 1] and _stands(gnss.time_s - time_s, position, sigma):
-            out.append((time_s, ZeroVelocity(sigma_m_s)))
+            nearest = int(np.argmin(np.abs(gnss.time_s - time_s)))
+            out.append((time_s, ZeroVelocity(sigma_m_s, axes=gnss.R_en[nearest].T)))
     return out
 
 

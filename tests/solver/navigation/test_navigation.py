@@ -397,6 +397,11 @@ def test_zero_velocity_and_heading_aids():
     assert a[3] < 0.3 * b[3] and np.degrees(a[8]) < 0.3
     z = sim.errors(aided.filtered, f.motion, at_rest) / aided.filtered.sigmas(at_rest)
     assert sim.rms(z[:, 8]) < 2.0
+    shown = [i for i in aided.forward.innovations if i.kind == "zero velocity"]
+    prior = aided.forward.prior
+    velocity_n = NavigationStates(prior.time_s, prior.r_e, prior.v_e, prior.R_eb).velocity_n
+    at = [int(np.abs(prior.time_s - i.time_s).argmin()) for i in shown]
+    np.testing.assert_allclose([i.value for i in shown], -velocity_n[at], atol=1e-5)  # north, east, down, as plots say
 
 
 def test_long_gap_divides_and_short_gap_is_bridged():
