@@ -37,10 +37,16 @@ class Smoothed:
 
 
 def gains(F: Array, P_posterior: Array, P_prior: Array) -> Array:
-    """Smoother gains (N - 1, n, n) ``P_k F' inv(P_prior)`` of N nodes; scaled, since metres meet rad/s."""
+    """Smoother gains (N - 1, n, n) ``P_k F' inv(P_prior)`` of N nodes; scaled, since metres meet rad/s.
+
+    What is known, and so has no variance, has no gain.
+    """
     s = np.sqrt(np.einsum("kii->ki", P_prior[1:]))
-    s = np.where(s > 0.0, s, 1.0)
+    known = s <= 0.0
+    s = np.where(known, 1.0, s)
     scaled = P_prior[1:] / (s[:, :, None] * s[:, None, :])
+    node, place = np.nonzero(known)
+    scaled[node, place, place] = 1.0
     G = np.linalg.solve(scaled, (F[1:] @ P_posterior[:-1]) / s[:, :, None])
     return np.swapaxes(G, -1, -2) / s[:, None, :]
 

@@ -419,6 +419,18 @@ def test_long_gap_divides_and_short_gap_is_bridged():
     assert [round(p.best.end_s) for p in parts] == [100, 300] and round(parts[1].best.start_s) == 130
 
 
+@pytest.mark.parametrize("scales", [(2e-4, 0.0), (0.0, 2e-4)])
+def test_scale_factors_of_one_kind_of_sensor(scales):
+    gyro, accel = scales
+    f = sim.flight(duration_s=100.0, seed=61, rate_hz=100, line_s=20.0)
+    grade = replace(f.settings.grade, gyro_scale=gyro, accel_scale=accel)
+    r = navigate(f.inertial, f.gnss, replace(f.settings, grade=grade, scale_factors=True))[0]
+    t = np.arange(60.0, 95.0)
+    assert np.sqrt(np.mean(np.square(sim.errors(r.smoothed, f.motion, t) / r.smoothed.sigmas(t)))) < 1.6
+    of_scales = r.best.nodes.accel if gyro else r.best.nodes.gyro
+    assert np.abs(of_scales[:, 3:]).max() == 0.0
+
+
 @pytest.mark.parametrize("kind", ["position", "velocity", "zero velocity", "heading"])
 def test_observation_derivatives(kind):
     settings = NavigationSettings(
