@@ -18,6 +18,9 @@ from ..solver.matching.options import REAL_FLOOR_PX
 from .errors import UserError
 
 Tables = dict[str, dict[str, Any]]
+#: Keys of ``[mounting]`` and ``[imu]`` in a flight.toml that are settings of the navigator.
+_ARM = "camera_lever_arm_m"
+_UNIT = ("gyro_bias_deg_h", "accel_bias_mgal", "bias_time_s", "gyro_scale_ppm", "accel_scale_ppm")
 #: Keys of ``[dem]`` in a flight.toml: the adjuster's setting, its type, and what is wanted.
 _ELEVATION: dict[str, tuple[str, Any, str]] = {
     "file": ("dem", str, "a raster of heights in the folder"),
@@ -31,8 +34,8 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     """The tables of a configuration file, none without a file.
 
     Of a ``flight.toml`` those in ``[nodes]``, the elevation model of its ``[dem]`` as settings of the adjuster, and
-    ``camera_lever_arm_m`` of its ``[mounting]`` as one of the navigator. A flight folder is of a real camera: where
-    nothing else is said the matcher has the floor of real pixels.
+    ``camera_lever_arm_m`` of its ``[mounting]`` and the biases of its ``[imu]`` as settings of the navigator. A flight
+    folder is of a real camera: where nothing else is said the matcher has the floor of real pixels.
 
     Parameters
     ----------
@@ -57,12 +60,12 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     if isinstance(tables.get("flight"), dict):  # the settings of nodes in a flight.toml
         dem = elevation(Path(path)) if "dem" in tables else {}
         navigates = known is None or "navigator" in known
-        arm = _camera_lever_arm(Path(path), tables.get("mounting", {})) if navigates else {}
+        unit = _inertial_unit(Path(path), tables) if navigates else {}
         tables = tables.get("nodes", {})
         if dem and isinstance(tables.get("adjuster", {}), dict):
             tables = tables | {"adjuster": dem | tables.get("adjuster", {})}
-        if arm and isinstance(tables.get("navigator", {}), dict):
-            tables = tables | {"navigator": arm | tables.get("navigator", {})}
+        if unit and isinstance(tables.get("navigator", {}), dict):
+            tables = tables | {"navigator": unit | tables.get("navigator", {})}
         if isinstance(tables.get("matcher", {}), dict):
             tables = tables | {"matcher": {"image_sigma_px": REAL_FLOOR_PX} | tables.get("matcher", {})}
     for name, table in tables.items():
@@ -73,13 +76,15 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     return tables
 
 
-def _camera_lever_arm(path: Path, mounting: Any) -> dict[str, Any]:
-    """Setting of the navigator that says what ``[mounting]`` of a ``flight.toml`` does; none where that is zero."""
-    key = "camera_lever_arm_m"
-    arm = mounting.get(key, [0.0]) if isinstance(mounting, dict) else None
+def _inertial_unit(path: Path, tables: Tables) -> dict[str, Any]:
+    """Settings of the navigator by ``[mounting]`` and ``[imu]`` of a ``flight.toml``: what messages do not say of a
+    unit, where it is from the perspective centre, and its biases and scale factors."""
+    mounting, imu = tables.get("mounting", {}), tables.get("imu", {})
+    arm = mounting.get(_ARM, [0.0]) if isinstance(mounting, dict) else None
     if not (isinstance(arm, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in arm)):
-        raise UserError(f"{path}: mounting.{key} is {arm!r}, wanted 3 numbers: forward, right, down, m")
-    return {key: arm} if any(arm) else {}
+        raise UserError(f"{path}: mounting.{_ARM} is {arm!r}, wanted 3 numbers: forward, right, down, m")
+    found: dict[str, Any] = {_ARM: arm} if any(arm) else {}
+    return found | {key: imu[key] for key in _UNIT if isinstance(imu, dict) and key in imu}
 
 
 def elevation(path: Path, wanted: bool = False) -> dict[str, Any]:

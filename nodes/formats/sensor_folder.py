@@ -351,13 +351,17 @@ def read_grade(imu: Keys, notes: list[str], file: str, default_grade: InertialGr
     if missing and default_grade is None:
         notes.append(f"{file}: [imu] {', '.join(missing)} absent: those of a MEMS unit are assumed")
     values = [imu.number(name, round(d, 9), positive=True) for name, d in zip(names, default, strict=True)]
-    # biases of MEMS units wander within minutes, those of better ones within hours
-    time_s = imu.number("bias_time_s", 600.0 if values[1] > 2.0 else 7200.0, positive=True)
+    time_s = imu.number("bias_time_s", usual_bias_time_s(values[1]), positive=True)
     grade = InertialGrade.from_datasheet(values[0], values[1], values[2], values[3], time_s)
     ppm = [imu.number(name, 0.0) * 1e-6 for name in ("gyro_scale_ppm", "accel_scale_ppm")]
     if min(ppm) < 0.0:
         raise imu.refuse("gyro_scale_ppm" if ppm[0] < 0.0 else "accel_scale_ppm", "a number of at least 0")
     return InertialGrade(grade.gyro_noise, grade.gyro_bias, grade.accel_noise, grade.accel_bias, time_s, ppm[0], ppm[1])
+
+
+def usual_bias_time_s(gyro_bias_deg_h: float) -> float:
+    """Correlation time of biases: those of MEMS units wander within minutes, those of better ones within hours."""
+    return 600.0 if gyro_bias_deg_h > 2.0 else 7200.0
 
 
 def _prior(initial: Keys) -> AttitudePrior | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from ...solver.navigation.inertial_navigator import InertialNavigator
 from ...solver.navigation.kinematic import KinematicFilter, KinematicOptions
 from ...solver.navigation.online_poses import OnlineOptions
 from .. import convert
+from ..formats.sensor_folder import usual_bias_time_s
+from ..formats.track import MOST_LEVER_ARM_M
 
 #: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.
 LARGEST_RATE_SIGMA, LARGEST_FORCE_SIGMA = 1.0, 50.0
@@ -47,8 +50,50 @@ def stated_noise(sample: Any) -> tuple[float, float, str]:
     return noise[0], noise[1], text
 
 
+@dataclass(frozen=True)
+class InertialUnit:
+    """What messages do not say of an inertial unit.
+
+    Attributes
+    ----------
+    camera_lever_arm_m : perspective centre from the unit, body axes
+    gyro_bias_deg_h, accel_bias_mgal : of its data sheet, 1 sigma; 0 = as usual for its noise
+    bias_time_s : correlation time of the biases; 0 = as usual for them
+    gyro_scale_ppm, accel_scale_ppm : of scale factors, 1 sigma
+    """
+
+    camera_lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0)
+    gyro_bias_deg_h: float = 0.0
+    accel_bias_mgal: float = 0.0
+    bias_time_s: float = 0.0
+    gyro_scale_ppm: float = 0.0
+    accel_scale_ppm: float = 0.0
+
+    def __post_init__(self) -> None:
+        arm = [float(v) if isinstance(v, int | float) else np.nan for v in self.camera_lever_arm_m]
+        if not (len(arm) == 3 and all(abs(v) <= MOST_LEVER_ARM_M for v in arm)):  # false for NaN
+            wanted = f"3 numbers within {MOST_LEVER_ARM_M:g} m: forward, right, down"
+            raise ValueError(f"camera_lever_arm_m is {self.camera_lever_arm_m}, wanted {wanted}")
+        for name, value in vars(self).items():
+            if name != "camera_lever_arm_m" and not 0.0 <= value < np.inf:
+                raise ValueError(f"{name} is {value:g}, wanted 0 or more")
+
+    def grade(self, gyro_noise: float, accel_noise: float) -> InertialGrade:
+        """Error model for a white noise (rad/sqrt(s), m/s/sqrt(s); 0 = not known)."""
+        usual = InertialGrade.of_noise(gyro_noise, accel_noise)
+        time_s = self.bias_time_s or (usual_bias_time_s(self.gyro_bias_deg_h) if self.gyro_bias_deg_h else 0.0)
+        return replace(
+            usual,
+            gyro_bias=float(np.radians(self.gyro_bias_deg_h)) / 3600.0 or usual.gyro_bias,
+            accel_bias=self.accel_bias_mgal * 1e-5 or usual.accel_bias,
+            bias_time_s=time_s or usual.bias_time_s,
+            gyro_scale=self.gyro_scale_ppm * 1e-6,
+            accel_scale=self.accel_scale_ppm * 1e-6,
+        )
+
+
 def inertial_engine(
-    project: Any, first_sample: Any, camera_lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0), **options: float
+    project: Any, first_sample: Any, unit: InertialUnit = InertialUnit(), **options: float
 ) -> InertialNavigator:
     """The engine for raw inertial data; its noise is what the first sample says, of a MEMS unit where it says nothing.
 
@@ -57,11 +102,13 @@ def inertial_engine(
     """
     slow = convert.slow_errors_of(project)
     east, north, up = slow.wander_m
-    camera, antenna = np.asarray(camera_lever_arm_m, dtype=float), convert.lever_arm_of(project)
+    camera, antenna = np.asarray(unit.camera_lever_arm_m, dtype=float), convert.lever_arm_of(project)
     forward, right, down = (float(v) for v in camera + antenna)
     gyro_noise, accel_noise, _ = stated_noise(first_sample)
+    grade = unit.grade(gyro_noise, accel_noise)
     settings = NavigationSettings(
-        grade=InertialGrade.of_noise(gyro_noise, accel_noise),
+        grade=grade,
+        scale_factors=grade.gyro_scale > 0.0 or grade.accel_scale > 0.0,
         lever_arm_b=(forward, right, down),
         wander_sigma_ned_m=(north, east, up),
         wander_time_s=slow.wander_time_s,

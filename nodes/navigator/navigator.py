@@ -20,9 +20,8 @@ from ...solver.navigation.kinematic import KinematicFilter
 from ...solver.navigation.online_poses import OnlineOptions
 from ...solver.navigation.pose import NavigationPose
 from .. import convert
-from ..formats.track import MOST_LEVER_ARM_M
 from ..node import Message, Node
-from .engines import inertial_engine, kinematic_engine, stated_noise
+from .engines import InertialUnit, inertial_engine, kinematic_engine, stated_noise
 
 #: A measurement cannot be so much later than its message, s: one clock that runs away must not stop the filter.
 AHEAD_S = 1.0
@@ -51,6 +50,8 @@ class Navigator(Node):
     smooth_every_s : from inertial data smoothed poses come so often, s
     gnss_clock_s : GNSS times are behind by so much; it is added to them. A verdict on ``sensor/gnss`` changes it
     camera_lever_arm_m : perspective centre from the inertial sensor, body axes; measured attitudes need none
+    gyro_bias_deg_h, accel_bias_mgal, bias_time_s, gyro_scale_ppm, accel_scale_ppm : of the inertial sensor's data
+        sheet; biases of 0 are those that are usual for its noise
     """
 
     name = "navigator"
@@ -64,6 +65,11 @@ class Navigator(Node):
         smooth_every_s: float = OnlineOptions.smooth_every_s,
         gnss_clock_s: float = 0.0,
         camera_lever_arm_m: Sequence[float] = (0.0, 0.0, 0.0),
+        gyro_bias_deg_h: float = 0.0,
+        accel_bias_mgal: float = 0.0,
+        bias_time_s: float = 0.0,
+        gyro_scale_ppm: float = 0.0,
+        accel_scale_ppm: float = 0.0,
     ) -> None:
         super().__init__()
         if not 0.0 <= filtered_s <= 1.0:
@@ -72,11 +78,9 @@ class Navigator(Node):
             raise ValueError(f"smooth_every_s is {smooth_every_s:g}, wanted more than 0 and at most 10 s")
         if not abs(gnss_clock_s) <= LARGEST_CORRECTION_S:
             raise ValueError(f"gnss_clock_s is {gnss_clock_s:g}, wanted at most {LARGEST_CORRECTION_S:g} s either way")
-        arm = [float(v) if isinstance(v, int | float) else np.nan for v in camera_lever_arm_m]
-        if not (len(arm) == 3 and all(abs(v) <= MOST_LEVER_ARM_M for v in arm)):  # false for NaN
-            wanted = f"3 numbers within {MOST_LEVER_ARM_M:g} m: forward, right, down"
-            raise ValueError(f"camera_lever_arm_m is {camera_lever_arm_m}, wanted {wanted}")
-        self._camera_arm_m = arm
+        self._unit = InertialUnit(
+            camera_lever_arm_m, gyro_bias_deg_h, accel_bias_mgal, bias_time_s, gyro_scale_ppm, accel_scale_ppm
+        )
         self._correction_s = float(gnss_clock_s)
         self._offset = OffsetWatch()
         self._filtered_s, self._smooth_every_s = filtered_s, smooth_every_s
@@ -242,7 +246,7 @@ class Navigator(Node):
         convert.check_inertial(interval_ns, force, rate)
         if not isinstance(self._engine, InertialNavigator):
             self._engine = inertial_engine(
-                self._configuration, body, self._camera_arm_m,
+                self._configuration, body, self._unit,
                 filtered_s=self._filtered_s, smooth_every_s=self._smooth_every_s,
             )  # fmt: skip
             self._seen = Counter()

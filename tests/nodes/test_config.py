@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from triline.nodes import registry
@@ -9,7 +10,9 @@ from triline.nodes.bus.session import DEFAULT_PORT, configuration, default_port
 from triline.nodes.cli import main
 from triline.nodes.config import build, load
 from triline.nodes.errors import UserError
+from triline.nodes.navigator.engines import InertialUnit
 from triline.nodes.node import Node
+from triline.solver.navigation.inertial_data import InertialGrade
 
 
 class Gauge(Node):
@@ -67,6 +70,21 @@ def test_a_flight_folder_tells_the_navigator_where_the_camera_is(tmp_path):
             build(registry.node_class("navigator"), tables)
     with pytest.raises(UserError, match=r"mounting.camera_lever_arm_m is '0.3', wanted 3 numbers"):
         load(write(tmp_path / "flight.toml", flight.replace("[0.1, 0.0, 0.3]", "'0.3'")))
+
+
+def test_a_flight_folder_tells_the_navigator_what_its_inertial_unit_is(tmp_path):
+    imu = "[imu]\ngyro_noise_deg_sqrt_h = 0.1\ngyro_bias_deg_h = 100\naccel_bias_mgal = 5000\ngyro_scale_ppm = 300\n"
+    tables = load(write(tmp_path / "flight.toml", f'[flight]\nname = "x"\n{imu}'))
+    assert tables["navigator"] == {"gyro_bias_deg_h": 100, "accel_bias_mgal": 5000, "gyro_scale_ppm": 300}
+    build(registry.node_class("navigator"), tables)
+    with pytest.raises(UserError, match=r"configuration \[navigator\]: gyro_bias_deg_h is -1, wanted 0 or more"):
+        build(registry.node_class("navigator"), {"navigator": {"gyro_bias_deg_h": -1}})
+    noise = np.radians(0.1) / 60.0, 0.05 / 60.0
+    grade = InertialUnit(gyro_bias_deg_h=100, accel_bias_mgal=5000, gyro_scale_ppm=300).grade(*noise)
+    assert (grade.gyro_noise, grade.accel_noise) == noise
+    assert grade.gyro_bias == pytest.approx(np.radians(100) / 3600) and grade.accel_bias == pytest.approx(0.05)
+    assert (grade.bias_time_s, grade.gyro_scale, grade.accel_scale) == (600.0, pytest.approx(3e-4), 0.0)
+    assert InertialUnit().grade(*noise) == InertialGrade.of_noise(*noise)
 
 
 def test_tables_and_keys_that_nobody_reads_are_refused(tmp_path, capsys):
