@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"), help="of the orbit, m"
     )
     parser.add_argument(
-        "--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"), help="about the axes of the body, degrees"
+        "--attitude-sigma", type=float, nargs=3, metavar=("ROLL", "PITCH", "YAW"), help="of the satellite, degrees"
     )
     parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
     parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given")

@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"),
-        help="about the axes of the body, degrees; of a frame camera about east, north, up",
+        help="roll, pitch, yaw of the satellite, degrees; of a frame camera about east, north, up",
     )  # fmt: skip
     group.add_argument("--pixel-sigma", type=float, metavar="PX", help="of what is measured in the image (matching)")
     group.add_argument("--height-sigma", type=float, metavar="M", help="of the heights")

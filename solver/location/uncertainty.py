@@ -7,13 +7,25 @@ d/(n'd) dh``; so every source of error has its columns in closed form.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..orbit.motion import R_from_orbital
 from .pushbroom import PushbroomSensor
 
 Array = NDArray[np.floating]
+
+#: The 24 ways to call the axes of a body forward, right and down: columns of (24, 3, 3).
+_WAYS = np.array(
+    [
+        axes
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+        if np.linalg.det(axes := np.eye(3)[:, list(order)] * signs) > 0
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -23,7 +35,7 @@ class Sigmas:
     Attributes
     ----------
     position_m : (3,) of the orbit along the track, across, and up
-    attitude_rad : (3,) of small turns about the axes of the body
+    attitude_rad : (3,) of small turns about the axes of the body that point forward, right and down (`named_axes_b`)
     time_s : of the times of the lines against orbit and attitude
     pixel : (2,) of line and sample
     height_m : of the height that is given with a pixel
@@ -50,6 +62,18 @@ class Sigmas:
         return any((*self.position_m, *self.attitude_rad, self.time_s, *self.pixel, self.height_m))
 
 
+def named_axes_b(sensor: PushbroomSensor) -> Array:
+    """Axes of the body (columns, (3, 3)) that point most nearly forward, right and down in the middle of the scene.
+
+    Makers name the axes of their bodies as they like: x points across the flight of SPOT-5, and to anywhere in a
+    camera. An error of roll is one about what points forward.
+    """
+    pose = sensor.pose([0.5 * (sensor.lines - 1)])
+    velocity = sensor.motion.inertial_velocity(pose.position_e, pose.velocity_e)
+    flight = pose.R_eb[0].T @ R_from_orbital(pose.position_e, velocity)[0]
+    return _WAYS[int(np.argmax(np.einsum("nij,ij->n", _WAYS, flight)))]
+
+
 def ground_derivatives(sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
     """Derivatives (n, 3, 10) of the ground position in east, north, up by the ten quantities of `Sigmas`.
 
@@ -74,7 +98,7 @@ def ground_derivatives(sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLi
     J[:, :, 0:3] = slide @ np.stack([np.cross(up, across), across, up], axis=-1)
     length = np.linalg.norm(look, axis=1, keepdims=True)
     unit = look / length
-    turns = np.cross(np.eye(3)[None], unit[:, None, :])  # row k: a small turn about axis k
+    turns = np.cross(named_axes_b(sensor).T[None], unit[:, None, :])  # row k: a small turn about axis k
     J[:, :, 3:6] = slide @ (s[:, None, None] * np.einsum("nij,nkj->nik", pose.R_eb, turns))
     # a later time is a later line: half a line on each side, inside what orbit and attitude cover
     low, high = sensor.covered_lines

@@ -16,7 +16,7 @@ from ..geometry.earth import R_en
 from ..geometry.rotation import R_ENU_NED, matrix_from_angles
 from ..location.frame_camera import FrameCamera
 from ..location.pushbroom import PushbroomSensor, Rays, without_aberration
-from ..location.uncertainty import Sigmas
+from ..location.uncertainty import Sigmas, named_axes_b
 from .inputs import Normal
 
 Array = NDArray[np.floating]
@@ -63,6 +63,7 @@ class SatellitePixel:
     def __init__(self, sensor: PushbroomSensor, line: float, sample: float, height_m: float):
         self._sensor, self._line, self._sample, self._height = sensor, line, sample, height_m
         self._ground = sensor.ground(line, sample, height_m)[0]
+        self._axes_b = named_axes_b(sensor)
         if not np.isfinite(self._ground).all():
             raise ValueError(f"line {line:g}, sample {sample:g}: the ray misses the ground at {height_m:g} m")
         lat, lon, _ = sensor.ellipsoid.geodetic(self._ground)
@@ -83,7 +84,7 @@ class SatellitePixel:
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         axes = np.stack([np.cross(up, across), across, up], axis=-1)
         look = sensor.look.at(self._sample + errors[:, 8])[0]
-        look = np.einsum("nij,nj->ni", Rotation.from_rotvec(errors[:, 3:6]).as_matrix(), look)
+        look = np.einsum("nij,nj->ni", Rotation.from_rotvec(errors[:, 3:6] @ self._axes_b.T).as_matrix(), look)
         d = np.einsum("nij,nj->ni", pose.R_eb, look)
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         if sensor.aberration:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from satellite_scenes import Truth, write_dimap2
+from satellite_scenes import Truth, write_dimap1, write_dimap2
 from scipy.spatial.transform import Rotation
 
 from triline.nodes.formats.satellite.read import read_scene
@@ -12,6 +12,7 @@ from triline.solver.location.pushbroom import PushbroomSensor
 from triline.solver.location.uncertainty import Sigmas, ground_covariance, ground_derivatives, pixel_covariance
 from triline.solver.orbit.line_times import UniformLineTimes
 from triline.solver.orbit.motion import Motion
+from triline.solver.sensitivity.located_pixel import SatellitePixel
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,31 @@ def test_derivatives_of_all_ten_sources(sensor):
     np.testing.assert_allclose(J[:, 7], change(sensor, 0.1, line=u + 0.1), atol=1e-4)
     np.testing.assert_allclose(J[:, 8], change(sensor, 0.1, sample=v + 0.1), atol=1e-4)
     np.testing.assert_allclose(J[:, 9], change(sensor, 1.0, height=h + 1.0), atol=1e-4)
+
+
+def test_attitude_errors_are_of_roll_pitch_and_yaw_whatever_the_maker_calls_his_axes(tmp_path):
+    """The body of SPOT-5 has x across the flight: an error of roll moves the ground across the track all the same."""
+    sensor = read_scene(write_dimap1(tmp_path / "scene.xml", Truth(tilt_deg=(1.0, -1.0, 2.0)))).model("rigorous")
+    u, v, h = 0.5 * (sensor.lines - 1), 0.5 * (sensor.samples - 1), 350.0
+    pose = sensor.pose([u])
+    velocity = sensor.motion.inertial_velocity(pose.position_e, pose.velocity_e)[0]
+    C, down = pose.position_e[0], -pose.position_e[0] / np.linalg.norm(pose.position_e[0])
+    right = np.cross(down, velocity) / np.linalg.norm(np.cross(down, velocity))
+    forward = np.cross(right, down)
+    P = sensor.ground([u], [v], h)[0]
+    R = enu(P)
+    J = ground_derivatives(sensor, [u], [v], [h])[0]
+    one = SatellitePixel(sensor, u, v, h)
+    for k, axis in enumerate((forward, right, down)):
+        turned = Rotation.from_rotvec(1e-6 * axis).apply(P - C)
+        d = turned / np.linalg.norm(turned)
+        there = C + sensor.ellipsoid.intersect(C[None], d[None], h)[0] * d
+        errors = np.zeros((1, 10))
+        errors[0, 3 + k] = 1e-6
+        size = np.linalg.norm(P - C)
+        # the body is within a few degrees of the flight
+        np.testing.assert_allclose(J[:, 3 + k] / size, R @ (there - P) / 1e-6 / size, atol=0.05)
+        np.testing.assert_allclose(one(errors)[0] / 1e-6 / size, J[:, 3 + k] / size, atol=1e-3)
 
 
 def test_errors_are_as_large_as_their_sigmas(sensor):
