@@ -10,10 +10,17 @@ from ..convert import SECOND_NS
 
 #: A strip has ended when no line of it has come for so long, ns of platform time.
 SILENT_NS = 5 * SECOND_NS
-#: Lines that are off the rate of their strip by more are told, lines; then its tie points are worse than their sigma.
+#: Lines that are off the rate of their strip by more are told, lines; then its tie points are worse than their sigma,
+#: also where the strip was announced: with a nominal rate, while the lines have times of their own.
 OFF_LINES = 0.5
 #: Lines that are off by more are not of this strip, lines: the camera was off meanwhile, or the driver began anew.
 OTHER_LINES = 20.0
+
+
+def _off(strip: Any, block: LineBlock) -> float:
+    """How many lines later than by the rate of a strip a block has come."""
+    due_ns = strip.first_line_time_ns + round(block.first_line * SECOND_NS / strip.line_rate_hz)
+    return float((block.time_ns - due_ns) * strip.line_rate_hz / SECOND_NS)
 
 
 class FoundStrips:
@@ -49,18 +56,21 @@ class FoundStrips:
         self._begun[block.strip] = strip
         return strip
 
-    def note(self, block: LineBlock, stamp_ns: int) -> str:
+    def note(self, block: LineBlock, stamp_ns: int, announced: Any = None) -> str:
         """Keep how far a strip is; returns a line for the operator where lines are off its rate, once a strip.
+
+        Parameters
+        ----------
+        announced : the strip of the block, if it was announced and not found
 
         Raises
         ------
-        ValueError : the lines are far off, so their numbers do not go with their times
+        ValueError : the lines of a strip that was found are far off, so their numbers do not go with their times
         """
         strip = self._begun.get(block.strip)
         if strip is None:
-            return ""
-        due_ns = strip.first_line_time_ns + round(block.first_line * SECOND_NS / strip.line_rate_hz)
-        off = (block.time_ns - due_ns) * strip.line_rate_hz / SECOND_NS
+            return "" if announced is None else self._told_off(announced, _off(announced, block), block)
+        off = _off(strip, block)
         if abs(off) > OTHER_LINES:
             raise ValueError(
                 f"line {block.first_line} of strip {strip.id!r} came {off:+.0f} lines off its time; a strip that "
@@ -68,12 +78,19 @@ class FoundStrips:
             )
         self._lines[strip.id] = max(self._lines.get(strip.id, 0), int(block.first_line) + len(block.pixels))
         self._newest_ns[strip.id] = max(self._newest_ns.get(strip.id, 0), stamp_ns)
+        return self._told_off(strip, off, block)
+
+    def _told_off(self, strip: Any, off: float, block: LineBlock) -> str:
+        """A line for the operator where lines are off the rate by which tie points get their times, once a strip."""
         if abs(off) < OFF_LINES or strip.id in self._off:
             return ""
         self._off.add(strip.id)
+        where = f"{strip.id}: line {block.first_line} came {off:+.1f} lines off the {strip.line_rate_hz:.4f} lines/s"
+        if strip.id in self._begun:
+            return f"{where} of its first block: give line_period_ns, or announce the strip with its rate"
         return (
-            f"{strip.id}: line {block.first_line} came {off:+.1f} lines off the {strip.line_rate_hz:.4f} lines/s of "
-            "its first block: give line_period_ns, or announce the strip with its rate"
+            f"{where} that the strip was announced with: tie points get wrong times, orientation and points wrong "
+            "places; announce it with the rate that its lines keep (line_rate_hz)"
         )
 
     def ended(self, stamp_ns: int, block: LineBlock | None = None) -> list[Any]:

@@ -371,7 +371,7 @@ class Matcher(Node):
             strip = self._strips[block.strip] = self._found.begin(block)
             out += self._ended(self._found.ended(self._stamp_ns, block))
             out += [self._strip(strip), self._log(f"{strip.id}: nobody announced it, found from its image lines")]
-        off = self._found.note(block, self._stamp_ns)
+        off = self._found.note(block, self._stamp_ns, self._strips[block.strip])
         return out + ([self._log(off, warning=True)] if off else [])
 
     def _ended(self, strips: list[Any]) -> list[Message]:

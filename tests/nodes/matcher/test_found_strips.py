@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sample_messages as sample
@@ -15,6 +17,7 @@ from triline.nodes.node import Message
 from triline.nodes.rectifier.rectifier import Rectifier
 from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.simulator.simulator import Simulator
+from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
 from triline.schemas.topics import find
 from triline.solver.camera.sensors import preset
@@ -62,6 +65,22 @@ def test_lines_that_are_off_the_rate_are_told_once():
         block("S1", 200, late_ns=4_000_000), EPOCH_NS
     )
     assert found.note(block("S1", 300, late_ns=9_000_000), EPOCH_NS) == ""
+
+
+def test_lines_that_are_off_the_rate_of_an_announced_strip_are_told_once():
+    """A nominal rate, and lines with times of their own: tie points take the rate, and would be metres off for it."""
+    node = Matcher()
+    node.step(Message("configuration/camera", EPOCH_NS, camera_message(preset("ads40-small")), "x"))
+    strip = m.Strip(id="S1", first_line_time_ns=EPOCH_NS, line_rate_hz=199.0)
+    node.step(Message("configuration/strip", EPOCH_NS, strip, "x"))
+    told = []
+    for first in range(0, 400, 20):
+        times = EPOCH_NS + (first + np.arange(20)) * PERIOD_NS
+        lines = replace(block("S1", first, period_ns=0, times=times), pixels=np.zeros((20, 1500), np.uint8))
+        out = node.step(Message("sensor/lines/N", EPOCH_NS + (first + 19) * PERIOD_NS, lines, "x"))
+        told += [o.body.message for o in out if o.topic == "event/log" and "lines/s" in o.body.message]
+    assert len(told) == 1
+    assert told[0].startswith("S1: line 100 came -0.5 lines off the 199.0000 lines/s that the strip was announced with")
 
 
 def test_a_strip_that_begins_anew_under_its_name_is_refused():
