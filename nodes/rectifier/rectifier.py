@@ -14,6 +14,7 @@ from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import LocalFrame
+from ...solver.matching.line_quality import full_scale_of
 from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.growing import GrowingOrthoimage, WaitingLines
 from ...solver.orthoimage.heights_of_points import heights_of_points
@@ -45,7 +46,7 @@ class Rectifier(Node):
     samples : at most, across; the orthoimage's cells are as much larger than pixels
     publish_s : platform time between two looks for changed tiles
     budget_mb : megabytes of lines that may wait for their final orientation
-    full_scale : largest grey value; 0 for 4095, or 255 for 8-bit images
+    full_scale : largest grey value; 0 for 255 of 8-bit images, else 4095, or 16383 or 65535 once there are larger ones
     """
 
     name = "rectifier"
@@ -97,6 +98,7 @@ class Rectifier(Node):
         self._factor = 1
         self._next_line: dict[str, int] = {}
         self._rest: WaitingLines | None = None
+        self._seen_scale = 0
         self._heights: dict[str, tuple[float, float, float]] = {}
         self._next_relief_s = -np.inf
         self._surface: Surface | None = None
@@ -251,7 +253,8 @@ class Rectifier(Node):
         self._rest = WaitingLines(lines.strip, first + used, pixels[used:], time_s[used:])
         if not n:
             return
-        scale = 255.0 / (self._full_scale or (255 if pixels.dtype == np.uint8 else 4095))
+        self._seen_scale = full_scale_of(pixels, self._seen_scale)
+        scale = 255.0 / (self._full_scale or self._seen_scale)
         grey = pixels[:used, : width * f].reshape(n, f, width, f).mean(axis=(1, 3), dtype=np.float32) * scale
         small = np.clip(np.rint(grey), 1, 255).astype(np.uint8)
         time_s = time_s[:used].reshape(n, f).mean(axis=1)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .line_quality import GOOD, IS_PARTLY_SATURATED, REASONS, SATURATED, judge_lines
+from .line_quality import FULL_SCALES, GOOD, IS_PARTLY_SATURATED, REASONS, SATURATED, full_scale_of, judge_lines
 from .line_store import LineStore
 from .options import MatchingOptions
 
@@ -68,6 +68,7 @@ class LineIntake:
         self._silent: set[str] = set()
         self._returning: dict[str, int] = {}  # CCD lines that see nothing, and their good lines since
         self._rate = 1.0
+        self._full_scale = 0
         self._faults: dict[tuple[str, str], tuple[int, int, int]] = {}
         self._told_of: set[str] = set()
 
@@ -101,7 +102,7 @@ class LineIntake:
             raise ValueError(f"lines of {ccd} of {pixels.dtype}, wanted uint8 or uint16")
         if not len(pixels) or first_line < 0:
             raise ValueError(f"no lines of {ccd}, or their number {first_line} is below 0")
-        full_scale = self._options.full_scale or (255 if pixels.dtype == np.uint8 else 4095)
+        full_scale = self._options.full_scale or self._full_scale_now(pixels)
         self.saturated = SATURATED * full_scale
         verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
         self._last_line[ccd] = pixels[-1].copy()
@@ -122,6 +123,16 @@ class LineIntake:
         if late:
             self.counters["lines twice or late"] += late
         return usable
+
+    def _full_scale_now(self, pixels: NDArray[np.unsignedinteger]) -> int:
+        """Largest grey value where none is stated, as lines have shown it."""
+        before, self._full_scale = self._full_scale, full_scale_of(pixels, self._full_scale)
+        if self._full_scale > max(before, FULL_SCALES[0]):
+            self.tell(
+                f"grey values above {max(before, FULL_SCALES[0])}: full scale is taken to be {self._full_scale}; "
+                "full_scale in [matcher] states another one"
+            )
+        return self._full_scale
 
     @property
     def seeing(self) -> frozenset[str]:

@@ -8,11 +8,31 @@ from numpy.typing import NDArray
 #: A line is dark if nine tenths of it lie below this share of full scale, saturated if nine tenths lie above;
 #: if a third does, it is told of, but what is left of it is used.
 DARK, SATURATED = 0.02, 0.995
+#: Largest grey values of cameras of 12, 14 and 16 bits, whose pixels all come as 16 bits (definition).
+FULL_SCALES = (4095, 16_383, 65_535)
+#: A camera has more bits if more than this share of its pixels is above; a few may be faults of the transmission.
+ABOVE = 0.01
 #: Places in `REASONS` (definition).
 GOOD, IS_DARK, IS_SATURATED, IS_FROZEN, IS_PARTLY_SATURATED = 0, 1, 2, 3, 4
 REASONS = ("good", "dark", "saturated", "frozen", "partly saturated")
 #: So many samples of a line are looked at. Tuned, for speed.
 SAMPLES = 512
+
+
+def full_scale_of(pixels: NDArray[np.unsignedinteger], so_far: int = 0) -> int:
+    """Largest grey value of a camera that nobody states: the least of `FULL_SCALES` that its pixels keep within.
+
+    Parameters
+    ----------
+    pixels : (n, samples) lines that have come now
+    so_far : what it was taken for by those before; 0 for the first ones
+    """
+    if pixels.dtype == np.uint8:
+        return 255
+    full_scale = max(so_far, FULL_SCALES[0])
+    while full_scale < FULL_SCALES[-1] and (pixels > full_scale).mean() > ABOVE:
+        full_scale = next(scale for scale in FULL_SCALES if scale > full_scale)
+    return full_scale
 
 
 def judge_lines(

@@ -38,7 +38,7 @@ class MatchingOptions:
     least_rays : of a tie point
     budget_mb : megabytes (10^6 bytes) for image lines
     chips_mb : megabytes for patches of earlier strips, 0 for none: no ties from strip to strip
-    full_scale : largest grey value; 0 for 4095, or 255 for 8-bit images
+    full_scale : largest grey value; 0 for 255 of 8-bit images, else 4095, or 16383 or 65535 once there are larger ones
 
     Raises
     ------

@@ -774,6 +774,24 @@ def test_node_begins_again_in_another_local_frame(flown):
     assert not list(node.finish())
 
 
+def test_node_draws_cameras_of_16_bits_as_it_draws_those_of_12(flown):
+    reader = RecordingReader(flown)
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9
+    greys = {}
+    for factor in (1, 16):
+        node, newest = Rectifier(), {}
+        for message in reader.sorted_messages([*node.inputs]):
+            if message.stamp_ns > end_ns:
+                break
+            if message.topic.startswith("sensor/lines/"):
+                message = replace(message, body=replace(message.body, pixels=message.body.pixels * np.uint16(factor)))
+            newest |= {(t.body.row, t.body.column): t.body.data for t in node.step(message)}
+        greys[factor] = {key: np.frombuffer(data, np.uint8).astype(int) for key, data in newest.items()}
+    assert greys[1].keys() == greys[16].keys() and len(greys[1]) > 1
+    for key, grey in greys[1].items():
+        np.testing.assert_allclose(greys[16][key], grey, atol=1)
+
+
 def test_node_draws_no_lines_by_poses_that_are_not_valid(flown):
     reader, node = RecordingReader(flown), Rectifier()
     begin = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9

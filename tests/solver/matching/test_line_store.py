@@ -68,6 +68,27 @@ def test_bad_lines_are_told_apart():
     assert any("partly saturated" in text for text in intake.take_events())
 
 
+@pytest.mark.parametrize(("bits", "full_scale"), [(12, 4095), (14, 16_383), (16, 65_535)])
+def test_bright_pixels_of_14_and_16_bits_are_not_saturated(bits, full_scale):
+    rng = np.random.default_rng(3)
+    intake = LineIntake({"N": 600}, MatchingOptions(), lambda dtype: None)
+    intake.begin_strip(100.0)
+    dim, bright = (
+        rng.integers(low, high, (20, 600)).astype(np.uint16) << (bits - 12) for low, high in ((200, 900), (800, 3900))
+    )
+    dim[5, 300] = 65_535 if bits == 12 else 0  # one wrong bit makes no other camera
+    assert intake.add("N", 0, dim).all() and intake.add("N", 20, bright).all()
+    assert intake.saturated == pytest.approx(0.995 * full_scale)
+    told = intake.take_events()
+    assert bool(told) == (bits > 12) and all(f"full scale is taken to be {full_scale}" in text for text in told[-1:])
+    spoilt = bright.copy()
+    spoilt[3] = full_scale
+    assert intake.add("N", 40, spoilt).tolist() == [i != 3 for i in range(20)]
+    stated = LineIntake({"N": 600}, MatchingOptions(full_scale=4095), lambda dtype: None)
+    stated.begin_strip(100.0)
+    assert stated.add("N", 0, bright).all() == (bits == 12)
+
+
 def test_a_fault_that_comes_again_and_again_is_summed_up():
     intake = LineIntake({"N": 64}, MatchingOptions(), lambda dtype: None)
     intake.begin_strip(100.0)
