@@ -348,7 +348,9 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, roles in (("check", ("check",)), ("control", ("control", "planimetric", "height"))):
         points, d = differences(a, *roles)
-        found[key] = _accuracy(d, np.where(np.isfinite(d), sigma[points], np.nan))
+        mine = np.where(np.isfinite(d), sigma[points], np.nan)
+        survey = np.einsum("nii->ni", known.covariance_enu[_known(a, *roles)])
+        found[key] = _accuracy(d, mine) | _expected(a, mine, survey, independent=key == "check")
     tie = a.solution.determined.copy()
     tie[known.point] = False
     found["tie"] = {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()}
@@ -362,6 +364,27 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     d = points_enu(a.problem, position, known.position_e[k], points)
     found["direct_georeferencing"] = _accuracy(d, np.full_like(d, np.nan)) | {"against": against}
     return found
+
+
+def _expected(a: SceneAdjustment, sigma: Array, survey: Array, *, independent: bool) -> dict[str, Any]:
+    """RMSE to be expected of the differences to given coordinates, which have errors of their own.
+
+    As of any adjustment (`adjustment_result`): check points differ by both errors; control took part, and its sigmas
+    scale with the others, so that the variance of its differences is that of the given coordinate less that of the
+    adjusted one.
+
+    Parameters
+    ----------
+    sigma : (k, 3) of the adjusted points, NaN where nothing is compared
+    survey : (k, 3) variances of the given coordinates, 0 where none is stated
+    """
+    both = survey + sigma**2 if independent else np.maximum(a.test.sigma0**2 * survey - sigma**2, 0.0)
+    used = np.isfinite(both)
+    n = used.sum(axis=0)
+    if not n.any():
+        return {}
+    mean = np.where(used, both, 0.0).sum(axis=0) / np.maximum(n, 1)
+    return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
 
 
 def _beforehand(problem: Problem, solution: SceneSolution) -> Any:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from full_disk import files_of_at_most
 from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
@@ -78,6 +79,33 @@ def test_result_and_tables(block, tmp_path, capsys):
     residuals = rows(out / "residuals.csv")
     assert sum(int(row["rejected"]) for row in residuals) == len(result["rejected"])
     assert {row["ccd"] for row in residuals} == {"F", "B"}
+
+
+def test_expected_rmse_of_check_points_and_control_holds_the_survey(tmp_path, capsys):
+    """Errors of a poor survey looked like those of the adjustment, whose sigmas alone stood beside them."""
+    check, control = [], []
+    for seed in range(4):
+        block = tmp_path / f"pair{seed}"
+        arguments = ["--satellite", "spot5-hrs", "--points", "60", "--control", "9", "--check", "30"]
+        assert main(["simulate", "-q", "-o", str(block), *arguments, "--seed", str(seed)]) == 0
+        points = pd.read_csv(block / "ground_points.csv")
+        given = points["role"] == "check"
+        rng = np.random.default_rng(100 + seed)
+        east = 111_320.0 * np.cos(np.radians(36.0))
+        for axis, metres in zip("XYZ", (east, 111_000.0, 1.0), strict=True):
+            points.loc[given, f"{axis}_m"] += rng.normal(0.0, 6.0, np.count_nonzero(given)) / metres
+            points[f"sigma_{axis}_m"] = points[f"sigma_{axis}_m"].astype(float)
+            points.loc[given, f"sigma_{axis}_m"] = 6.0
+        points.to_csv(block / "ground_points.csv", index=False)
+        assert main(["adjust", str(block), "-o", str(tmp_path / "out")]) == 0
+        assert "RMSE to be expected" in capsys.readouterr().out
+        result = json.loads((tmp_path / "out" / "result.json").read_text())
+        np.testing.assert_allclose(result["check"]["expected_m"], np.hypot(result["check"]["sigma_m"], 6.0), rtol=1e-6)
+        check.append(np.divide(result["check"]["rmse_m"], result["check"]["expected_m"]))
+        control.append(np.divide(result["control"]["rmse_m"], result["control"]["expected_m"]))
+        assert np.mean(np.divide(result["check"]["rmse_m"], result["check"]["sigma_m"])) > 1.8
+    assert 0.9 < np.sqrt(np.mean(np.square(check))) < 1.1
+    assert 0.7 < np.sqrt(np.mean(np.square(control))) < 1.3
 
 
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
