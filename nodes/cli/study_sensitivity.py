@@ -15,7 +15,7 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,7 @@ class _Scene:
     pixel : column and row to the function of any pixel; ValueError where it sees no ground
     rows : (lowest, highest) row of the image, or the names of its lines of detectors where a row is such a line
     samples : columns
+    notes : remarks of who read the metadata
     """
 
     name: str
@@ -91,6 +92,7 @@ class _Scene:
     pixel: Callable[[float, float], Function]
     rows: tuple[float, float] | Sequence[str]
     samples: int
+    notes: tuple[str, ...] = ()
 
     def map(self, n: int) -> SceneMap:
         """Errors on a grid of n columns and n rows, or as many rows as there are lines of detectors."""
@@ -167,8 +169,13 @@ def _scene(args: argparse.Namespace, name: str) -> _Scene:
     if name == "bilsat":
         return _frame(args, name, bilsat_camera(), _FRAME_GROUND_M)
     if path.is_file() and is_frame_json(path):
-        camera, stated = read_frame(path, [])
-        return _frame(args, name, camera, _GROUND_M, Sigmas(stated["position_m"], stated["attitude_rad"]))
+        notes: list[str] = []
+        camera, found = read_frame(path, notes)
+        stated = Sigmas(found["position_m"], found["attitude_rad"])
+        if stated.any:  # a frame image has no keys for the others
+            _, _, _, pixel, height = _FRAME
+            stated = replace(stated, pixel=(pixel, pixel), height_m=height)
+        return _frame(args, name, camera, _GROUND_M, stated, notes)
     return _satellite(args, name)
 
 
@@ -197,7 +204,7 @@ def _sigmas(args: argparse.Namespace, usual: tuple[Any, ...], stated: Sigmas | N
 
 
 def _satellite(args: argparse.Namespace, name: str) -> _Scene:
-    stated = None
+    stated, notes = None, []
     if name in ORBITAL_SENSORS:
         sensors = overpass(ORBITAL_SENSORS[name], *_PLACE_DEG).sensors
         ccd = args.ccd or next(iter(sensors))
@@ -209,7 +216,10 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
             known = ", ".join([*ORBITAL_SENSORS, "ads40"])
             raise UserError(f"{name}: neither a file nor a simulated sensor, wanted metadata or one of {known}")
         scene = read_scene(Path(name))
-        stated = scene.sigmas
+        stated, notes = scene.sigmas, list(scene.notes)
+        if args.ccd is None and len(scene.sensors) > 1:
+            taken = next(ccd for ccd, sensor in scene.sensors.items() if sensor is scene.sensor)
+            notes.append(f"line of detectors {taken} of {', '.join(scene.sensors)}: --ccd takes another")
         model = scene.model("rigorous", args.ccd)
         assert isinstance(model, PushbroomSensor)
         sensor = model
@@ -227,12 +237,14 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
     return _Scene(
         name, where, function, satellite_inputs(_sigmas(args, _SATELLITE, stated)), SATELLITE,
         lambda column, row: SatellitePixel(sensor, row, column, height), (0.0, sensor.lines - 1.0), sensor.samples,
+        tuple(notes),
     )  # fmt: skip
 
 
 def _frame(
-    args: argparse.Namespace, name: str, camera: FrameCamera, ground_m: float, stated: Sigmas | None = None
-) -> _Scene:
+    args: argparse.Namespace, name: str, camera: FrameCamera, ground_m: float, stated: Sigmas | None = None,
+    notes: Sequence[str] = (),
+) -> _Scene:  # fmt: skip
     if args.ccd is not None:
         raise UserError(f"{name}: --ccd {args.ccd}, but a frame image has no lines of detectors")
     if args.refraction:
@@ -247,6 +259,7 @@ def _frame(
         name, {"column": column, "row": row, "height_m": height}, function,
         camera_inputs(FRAME, _sigmas(args, _FRAME, stated), _FRAME_FOCAL_MM), FRAME,
         lambda column, row: FramePixel(camera, row, column, height), (0.0, camera.lines - 1.0), camera.samples,
+        tuple(notes),
     )  # fmt: skip
 
 
@@ -323,6 +336,7 @@ def _as_table(scene: _Scene, found: Study) -> dict[str, Any]:
         "missed": found.drawn.missed,
         "converged": found.drawn.converged,
         "results": per_result,
+        "notes": list(scene.notes),
     }
 
 
@@ -387,6 +401,7 @@ def _as_text(table: dict[str, Any]) -> str:
         lines.append("  note: Monte Carlo has not converged to 2 %; take more --runs")
     if table["missed"]:
         lines.append(f"  note: {table['missed']} of {table['runs']} runs missed the ground")
+    lines += [f"  note: {note}" for note in table["notes"]]
     return "\n".join(lines)
 
 

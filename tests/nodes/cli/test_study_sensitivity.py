@@ -6,7 +6,7 @@ import json
 
 import pandas as pd
 import pytest
-from satellite_scenes import Truth, write_dimap2
+from satellite_scenes import Truth, write_dimap2, write_folder
 
 from triline.nodes.cli import main
 
@@ -81,6 +81,32 @@ def test_a_frame_camera_of_ones_own(tmp_path, capsys):
     parameters = scene["results"]["east"]["parameters"]
     assert parameters["phi"]["moves_m"] == pytest.approx(3000.0 * 0.01 * 3.14159 / 180.0, rel=1e-3)
     assert parameters["east"]["moves_m"] == pytest.approx(0.1, rel=1e-3) and len(scene["map"]) == 81
+
+
+def test_what_a_frame_image_cannot_state_has_its_usual_sigma(tmp_path, capsys):
+    """With sigmas of position and attitude alone, ground and pixels of a frame image counted as known without error."""
+    file = tmp_path / "photo.json"
+    exterior = {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 3300.0, "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
+    interior = {"focal_length_mm": 100.0, "pixel_size_mm": 0.005, "lines": 3000, "samples": 4000}
+    sigma = {"position_m": [0.1, 0.1, 0.2], "atitude_deg": [0.01, 0.01, 0.01]}
+    file.write_text(json.dumps({"interior": interior, "exterior": exterior, "sigma": sigma}))
+    command = ["study", "sensitivity", str(file), *FEW, "--pixel", "0", "1499.5", "--json"]
+    assert main(command) == 0
+    scene = json.loads(capsys.readouterr().out)["scenes"][0]
+    east = scene["results"]["east"]["parameters"]
+    # seen 10 mm beside the middle of an image of 100 mm: a metre of height moves it 0.1 m
+    assert east["height"]["moves_m"] == pytest.approx(15.0 * 9.9975 / 100.0, rel=0.01)
+    assert east["sample"]["moves_m"] == pytest.approx(0.3 * 3000.0 * 0.005 / 100.0, rel=0.01)
+    assert scene["notes"] == ["photo.json: key sigma.atitude_deg is not known and was ignored"]
+    assert main([*command, "--height-sigma", "0.5", "--pixel-sigma", "0"]) == 0
+    east = json.loads(capsys.readouterr().out)["scenes"][0]["results"]["east"]["parameters"]
+    assert east["height"]["sigma"] == 0.5 and east["sample"]["sigma"] == 0.0
+
+
+def test_what_reading_the_metadata_told_is_told(tmp_path, capsys):
+    folder = write_folder(tmp_path / "scene", Truth(lines=400, samples=50), settings="[sigma]\npostion_m = [1, 1, 1]\n")
+    assert main(["study", "sensitivity", str(folder), *FEW]) == 0
+    assert "  note: scene.toml: key sigma.postion_m is not known and was ignored" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
