@@ -100,18 +100,14 @@ def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
             R_axes = frame.R_l_crs(position[None])[0]
         except CrsError as error:
             raise UserError(f"{path}: {exterior.name('crs')}: {error}") from None
-        C, R_el = frame.origin_e + frame.R_el @ local, frame.R_el
-        if exterior.has("omega_phi_kappa_deg"):
-            return C, R_el @ R_axes @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
-        lat, lon, _ = WGS84.geodetic(C)
+        C, R_axes_e = frame.origin_e + frame.R_el @ local, frame.R_el @ R_axes
     elif exterior.has("lat_deg"):
         lat, lon = np.radians([_within(exterior, "lat_deg", 90.0), _within(exterior, "lon_deg", 360.0)])
         C = WGS84.cartesian(lat, lon, exterior.number("height_m"))
-        if exterior.has("omega_phi_kappa_deg"):
-            R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
-            return C, R_el @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
+        R_axes_e = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
     else:
         raise UserError(f"{path}: {exterior.where}: no orientation, wanted {_WAYS}")
-    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+    if exterior.has("omega_phi_kappa_deg"):
+        return C, R_axes_e @ matrix_from_angles(*np.radians(exterior.numbers("omega_phi_kappa_deg", 3)))
     rph = np.radians(exterior.numbers("roll_pitch_heading_deg", 3))
-    return C, R_el @ R_ENU_NED @ matrix_from_navigation(*rph) @ R_BC_NOMINAL
+    return C, R_axes_e @ R_ENU_NED @ matrix_from_navigation(*rph) @ R_BC_NOMINAL

@@ -434,6 +434,22 @@ def test_the_ways_to_state_an_orientation_agree(tmp_path, way):
     assert np.abs(second.R_ec - first.R_ec).max() < 1e-9
 
 
+@pytest.mark.parametrize("angles", [{"roll_pitch_heading_deg": [0, 0, 30]}, {"omega_phi_kappa_deg": [0, 0, 60.0]}])
+def test_angles_of_a_frame_camera_in_a_crs_are_from_its_grid_north(tmp_path, angles):
+    """Three degrees from the middle of the zone grid north is 2.3 degrees off; headings were from true north."""
+    from pyproj import Transformer
+
+    to_map = Transformer.from_crs("EPSG:4326", "EPSG:32636", always_xy=True)
+    x, y = to_map.transform(36.0, 50.0)
+    exterior = {"crs": "EPSG:32636", "position": [x, y, 3000.0], **angles}
+    (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": exterior}))
+    camera = read_frame(tmp_path / "f.json", [])[0]
+    middle, ends = 0.5 * (camera.lines - 1), np.array([0.0, camera.samples - 1.0])
+    located = camera.direct(np.full(2, middle), ends, np.zeros(2))
+    east, north = np.diff(to_map.transform(np.degrees(located[:, 1]), np.degrees(located[:, 0])), axis=1)[:, 0]
+    assert np.degrees(np.arctan2(east, north)) == pytest.approx(30.0, abs=1e-3)
+
+
 def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
     _, path, model, relief, dem, image = scene
     rng = np.random.default_rng(4)
