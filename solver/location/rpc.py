@@ -30,6 +30,9 @@ _MOST_STEPS = 60
 #: The slope is computed anew in every third step; tuned for time.
 _STEPS_PER_SLOPE = 3
 _PORTION = 4096
+#: Polynomials of third order come back to where they were: points further from the middle of the box than so many
+#: halves of it, beside the margin asked for, are not seen, whatever pixel comes out. Tuned: boxes are like scenes.
+_FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -142,13 +145,18 @@ class Rpc:
 
         Parameters
         ----------
-        margin_px : points further outside the image become NaN; None for no limit
+        margin_px : points further outside the image become NaN, and those far beyond the ground of the polynomials,
+            which may come back into it; None for no limit
         """
         out = self.to_image.at(np.degrees(lon), np.degrees(lat), height_m)[:, ::-1].copy()
-        if margin_px is not None and self.lines and self.samples:
-            ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
-            with np.errstate(invalid="ignore"):
+        if margin_px is None:
+            return out
+        with np.errstate(invalid="ignore"):
+            if self.lines and self.samples:
+                ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
                 out[~((out >= -0.5 - margin_px) & (out <= ends)).all(axis=1)] = np.nan
+            beyond = np.abs(self.to_image.normalised(np.degrees(lon), np.degrees(lat), height_m)[:2]).max(axis=0)
+            out[~(beyond <= _FARTHEST * (1.0 + margin_px / np.abs(self.to_image.out_scale).min()))] = np.nan
         return out
 
     def direct(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:

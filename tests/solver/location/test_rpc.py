@@ -10,7 +10,7 @@ from satellite_scenes import Truth, write_dimap2
 
 from triline.nodes.formats.satellite.read import read_scene
 from triline.solver.location.affine_bias import AffineBias, CorrectedModel, fit_bias
-from triline.solver.location.rpc import RationalFunctions, term_slopes, terms
+from triline.solver.location.rpc import RationalFunctions, Rpc, term_slopes, terms
 from triline.solver.location.rpc_fit import fit_to_model, fit_to_points
 
 
@@ -126,6 +126,23 @@ def test_too_few_points_and_heights_in_the_wrong_order(scene):
 TRUE_BIAS = AffineBias(
     np.array([[3.0, 0.4, -0.2], [-5.0, 0.1, 0.6]]), np.zeros((6, 6)), np.full(2, 2e4), np.full(2, 2e4)
 )
+
+
+def test_what_lies_far_beyond_the_ground_of_polynomials_is_not_in_the_image():
+    """Cubics come back: ground 370 km from a Pleiades scene of its own RPC appeared in the image."""
+    c = np.zeros((4, 20))
+    c[0, 1], c[0, 11], c[2, 2] = 1.0, -1.0 / 25.0, -1.0  # sample by L - L3 / 25, line by -P
+    c[1, 0] = c[3, 0] = 1.0
+    functions = RationalFunctions(c, [7.0, 43.0, 500.0], [0.1, 0.1, 500.0], [999.5, 999.5], [1000.0, 1000.0])
+    rpc = Rpc(functions, None, 2000, 2000)
+    lat, lon = np.radians([43.0, 43.0, 43.0]), np.radians([7.05, 7.5, 7.2])
+    pixel = rpc.inverse(lat, lon, 500.0, 0.0)
+    np.testing.assert_allclose(pixel[0], [999.5, 999.5 + 1000.0 * (0.5 - 0.125 / 25.0)])
+    assert np.isnan(pixel[1:]).all()
+    assert np.isfinite(rpc.inverse(lat[2:], lon[2:], 500.0, 1000.0)).all()  # a margin is for what lies beside
+    assert np.isfinite(rpc.inverse(lat, lon, 500.0)).all()
+    unsized = replace(rpc, lines=0, samples=0)
+    assert np.isnan(unsized.inverse(lat, lon, 500.0, 0.0)[:, 0]).tolist() == [False, True, False]
 
 
 def test_a_corrected_model_is_a_pair(fitted):
