@@ -516,8 +516,13 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor, ground: Ground) -> Err
                 f"{args.sensor}: --position-sigma and --attitude-sigma go with a rigorous model, not with RPC"
             )
         rpc_m2 = bare.error_bias_m**2 + bare.error_random_m**2
+    factor = 1.0
     if fit is not None:
-        sensor.notes.append("sigma: of the correction by control, in place of the orientation's")
+        words = "sigma: of the correction by control, in place of the orientation's"
+        if args.pixel_sigma is None and fit.redundancy > 0:  # nobody has stated how well control is measured
+            factor = fit.sigma0
+            words += f", with control as good as it fits ({factor * CONTROL_SIGMA_PX:.2g} px)"
+        sensor.notes.append(words)
     elif not (oriented or rpc_m2 or stated.time_s):
         sensor.notes.append(
             "sigma: no sigma of the orientation is known (--position-sigma, --attitude-sigma, --control)"
@@ -536,7 +541,7 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor, ground: Ground) -> Err
             )
             J = np.zeros((len(line), 2, 6))
             J[:, 0, :3], J[:, 1, 3:] = T, T
-            return Q + J @ fit.bias.covariance @ np.swapaxes(J, 1, 2), level
+            return Q + factor**2 * J @ fit.bias.covariance @ np.swapaxes(J, 1, 2), level
         u, v = line + sensor.offset[0], sample + sensor.offset[1]
         if isinstance(bare, PushbroomSensor) and sensor_sigmas.any:
             u = np.clip(u, 0.0, bare.lines - 1.0)

@@ -481,6 +481,35 @@ def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
     assert values[:, row, column] - 10.0 == pytest.approx([a + 7.0 + 0.002 * b, b - 4.0 - 0.003 * a], abs=0.01)
 
 
+def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, capsys):
+    """Nobody states how well control is measured: half a pixel was taken, were it a tenth of one or two."""
+    _, path, model, _, dem, image = scene
+    rng = np.random.default_rng(6)
+    u, v = rng.uniform(20, 380, 60), rng.uniform(20, 280, 60)
+    g = model.direct(u, v, rng.uniform(100, 900, 60))
+    noise, means = rng.normal(size=(2, 60)), {}
+
+    def sigma_with(noise_px, *options):
+        control, target = tmp_path / "control.csv", tmp_path / "s.tif"
+        places = zip(g.tolist(), v + noise_px * noise[0], u + noise_px * noise[1], strict=True)
+        rows = [f"{np.degrees(lon):.10f},{np.degrees(lat):.10f},{h},{x},{y}" for (lat, lon, h), x, y in places]
+        control.write_text("\n".join(["lon_deg,lat_deg,height_m,column,row", *rows, ""]))
+        args = ["--dem", str(dem), "--dem-datum", "0", "--control", str(control), "--sigma", str(target), *options]
+        assert main(["rectify", str(image), "--sensor", str(path), "-o", str(tmp_path / "o.tif"), *args, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["control"]["rejected"] == 0
+        with rasterio.open(target) as found:
+            return float(np.nanmean(found.read(1))), told["notes"]
+
+    for noise_px in (0.1, 0.4):
+        means[noise_px], notes = sigma_with(noise_px)
+        assert any("with control as good as it fits" in note for note in notes)
+    assert means[0.4] / means[0.1] == pytest.approx(4.0, rel=0.01)
+    stated, notes = sigma_with(0.1, "--pixel-sigma", "0.5")
+    assert not any("as good as it fits" in note for note in notes)
+    assert stated > 4.0 * means[0.1]
+
+
 # -- what is said of bad input -------------------------------------------------------------------------------------
 
 
