@@ -194,6 +194,8 @@ class GrowingImage:
             self._offset = header_integer(path, header, "header offset", 0)
         elif not self._samples:
             raise UserError(f"{self.path}: neither an ENVI header beside it nor samples, wanted one of them")
+        elif self._band:
+            raise UserError(f"{self.path}: band {self._band + 1}: no ENVI header beside it, so that it has one band")
         self._file = open(self.path, "rb")  # noqa: SIM115  # for as long as it grows
 
     def close(self) -> None:

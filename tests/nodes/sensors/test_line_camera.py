@@ -83,6 +83,14 @@ def test_a_raw_file_with_its_own_line_times(tmp_path):
     assert strip.body.first_line_time_ns == times[0] - 500_000_000
 
 
+def test_a_second_band_of_a_raw_file_is_refused(tmp_path):
+    """Nobody says that it has one; the program ended with a Python error."""
+    (tmp_path / "n.raw").write_bytes(IMAGE[:20, 0].tobytes())
+    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw@2"}, first_time=START))
+    with pytest.raises(UserError, match=r"n\.raw: band 2: no ENVI header beside it, so that it has one band"):
+        read(sensor, 1)
+
+
 def test_a_folder_of_blocks(tmp_path):
     folder = tmp_path / "blocks"
     folder.mkdir()
