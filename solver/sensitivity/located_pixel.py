@@ -6,7 +6,7 @@ Results are metres east, north and up from where the pixel is located without er
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,14 @@ from ..geometry.rotation import R_ENU_NED, matrix_from_angles
 from ..location.frame_camera import FrameCamera
 from ..location.pushbroom import PushbroomSensor, Rays, without_aberration
 from ..location.uncertainty import Sigmas, named_axes_b
+from ..orbit.motion import FixedPoses
 from .inputs import Normal
 
 Array = NDArray[np.floating]
 
+#: Lines beyond the end of orbit and attitude that are still located, at the rate of the last one. Tuned: errors of time
+#: are a share of a line or a few of them.
+_BEYOND_LINES = 10.0
 #: Results of every function here.
 RESULTS = ("east", "north", "up")
 #: Parameters of a satellite, in the order of `Sigmas`, and their units.
@@ -75,9 +79,7 @@ class SatellitePixel:
         sensor = self._sensor
         time = sensor.line_times.time_of(np.array([self._line])) + errors[:, 6]
         line = sensor.line_times.line_of(time) + errors[:, 7]
-        low, high = sensor.covered_lines
-        inside = (line >= low) & (line <= high)
-        pose = sensor.pose(np.clip(line, low, high))
+        inside, pose = self._pose(line)
         C, velocity = pose.position_e, sensor.motion.inertial_velocity(pose.position_e, pose.velocity_e)
         up = C / np.linalg.norm(C, axis=1, keepdims=True)
         across = np.cross(velocity, up)
@@ -92,6 +94,24 @@ class SatellitePixel:
         moved = C + np.einsum("nij,nj->ni", axes, errors[:, :3])
         P = sensor.reach(Rays(moved, d), self._height + errors[:, 9])
         return np.where(inside[:, None], (P - self._ground) @ self._R_ne.T, np.nan)
+
+    def _pose(self, line: Array) -> tuple[NDArray[np.bool_], FixedPoses]:
+        """Whether lines (n,) have a pose, and their poses: as of the line inside where orbit and attitude end close by.
+
+        They may end with the image, whose first and last pixels have errors of time and line as the others.
+        """
+        low, high = self._sensor.covered_lines
+        within = np.clip(line, low, high)
+        pose, beyond = self._sensor.pose(within), line - within
+        out = np.flatnonzero(beyond)
+        if not len(out) or high - low < 1.0:
+            return beyond == 0, pose
+        inner = self._sensor.pose(within[out] - np.sign(beyond[out]))
+        position, R, share = pose.position_e.copy(), pose.R_eb.copy(), np.abs(beyond[out])[:, None]
+        position[out] += share * (position[out] - inner.position_e)
+        turn = Rotation.from_matrix(R[out] @ np.swapaxes(inner.R_eb, 1, 2)).as_rotvec()
+        R[out] = Rotation.from_rotvec(share * turn).as_matrix() @ R[out]
+        return np.abs(beyond) <= _BEYOND_LINES, replace(pose, position_e=position, R_eb=R)
 
 
 class FramePixel:

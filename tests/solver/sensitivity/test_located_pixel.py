@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,25 @@ def test_a_satellite_against_closed_derivatives(sensor):
     np.testing.assert_allclose(found.jacobian / scale, closed / scale, atol=2e-3)
     covariance = ground_covariance(sensor, 500.0, 1000.0, 200.0, SIGMAS)[0]
     np.testing.assert_allclose(found.sigma, np.sqrt(np.diag(covariance)), rtol=1e-3)
+
+
+def test_first_and_last_lines_where_orbit_and_attitude_end_with_the_image(sensor):
+    """Errors of time and line lead beyond: these pixels were refused, and the edges missing from maps of a scene."""
+    motion = copy(sensor.motion)
+    motion.start_s, motion.end_s = np.sort(sensor.line_times.time_of(np.array([0.0, sensor.lines - 1.0])))
+    ending = sensor.changed(motion, sensor.look)
+    inputs = satellite_inputs(SIGMAS)
+    for line in (0.0, sensor.lines - 1.0):
+        short, whole = (
+            propagate(SatellitePixel(s, line, 1000.0, 200.0), inputs.mean, inputs.sigma**2) for s in (ending, sensor)
+        )
+        scale = np.abs(whole.jacobian).max(axis=0)
+        np.testing.assert_allclose(short.jacobian / scale, whole.jacobian / scale, atol=1e-6)
+        errors = np.zeros((2, 10))
+        errors[:, 7] = [-5.0, 5.0] if line == 0.0 else [5.0, -5.0]
+        one, other = (SatellitePixel(s, line, 1000.0, 200.0)(errors) for s in (ending, sensor))
+        np.testing.assert_allclose(one, other, atol=1e-3)
+        assert np.isnan(SatellitePixel(ending, line, 1000.0, 200.0)(20.0 * errors[:1])).all()
 
 
 def test_no_errors_no_change_with_refraction_too(sensor):
