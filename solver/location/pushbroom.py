@@ -28,6 +28,8 @@ _PORTION = 8192
 _GUESS_LINES = 65
 #: How far Newton's method may look beyond the ends of the line of detectors, pixels.
 _OVERSHOOT_PX = 1000.0
+#: What is further off than this, lines, when it has come to rest is held at the end of orbit and attitude.
+_HELD_LINES = 1e-3
 #: Refraction is not computed anew once line and sample change by less, pixels. Derived: it changes by 1e-4 of that.
 _STEADY_PX = 1e-3
 
@@ -143,16 +145,46 @@ class PushbroomSensor:
 
     @property
     def covered_lines(self) -> tuple[float, float]:
-        """First and last line, with fractions, for which there are orbit and attitude."""
+        """First and last line, with fractions, for which there are orbit and attitude; all of the image at least."""
         ends = np.sort(self.line_times.line_of(np.array([self.motion.start_s, self.motion.end_s])))
-        return float(ends[0]), float(ends[1])
+        return min(float(ends[0]), -0.5), max(float(ends[1]), self.lines - 0.5)
+
+    @property
+    def _covered_s(self) -> tuple[float, float]:
+        """The same in the seconds of the motion."""
+        ends = np.sort(self.line_times.time_of(np.array([-0.5, self.lines - 0.5])))
+        return min(self.motion.start_s, float(ends[0])), max(self.motion.end_s, float(ends[1]))
 
     def _pose(self, time_s: Array) -> FixedPoses:
         """Earth-fixed pose of the perspective centre."""
-        pose = self.motion.at(time_s)
+        low, high = self._covered_s
+        inside = np.clip(time_s, self.motion.start_s, self.motion.end_s)
+        beyond = time_s - inside
+        if beyond.any() and low <= time_s.min() and time_s.max() <= high:
+            pose = self._continued(inside, beyond)
+        else:  # which tells what is not covered
+            pose = self.motion.at(time_s)
         if not self._lever_arm.any():
             return pose
         return replace(pose, position_e=pose.position_e + pose.R_eb @ self._lever_arm)
+
+    def _continued(self, time_s: Array, beyond_s: Array) -> FixedPoses:
+        """Poses so much before the first or after the last one of the motion, at its rates there.
+
+        Orbit and attitude may end with the centre of the first or last line, whose pixels are a line wide.
+        """
+        from scipy.spatial.transform import Rotation
+
+        pose = self.motion.at(time_s)
+        out = np.flatnonzero(beyond_s)
+        period = abs(float(self.line_times.time_of(1.0) - self.line_times.time_of(0.0)))
+        step = min(period, self.motion.end_s - self.motion.start_s)
+        inner = self.motion.at(time_s[out] - step * np.sign(beyond_s[out]))
+        position, R = pose.position_e.copy(), pose.R_eb.copy()
+        position[out] += pose.velocity_e[out] * beyond_s[out, None]
+        turn = Rotation.from_matrix(R[out] @ np.swapaxes(inner.R_eb, 1, 2)).as_rotvec()
+        R[out] = Rotation.from_rotvec(turn * (np.abs(beyond_s[out]) / step)[:, None]).as_matrix() @ R[out]
+        return replace(pose, position_e=position, R_eb=R)
 
     def ground(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
         """Earth-fixed positions (n, 3) in metres where the rays of pixels (n,) reach heights; NaN where they miss.
@@ -271,7 +303,7 @@ class PushbroomSensor:
             dv = (g + g_rate * du) * square / _dot(along, along)
             new_v = np.clip(v[active] + dv, low, high)
             moved[active] = np.maximum(np.abs(du), np.abs(new_v - v[active]))
-            seen[active] = (depth > 0) & (np.abs(f) <= np.abs(f_rate))  # less than a line off: not held at an end
+            seen[active] = (depth > 0) & (np.abs(f) <= _HELD_LINES * np.abs(f_rate))  # not held at an end
             u[active], v[active] = new_u, new_v
             active = active[moved[active] > _CONVERGED_PX]
             if not len(active):
@@ -320,7 +352,7 @@ class PushbroomSensor:
         return np.einsum("nij,ni->nj", pose.R_eb, d)
 
     def _time_inside(self, u: Array) -> Array:
-        return np.clip(self.line_times.time_of(u), self.motion.start_s, self.motion.end_s)
+        return np.clip(self.line_times.time_of(u), *self._covered_s)
 
     def _first_guess(self, P: Array) -> tuple[Array, Array]:
         """Line and sample (n,), (n,) near where points (n, 3) appear.

@@ -7,8 +7,10 @@ import re
 
 import numpy as np
 import pytest
-from satellite_scenes import Truth, write_dimap1, write_dimap2, write_folder, write_isd
+from satellite_scenes import Truth, utc, write_dimap1, write_dimap2, write_folder, write_isd
+from scipy.spatial.transform import Rotation
 
+from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.satellite.folder_writer import write_overpass
 from triline.nodes.formats.satellite.read import read_scene
@@ -89,6 +91,32 @@ def test_points_beside_the_image_are_not_in_it(tmp_path):
     ahead = sensor.ground(np.array([-300.0, 20_300.0]), v, 0.0)
     assert np.isnan(sensor.ground_to_pixel(ahead)).all()
     np.testing.assert_allclose(sensor.ground_to_pixel(ahead, 400.0)[:, 0], [-300.0, 20_300.0], atol=1e-6)
+
+
+def test_orbit_and_attitude_may_end_with_the_image(tmp_path, capsys):
+    """Its outer pixels are a line wide; what lies in their outer halves was a fault, and ground beside them in them."""
+    truth = Truth(lines=2000, samples=300)
+    whole = read_scene(write_folder(tmp_path / "whole", truth, angles=False)).model("rigorous")
+    folder = write_folder(tmp_path / "short", truth, angles=False)
+    t = np.linspace(0.0, (truth.lines - 1) * truth.period_s, 12)
+    for name, columns, values in (
+        ("ephemeris.csv", "X_m,Y_m,Z_m", truth.orbit(t)[0]),
+        ("attitude.csv", "qx,qy,qz,qw", Rotation.from_matrix(truth.R_eb(t)).as_quat()),
+    ):
+        rows = [f"{utc(k)}," + ",".join(f"{x:.15g}" for x in row) for k, row in zip(t, values, strict=True)]
+        (folder / name).write_text("\n".join([f"time_utc,{columns}", *rows, ""]))
+    short = read_scene(folder).model("rigorous")
+    line, sample = np.array([-0.4, 0.0, 1999.0, 1999.4]), np.array([10.0, 20.0, 30.0, 40.0])
+    np.testing.assert_allclose(short.ground(line, sample, 100.0), whole.ground(line, sample, 100.0), atol=2e-3)
+    inside = short.ground_to_pixel(whole.ground(line, sample, 100.0))
+    np.testing.assert_allclose(inside, np.stack([line, sample], axis=1), atol=1e-3)
+    beside = whole.ground(np.array([-0.9, -0.6, 1999.6, 1999.9]), sample, 100.0)
+    assert np.isnan(short.ground_to_pixel(beside)).all() and np.isnan(whole.ground_to_pixel(beside)).all()
+    with pytest.raises(ValueError, match="lies outside"):
+        short.ground([-2.0], [10.0], 100.0)
+    (tmp_path / "pixels.csv").write_text("column,row,height_m\n10,-0.4,100\n")
+    assert main(["locate", str(folder), "--pixels", str(tmp_path / "pixels.csv"), "-o", str(tmp_path / "g.csv")]) == 0
+    assert "1 rows, 0 of them miss" in capsys.readouterr().out
 
 
 def test_another_planet(tmp_path):
