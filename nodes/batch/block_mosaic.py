@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.matching.line_quality import FULL_SCALES
 from ...solver.orthoimage.seams import feather_weights, label_cost, seam_labels, seam_lines
 from ...solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance
 from ...solver.rectification.grid import transformer_to
@@ -201,7 +202,7 @@ def tones_job(folder: Path, key: Key, layers: dict[int, Layer], settings: Mosaic
     seen, values, off, rough = [], [], [], []
     for w in windows:
         whole = _places(w.known, n).mean(axis=(2, 3)) == 1.0
-        largest = _largest(layers[w.index].dtype)
+        largest = _largest(layers[w.index].dtype, w.values)
         for band in w.values:  # what is saturated says nothing of its radiance
             whole &= _places(band, n).max(axis=(2, 3)) < largest
         seen.append(whole)
@@ -239,9 +240,13 @@ def _places(cells: NDArray[Any], n: int) -> NDArray[Any]:
     return cells.reshape(n, PLACE, n, PLACE).swapaxes(1, 2)
 
 
-def _largest(dtype: str) -> float:
+def _largest(dtype: str, values: NDArray[np.float32]) -> float:
+    """Grey value at which a layer is saturated, by its type and its values: those of 12 bits stand in 16."""
     kind = np.dtype(dtype)
-    return float(np.iinfo(kind).max) if kind.kind in "iu" else np.inf
+    if kind.kind not in "iu":
+        return np.inf
+    top = float(values.max(initial=0.0))
+    return top if kind.itemsize > 1 and top in FULL_SCALES else float(np.iinfo(kind).max)
 
 
 def _windows(layers: dict[int, Layer], row: int, column: int, rows: int, columns: int) -> list[Window]:

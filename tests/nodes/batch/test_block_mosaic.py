@@ -111,6 +111,26 @@ def test_a_mosaic_has_one_no_data_value(tmp_path):
         assert (values == 1000).sum() == 2 * (200 * 300 - 100 * 100)
 
 
+def test_what_12_bits_saturate_says_nothing_of_tones(tmp_path, capsys):
+    """Clouds and snow at 4095 in both of two strips, whose values stand in 16 bits, made their gains alike."""
+    rng = np.random.default_rng(8)
+    ground = np.repeat(np.repeat(rng.uniform(300.0, 6000.0, (32, 36)), 16, axis=0), 16, axis=1)
+    inputs = []
+    for k, (left, gain) in enumerate(((0, 1.0), (64, 0.8))):
+        values = gain * ground[:, left : left + 512] + rng.normal(0.0, 5.0, (512, 512))
+        values = np.clip(np.rint(values), 1, 4095).astype(np.uint16)
+        inputs.append(tmp_path / f"ortho{k}.tif")
+        place = rasterio.Affine(GSD, 0, LEFT + left * GSD, 0, -GSD, TOP)
+        shape = {"driver": "GTiff", "height": 512, "width": 512, "count": 1, "dtype": "uint16", "crs": "EPSG:32632"}
+        with rasterio.open(inputs[-1], "w", transform=place, nodata=0, **shape) as target:
+            target.write(values[None])
+    words = [*map(str, inputs), "--mosaic", "--tile", "256", "--balance", "gain", "--workers", "1"]
+    assert main(["rectify", *words, "-o", str(tmp_path / "block.tif"), "--json"]) == 0
+    one, other = json.loads(capsys.readouterr().out)["bands"][0]["layers"]
+    sigma = float(np.hypot(one["gain_sigma"], other["gain_sigma"]))
+    assert abs(other["gain"] / one["gain"] - 0.8) < 4.0 * sigma < 0.01
+
+
 def test_seam_lines_are_where_the_source_changes(made):
     seams = json.loads(made.with_suffix(".seams.geojson").read_text())["features"]
     pairs = {tuple(f["properties"]["layers"]) for f in seams}
