@@ -72,10 +72,7 @@ def run(args: argparse.Namespace) -> int:
     sigmas = stated_sigmas(args, scene.sigmas)
     if sigmas.any and isinstance(model, Rpc):
         raise UserError(f"{args.sensor}: sigmas go with a rigorous model, this is an RPC")
-    notes = list(scene.notes)
-    if args.ccd is None and len(scene.sensors) > 1 and isinstance(model, PushbroomSensor):
-        taken = next(ccd for ccd, sensor in scene.sensors.items() if sensor is scene.sensor)
-        notes.append(f"line of detectors {taken} of {', '.join(scene.sensors)}: --ccd takes another")
+    notes = [*scene.notes, *scene.line_taken(model, args.ccd)]
     if args.pixels:
         columns, missed = _to_ground(Path(args.pixels), model, sigmas, notes)
     else:

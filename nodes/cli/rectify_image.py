@@ -247,7 +247,7 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     else:
         scene = read_scene(path)
         bare = scene.model(args.model, args.ccd)
-        notes += scene.notes
+        notes += [*scene.notes, *scene.line_taken(bare, args.ccd)]
         kind, sigmas = ("RPC" if isinstance(bare, Rpc) else "rigorous model"), scene.sigmas
     bare = with_refraction(args, bare)
     ellipsoid = WGS84 if isinstance(bare, Rpc) else bare.ellipsoid

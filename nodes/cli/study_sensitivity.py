@@ -216,11 +216,8 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
             known = ", ".join([*ORBITAL_SENSORS, "ads40"])
             raise UserError(f"{name}: neither a file nor a simulated sensor, wanted metadata or one of {known}")
         scene = read_scene(Path(name))
-        stated, notes = scene.sigmas, list(scene.notes)
-        if args.ccd is None and len(scene.sensors) > 1:
-            taken = next(ccd for ccd, sensor in scene.sensors.items() if sensor is scene.sensor)
-            notes.append(f"line of detectors {taken} of {', '.join(scene.sensors)}: --ccd takes another")
         model = scene.model("rigorous", args.ccd)
+        stated, notes = scene.sigmas, [*scene.notes, *scene.line_taken(model, args.ccd)]
         assert isinstance(model, PushbroomSensor)
         sensor = model
     if args.refraction:

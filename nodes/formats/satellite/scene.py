@@ -72,6 +72,13 @@ class SatelliteScene:
             raise UserError(f"no {which or 'rigorous'} model in a file of the kind {self.kind}")
         return chosen
 
+    def line_taken(self, model: PushbroomSensor | Rpc, ccd: str | None) -> list[str]:
+        """A note where the file has several lines of detectors and nobody said which: the first is taken."""
+        if ccd is not None or len(self.sensors) < 2 or not isinstance(model, PushbroomSensor):
+            return []
+        taken = next(id for id, sensor in self.sensors.items() if sensor is self.sensor)
+        return [f"line of detectors {taken} of {', '.join(self.sensors)}: --ccd takes another"]
+
 
 def ellipsoid_of(semi_major_m: float, semi_minor_m: float) -> Ellipsoid:
     """The ellipsoid of two half axes; WGS 84 where they are its, as far as files write them out."""

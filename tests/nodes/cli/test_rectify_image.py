@@ -450,6 +450,20 @@ def test_angles_of_a_frame_camera_in_a_crs_are_from_its_grid_north(tmp_path, ang
     assert np.degrees(np.arctan2(east, north)) == pytest.approx(30.0, abs=1e-3)
 
 
+def test_which_line_of_detectors_is_taken_is_told(tmp_path, capsys):
+    """An image of the lens that looks backward lay 34 km off, where the first lens looks, without a word."""
+    made = ["--satellite", "spot5-hrs-small", "--points", "40", "--seed", "1"]
+    assert main(["simulate", "-q", "-o", str(tmp_path / "pair"), *made]) == 0
+    with rasterio.open(tmp_path / "b.tif", "w", driver="GTiff", height=150, width=300, count=1, dtype="uint8") as image:
+        image.write(np.full((1, 150, 300), 100, dtype=np.uint8))
+    command = ["rectify", str(tmp_path / "b.tif"), "--sensor", str(tmp_path / "pair" / "spot5-hrs-small")]
+    command += ["--height", "300", "-o", str(tmp_path / "o.tif"), "--json"]
+    for options, told in (([], ["line of detectors F of F, B: --ccd takes another"]), (["--ccd", "B"], [])):
+        assert main([*command, *options]) == 0
+        notes = json.loads(capsys.readouterr().out)["notes"]
+        assert [note for note in notes if "line of detectors" in note] == told
+
+
 def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
     _, path, model, relief, dem, image = scene
     rng = np.random.default_rng(4)
