@@ -129,6 +129,7 @@ def run(args: argparse.Namespace) -> int:
     forget_files()
     result = _result(args, outputs, settings, layers, folder, done)
     result["notes"] = _notes(kinds, crs)
+    result["notes"] += [f"{layer.name}: {note}" for layer in layers for note in layer.told.get("notes", ())]
     result["continued"] = before + counts["done before"] if continued else 0
     if args.stac is not None:
         write_stac_item(args.stac, outputs.mosaic, crs, gsd, done, result, _assets(outputs))
@@ -350,7 +351,8 @@ def layer_job(
         target = inside / f"{stem}.tif"
         sigma = inside / f"{stem}.sigma.tif" if settings.sigma else None
         of = _for_image(args, path, meta, crs, gsd, target, sigma)
-        told = rectify_image.rectified(of)[4]
+        sensor, _, _, _, cells = rectify_image.rectified(of)
+        told = cells | {"notes": [note for note in sensor.notes if note not in notes_of_map(crs)]}
         layer = replace(layer_of_orthoimage(target, sigma, inside, stem, crs, gsd, tile, name), told=told)
     else:
         assert strip is not None

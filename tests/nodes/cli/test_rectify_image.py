@@ -462,6 +462,11 @@ def test_which_line_of_detectors_is_taken_is_told(tmp_path, capsys):
         assert main([*command, *options]) == 0
         notes = json.loads(capsys.readouterr().out)["notes"]
         assert [note for note in notes if "line of detectors" in note] == told
+    shutil.copy(tmp_path / "b.tif", tmp_path / "f.tif")
+    both = ["rectify", str(tmp_path / "f.tif"), *command[1:4], *command[2:], "--mosaic", "--workers", "1"]
+    assert main(both) == 0  # of every image of a mosaic too
+    told = json.loads(capsys.readouterr().out)["notes"]
+    assert told == [f"{name}: line of detectors F of F, B: --ccd takes another" for name in "fb"]
 
 
 def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
