@@ -23,6 +23,9 @@ from .keys import Keys, read_json
 from .projection import refuse_missing_grids
 
 _DISTORTION = ("k1", "k2", "k3", "p1", "p2")
+#: Places a side of the image at which the distortion is looked at, and by how much of the distance from the principal
+#: point it may move one without a word. Tuned: fisheye lenses, which are not Brown's, are beyond.
+_PLACES, MOST_BENT = 21, 0.4
 _WAYS = (
     "omega_phi_kappa_deg or roll_pitch_heading_deg with lat_deg, lon_deg, height_m or crs and position; "
     "roll_pitch_yaw_deg (orbital frame) or quaternion_xyzw with position_e_m"
@@ -64,11 +67,38 @@ def read_frame(path: Path, notes: list[str]) -> tuple[FrameCamera, dict[str, tup
         )  # fmt: skip
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
+    notes += _of_distortion(camera, lens)
     file.raw("name")
     for keys in (file, interior, exterior, lens, sigma):
         notes.extend(f"{path.name}: key {key} is not known and was ignored" for key in keys.unread())
     x, y, z = np.radians(attitude).tolist()
     return camera, {"position_m": (position[0], position[1], position[2]), "attitude_rad": (x, y, z)}
+
+
+def _of_distortion(camera: FrameCamera, lens: Keys) -> list[str]:
+    """A note where the distortion turns back before the edge of the image, or bends more than lenses do.
+
+    Raises
+    ------
+    UserError : it does before half of the image
+    """
+    line, sample = (
+        a.ravel() for a in np.meshgrid(*(np.linspace(0.0, n - 1.0, _PLACES) for n in (camera.lines, camera.samples)))
+    )
+    measured = np.stack([(sample - 0.5 * (camera.samples - 1)), (0.5 * (camera.lines - 1) - line)], axis=1)
+    measured = measured * camera.pixel_mm - camera.principal_point_mm
+    ideal = camera.image_mm(line, sample)
+    lost = float(np.isnan(ideal).any(axis=1).mean())
+    units = "in powers of mm, of places in mm"
+    if lost > 0.5:
+        wanted = f"a distortion {units} that does not turn back before {100 * lost:.0f} % of the image"
+        raise lens.refuse(next(name for name in _DISTORTION if lens.number(name, 0.0)), wanted)
+    if lost:
+        return [f"{lens.path.name}: {lens.where}: turns back within the image, {100 * lost:.1f} % of it have no place"]
+    bent = float((np.linalg.norm(measured - ideal, axis=1) / np.maximum(np.linalg.norm(measured, axis=1), 1e-9)).max())
+    if bent > MOST_BENT:
+        return [f"{lens.path.name}: {lens.where}: moves places by up to {100 * bent:.0f} % of their distance: {units}?"]
+    return []
 
 
 def _within(keys: Keys, key: str, most: float) -> float:

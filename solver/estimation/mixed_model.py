@@ -103,8 +103,8 @@ class MixedSolution:
 
     @property
     def sigma(self) -> Array:
-        """(d,) of the parameters."""
-        return np.sqrt(np.diag(self.covariance))
+        """(d,) of the parameters; 0 of those that are held, whose variance rounding may make a little less."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
 def estimate(model: MixedModel, snoop: bool = False) -> MixedSolution:

@@ -18,12 +18,10 @@ from .refraction import Refraction
 
 Array = NDArray[np.floating]
 
-#: Fixed point that takes the distortion off. Derived: each step leaves the slope of the distortion, 1e-2, of the error.
-_MOST_STEPS, _CONVERGED_MM = 50, 1e-11
+#: Newton's method that takes the distortion off, and what it may miss by where it has found a place.
+_MOST_STEPS, _CONVERGED_MM, _FOUND_MM = 50, 1e-11, 1e-7
 #: Directions further from the axis than this, as tangents, are not looked at: Brown's polynomial folds far outside.
 _WIDEST = 20.0
-#: Step of derivatives of the distortion. Derived: it bends by a share of 1e-8 over it, and rounding leaves 1e-12.
-_STEP_MM = 1e-3
 _PORTION = 8192
 
 
@@ -90,18 +88,36 @@ class FrameCamera:
     # -- the camera ----------------------------------------------------------------------------------------------------
 
     def image_mm(self, line: ArrayLike, sample: ArrayLike) -> Array:
-        """Image coordinates (n, 2), mm, of pixels, reduced to the principal point and without distortion."""
+        """Image coordinates (n, 2), mm, of pixels, reduced to the principal point and without distortion.
+
+        NaN where no ideal place is distorted to the pixel: Brown's polynomial turns back before.
+        """
         v, u = np.asarray(sample, dtype=float), np.asarray(line, dtype=float)
         x = (v - 0.5 * (self.samples - 1)) * self.pixel_mm[0]
         y = (0.5 * (self.lines - 1) - u) * self.pixel_mm[1]
         measured = np.stack(np.broadcast_arrays(x, y), axis=-1) - self.principal_point_mm
-        ideal = measured
-        if self.distortion.any():
+        return self._undistorted(measured) if self.distortion.any() else measured
+
+    def _undistorted(self, measured_mm: Array) -> Array:
+        """Ideal image coordinates (..., 2) of measured ones (..., 2); NaN where there are none."""
+        ideal, slope = measured_mm, np.empty(0)
+        miss = np.full(measured_mm.shape, np.nan)
+        with np.errstate(all="ignore"):  # what is not found does not count
             for _ in range(_MOST_STEPS):
-                before, ideal = ideal, measured - brown_distortion(ideal, *self.distortion)
-                if not np.nanmax(np.abs(ideal - before), initial=0.0) > _CONVERGED_MM:
+                miss = measured_mm - ideal - brown_distortion(ideal, *self.distortion)
+                slope = self._distorted(ideal)
+                step = np.stack(
+                    [
+                        slope[..., 1, 1] * miss[..., 0] - slope[..., 0, 1] * miss[..., 1],
+                        slope[..., 0, 0] * miss[..., 1] - slope[..., 1, 0] * miss[..., 0],
+                    ],
+                    axis=-1,
+                ) / _determinant(slope)[..., None]  # fmt: skip
+                if not np.nanmax(np.abs(step), initial=0.0) > _CONVERGED_MM:
                     break
-        return ideal
+                ideal = ideal + step
+            found = (np.abs(miss).max(axis=-1) < _FOUND_MM) & _unfolded(slope)
+        return np.where(found[..., None], ideal, np.nan)
 
     def pixel_of(self, ideal_mm: Array) -> Array:
         """Line and sample (n, 2) of ideal image coordinates (n, 2); the inverse of `image_mm`."""
@@ -149,11 +165,14 @@ class FrameCamera:
         with np.errstate(divide="ignore", invalid="ignore"):
             tangent = d[:, :2] / -d[:, 2:]
             seen = visible & (d[:, 2] < 0) & (np.abs(tangent) < _WIDEST).all(axis=1)
-            pixel = self.pixel_of(np.where(seen[:, None], tangent, 0.0) * self.focal_length_mm)
+            ideal = np.where(seen[:, None], tangent, 0.0) * self.focal_length_mm
+            pixel = self.pixel_of(ideal)
         ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
         # far outside the image the distortion's polynomial may bring a point back in
         widest = 1.5 * np.linalg.norm(self._half_mm) + margin_px * self.pixel_mm.max()
         folded = np.linalg.norm(tangent, axis=1) * self.focal_length_mm > widest
+        if self.distortion.any():
+            folded |= ~_unfolded(self._distorted(ideal))
         inside = ((pixel >= -0.5 - margin_px) & (pixel <= ends)).all(axis=1)
         pixel[~(inside & seen & ~folded)] = np.nan
         return pixel
@@ -186,7 +205,22 @@ class FrameCamera:
         return out
 
     def _distorted(self, ideal_mm: Array) -> Array:
-        """Derivatives (n, 2, 2) of image coordinates by ideal ones (n, 2)."""
-        step = _STEP_MM * np.eye(2)
-        ends = [brown_distortion(ideal_mm + sign * step[:, None], *self.distortion) for sign in (1.0, -1.0)]
-        return np.eye(2) + np.moveaxis((ends[0] - ends[1]) / (2.0 * _STEP_MM), 0, 2)
+        """Derivatives (..., 2, 2) of image coordinates by ideal ones (..., 2)."""
+        k1, k2, k3, p1, p2 = self.distortion
+        x, y = ideal_mm[..., 0], ideal_mm[..., 1]
+        r2 = x * x + y * y
+        radial, by_r2 = r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+        mixed = 2.0 * (x * y * by_r2 + y * p1 + x * p2)
+        along = 1.0 + radial + 2.0 * x * x * by_r2 + 6.0 * x * p1 + 2.0 * y * p2
+        across = 1.0 + radial + 2.0 * y * y * by_r2 + 6.0 * y * p2 + 2.0 * x * p1
+        return np.stack([np.stack([along, mixed], axis=-1), np.stack([mixed, across], axis=-1)], axis=-2)
+
+
+def _determinant(M: Array) -> Array:
+    """Of matrices (..., 2, 2)."""
+    return M[..., 0, 0] * M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0]
+
+
+def _unfolded(slope: Array) -> NDArray[np.bool_]:
+    """Where derivatives (..., 2, 2) neither mirror nor turn round: before the distortion turns back."""
+    return (_determinant(slope) > 0) & (slope[..., 0, 0] + slope[..., 1, 1] > 0)

@@ -15,6 +15,7 @@ from relief import Waves
 from satellite_scenes import Truth, write_dimap2
 
 from triline.nodes.cli import main
+from triline.nodes.errors import UserError
 from triline.nodes.formats.frame_json import read_frame
 from triline.nodes.formats.projection import missing_grids, notes_of_map
 from triline.nodes.formats.satellite.read import read_scene
@@ -448,6 +449,26 @@ def test_angles_of_a_frame_camera_in_a_crs_are_from_its_grid_north(tmp_path, ang
     located = camera.direct(np.full(2, middle), ends, np.zeros(2))
     east, north = np.diff(to_map.transform(np.degrees(located[:, 1]), np.degrees(located[:, 0])), axis=1)[:, 0]
     assert np.degrees(np.arctan2(east, north)) == pytest.approx(30.0, abs=1e-3)
+
+
+def test_a_distortion_in_other_units_is_told(tmp_path):
+    """Of normalised coordinates in place of mm: orthoimages were far too large, or an error was about the date line."""
+    interior = {"focal_length_mm": 10.0, "pixel_size_mm": 0.02, "lines": 600, "samples": 800}
+
+    def read(**distortion):
+        notes = []
+        text = json.dumps({"interior": interior | {"distortion": distortion}, "exterior": FRAME["exterior"]})
+        (tmp_path / "f.json").write_text(text)
+        read_frame(tmp_path / "f.json", notes)
+        return notes
+
+    assert read(k1=-8e-4, k2=1e-6) == read(k1=1e-3) == []
+    assert read(k1=-1.5e-3) == ["f.json: interior.distortion: turns back within the image, 0.9 % of it have no place"]
+    assert read(k1=0.27) == [
+        "f.json: interior.distortion: moves places by up to 70 % of their distance: in powers of mm, of places in mm?"
+    ]
+    with pytest.raises(UserError, match=r"interior.distortion.k1: -0.27, wanted a distortion in powers of mm"):
+        read(k1=-0.27)
 
 
 def test_which_line_of_detectors_is_taken_is_told(tmp_path, capsys):

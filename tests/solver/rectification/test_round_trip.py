@@ -119,6 +119,33 @@ def test_derivatives_of_a_wide_lens_hold_its_distortion(k1):
     np.testing.assert_allclose(by_shift, np.broadcast_to(-np.eye(2), (3, 2, 2)), atol=3e-3)
 
 
+@pytest.mark.parametrize(
+    ("k1", "seen"),
+    [
+        (0.005, 1.0),  # by so much that a fixed point runs away from it
+        (-1.5e-3, 0.99),  # turns back at the corners, 10 mm from the middle
+        (-0.05, 0.05),  # of a lens whose distortion is in units of the focal length
+    ],
+)
+def test_distortion_is_taken_off_as_far_as_it_goes(k1, seen):
+    C, R = WGS84.cartesian(np.radians(47.0), np.radians(8.0), 600.0), LocalFrame(47.0, 8.0, 0.0).R_el
+    camera = FrameCamera(C, R, 10.0, 0.02, 600, 800, distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    line, sample = (a.ravel() for a in np.meshgrid(np.linspace(0.0, 599.0, 61), np.linspace(0.0, 799.0, 81)))
+    ideal = camera.image_mm(line, sample)
+    known = np.isfinite(ideal).all(axis=1)
+    assert known.mean() == pytest.approx(seen, abs=0.01)
+    assert np.abs(camera.pixel_of(ideal) - np.stack([line, sample], axis=1))[known].max() < 1e-7
+    # the ideal place of a pixel lies between the middle and where the distortion turns back
+    r = np.linalg.norm(ideal[known], axis=1)
+    assert (1.0 + 3.0 * k1 * r**2 > 0.0).all()
+    located = camera.direct(line, sample, np.full(len(line), 500.0))
+    assert (np.isfinite(located[:, 0]) == known).all()
+    assert np.abs(camera.inverse(*located[known].T) - np.stack([line, sample], axis=1)[known]).max() < 1e-5
+    if k1 < 0:  # ground beyond comes back into the image
+        lat, lon, _ = WGS84.geodetic(C + R @ np.array([[0.0, 1.2 * 10.0 / np.sqrt(-3.0 * k1), -100.0]]).T[:, 0])
+        assert np.isnan(camera.inverse(lat, lon, 500.0)).all()
+
+
 def test_frame_camera_derivatives_by_its_orientation():
     camera = frame_camera(30.0)
     line, sample, height = (
