@@ -101,7 +101,7 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
             group: {"observations": n, "redundancy": r, "sigma0": float(np.sqrt(v / r)) if r > 1e-3 else None}
             for group, (n, v, r) in result.groups.items()
         },
-        "n_observations": solution.n_observations,
+        "n_observations": solution.n_observations - solution.assumed.number,
         "n_unknowns": solution.n_unknowns,
         "redundancy": redundancy,
         "n_image_points": len(solution.network.rays),

@@ -25,7 +25,7 @@ from .linearisation import (
 )
 from .normal_equations import PointNormals, back_substitute, reduce_normals
 from .normal_matrix import NormalMatrix
-from .problem import Iteration, Problem, Solution, State, cost_of, start_state
+from .problem import Iteration, Problem, Solution, State, assumed_of, cost_of, start_state
 from .reduced_system import Factor
 from .robust import WeightFunction
 
@@ -213,6 +213,7 @@ class BlockEquations:
             outcome.steps,
             outcome.converged,
             history,
+            assumed_of(at.layout, p.prior, at.state.theta, outcome.factor),
         )
 
 

@@ -252,7 +252,7 @@ def run(network: Network, job: Job, progress: Progress | None = None, pose: Pose
         tuple(stages),
         Q,
         ray_statistics(solution, Q),
-        global_test(solution.cost, max(solution.redundancy, 0)),
+        global_test(solution.weighted_squares, max(solution.redundancy, 0)),
         rejected,
         found.given_up if found else 0.0,
         outcome.removed,

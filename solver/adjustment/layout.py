@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,7 @@ class Layout:
     shift : of the rays to where they are linearised; None if that is where they were measured
     n_surface : 1 where points lie on a surface, whose shift is the last unknown; else 0
     platform : constant errors of the platform among the unknowns; their terms come last
+    assumed : (m,) additional parameters by their columns whose a-priori sigmas nobody stated
     """
 
     sets: tuple[CorrectionSet, ...]
@@ -99,6 +100,7 @@ class Layout:
     shift: RayShift | None = None
     n_surface: int = 0
     platform: PlatformErrors = NO_PLATFORM_ERRORS
+    assumed: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
     def n_of_sets(self) -> int:
@@ -253,6 +255,7 @@ def layout_of(
         network.heading,
         n_surface=int(network.surface is not None),
         platform=platform,
+        assumed=unknowns.assumed,
     )
 
 
@@ -264,6 +267,7 @@ class Unknowns:
     n_camera: int
     names: tuple[str, ...]
     prior: PseudoObservations
+    assumed: IntArray
 
 
 def unknowns_of(
@@ -280,7 +284,9 @@ def unknowns_of(
         names += platform.unknown_names
         prior.append(_shifted(platform.pseudo_observations(), first))
         first += platform.n_unknowns
+    assumed = np.empty(0, dtype=np.int64)
     if self_calibration is not None and self_calibration.n_unknowns:
+        assumed = first + np.flatnonzero(self_calibration.assumed)
         names += self_calibration.unknown_names
         m = self_calibration.n_unknowns
         prior.append(
@@ -298,7 +304,7 @@ def unknowns_of(
         sigma = np.array([surface.shift_sigma_m])
         column = np.array([[first + n_camera]], dtype=np.int32)
         prior.append(PseudoObservations(column, np.ones((1, 1)), np.zeros(1), sigma, (SURFACE_SHIFT,)))
-    return Unknowns(first, n_camera, tuple(names), join_observations(prior))
+    return Unknowns(first, n_camera, tuple(names), join_observations(prior), assumed)
 
 
 def platform_design(strip: Strip, time_s: Array, platform: PlatformErrors, heading: bool) -> Design:

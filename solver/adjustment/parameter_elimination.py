@@ -13,7 +13,7 @@ from .covariance import point_cofactors, point_unknown_cofactors
 from .determinability import Evidence, Limits, Removal, examine, point_sigmas, ranks, strongest_correlations
 from .network import Network
 from .network_weakness import PART, describe
-from .problem import with_left_out
+from .problem import Assumed, with_left_out
 
 #: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
 #: rounding.
@@ -58,7 +58,7 @@ class Reduced:
     to_points : (3 p, m) between coordinates of object points and these parameters
     orientation, of_points : (n_model,) and (3 p,) variances of the orientation and of the coordinates of object points
     theta, points_l : (n_unknowns,) and (3 p,) values
-    cost, redundancy : as in `Solution`
+    cost, redundancy : with a-priori values that nobody stated, too
     information : (n_camera,) of the parameters before anything is eliminated
     gsd_m : ground sample distance
     """
@@ -93,7 +93,7 @@ class Reduced:
             solution.state.theta,
             solution.state.points_l.ravel(),
             solution.cost,
-            max(solution.redundancy, 0),
+            solution.n_observations - solution.n_unknowns,
             own_information(solution)[columns],
             ground_sample_distance(solution.network),
         )
@@ -118,7 +118,9 @@ class Reduced:
         q = np.maximum(np.diagonal(inner), 0.0)
         cross = np.concatenate([self.cofactors[: layout.n_model], self.to_points])
         strongest, r = strongest_correlations(cross, np.concatenate([self.orientation, self.of_points]), q)
-        names = self.names
+        names, assumed = self.names, self._assumed(q)
+        redundancy = max(self.redundancy - assumed.number, 0)
+        squares = max(self.cost - assumed.squares, 0.0)
         return Evidence(
             names,
             self.theta[columns],
@@ -127,8 +129,8 @@ class Reduced:
             _partners(self.solution, self.places, strongest),
             r,
             point_sigmas(self.to_points.reshape(len(self.to_points) // 3, 3, len(q)), q),
-            float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else 1.0,
-            self.redundancy,
+            float(np.sqrt(squares / redundancy)) if redundancy > 0 else 1.0,
+            redundancy,
             self.gsd_m,
             ranks(names, self.solution.network.camera),
         )
@@ -163,6 +165,12 @@ class Reduced:
             cost=self.cost + float(value**2 / q),
             redundancy=self.redundancy + 1 - prior.nnz,
         )
+
+    def _assumed(self, q: Array) -> Assumed:
+        """What nobody stated of the parameters that are left, with their variances q (m,)."""
+        columns = self.solution.layout.n_model + self.places
+        mine = np.isin(columns, self.solution.layout.assumed)
+        return Assumed.of(self.solution.problem.prior, columns[mine], self.theta, q[mine])
 
     def _pivots(self, q: Array) -> Array:
         """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ..models.base import ModelOptions
 from ..models.platform import NO_PLATFORM_ERRORS, PlatformErrors
 from .elimination import Elimination, plan_elimination
 from .freed_memory import keep_freed_memory
-from .layout import Layout, build_layout
+from .layout import Layout, Unknowns, build_layout
 from .linearisation import Linearisation, Whitening, corrected
 from .network import Network
 from .normal_equations import ControlWeights, PointNormals, Prior, weigh_control, whiten_prior
@@ -126,21 +126,61 @@ class State:
     points_l: Array
 
 
+class Assumed(NamedTuple):
+    """Values of unknowns that nobody stated: how many of them the data determine by themselves, and the squared
+    whitened residuals of all.
+
+    Their wide sigmas say nothing of the data: counted as observations, which fit as if by a wonder, they would make
+    sigma0 too small.
+    """
+
+    number: int
+    squares: float
+
+    @classmethod
+    def of(cls, prior: Prior, columns: IntArray, theta: Array, variance: Array) -> Assumed:
+        """Of unknowns (m,) with these columns and variances (m,), for sigma0 = 1; ``theta`` (n_unknowns,) of all."""
+        stated = prior.matrix.tocsc()[:, columns].tocoo()
+        share = np.clip(1.0 - stated.data**2 * variance[stated.col], 0.0, 1.0)
+        away = prior.value[stated.row] - stated.data * theta[columns[stated.col]]
+        return cls(round(float(share.sum())), float(away @ away))
+
+
+#: Where all values of unknowns are stated.
+NOTHING_ASSUMED = Assumed(0, 0.0)
+
+
+def assumed_of(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor) -> Assumed:
+    """`Assumed` at values ``theta`` of a reduced system."""
+    columns = unknowns.assumed
+    if not len(columns):
+        return NOTHING_ASSUMED
+    unit = np.zeros((len(theta), len(columns)))
+    unit[columns, np.arange(len(columns))] = 1.0
+    return Assumed.of(prior, columns, theta, np.einsum("um,um->m", unit, factor.solve(unit)))
+
+
 class Fitted:
     """What a solution says of its fit, from its cost and what it counts."""
 
     cost: float
     n_observations: int
     n_unknowns: int
+    assumed: Assumed
+
+    @property
+    def weighted_squares(self) -> float:
+        """``v^T P v`` of what was measured or stated."""
+        return max(self.cost - self.assumed.squares, 0.0)
 
     @property
     def redundancy(self) -> int:
-        return self.n_observations - self.n_unknowns
+        return self.n_observations - self.assumed.number - self.n_unknowns
 
     @property
     def sigma0(self) -> float:
         """``sqrt(v^T P v / (n - u))`` [K 4.54]; NaN without redundancy."""
-        return float(np.sqrt(self.cost / self.redundancy)) if self.redundancy > 0 else float("nan")
+        return float(np.sqrt(self.weighted_squares / self.redundancy)) if self.redundancy > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -161,6 +201,7 @@ class Solution(Fitted):
     iterations : number of steps taken
     converged : whether the tolerance was reached
     history : all steps
+    assumed : of the a-priori observations, values that nobody stated; the redundancy is without them
     """
 
     problem: Problem
@@ -176,6 +217,7 @@ class Solution(Fitted):
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
+    assumed: Assumed = NOTHING_ASSUMED
 
     @property
     def network(self) -> Network:

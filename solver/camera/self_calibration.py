@@ -120,6 +120,7 @@ class SelfCalibration:
     estimated : (m,) which are unknowns; the others are zero
     chips : per CCD line the first sample of each of its patterns
     weighted : whether the a-priori sigmas carry weight
+    stated : parameters whose a-priori sigmas are somebody's knowledge of the camera, not the usual ones
     """
 
     name: str
@@ -130,6 +131,7 @@ class SelfCalibration:
     estimated: NDArray[np.bool_]
     chips: tuple[tuple[int, ...], ...] = field(repr=False)
     weighted: bool = True
+    stated: frozenset[str] = frozenset()
 
     @property
     def unknown_names(self) -> tuple[str, ...]:
@@ -144,6 +146,13 @@ class SelfCalibration:
     def apriori_sigma(self) -> Array:
         """(n_unknowns,) of the estimated parameters."""
         return self.sigma[self.estimated]
+
+    @property
+    def assumed(self) -> NDArray[np.bool_]:
+        """(n_unknowns,) of the estimated parameters, whether nobody stated the sigma, and it is wide so that the data
+        decide. Such a value holds what nothing else determines, and is no observation that sigma0 could be judged
+        by."""
+        return np.array([name not in self.stated for name in self.unknown_names], dtype=bool)
 
     @property
     def as_calibrated(self) -> bool:
@@ -171,13 +180,14 @@ class SelfCalibration:
 
     def with_sigma(self, sigma: Mapping[str, float]) -> SelfCalibration:
         """The set with other a-priori sigmas, by parameter or by kind (``{"k1": 1e-6, "th": 1e-4}``)."""
-        values = self.sigma.copy()
+        values, stated = self.sigma.copy(), set(self.stated)
         for name, value in sigma.items():
             if not value > 0:
                 raise ValueError(f"a-priori sigma of {name} must be positive, got {value}")
-            of_kind = [i for i, n in enumerate(self.names) if n.split("_")[0] == name]
-            values[of_kind if of_kind else [self._place(name)]] = value
-        return replace(self, sigma=values)
+            of_kind = [i for i, n in enumerate(self.names) if n.split("_")[0] == name] or [self._place(name)]
+            values[of_kind] = value
+            stated.update(self.names[i] for i in of_kind)
+        return replace(self, sigma=values, stated=frozenset(stated))
 
     def scaled(self, share: float) -> SelfCalibration:
         """The set with all a-priori sigmas times a factor.
@@ -188,11 +198,11 @@ class SelfCalibration:
         """
         if not share > 0:
             raise ValueError(f"factor of the a-priori sigmas must be positive, got {share}")
-        return replace(self, sigma=share * self.sigma)
+        return replace(self, sigma=share * self.sigma, stated=frozenset(self.names))
 
     def free(self) -> SelfCalibration:
         """The set with a-priori sigmas so large that they carry no weight."""
-        return replace(self, sigma=self.sigma * FREE, weighted=False)
+        return replace(self, sigma=self.sigma * FREE, weighted=False, stated=frozenset())
 
     def design(self, ccd: NDArray[np.int64], sample: Array, xy_mm: Array, focal_length_mm: Array) -> CameraDesign:
         """Coefficients for rays (n,) at image coordinates (n, 2) reduced to the principal point."""
@@ -286,7 +296,7 @@ def prism(camera: LineCamera) -> SelfCalibration:
         shape = [names.index(f"b_{line.id}"), names.index(f"s_{line.id}")]
         columns += [[names.index(shifts[2 * n]), names.index(shifts[2 * n + 1]), *shape] for n in range(len(starts))]
     name = "prism30" if len(names) == 30 else f"prism{len(names)}"
-    return _set(name, names, _PRISM, columns, chips).with_sigma(PRISM_SIGMA)
+    return replace(_set(name, names, _PRISM, columns, chips).with_sigma(PRISM_SIGMA), stated=frozenset())
 
 
 def lens(camera: LineCamera) -> SelfCalibration:

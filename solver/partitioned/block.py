@@ -18,7 +18,7 @@ from ..adjustment.nested_dissection import Dissection
 from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
-from ..adjustment.problem import USUAL, AdjustmentOptions, Fitted, Iteration, State
+from ..adjustment.problem import USUAL, AdjustmentOptions, Assumed, Fitted, Iteration, State, assumed_of
 from ..adjustment.reduced_system import DenseFactor, Factor
 from ..adjustment.robust import WeightFunction
 from ..camera.line_camera import LineCamera
@@ -106,7 +106,7 @@ class PartitionedSolution(Fitted):
     theta : (n_unknowns,) of the reduced system
     factor : factorised reduced system
     cost : sum of squared whitened residuals of rays, control and a-priori observations
-    n_observations, n_unknowns, iterations, converged, history : as in `adjustment.Solution`
+    n_observations, n_unknowns, iterations, converged, history, assumed : as in `adjustment.Solution`
     kept : the state of the partitions
     """
 
@@ -119,6 +119,7 @@ class PartitionedSolution(Fitted):
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
+    assumed: Assumed
     kept: Kept
 
 
@@ -296,8 +297,9 @@ class PartitionedEquations:
         block = self.block
         n = 2 * n_rays + self.prior.n_observations + n_control
         u = block.n_unknowns - len(outcome.factor.undetermined) + self.rank
+        assumed = assumed_of(block.unknowns, self.prior, self.theta, outcome.factor)
         return PartitionedSolution(
-            block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history,
+            block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history, assumed,
             Kept(block, self.version),
         )  # fmt: skip
 

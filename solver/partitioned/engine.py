@@ -141,6 +141,7 @@ class Engine:
             solved.iterations,
             solved.converged,
             history,
+            solved.assumed,
             solved.kept,
         )
 
@@ -255,4 +256,5 @@ def _layout(block: PartitionedBlock, heading: bool) -> Layout:
         unknowns.prior,
         heading,
         platform=block.posed.platform,
+        assumed=unknowns.assumed,
     )

@@ -130,6 +130,7 @@ def _own_unknowns(layout: Layout) -> tuple[Layout, IntArray]:
         n_model=len(used) + layout.platform.n_unknowns,
         names=(),
         prior=nothing,
+        assumed=np.empty(0, dtype=np.int64),  # what is known beforehand is counted for the whole block
     )
     return own, columns
 

@@ -48,7 +48,10 @@ def test_calibrated_camera_gives_the_same_points_without_parameters(block, tmp_p
     assert without["additional_parameters"] == {}
     assert not (tmp_path / "two" / "camera.json").exists()  # nothing was calibrated
     assert same[AXES].to_numpy() == pytest.approx(points[AXES].to_numpy(), abs=1e-3)
-    assert without["sigma0"] == pytest.approx(with_parameters["sigma0"], rel=1e-3)
+    # the same residuals, though a camera that is taken as known has the redundancy of its 18 parameters
+    squares = [result["sigma0"] ** 2 * result["redundancy"] for result in (without, with_parameters)]
+    assert squares[0] == pytest.approx(squares[1], rel=2e-3)
+    assert 16 <= without["redundancy"] - with_parameters["redundancy"] <= 18
     # and without either, the block does not fit at all
     bent, _ = adjusted(folder, tmp_path / "three")
     assert bent["sigma0"] > 1.5 * without["sigma0"]

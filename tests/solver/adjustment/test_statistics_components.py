@@ -31,7 +31,7 @@ def block(seed, points=60, control=6, errors=MODEL, **more):
     rng = np.random.default_rng(seed)
     ground = scatter_points(points, (-1500, 1500, -1200, 1200), lambda x, y: 60 * np.sin(x / 400 + y / 700), rng)
     lines = parallel_and_cross(CAMERA, 2000.0, 2, 2, 3000.0)
-    check = range(control, 25)
+    check = range(control, min(25, points))
     return simulate_network(
         CAMERA, lines, ground, dict.fromkeys(range(control), "control"), check, errors, rng, Noise(), **more
     )
@@ -57,6 +57,26 @@ def test_group_redundancies_sum_up():
     assert sum(r for _, _, r in sums.values()) == pytest.approx(solution.redundancy, rel=1e-6)
     assert sum(s for _, s, _ in sums.values()) == pytest.approx(solution.cost, rel=1e-9)
     assert sum(n for n, _, _ in sums.values()) == solution.n_observations
+
+
+@pytest.mark.parametrize("how", ["usual", "free", "stated"])
+def test_usual_sigmas_of_a_camera_are_no_observations(how):
+    """A camera without errors fits them as if by a wonder: as observations they make sigma0 too small."""
+    parameters = {"usual": tls(CAMERA), "free": tls(CAMERA).free(), "stated": tls(CAMERA).scaled(1.0)}[how]
+    plain, with_camera = [], []
+    for seed in range(20):
+        network = block(seed, points=12).network
+        plain.append(run(network, Job(MODEL)).test)
+        result = run(network, Job(MODEL, self_calibration=parameters, eliminate=False))
+        with_camera.append(result.test)
+        of_groups = sum(r for _, _, r in result.groups.values())
+        assert abs(with_camera[-1].redundancy - of_groups) < 1.0 or how == "stated"
+    least = plain[0].redundancy - 18
+    assert (
+        plain[0].redundancy == with_camera[0].redundancy if how == "stated" else with_camera[0].redundancy <= least + 1
+    )
+    ratio = np.mean([t.sigma0**2 for t in with_camera]) / np.mean([t.sigma0**2 for t in plain])
+    assert ratio < 0.93 if how == "stated" else ratio == pytest.approx(1.0, abs=0.03)
 
 
 def test_components_recover_sigmas_that_were_stated_wrongly():
