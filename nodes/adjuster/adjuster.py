@@ -349,7 +349,11 @@ class Adjuster(Node):
             return []
         self._control.judge(body, self._window)
         verdict = "confirmed" if body.accepted else "rejected: its coordinates do not count"
-        return [self._log(f"{body.point} is {verdict} ({body.by or 'a surveyor'})", warning=not body.accepted)]
+        words = f"{body.point} is {verdict} ({body.by or 'a surveyor'})"
+        stated = body.point in self._control
+        if not stated:
+            words += "; it is no ground point so far, and the verdict counts when it is stated"
+        return [self._log(words, warning=not (body.accepted and stated))]
 
     def _tie_came(self, body: Any, source: str, stamp_ns: int) -> list[Message]:
         """Take a tie point, or let it wait for the choice; an update, if enough have come."""

@@ -88,16 +88,10 @@ class StatedControl:
         return lines
 
     def judge(self, verdict: Any, window: Window | None) -> None:
-        """A surveyor says whether the coordinates of a point count.
-
-        Raises
-        ------
-        ValueError : it is no ground point
-        """
-        if verdict.point not in self.bodies:
-            raise ValueError(f"verdict on {verdict.point!r}, which is no ground point")
+        """A surveyor says whether the coordinates of a point count, now or when they are stated."""
         (self._refused.discard if verdict.accepted else self._refused.add)(verdict.point)
-        self.take(self.bodies[verdict.point], window)
+        if verdict.point in self.bodies:
+            self.take(self.bodies[verdict.point], window)
 
 
 def _several(names: list[str]) -> str:

@@ -64,14 +64,8 @@ class DoubtfulTargets:
             self._finder.set_target(target)
 
     def verdict(self, body: Any, stamp_ns: int) -> list[Message]:
-        """Take a surveyor's verdict; what was held goes out, or is dropped.
-
-        Raises
-        ------
-        ValueError : a point that is not a target
-        """
-        if body.point not in self._points:
-            raise ValueError(f"{body.point!r} is not a signalised point")
+        """Take a surveyor's verdict; what was held goes out, or is dropped. Of a point that is not stated yet it counts
+        when it is."""
         self._verdict[body.point] = body.accepted
         held = self._held.pop(body.point, [])
         state = "CONFIRMED" if body.accepted else "REJECTED"

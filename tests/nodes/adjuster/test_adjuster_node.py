@@ -333,6 +333,26 @@ def test_control_that_comes_or_changes_in_flight_is_told(done, flight):
     assert not [text for text, _ in lines(done[1]) if "in flight" in text]
 
 
+@pytest.mark.parametrize("accepted", [True, False])
+def test_a_verdict_counts_that_comes_before_its_ground_point(flight, accepted):
+    """A router or a recorder may hand on what an operator said before it hands on the point."""
+    messages = [x for x in flight[1] if not x.topic.startswith("sensor/")]
+    point = next(x.body.point for x in messages if x.topic == "observation/control")
+    of_point = next(i for i, x in enumerate(messages) if x.topic == "observation/control")
+    said = Message("observation/verdict", messages[of_point].stamp_ns, m.Verdict(point=point, accepted=accepted))
+    nodes = []
+    for place in (of_point, of_point + 1):  # before it, and after it
+        node, log = Adjuster(grid_hz=10.0), []
+        for message in [*messages[:place], said, *messages[place : place + 400]]:
+            log += [o.body.message for o in node.step(message) if o.topic == "event/log"]
+        nodes.append((node, log))
+        assert not node.counters["malformed"]
+    (early, said_early), (late, _) = nodes
+    assert early._window.network.intake.control[point].role == late._window.network.intake.control[point].role
+    assert (late._window.network.intake.control[point].role == "check") != accepted
+    assert any(text.startswith(f"{point} is ") and "no ground point so far" in text for text in said_early)
+
+
 def test_a_strip_joined_in_its_middle_says_so_and_begins_there(done, flight):
     start = next(x.body.first_line_time_ns for x in flight[1] if x.topic == "configuration/strip")
     joined = start + 15 * convert.SECOND_NS

@@ -283,15 +283,23 @@ def test_a_surveyor_lets_it_out_or_stops_it(held):
     assert told == ["HELD", "CONFIRMED", "CONFIRMED", "CONFIRMED"] and len(ties) == 3
     told, ties = states(fly(desk(), verdict_at=middle, accepted=False)[0], name)
     assert told == ["HELD", "REJECTED", "REJECTED", "REJECTED"] and not ties
-    with pytest.raises(ValueError, match="not a signalised point"):
-        desk().verdict(m.Verdict(point="nobody"), 0)
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_what_he_said_before_the_point_was_stated_counts(held, accepted):
+    name, desk, fly = held
+    late = desk()
+    stated = late._points.pop(name)
+    assert late.verdict(m.Verdict(point=name, accepted=accepted), 0) == []
+    late._points[name] = stated
+    told, ties = states(fly(late)[0], name)
+    assert told == ["CONFIRMED" if accepted else "REJECTED"] * 3 and len(ties) == 3 * accepted
 
 
 def test_what_is_not_signalised_is_left_alone():
     desk = DoubtfulTargets()
     desk.ground_point(m.GroundPoint(point="P", x=1.0))
-    with pytest.raises(ValueError, match="not a signalised point"):
-        desk.verdict(m.Verdict(point="P", accepted=True), 0)
+    assert desk.verdict(m.Verdict(point="P", accepted=True), 0) == []
     with pytest.raises(ValueError, match="radius"):
         desk.ground_point(m.GroundPoint(point="P", target_radius=-1.0, covariance=[0.0] * 9))
 
