@@ -162,11 +162,20 @@ def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
 
 
 def platform_of(result: BatchResult) -> dict[str, Any]:
-    """Constant errors of the platform, with their sigmas; nothing where none is an unknown."""
+    """Constant errors of the platform, with their sigmas; nothing where none is an unknown.
+
+    The orientation that a model refined has what it found of them; a model after it finds what is left.
+    """
     solution, layout = result.solution, result.solution.layout
     sigma = result.sigma0 * np.sqrt(np.maximum(solution.factor.variances(), 0.0))
+    found_by = np.array([stage.state.theta[stage.layout.platform_columns] for stage in result.stages])
+    value = found_by.sum(axis=0)
     found = {
-        name: {"value": float(solution.state.theta[k]), "sigma": float(sigma[k]), "unit": layout.platform.UNITS[name]}
+        name: {
+            "value": float(value[k - layout.n_of_sets]),
+            "sigma": float(sigma[k]),
+            "unit": layout.platform.UNITS[name],
+        }
         for name, k in zip(layout.platform.unknown_names, layout.platform_columns.tolist(), strict=True)
     }
     return {"platform": found} if found else {}

@@ -326,6 +326,20 @@ def test_models(folder, tmp_path, options, key):
     assert (np.array(result["check"]["rmse_m"]) < 3 * sigma).all()
 
 
+def test_a_second_step_keeps_what_the_first_found_of_the_clock(folder, tmp_path):
+    late = shutil.copytree(folder, tmp_path / "late")
+    strips = pd.read_csv(late / "strips.csv")
+    strips["first_line_time_s"] += 0.02
+    strips.to_csv(late / "strips.csv", index=False)
+    found = []
+    for name, options in (("one", ["--model", "dgr"]), ("two", ["--model", "dgr", "--then", "ppm", "--segments", "2"])):
+        assert adjust(late, *options, "--clock-sigma", 0.05, "-q", "-o", tmp_path / name) == 0
+        found.append(result_in(tmp_path / name)["platform"]["clock"])
+    one, two = found
+    assert abs(one["value"] + 0.02) < 4.0 * one["sigma"] < 0.01
+    assert abs(two["value"] + 0.02) < 4.0 * two["sigma"] < 0.01
+
+
 def test_the_second_step_has_settings_of_its_own(folder, tmp_path):
     block = shutil.copytree(folder, tmp_path / "block")
     project = block / "project.toml"
