@@ -307,9 +307,10 @@ class _Stage:
         self.steps = before.steps if before else 0
         self.free_shift = before.free_shift if before else False
         tell(Phase(f"adjustment, {model.name}"))
-        weight, points = None, None
+        points = None
+        self.given = np.ones(len(network.rays))  # weights of the rays before those of robust estimation
         if before:
-            weight, points = before.solution.ray_weight, before.solution.state.points_l
+            self.given, points = before.given, before.solution.state.points_l
             self.snooping = before.snooping
             problem = continue_problem(before.solution, model)
             problem = self._adapt(replace(problem, control=before.solution.problem.control), control=False)
@@ -317,11 +318,13 @@ class _Stage:
             problem = (pose or pose_problem)(network, model, job.self_calibration, job.platform)
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
-            start = solve(problem, points, weight, replace(job.options, robust=Huber()), tell)
-        self._keep(solve(problem, start, weight, replace(job.options, robust=job.robust), tell))
+            start = solve(problem, points, self.given, replace(job.options, robust=Huber()), tell)
+        self._keep(solve(problem, start, self.given, replace(job.options, robust=job.robust), tell))
         self._read_surface()
         if not before and not self._cut_short:  # far from the solution residuals tell nothing of noise
             self._state_noise(network, model)
+        if job.robust is not None and not job.snoop and not self._cut_short:
+            self._leave_out_robustly()
         if self.scales.factor["image"] != 1.0:
             self._keep(scaled(self.solution, {"image": self.scales.factor["image"]}, job.options))
 
@@ -332,8 +335,7 @@ class _Stage:
             for _ in range(NOISE_ROUNDS):
                 if not parts.with_noise_left(self.solution):
                     return
-                problem = self.solution.problem
-                self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
+                self._keep(solve(self.solution.problem, self.solution.state, self.given, options))
             return
         for _ in range(NOISE_ROUNDS):
             left = with_noise_left(network, self.solution)
@@ -342,7 +344,14 @@ class _Stage:
             problem = pose_problem(left, model, self.job.self_calibration, self.job.platform)
             problem = self._adapt(replace(problem, control=self.solution.problem.control), control=False)
             options = replace(self.job.options, robust=self.job.robust)
-            self._keep(solve(problem, self.solution.state, self.solution.ray_weight, options))
+            self._keep(solve(problem, self.solution.state, self.given, options))
+
+    def _leave_out_robustly(self) -> None:
+        """Rays that robust estimation leaves hardly any weight have none: as observations they would count in full."""
+        weight = self.solution.ray_weight
+        if ((weight > 0) & (weight < ROBUST_OUT)).any():
+            left = np.where(weight < ROBUST_OUT, 0.0, weight)
+            self._keep(solve(self.solution.problem, self.solution, left, self.job.options))
 
     def work(self, last: bool) -> None:
         """All steps after the first adjustment; elimination and variance components in the last stage only."""
@@ -501,6 +510,7 @@ class _Stage:
         self.tell(Phase("data snooping"))
         self.snooping = snoop(self.solution, self.job.critical, self.job.on_the_way, self.tell, self.snooping)
         self._keep(self.snooping.solution)
+        self.given = self.solution.ray_weight
 
     def _reweigh(self) -> None:
         for _ in range(REWEIGHTINGS):
@@ -552,7 +562,7 @@ def _taking_part(solution: Solution) -> Array:
 
 
 def _robust_rejected(solution: Solution) -> tuple[Rejected, ...]:
-    """Rays that robust estimation left without weight; their w is against the adjustment with what they have left."""
+    """Rays that robust estimation left without weight; their w is against the adjustment without them."""
     out = np.flatnonzero(solution.ray_weight < ROBUST_OUT)
     if not len(out):
         return ()

@@ -9,6 +9,7 @@ from triline.solver.adjustment.adjustment import solve
 from triline.solver.adjustment.job import Job, run
 from triline.solver.adjustment.pose_noise import followed, share_left, with_noise_left
 from triline.solver.adjustment.problem import pose_problem
+from triline.solver.adjustment.robust import Huber
 from triline.solver.camera.self_calibration import tls
 from triline.solver.navigation.kinematic_model import noise_time
 from triline.solver.simulation.flight import FlightPlan
@@ -97,6 +98,16 @@ def test_many_rays_without_control_do_not_make_the_image_small():
         known = next(r.parameters for r in reversed(result.reports) if r.parameters)
         off.append(np.mean([p.value / p.sigma for p in known if p.name.startswith("sy")]))
     assert abs(np.mean(off)) < 1.5, off
+
+
+def test_robust_weights_of_rays_that_are_weighed_anew_are_those_of_their_function():
+    plan = FlightPlan(height_m=800.0, strip_s=12.0, lead_in_s=3.0, lead_out_s=2.0)
+    flown = simulate(plan, 3, observation_plan=ObservationPlan(tie_points_per_s=15.0))
+    model = model_options(slow_errors_of(flown.errors), WindowOptions(snoop=False), plan.strip_s)
+    found = run(network_of(flown, navigate(flown)), Job(model, robust=Huber(1.0))).solution
+    wanted = Huber(1.0)(np.abs(found.linearisation.residual).max(axis=0))
+    assert (wanted < 0.7).sum() > 20
+    np.testing.assert_allclose(found.ray_weight, wanted, rtol=1e-2)
 
 
 def test_the_batch_adjustment_states_as_much_of_the_noise_as_the_window_does():

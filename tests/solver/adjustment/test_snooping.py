@@ -317,6 +317,25 @@ def test_igg3_names_what_it_left_without_weight():
     assert (out & bad).sum() / bad.sum() >= 0.98
 
 
+@pytest.mark.parametrize("then", [None, MODEL])
+def test_robust_weights_are_those_of_their_function_in_a_second_model_too(then):
+    network, _ = with_outliers(block(7).network, 0.05, 1, high=12.0)
+    found = run(network, Job(MODEL, then, robust=Huber())).solution
+    wanted = Huber()(np.abs(found.linearisation.residual).max(axis=0))
+    assert (wanted < 0.8).sum() > 10
+    np.testing.assert_allclose(found.ray_weight, wanted, rtol=1e-2)
+
+
+def test_what_robust_estimation_leaves_out_is_no_observation():
+    """Danish weights of outliers are tiny and not zero: counted in full such rays made sigma0 too small."""
+    network, _ = with_outliers(block(7).network, 0.08, 1)
+    danish, igg3 = (run(network, Job(MODEL, robust=weights)) for weights in (Danish(), Igg3()))
+    assert len(danish.rejected) > 0.07 * len(network.rays)
+    for result in (danish, igg3):
+        assert {r.ray for r in result.rejected} == set(np.flatnonzero(result.solution.ray_weight == 0.0))
+    assert danish.test.sigma0 == pytest.approx(igg3.test.sigma0, rel=0.01)
+
+
 def with_half_the_sigma():
     """A network with gross errors whose image sigma is stated half as large as it is; which rays are spoilt."""
     network = block(8, noise=0.6).network
