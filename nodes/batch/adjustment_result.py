@@ -30,6 +30,9 @@ MOST_LISTED = 20
 #: Undetermined combinations that the notes name.
 MOST_NAMED = 4
 
+#: Times in what a model says of a strip.
+TIMES = ("time_s", "start_s", "end_s")
+
 #: More undetermined combinations than a block with a defect has.
 MANY_WEAK = 30
 
@@ -151,14 +154,28 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
 
 
 def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
-    """Correction functions of every strip, as their model describes them, with a-posteriori sigmas."""
+    """Correction functions of every strip, as their model describes them, with a-posteriori sigmas and the times of
+    tables."""
     sigma0 = adjustment.result.sigma0
     sigma = sigma0 * np.sqrt(np.maximum(solution.factor.variances(), 0.0))
     found = {}
     for item in solution.layout.sets:
         part = item.columns
-        found[set_name(adjustment, item)] = item.model.describe(solution.state.theta[part], sigma[part])
+        described = item.model.describe(solution.state.theta[part], sigma[part])
+        found[set_name(adjustment, item)] = _timed(described, adjustment.block.time_reference_ns)
     return found
+
+
+def _timed(described: Any, reference_ns: int) -> Any:
+    """What a model describes, with its times as tables have them: of a recording UTC since 1970, s."""
+    if isinstance(described, list):
+        return [_timed(one, reference_ns) for one in described]
+    if not isinstance(described, dict):
+        return described
+    return {
+        key: value + reference_ns * 1e-9 if key in TIMES else _timed(value, reference_ns)
+        for key, value in described.items()
+    }
 
 
 def platform_of(result: BatchResult) -> dict[str, Any]:

@@ -240,6 +240,16 @@ def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
     assert strip.noise is not None and strip.noise.shape == (len(strip.trajectory), 6, 6)
     assert adjust(smoothed, "-q", "--model", "dgr", "-o", tmp_path / "dgr") == 0
     assert result_in(tmp_path / "dgr")["model"] == "dgr"
+    for options, key, time in (
+        (["--model", "wander"], "borders", "time_s"),
+        (["--model", "lim", "--fixes", 4], "fixes", "time_s"),
+        (["--model", "ppm", "--segments", 2], "segments", "start_s"),
+    ):
+        out = tmp_path / key
+        assert adjust(smoothed, *options, "-q", "-o", out) == 0
+        refined = pd.read_csv(out / "trajectory_refined.csv")["time_s"]  # UTC, seconds since 1970
+        (strip,) = result_in(out)["strips"].values()
+        assert strip[key][0][time] == pytest.approx(refined.iloc[0], abs=1e-5)
 
 
 @pytest.mark.parametrize("noise", ["t3", "normal"])
