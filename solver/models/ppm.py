@@ -135,7 +135,7 @@ class PiecewisePolynomial(CorrectionModel):
             for component in COMPONENTS
         ]
         self.unknown_names = (*(constant_names(extent) if options.slow else ()), *names)
-        self.notes = ("s = 0 at the start, 1 at the end of each segment",)
+        self.notes = ("s = 0 at the start, 1 at the end of each segment", *_not_used(options))
 
     @property
     def segments(self) -> int:
@@ -253,6 +253,18 @@ class PiecewisePolynomial(CorrectionModel):
                     one[f"{name}_deg{suffix}"] = np.degrees(array[k, j, 3:]).tolist()
             segments.append(one)
         return result | {"segments": segments}
+
+
+def _not_used(options: PpmOptions) -> list[str]:
+    """Notes on settings that have no part in weights which follow from the slow errors."""
+    if options.slow is None:
+        return []
+    given = {"order": (options.order, PpmOptions.order), "continuity": (options.continuity, PpmOptions.continuity)}
+    return [
+        f"{name} {value} was not used: a wander is stated, from which follow second-order terms and how pieces go on"
+        for name, (value, usual) in given.items()
+        if value != usual
+    ]
 
 
 def _borders(extent: Extent, options: PpmOptions) -> Array:

@@ -132,6 +132,20 @@ def test_own_weights_of_the_piecewise_model_come_first():
     assert PpmOptions.from_settings(SETTINGS | {"first_sigma_m": 0.1}).slow is None
 
 
+def test_settings_that_a_stated_wander_replaces_are_told():
+    extent = Extent("strip S1", START, END)
+    plain, told = (
+        PpmOptions.from_settings(settings).build(extent).notes
+        for settings in (SETTINGS, SETTINGS | {"order": 1, "continuity": 2})
+    )
+    assert set(told) - set(plain) == {
+        f"{what} was not used: a wander is stated, from which follow second-order terms and how pieces go on"
+        for what in ("order 1", "continuity 2")
+    }
+    own = SETTINGS | {"order": 1, "first_sigma_m": 0.1}
+    assert PpmOptions.from_settings(own).build(extent).notes == plain
+
+
 def test_the_batch_weighs_rays_by_what_the_model_cannot_follow():
     """And a model run after another takes no part of the first one's."""
     network = simulate(1, LimOptions(5, False)).network
