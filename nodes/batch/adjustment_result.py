@@ -17,7 +17,7 @@ from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability,
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
 from ...solver.adjustment.surface_control import SurfaceFit
-from ...solver.adjustment.variance_components import CONSTANTS
+from ...solver.adjustment.variance_components import CONSTANTS, LEAST_REDUNDANCY
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
 from .json_values import plain
@@ -154,9 +154,11 @@ def result_of(adjustment: Adjustment) -> dict[str, Any]:
 
 
 def strips_of(adjustment: Adjustment, solution: Solution) -> dict[str, Any]:
-    """Correction functions of every strip, as their model describes them, with a-posteriori sigmas and the times of
-    tables."""
-    sigma0 = adjustment.result.sigma0
+    """Correction functions of every strip, as their model describes them, with the times of tables, and sigmas that are
+    a posteriori of the model's own adjustment."""
+    result = adjustment.result
+    scaled = result.measured_redundancy >= LEAST_REDUNDANCY and solution.redundancy > 0
+    sigma0 = solution.sigma0 if scaled else 1.0
     sigma = sigma0 * np.sqrt(np.maximum(solution.factor.variances(), 0.0))
     found = {}
     for item in solution.layout.sets:

@@ -350,6 +350,21 @@ def test_a_second_step_keeps_what_the_first_found_of_the_clock(folder, tmp_path)
     assert abs(two["value"] + 0.02) < 4.0 * two["sigma"] < 0.01
 
 
+def test_sigmas_of_a_first_step_are_of_its_own_adjustment(folder, tmp_path):
+    """A model that is too poor has a large sigma0; the one after it has not."""
+    wandering = shutil.copytree(folder, tmp_path / "wandering")
+    trajectory = pd.read_csv(wandering / "trajectory.csv")
+    trajectory["Y_m"] += 0.5 * np.sin(trajectory["time_s"] / 5.0)
+    trajectory.to_csv(wandering / "trajectory.csv", index=False)
+    for name, options in (("one", []), ("two", ["--then", "lim", "--fixes", 8])):
+        assert adjust(wandering, "--model", "dgr", *options, "-q", "-o", tmp_path / name) == 0
+    one, two = result_in(tmp_path / "one"), result_in(tmp_path / "two")
+    (before,) = two["before"]
+    assert before["sigma0"] == pytest.approx(one["sigma0"]) and one["sigma0"] > 1.5 * two["sigma0"]
+    for id, strip in one["strips"].items():
+        np.testing.assert_allclose(before["strips"][id]["offset_m_sigma"], strip["offset_m_sigma"], rtol=1e-6)
+
+
 def test_the_second_step_has_settings_of_its_own(folder, tmp_path):
     block = shutil.copytree(folder, tmp_path / "block")
     project = block / "project.toml"
