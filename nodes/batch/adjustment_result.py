@@ -20,6 +20,7 @@ from ...solver.adjustment.surface_control import SurfaceFit
 from ...solver.adjustment.variance_components import CONSTANTS, LEAST_REDUNDANCY
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
+from ...solver.geometry.frames import CrsError, LocalFrame
 from .json_values import plain
 
 Array = NDArray[np.floating]
@@ -29,6 +30,9 @@ MOST_LISTED = 20
 
 #: Undetermined combinations that the notes name.
 MOST_NAMED = 4
+
+#: Axes of a CRS that are turned by more against east and north are told, degrees: a tenth of X is in Y then.
+TURNED_DEG = 5.0
 
 #: Times in what a model says of a strip.
 TIMES = ("time_s", "start_s", "end_s")
@@ -324,7 +328,7 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     """What a reader of the result should know, one sentence each."""
     result, solution = adjustment.result, adjustment.result.solution
     network = result.network
-    notes = list(adjustment.block.notes)
+    notes = [*adjustment.block.notes, *_axes_notes(adjustment.block.frame)]
     notes += dict.fromkeys(note for item in solution.layout.sets for note in item.model.notes)
     if not solution.converged:
         notes.append("not converged: the figures are those of the last step")
@@ -349,6 +353,23 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     if lost:
         notes.append(f"{lost} object points are not determined by their rays and have no coordinates in points.csv")
     return notes
+
+
+def _axes_notes(frame: LocalFrame) -> list[str]:
+    """Which way X goes, where that is not nearly the X of the tables."""
+    if frame.crs == "local":
+        return []
+    try:
+        x_l = frame.R_l_crs(frame.to_crs(np.zeros((1, 3))))[0, :, 0]
+    except CrsError:  # whoever writes tables in it says so
+        return []
+    turned = float(np.degrees(np.arctan2(x_l[1], x_l[0])))
+    if abs(turned) < TURNED_DEG:
+        return []
+    return [
+        "X, Y, Z of accuracies, corrections of strips and names of coordinates are those of the local frame (east, "
+        f"north, up); X of the tables, which are in {frame.crs}, is turned from the east by {turned:+.0f} deg"
+    ]
 
 
 def _doubt_note(result: BatchResult) -> str:

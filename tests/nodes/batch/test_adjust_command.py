@@ -262,12 +262,9 @@ def test_heavy_tails_are_told(tmp_path, noise):
     assert any("fail narrowly" in note for note in result_in(tmp_path / "out")["notes"]) == (noise == "t3")
 
 
-@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
-def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
-    """The block moved to 9 deg 30' east, 48 deg north: same adjustment, coordinates and angles in the other system."""
-    there = tmp_path / "there"
+def moved_to(folder, there, frame):
+    """A block folder with its places and angles in the CRS of a frame; the trajectory."""
     shutil.copytree(folder, there)
-    frame = LocalFrame(48.0, 9.5, 0.0, crs)
     ground = pd.read_csv(there / "ground_points.csv")
     ground[AXES] = frame.to_crs(ground[AXES].to_numpy())
     ground.to_csv(there / "ground_points.csv", index=False)
@@ -278,7 +275,27 @@ def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
     trajectory[AXES] = places
     trajectory.to_csv(there / "trajectory.csv", index=False)
     text = (there / "project.toml").read_text()
-    (there / "project.toml").write_text(text.replace("[project]", f'[project]\ncrs = "{crs}"'))
+    (there / "project.toml").write_text(text.replace("[project]", f'[project]\ncrs = "{frame.crs}"'))
+    return trajectory
+
+
+def test_axes_of_a_crs_that_are_turned_are_told(folder, tmp_path):
+    """South African X goes to the west: a mean difference of X in the result has the other sign in points.csv."""
+    for crs, latitude, longitude, turned in (
+        ("EPSG:2048", -30.0, 19.2, "-180 deg"), ("EPSG:3031", -75.0, 60.0, "+60 deg"), ("EPSG:32632", 48.0, 9.5, "")
+    ):  # fmt: skip
+        there = tmp_path / crs.replace(":", "")
+        moved_to(folder, there, LocalFrame(latitude, longitude, 0.0, crs))
+        assert adjust(there, "-q", "-o", tmp_path / f"{there.name}-out") == 0
+        told = [note for note in result_in(tmp_path / f"{there.name}-out")["notes"] if "local frame" in note]
+        assert len(told) == bool(turned) and all(turned in note and crs in note for note in told)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4979"])
+def test_result_is_in_the_crs_of_the_project(folder, tmp_path, crs):
+    """The block moved to 9 deg 30' east, 48 deg north: same adjustment, coordinates and angles in the other system."""
+    there, frame = tmp_path / "there", LocalFrame(48.0, 9.5, 0.0, crs)
+    trajectory = moved_to(folder, there, frame)
     for source, name in ((folder, "here"), (there, "out")):
         assert adjust(source, "-q", "-o", tmp_path / name) == 0
     one, other = result_in(tmp_path / "here"), result_in(tmp_path / "out")
