@@ -259,7 +259,7 @@ def accuracies(result: BatchResult) -> dict[str, Any]:
     """Empirical and theoretical accuracy of check, control and tie points, and of direct georeferencing.
 
     Direct georeferencing is compared with the check points, or with the control where there are none. Coordinates of
-    control that were left out are compared with nothing.
+    control that were left out are compared with nothing, nor are points that no image point measures.
     """
     network, points, sigma = result.network, result.adjusted_points(), result.point_sigma_m
     surveyed = result.kept_control

@@ -198,9 +198,11 @@ class BatchResult:
 
     @property
     def kept_control(self) -> Control:
-        """The control without the coordinates that were left out: as if they were not given."""
-        control = self.network.control
-        sigma = control.sigma_m.copy()
+        """The control without the coordinates that were left out, and without points that no image point in use
+        measures, which stay where they are given: as if they were not given."""
+        network, control = self.network, self.network.control
+        used = np.bincount(network.rays.point[self.solution.ray_weight > 0], minlength=network.n_points)
+        sigma = np.where(used[control.point, None] > 0, control.sigma_m, np.inf)
         for r in self.rejected:
             if r.ray < 0:
                 sigma[control.point == r.point, r.axis] = np.inf

@@ -279,6 +279,21 @@ def moved_to(folder, there, frame):
     return trajectory
 
 
+def test_control_that_no_image_measures_is_not_in_the_accuracy_of_control(folder, tmp_path):
+    """It stays where it is given: differences of nothing made RMSE and mean of the others smaller."""
+    more = shutil.copytree(folder, tmp_path / "more")
+    with open(more / "ground_points.csv", "a") as file:
+        file.writelines(f"U{i},{100 * i},50.0,10.0,0.02,0.02,0.02,control\n" for i in range(6))
+    for source, name in ((folder, "one"), (more, "two")):
+        assert adjust(source, "-q", "-o", tmp_path / name) == 0
+    one, two = (result_in(tmp_path / name)["control"] for name in ("one", "two"))
+    assert two["n"] == one["n"] == 5
+    for key in ("rmse_m", "mean_m", "sigma_m", "expected_m"):
+        np.testing.assert_allclose(two[key], one[key], rtol=1e-6)
+    points = pd.read_csv(tmp_path / "two" / "points.csv", index_col="point")
+    assert points.loc["U3", AXES].to_list() == [300.0, 50.0, 10.0]
+
+
 def test_axes_of_a_crs_that_are_turned_are_told(folder, tmp_path):
     """South African X goes to the west: a mean difference of X in the result has the other sign in points.csv."""
     for crs, latitude, longitude, turned in (
