@@ -317,15 +317,18 @@ def _rigorous(a: SceneAdjustment) -> list[RigorousImage]:
 
 
 def _known(a: SceneAdjustment, *roles: str) -> NDArray[np.int64]:
-    known = a.problem.block.known
+    """Places of known points (k,) of some roles that an image point in use measures, and that are determined."""
+    known, block = a.problem.block.known, a.problem.block
+    measured = np.zeros(len(block.point_ids), dtype=bool)
+    measured[block.rays.point[a.solution.ray_weight > 0]] = True  # others stay where they are given
     places = [k for k, role in enumerate(known.role) if role in roles]
-    return np.array([k for k in places if a.solution.determined[known.point[k]]], dtype=np.int64)
+    return np.array([k for k in places if (measured & a.solution.determined)[known.point[k]]], dtype=np.int64)
 
 
 def differences(a: SceneAdjustment, *roles: str) -> tuple[NDArray[np.int64], Array]:
-    """Determined known points (k,) of some roles, and adjusted minus given (k, 3): east, north, up, metres.
+    """Known points (k,) of some roles that are measured and determined, and adjusted minus given (k, 3), metres.
 
-    NaN where the role says that a coordinate is not given, and where it was left out.
+    East, north, up; NaN where the role says that a coordinate is not given, and where it was left out.
     """
     known, k = a.problem.block.known, _known(a, *roles)
     points = known.point[k]

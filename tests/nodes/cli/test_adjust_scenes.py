@@ -108,6 +108,22 @@ def test_expected_rmse_of_check_points_and_control_holds_the_survey(tmp_path, ca
     assert 0.7 < np.sqrt(np.mean(np.square(control))) < 1.3
 
 
+def test_control_that_no_image_measures_is_not_in_the_accuracy_of_control(block, capsys):
+    found = []
+    for more in (False, True):
+        if more:
+            given = rows(block / "ground_points.csv")
+            control = [row for row in given if row["role"] == "control"]
+            with open(block / "ground_points.csv", "a", newline="") as file:
+                writer = csv.DictWriter(file, given[0])
+                writer.writerows({**row, "point": f"U{i}"} for i, row in enumerate(control))
+        assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["control"])
+    one, two = found
+    assert one["n"] == two["n"] == 9
+    np.testing.assert_allclose(two["rmse_m"], one["rmse_m"], rtol=1e-6)
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 
