@@ -159,6 +159,15 @@ def image_scale(statistics: RayStatistics, ray_weight: Array) -> float:
     return float(np.median(w)) / 0.6745 if len(w) else 1.0
 
 
+def _weight_of_all_control(solution: Solution) -> Array:
+    """Weights (p, 3) of control with those that were left out, whose sigmas are as many times what was stated as those
+    of the others."""
+    given = weigh_control(solution.network.control, solution.network.n_points).weight
+    weight = solution.problem.control.weight
+    on = (weight > 0) & (given > 0)
+    return given * (float(np.median(weight[on] / given[on])) if on.any() else 1.0)
+
+
 class _Search:
     """The state of a search: weights of rays and control, and what was left out when."""
 
@@ -167,7 +176,7 @@ class _Search:
         self.point = solution.network.rays.point
         self.weight = solution.ray_weight.copy()
         self.control_weight = solution.problem.control.weight.copy()
-        self.given_weight = weigh_control(solution.network.control, solution.network.n_points).weight
+        self.given_weight = _weight_of_all_control(solution)
         self.out: dict[int, float] = {}
         self.control_out: dict[tuple[int, int], float] = {}
         self.returned: set[int | tuple[int, int]] = set()

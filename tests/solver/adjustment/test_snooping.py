@@ -15,7 +15,8 @@ from triline.solver.adjustment.point_consensus import consensus
 from triline.solver.adjustment.ray_statistics import ray_statistics
 from triline.solver.adjustment.reliability import CRITICAL_W
 from triline.solver.adjustment.robust import Danish, Huber, Igg3
-from triline.solver.adjustment.snooping import control_tests, joint_limit, snoop
+from triline.solver.adjustment.snooping import Rejected, control_tests, joint_limit, snoop
+from triline.solver.adjustment.variance_components import scaled
 from triline.solver.camera.self_calibration import tls
 from triline.solver.camera.sensors import preset
 from triline.solver.models.dgr import DgrOptions
@@ -278,6 +279,22 @@ def test_two_rays_that_contradict_each_other_are_both_named():
 def test_joint_limit_has_the_error_probability_of_one_coordinate():
     assert joint_limit(CRITICAL_W) == pytest.approx(13.8, abs=0.05)
     assert stats.chi2.sf(joint_limit(CRITICAL_W), 2) == pytest.approx(0.001, abs=5e-6)
+
+
+def test_control_that_returns_has_the_weight_of_the_other_control():
+    """Whose sigmas were found to be three times as large as stated, before the search."""
+    solution = scaled(adjust(block(2).network, MODEL), {"control": 3.0})
+    control = solution.problem.control
+    key = next(zip(*np.nonzero(control.weight > 0), strict=True))
+    stated = control.weight[key]
+    without = replace(control, weight=control.weight.copy())
+    without.weight[key] = 0.0
+    start = solve(replace(solution.problem, control=without), solution)
+    out = Rejected(-1, int(key[0]), int(key[1]), 4.0, "snooping")
+    before = replace(snoop(start), rejected=(out,))
+    found = snoop(start, before=before)
+    assert not [r for r in found.rejected if r.ray < 0]
+    assert found.solution.problem.control.weight[key] == pytest.approx(stated)
 
 
 def test_critical_value_must_be_positive():
