@@ -125,6 +125,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     return BlockData(
         project.name or name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes), reference,
         heading=not any(pose[1] for pose in poses),  # poses that name a strip come from a block folder
+        refused=frozenset(found.refused & found.ground.keys()),
     )  # fmt: skip
 
 

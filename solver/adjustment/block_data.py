@@ -111,6 +111,7 @@ class BlockData:
     notes : what the reader wants said (ignored columns, rows that cannot be used, assumptions)
     time_reference_ns : times count from here (ns since the Unix epoch)
     heading : the attitude is that of an inertial system, whose error of kappa is one of heading (`Layout.heading`)
+    refused : names of ground points whose coordinates do not count, as an operator said in flight
     """
 
     name: str
@@ -124,6 +125,7 @@ class BlockData:
     notes: tuple[str, ...] = ()
     time_reference_ns: int = 0
     heading: bool = False
+    refused: frozenset[str] = frozenset()
 
     def image_name(self, row: int) -> tuple[str, str, str]:
         """Point, strip and CCD of an image point, as written."""

@@ -89,6 +89,7 @@ def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBloc
         ground=ground,
         image=image,
         notes=notes,
+        refused=frozenset[str]().union(*(block.refused for block in blocks)),
     )
     of_ground = int(common[: len(ground)].sum())
     return JoinedBlock(
@@ -169,11 +170,15 @@ def _moved(strip: Strip, shift_s: float, turn: Array | None, offset: Array) -> S
 
 
 def _known_points(blocks: Sequence[BlockData], names: Sequence[str]) -> tuple[KnownPoints, dict[str, int]]:
-    """Known points of all blocks, each once, and their places."""
+    """Known points of all blocks, each once, and their places; without those that an operator refused in one of them,
+    since the others state the same coordinates."""
+    refused = frozenset[str]().union(*(block.refused for block in blocks))
     place: dict[str, int] = {}
     rows: list[tuple[int, int]] = []
     for i, block in enumerate(blocks):
         for k, id in enumerate(block.ground.id):
+            if id in refused:
+                continue
             if id not in place:
                 place[id] = len(rows)
                 rows.append((i, k))

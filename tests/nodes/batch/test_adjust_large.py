@@ -12,6 +12,8 @@ from test_adjust_command import write_block
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
 from triline.nodes.formats.block_messages import block_messages
+from triline.nodes.node import Message
+from triline.schemas import messages as m
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +82,23 @@ def test_two_recordings_are_adjusted_as_one(folder, tmp_path, capsys):
     np.testing.assert_allclose(two.loc[one.index, axes], one[axes], atol=1e-6)
     sigma = [name for name in one.columns if name.startswith("sigma")]
     np.testing.assert_allclose(two.loc[one.index, sigma], one[sigma], rtol=1e-6)
+
+
+def test_coordinates_that_were_refused_in_one_recording_do_not_count_in_the_block(folder, tmp_path):
+    """The other recording states the same coordinates."""
+    days = []
+    for i, strips in enumerate((["S1"], ["S2", "C1"])):
+        messages = list(block_messages(read_input(split(folder, tmp_path, strips))))
+        if not i:
+            said = m.Verdict(point="P0", accepted=False)
+            messages.append(Message("observation/verdict", messages[-1].stamp_ns, said))
+        days.append(write_recording(tmp_path / f"day{i + 1}.mcap", messages))
+    for name, paths in (("one", days), ("two", days[::-1])):
+        assert adjust(*paths, "-o", tmp_path / name) == 0
+        result = json.loads((tmp_path / name / "result.json").read_text())
+        points = tables(tmp_path / name)["points.csv"].set_index("point")
+        assert result["control"]["n"] == 4 and points.role["P0"] == "tie"
+        assert any("P0: its coordinates do not count" in note for note in result["notes"])
 
 
 @pytest.mark.parametrize(
