@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -166,6 +168,7 @@ def _strips_of(
             notes.append(f"strip {id} has no trajectory or no line rate and was left out")
             continue
         bodies = [poses[row][2] for row in rows]
+        notes += _notes_of_validity(id, bodies)
         p = [body.pose for body in bodies]
         trajectory = Trajectory(
             (time_ns[rows] - reference) * 1e-9,
@@ -187,6 +190,18 @@ def _strips_of(
             )
         )
     return tuple(strips)
+
+
+def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
+    """What a navigator says against the poses of a strip, which the adjustment takes as they are."""
+    # reasons without how long and how much, which differ from pose to pose
+    reasons = Counter(re.sub(r"( for)? [\d.]+ m?s?$", "", pose.reason) for pose in poses if not pose.valid)
+    if not reasons:
+        return []
+    reason = reasons.most_common(1)[0][0] or "no reason is said"
+    return [
+        f"strip {strip}: {reasons.total()} of {len(poses)} poses are not valid ({reason}), and were taken as they are"
+    ]
 
 
 def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating] | None:

@@ -227,6 +227,19 @@ def test_recording_gives_what_the_folder_gives(folder, tmp_path):
     np.testing.assert_allclose(other["check"]["rmse_m"], one["check"]["rmse_m"], atol=1e-5)
 
 
+def test_poses_that_are_not_valid_are_told(folder, tmp_path):
+    """The navigator says so where a trajectory drifts without GNSS; the adjustment cannot know."""
+    lost, messages = 0, list(block_messages(read_input(folder)))
+    for message in messages:
+        if message.topic.startswith("trajectory/") and message.body.strip == "S1" and lost < 700:
+            lost += 1
+            message.body.valid, message.body.reason = False, f"no GNSS for {lost / 50:.1f} s"
+    recording = write_recording(tmp_path / "lost.mcap", messages)
+    assert adjust(recording, "-q", "-o", tmp_path / "out") == 0
+    (note,) = (note for note in result_in(tmp_path / "out")["notes"] if "not valid" in note)
+    assert note.startswith("strip S1: 700 of ") and "(no GNSS)" in note
+
+
 def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
     """Wander and the white noise of the poses are the project's: image points do not get the blame for either."""
     flight, smoothed = tmp_path / "flight.mcap", tmp_path / "smoothed.mcap"
