@@ -223,7 +223,9 @@ def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
         if id in found.refused:
             notes.append(f"ground point {id}: its coordinates do not count, as an operator said in flight")
             continue
-        if len(body.covariance) != 9 or not np.isfinite([body.x, body.y, body.z, *body.covariance]).all():
+        given = {"control": (0, 1, 2), "planimetric": (0, 1), "height": (2,)}.get(role_of(body), ())
+        usable = len(body.covariance) == 9 and np.isfinite([body.x, body.y, body.z, *body.covariance]).all()
+        if not usable or not all(body.covariance[4 * axis] > 0 for axis in given):  # as on line
             notes.append(f"ground point {id} has no usable covariance or coordinates and was left out")
             continue
         ids.append(id)

@@ -227,6 +227,18 @@ def test_recording_gives_what_the_folder_gives(folder, tmp_path):
     np.testing.assert_allclose(other["check"]["rmse_m"], one["check"]["rmse_m"], atol=1e-5)
 
 
+@pytest.mark.parametrize("variance", [0.0, -4e-4])
+def test_control_without_a_variance_is_left_out_as_on_line(folder, tmp_path, variance):
+    messages = list(block_messages(read_input(folder)))
+    control = next(x.body for x in messages if x.topic == "observation/control" and not x.body.role)
+    control.covariance[0] = variance
+    recording = write_recording(tmp_path / "block.mcap", messages)
+    assert adjust(recording, "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    assert result["control"]["n"] == 4
+    assert f"ground point {control.point} has no usable covariance or coordinates and was left out" in result["notes"]
+
+
 def test_poses_that_are_not_valid_are_told(folder, tmp_path):
     """The navigator says so where a trajectory drifts without GNSS; the adjustment cannot know."""
     lost, messages = 0, list(block_messages(read_input(folder)))
