@@ -145,20 +145,34 @@ def build(cls: Any, tables: Tables, name: str | None = None) -> Any:
     """
     table_name: str = cls.name if name is None else name
     table = tables.get(table_name, {})
-    parameters = inspect.signature(cls).parameters
-    known = [key for key, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    known = settings_of(cls)
     for key in table:
         if key not in known:
             wanted = f"wanted one of {', '.join(known)}" if known else "the node has nothing to configure"
             raise UserError(f"configuration [{table_name}]: {key} is not known, {wanted}")
     for key, value in table.items():
-        wanted = _wanted(parameters[key].default, value)
+        wanted = _wanted(known[key], value)
         if wanted:
             raise UserError(f"configuration [{table_name}]: {key} is {value!r}, wanted {wanted}")
     try:
         return cls(**table)
     except (ValueError, TypeError) as error:
         raise UserError(f"configuration [{table_name}]: {error}") from None
+
+
+def settings_of(cls: Any) -> dict[str, Any]:
+    """Settings of a node class and their defaults: its named arguments that a file can state.
+
+    None as the default stands for a number that is found where nobody states it. Arguments for programs that make a
+    node themselves (what a viewer draws on) are no settings.
+    """
+    parameters = inspect.signature(cls).parameters.items()
+    named = {key: p for key, p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
+    return {
+        key: p.default
+        for key, p in named.items()
+        if isinstance(p.default, bool | int | float | str) or "float" in str(p.annotation)
+    }
 
 
 def _wanted(default: Any, value: Any) -> str:

@@ -25,6 +25,8 @@ from ..recording.runner import active_nodes, is_remade
 from ..voices import FIXED, VERDICT, RecordedVoices
 
 SECOND_NS = 1_000_000_000
+#: Settings of the player beside the recording (``input``), and their defaults.
+SETTINGS: dict[str, float | bool | None] = {"rate": 1.0, "from": None, "to": None, "loop": False, "all": False}
 #: Between the end of a recording and its next round, platform time.
 LOOP_PAUSE_NS = SECOND_NS
 #: Tells a message from all others: topic, source, start and sequence.
@@ -307,9 +309,11 @@ def run(options: ProgramOptions) -> int:
     path = table.pop("input", None)
     if not path or not isinstance(path, str):
         raise UserError("the player needs a recording: --set input=FILE, or [player] input in the configuration")
-    unknown = set(table) - {"rate", "from", "to", "loop", "all"}
-    if unknown:
-        raise UserError(f"configuration [player]: {', '.join(sorted(unknown))} is not known")
+    for key, value in table.items():
+        if key not in SETTINGS:
+            raise UserError(f"configuration [player]: {key} is not known, wanted one of input, {', '.join(SETTINGS)}")
+        if SETTINGS[key] is False and not isinstance(value, bool):
+            raise UserError(f"configuration [player]: {key} is {value!r}, wanted true or false")
     rate = table.get("rate", 1.0)
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 <= rate < 1e6:
         raise UserError(f"configuration [player]: rate is {rate!r}, wanted a number of at least 0")

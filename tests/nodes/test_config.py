@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+
 import numpy as np
 import pytest
+from places import ROOT
 
 from triline.nodes import registry
 from triline.nodes.bus.session import DEFAULT_PORT, configuration, default_port
 from triline.nodes.cli import main
-from triline.nodes.config import build, load
+from triline.nodes.config import build, load, settings_of
 from triline.nodes.errors import UserError
 from triline.nodes.navigator.engines import InertialUnit
 from triline.nodes.node import Node
+from triline.nodes.player.player import SETTINGS as PLAYER
+from triline.nodes.recorder.recorder import Recorder
+from triline.nodes.router.router import OnBoardRouter
 from triline.solver.navigation.inertial_data import InertialGrade
 
 
@@ -137,3 +144,43 @@ def test_the_meeting_port(monkeypatch):
         monkeypatch.setenv("TRILINE_PORT", bad)
         with pytest.raises(UserError, match="wanted a port number"):
             default_port()
+
+
+def stated_on_the_page() -> tuple[dict[str, dict], dict[str, set[str]]]:
+    """Tables of the page's settings: values of keys, and all keys with those that are commented out."""
+    page = (ROOT / "docs" / "bus.md").read_text(encoding="utf-8")
+    text = page.split("## Settings of the nodes")[1].split("\n## ")[0]
+    lines = [line[4:] for line in text.splitlines() if line.startswith("    ")]
+    keys: dict[str, set[str]] = {}
+    for line in lines:
+        if name := re.match(r"\[(\w+)\]", line):
+            table = keys.setdefault(name[1], set())
+        elif key := re.match(r"(?:# (?:\.\.\. )?)?(\w+) = ", line):
+            table.add(key[1])
+    return tomllib.loads("\n".join(lines)), keys
+
+
+def test_the_page_names_all_settings_with_their_defaults():
+    values, keys = stated_on_the_page()
+    settings = {name: settings_of(registry.node_class(name)) for name in (*registry.STEP_NODES, *registry.ONLOOKERS)}
+    settings |= {"recorder": settings_of(Recorder), "router": settings_of(OnBoardRouter)}
+    settings |= {"player": {"input": None} | PLAYER}
+    for name, known in settings.items():
+        assert keys[name] == set(known), name
+        assert {key: known[key] for key in values[name]} == values[name], name
+    assert set(settings) | {"simulator", "nmea"} == set(keys)
+
+
+def test_what_a_program_hands_to_a_node_is_no_setting(capsys):
+    assert main(["node", "viewer", "--set", "canvas=5"]) == 1
+    told = capsys.readouterr().err
+    assert told.endswith("[viewer]: canvas is not known, wanted one of mode, queue_size, truth\n")
+
+
+def test_settings_of_the_player(tmp_path, capsys):
+    for word, told in (
+        ("pace=4", "pace is not known, wanted one of input, rate, from, to, loop, all"),
+        ("loop=no", "loop is 'no', wanted true or false"),
+    ):
+        assert main(["node", "player", "--set", "input=flight.mcap", "--set", word]) == 1
+        assert told in capsys.readouterr().err
