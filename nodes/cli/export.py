@@ -178,7 +178,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
         result |= _write_camera(recording, name, target)
     tell_other_frame("export", reader)
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json.dumps(result | {"damage": damage_lines(reader)}, indent=2))
         return 0
     if not args.quiet:
         print(f"{path} -> {target}: {said}")

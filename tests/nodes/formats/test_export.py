@@ -583,3 +583,5 @@ def test_what_a_damaged_recording_lacks_is_named(recording, tmp_path, capsys):
     assert "()" not in said.out + said.err
     assert main([*args, "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["damage"]) == 1
+    assert main(["export", str(cut), "--points", str(tmp_path / "p.csv"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["damage"]) == 1
