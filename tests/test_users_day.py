@@ -14,6 +14,7 @@ from places import ROOT
 
 import triline
 from triline.nodes.convert import local_frame
+from triline.schemas import topics
 from triline.solver.geometry.frames import navigation_from_R_lc
 from triline.solver.geometry.rotation import matrix_from_quaternion
 
@@ -103,6 +104,8 @@ def judge(folder: Path, truth: users_day.Truth) -> None:
         assert found[2] < 0.3 * measured[2] and found[5] < 0.3 * measured[5]  # what nothing else can stand in for
     off, alike = shift_of(folder / "ortho.tif", truth)
     assert off < 1.0 and alike > 0.9
+    # what the recorder of a flight keeps, and nothing that is there for the order on the bus alone
+    assert all(topics.find(name).recorded for name in recording.topics().index)
     assert (folder / "report.html").stat().st_size > 100_000
     assert (folder / "adjusted" / "points.csv").exists()
 

@@ -135,7 +135,7 @@ def process(
     ----------
     reader : the recording
     nodes : the nodes; those with nothing to work on stay out
-    write : takes inputs and outputs, in the order of `order_key`; receive time = stamp
+    write : takes inputs and outputs, in the order of `order_key`, of topics that are recorded; receive time = stamp
     progress : told the fraction that is done, now and then
     apart : the nodes before the last may run in a process of their own, if they need nothing of it; what comes out is
         the same
@@ -143,6 +143,7 @@ def process(
     copy : takes inputs in place of ``write``, many at once, in the same order; most of them need no envelope
     """
     copy = copy or (lambda messages: _each(write, messages))
+    write = _as_recorded(write)
     summary = ProcessSummary()
     held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
     recorded = {c.topic for c in reader.channels.values() if c.known and c.id in held}
@@ -185,6 +186,8 @@ def process(
             told.add(len(part))
         line.work_off()
     line.finish()
+    for topic in [name for name in summary.outputs if not topics.find(name).recorded]:
+        del summary.outputs[topic]
     return summary
 
 
@@ -525,6 +528,11 @@ class _Line:
 
 def _listens(driver: StepDriver, topic: str) -> bool:
     return any(topics.find(name).matches(topic) for name in (*driver.inputs, *driver.node.decisions))
+
+
+def _as_recorded(write: Callable[[RawMessage], None]) -> Callable[[RawMessage], None]:
+    """Writes what the recorder of a flight keeps: no messages that are there for the order on the bus alone."""
+    return lambda raw: write(raw) if topics.find(raw.topic).recorded else None
 
 
 def _each(write: Callable[[RawMessage], None], messages: Iterable[Recorded]) -> None:
