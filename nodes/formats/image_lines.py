@@ -171,6 +171,7 @@ def open_strip(
     views: dict[str, GreyImage] = {}
     notes: list[str] = []
     first: GreyImage | None = None
+    _refuse_type_without_effect(given)
     for name, path, band in given.files:
         view = _view(name, path, camera)
         image = open_image(path, given.raw, 0 if camera is None else camera.lines[camera.line_index[view]].pixels)
@@ -235,7 +236,7 @@ def open_image(path: Path, raw: tuple[str, int] | None = None, samples: int = 0)
         raise UserError(f"{path}: no such file")
     if is_tiff(path):
         return open_tiff(path)
-    if raw is None or path.suffix.lower() == ".hdr" or header_of(path) is not None:
+    if raw is None or _says_its_values(path):
         return open_envi(path)
     kind, width = raw
     if kind not in TYPES:
@@ -243,6 +244,21 @@ def open_image(path: Path, raw: tuple[str, int] | None = None, samples: int = 0)
     if not (width or samples):
         raise UserError(f"{path}: pixels of a line are not known, wanted --samples, or --camera")
     return open_raw(path, kind, width or samples)
+
+
+def _refuse_type_without_effect(given: LinesGiven) -> None:
+    """Raise UserError for a type of raw values where every file says itself what its values are."""
+    if given.raw is None or not given.files or not all(_says_its_values(path) for _, path, _ in given.files):
+        return
+    path = given.files[0][1]
+    header = header_of(path)
+    says = "a TIFF" if header is None else f"{header.name} beside it says what its values are"
+    raise UserError(f"{path}: {says}, wanted no type {given.raw[0]}: that is of files without a header")
+
+
+def _says_its_values(path: Path) -> bool:
+    """Whether an image is a TIFF, or has an ENVI header."""
+    return path.is_file() and (is_tiff(path) or path.suffix.lower() == ".hdr" or header_of(path) is not None)
 
 
 def _view(name: str, path: Path, camera: LineCamera | None) -> str:

@@ -177,6 +177,8 @@ def test_tiff_and_raw_strips_that_cannot_be(tmp_path, capsys):
     complex_tiff = write_tiff(tmp_path / "c.tif", np.ones((50, 7, 1), np.complex64))
     raw, empty = tmp_path / "a.raw", tmp_path / "empty.raw"
     raw.write_bytes(bytes(349))
+    headed = write_image(tmp_path / "b.img", cube_of("u1", bands=1)).with_suffix(".raw")  # has the header of b.img
+    headed.write_bytes(bytes(300))
     empty.write_bytes(bytes(3))
     for arguments, wanted in (
         (["--lines", f"F={tiff}"], "a.tif: 3 bands, wanted one of them (--band 2)"),
@@ -193,6 +195,8 @@ def test_tiff_and_raw_strips_that_cannot_be(tmp_path, capsys):
         (["--lines", f"F={empty}", "--raw", "u1", "--camera", camera], "empty.raw: 3 bytes, wanted lines of 7 samples"),
         (["--lines", f"F={tiff}@1", "--samples", "7"], "--samples 7: wanted the pixels of a line, with --raw TYPE"),
         (["--raw", "u1"], "--raw is of images, wanted --lines VIEW=FILE with it"),
+        (["--lines", f"F={tiff}@1", "--raw", "u2"], "a.tif: a TIFF, wanted no type u2: that is of files without"),
+        (["--lines", f"F={headed}", "--raw", ">u2"], "b.raw: b.hdr beside it says what its values are, wanted no type"),
     ):
         more = ["--format", "csv"] if arguments == ["--raw", "u1"] else times
         assert main(["import", poses, "-o", str(out), *arguments, *more]) == 1, arguments
