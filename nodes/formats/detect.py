@@ -12,7 +12,7 @@ import numpy as np
 
 from ...solver.camera.line_camera import LineCamera
 from ...solver.navigation.inertial_data import InertialGrade
-from ..convert import camera_message, state_noise
+from ..convert import SECOND_NS, camera_message, state_noise
 from ..errors import UserError
 from ..node import Message
 from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
@@ -21,6 +21,7 @@ from .block_folder import is_block_folder, read_block
 from .block_messages import block_messages, not_carried
 from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
+from .gps_time import GPS_EPOCH_S, WEEK_S
 from .gpx import has_attitudes, is_gpx, position_messages, read_gpx, read_positions
 from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
@@ -40,6 +41,8 @@ from .track import Accuracy, Mounting, NavigationTrack, frame_of, track_messages
 from .trajectory_csv import is_trajectory_csv, read_trajectory_csv
 from .vendor_poses import is_headwall, is_resonon, read_headwall, read_resonon
 
+#: Times before this one, ns, are GPS seconds of the week whose day nobody has said.
+_NO_DAY_NS = (GPS_EPOCH_S + 2 * WEEK_S) * SECOND_NS
 #: What `triline import` understands: name -> words.
 KINDS = {
     "flight": "flight folder (flight.toml)",
@@ -321,8 +324,9 @@ def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStr
     first, last = int(strip.time_ns[0]), int(strip.time_ns[-1])
     if last < begin_ns or first > end_ns:
         spans = [f"{_utc(a)} to {_utc(b)}" for a, b in ((first, last), (begin_ns, end_ns))]
+        day = " (GPS seconds without a day count from 1980-01-06, wanted --date)" if begin_ns < _NO_DAY_NS else ""
         raise UserError(
-            f"strip {strip.id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale"
+            f"strip {strip.id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale{day}"
         )
     out = int(np.count_nonzero((strip.time_ns < begin_ns) | (strip.time_ns > end_ns)))
     if not out:

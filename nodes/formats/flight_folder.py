@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -91,6 +92,20 @@ _KEYS = {
     "dem": ("file", "crs", "sigma_m", "shift_sigma_m"),
     "strips": (*("id", "images", "line_times", "first_time", "line_rate_hz", "band", "grey_range", "type", "samples"),),
 }
+#: Options of `triline import` in what readers say, and the keys that stand for them here.
+_AS_KEYS = (
+    (r"--grey-range LOW HIGH", "grey_range = [LOW, HIGH]"),
+    (r"--band ([\w:.,+-]*\w)", r'band = "\1"'),
+    (r"--raw TYPE", "type (u1, u2 or >u2)"),
+    (r"--samples\b", "samples"),
+    (r"--line-times(?: CSV)?", "line_times"),
+    (r"--first-time\b", "first_time"),
+    (r"--line-rate\b", "line_rate_hz"),
+    (r"--date\b", "navigation.date"),
+    (r"--crs\b", "flight.crs"),
+    (r"--ground-height\b", "flight.ground_height_m"),
+    (r"--camera\b", "camera.file"),
+)
 _ZERO = (0.0, 0.0, 0.0)
 T = TypeVar("T")
 
@@ -158,7 +173,7 @@ class Flight:
         try:
             return work()
         except UserError as error:
-            self.problems.append(str(error))
+            self.problems.append(_in_keys(str(error)))
         except OSError as error:
             self.problems.append(f"{error.filename}: {(error.strerror or str(error)).lower()}")
         return None
@@ -216,6 +231,13 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
         unknown = [key for key in keys.values if key not in known]
         flight.problems.extend(f"{path}: {keys.name(key)}: not known, wanted {', '.join(known)}" for key in unknown)
     return flight
+
+
+def _in_keys(text: str) -> str:
+    """What a reader says, with keys of the ``flight.toml`` for the options that it names."""
+    for option, key in _AS_KEYS:
+        text = re.sub(option, key, text)
+    return text
 
 
 def refuse_problems(flight: Flight) -> None:
@@ -276,8 +298,8 @@ def flight_messages(folder: Path) -> tuple[Imported, str]:
     )
     imported = read_any(flight.navigation, flight.kind, options)
     notes = imported.notes
-    notes[:] = [note for note in notes if "--position-sigma" not in note]  # flight.toml has said them
-    notes[:0] = [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
+    notes[:] = [_in_keys(note) for note in notes if "--position-sigma" not in note]  # flight.toml has said them
+    notes[:0] = [*flight.notes, *(_in_keys(note) for strip in flight.strips for note in strip.notes)]
     return Imported("flight", _messages(flight, imported, notes), notes), flight.platform
 
 

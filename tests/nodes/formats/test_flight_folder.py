@@ -469,3 +469,22 @@ def test_options_that_the_folder_says(folder, tmp_path, capsys):
     (folder / "flight.toml").write_text("[flight\n")
     assert main(["check", str(folder)]) == 1
     assert "flight.toml: not valid TOML" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("date = 2020-06-01\n", ""), "(GPS seconds without a day count from 1980-01-06, wanted navigation.date)"),
+        (("date = 2020-06-01\n", "date = 2020-06-04\n"), "times.csv: navigation.date 2020-06-04, but its times begin"),
+        (('N = "nadir.img"', 'N = "dim.img"'), "wanted their range: grey_range = [LOW, HIGH]"),
+        (('N = "nadir.img"', 'N = "all.img"'), 'wanted one of them (band = "2") or a sum (band = "2:0.5,3:0.5")'),
+        (('N = "nadir.img"', 'N = "flight.toml"'), "a TIFF, or type (u1, u2 or >u2)"),
+    ],
+)
+def test_what_is_wrong_is_told_with_keys_and_no_options(folder, capsys, change, told):
+    """Options of `triline import` are refused beside a flight folder."""
+    write_image(folder / "dim.img", np.random.default_rng(2).random((20, 7, 1)).astype("f4"))
+    (folder / "flight.toml").write_text(TOML.replace(*change))
+    assert main(["check", str(folder)]) == 1
+    said = capsys.readouterr()
+    assert told in said.out and "--" not in said.out, said.out
