@@ -39,6 +39,9 @@ LINE_RATES_HZ = (0.01, 100_000.0)
 #: no flight, and unknowns for all of it would take the memory and the time of the others.
 LONGEST_STRIP_S = 86_400.0
 
+#: Between samples that are further apart nothing is interpolated: s, and times the usual step (both have to be passed).
+LARGEST_STEP_S, LARGEST_STEPS = 0.5, 5.0
+
 
 @dataclass(slots=True)  # not frozen, as messages are not
 class PoseSample:
@@ -179,6 +182,12 @@ def check_inertial(interval_ns: int, force: tuple[float, ...], rate: tuple[float
         raise ValueError(f"force {force} m/s^2, rate {rate} rad/s are no motion of an aircraft")
     if not 0 < interval_ns <= SECOND_NS:
         raise ValueError(f"interval {interval_ns} ns, wanted more than 0 and at most a second")
+
+
+def largest_step_ns(time_ns: NDArray[np.int64]) -> float:
+    """From where on a step between samples is a gap."""
+    usual = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else 0.0
+    return max(LARGEST_STEP_S * SECOND_NS, LARGEST_STEPS * usual)
 
 
 def plain_pose(message: Any) -> PlainPose:

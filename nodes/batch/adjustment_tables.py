@@ -141,7 +141,7 @@ def _refined(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tupl
 
 
 def oriented_lines(adjustment: Adjustment) -> Iterator[OrientedLines]:
-    """Refined orientation of all lines of each strip, as far as its trajectory goes."""
+    """Refined orientation of all lines of each strip, as far as its trajectory goes, without those in gaps of it."""
     reference = adjustment.block.time_reference_ns
     for item in adjustment.result.solution.layout.sets:
         strip = adjustment.block.strips[item.strip]
@@ -149,7 +149,8 @@ def oriented_lines(adjustment: Adjustment) -> Iterator[OrientedLines]:
         last = strip.lines - 1 if strip.lines else int((path.end_s - strip.first_line_time_s) * strip.line_rate_hz)
         line = np.arange(last + 1)
         time = np.asarray(strip.time_of(line), dtype=float)
-        line, time = line[path.covers(time)], time[path.covers(time)]
+        oriented = strip.oriented(time)
+        line, time = line[oriented], time[oriented]
         if not len(line):
             continue
         stamps = reference + np.rint(time * 1e9).astype(np.int64)

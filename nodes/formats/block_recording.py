@@ -18,7 +18,7 @@ from ...solver.geometry.frames import CrsError
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.slow_errors import SlowErrors
-from ..convert import SECOND_NS, camera_from, iso, local_frame, role_of, same_frame, slow_errors_of
+from ..convert import SECOND_NS, camera_from, iso, largest_step_ns, local_frame, role_of, same_frame, slow_errors_of
 from ..errors import UserError
 from ..node import Message
 from .block_messages import SIGMAS
@@ -187,6 +187,7 @@ def _strips_of(
                 lens=lens if lens in lenses else None,
                 noise=noise,
                 noise_time_s=bodies[-1].noise_time_s,
+                gap_s=largest_step_ns(time_ns[rows]) / SECOND_NS,
             )
         )
     return tuple(strips)

@@ -36,16 +36,6 @@ POSE_TOPICS = {
 }
 
 
-#: Between samples that are further apart nothing is interpolated: s, and times the usual step (both have to be passed).
-LARGEST_STEP_S, LARGEST_STEPS = 0.5, 5.0
-
-
-def largest_step_ns(time_ns: NDArray[np.int64]) -> float:
-    """From where on a step between samples is a gap."""
-    usual = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else 0.0
-    return max(LARGEST_STEP_S * SECOND_NS, LARGEST_STEPS * usual)
-
-
 def in_gap(known_ns: NDArray[np.int64], time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether times (n,) lie in a gap of ascending times (k,), or outside of them."""
     if len(known_ns) < 2:
@@ -53,7 +43,7 @@ def in_gap(known_ns: NDArray[np.int64], time_ns: NDArray[np.int64]) -> NDArray[n
     after = np.searchsorted(known_ns, time_ns)
     outside = (time_ns < known_ns[0]) | (time_ns > known_ns[-1])
     after = np.clip(after, 1, len(known_ns) - 1)
-    far = known_ns[after] - known_ns[after - 1] > largest_step_ns(known_ns)
+    far = known_ns[after] - known_ns[after - 1] > convert.largest_step_ns(known_ns)
     return outside | (far & (time_ns != known_ns[after]) & (time_ns != known_ns[after - 1]))
 
 
@@ -92,7 +82,7 @@ class PoseSeries:
 
     def gaps(self) -> list[tuple[int, int]]:
         """Gaps of the series, each from and to, ns."""
-        k = np.flatnonzero(np.diff(self.time_ns) > largest_step_ns(self.time_ns))
+        k = np.flatnonzero(np.diff(self.time_ns) > convert.largest_step_ns(self.time_ns))
         return [(int(self.time_ns[i]), int(self.time_ns[i + 1])) for i in k]
 
     def trajectory(self, start_ns: int) -> Trajectory:

@@ -13,7 +13,7 @@ from ..arrays import Array, Bools, IntArray
 from ..camera.line_camera import LineCamera
 from ..geometry.ray_intersection import intersect_rays
 from ..geometry.rotation import matrix_from_angles
-from ..geometry.trajectory import Trajectory, noise_between
+from ..geometry.trajectory import Trajectory, noise_between, sample_before
 from .surface_control import SurfaceControl
 
 #: Roles of ground points.
@@ -34,6 +34,7 @@ class Strip:
     lens : lens of the camera this strip was taken through, where strips are given lens by lens
     noise : (k, 6, 6) covariance of the noise of the trajectory's k samples, m and rad; None where it is not known
     noise_time_s : lag at which that of the positions is correlated by 1/e; 0 = white
+    gap_s : between samples of the trajectory that are farther apart there is no orientation
     """
 
     id: str
@@ -45,6 +46,7 @@ class Strip:
     lens: str | None = None
     noise: Array | None = field(default=None, repr=False)
     noise_time_s: float = 0.0
+    gap_s: float = np.inf
 
     def time_of(self, line: ArrayLike) -> Array:
         """Times of (fractional) image lines, seconds."""
@@ -65,7 +67,14 @@ class Strip:
         u = np.asarray(line, dtype=float)
         count = self.lines if self.line_time_s is None else len(self.line_time_s)
         inside = (u >= -0.5) & (u <= count - 0.5) if count else np.ones(u.shape, dtype=bool)
-        return inside & self.trajectory.covers(self.time_of(u))
+        return inside & self.oriented(self.time_of(u))
+
+    def oriented(self, time_s: ArrayLike) -> Bools:
+        """Which times lie on the trajectory, and not in a gap of it."""
+        t, samples_s = np.asarray(time_s, dtype=float), self.trajectory.time_s
+        before = sample_before(samples_s, t)
+        near = (samples_s[before + 1] - samples_s[before] <= self.gap_s) | (t == samples_s[before])
+        return self.trajectory.covers(t) & (near | (t == samples_s[before + 1]))
 
     def _below(self, u: Array) -> NDArray[np.int_]:
         assert self.line_time_s is not None
@@ -299,6 +308,8 @@ def _reasons(camera: LineCamera, strips: Sequence[Strip], m: Measurements) -> ND
     for i, strip in enumerate(strips):
         mine = np.flatnonzero((m.strip == i) & (reason == ""))
         reason[mine[~strip.contains(m.line[mine])]] = "outside strip or trajectory"
+        time = strip.time_of(m.line[mine])
+        reason[mine[strip.trajectory.covers(time) & ~strip.oriented(time)]] = "in a gap of the trajectory"
         if strip.lens is not None:
             other = np.array([line.lens != strip.lens for line in camera.lines])
             reason[mine[other[m.ccd[mine]]]] = "CCD line of another lens"

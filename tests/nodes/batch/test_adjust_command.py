@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
 from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.formats.block_writer import write_block as write_block_folder
+from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.units import place_columns
 from triline.solver.camera.self_calibration import tls
 from triline.solver.camera.sensors import preset
@@ -275,6 +277,27 @@ def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
         refined = pd.read_csv(out / "trajectory_refined.csv")["time_s"]  # UTC, seconds since 1970
         (strip,) = result_in(out)["strips"].values()
         assert strip[key][0][time] == pytest.approx(refined.iloc[0], abs=1e-5)
+
+
+def test_image_points_in_a_gap_of_the_trajectory_have_no_orientation(tmp_path):
+    """Six seconds without attitudes, in turbulence: an orientation across them would be off by tenths of a degree."""
+    flight, gap = tmp_path / "flight.mcap", tmp_path / "gap.mcap"
+    words = ["simulate", "-o", str(flight), "--seconds", "40", "--seed", "3", "--turbulence", "3", "-q"]
+    assert main(words) == 0
+    reader = RecordingReader(flight)
+    first_ns = reader.first("configuration/strip").first_line_time_ns
+    begin, end = first_ns + 18 * 10**9, first_ns + 24 * 10**9
+    sent = (m for m in reader.sorted_messages() if m.topic != "sensor/attitude" or not begin <= m.stamp_ns < end)
+    write_recording(gap, (replace(m, sequence=i) for i, m in enumerate(sent)))
+    smoothed = tmp_path / "smoothed.mcap"
+    assert main(["process", str(gap), "-o", str(smoothed), "--nodes", "navigator", "-q"]) == 0
+    assert adjust(smoothed, "-q", "--per-line", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    left_out = [r for r in result["rejected"] if r["reason"] == "in a gap of the trajectory"]
+    assert len(left_out) > 100 and result["sigma0"] == pytest.approx(1.0, abs=0.07)
+    assert all(result["check"]["rmse_m"][k] < 2.0 * result["check"]["sigma_m"][k] for k in range(3))
+    line_s = pd.read_csv(tmp_path / "out" / "orientation_lines.csv")["time_s"].to_numpy()
+    assert np.diff(line_s).max() == pytest.approx(6.0, abs=0.1)
 
 
 @pytest.mark.parametrize("noise", ["t3", "normal"])
