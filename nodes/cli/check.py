@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -49,7 +50,10 @@ def run(args: argparse.Namespace) -> int:
         found = [*(f"not as {seal.signer!r} signed it: {line}" for line in seal.altered), *found]
     if args.json:
         signed = None if seal is None else asdict(seal)
-        said = {"file": str(args.recording), "whole": not found, "findings": found, "signed": signed}
+        said = {
+            "file": str(args.recording), "whole": not found, "messages": len(reader.index), "chunks": reader.n_chunks,
+            "findings": found, "signed": signed,
+        }  # fmt: skip
         print(json.dumps(said, indent=2))
         return 1 if found else 0
     if found:
@@ -80,9 +84,11 @@ def _check_folder(args: argparse.Namespace) -> int:
     programs = read_sensors(flight)
     problems, notes = flight.problems, [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
     if args.json:
-        print(
-            json.dumps({"folder": str(args.recording), "complete": not problems, "problems": problems, "notes": notes})
-        )
+        held = {
+            "strips": len(flight.strips), "ground_height_m": None if problems else flight.ground_height_m,
+            "sensors": {program.id: program.node for program in programs},
+        }  # fmt: skip
+        _print_folder(args.recording, problems, notes, held)
         return 1 if problems else 0
     for problem in problems:
         print(f"  missing or wrong: {problem}")
@@ -102,6 +108,12 @@ def _check_folder(args: argparse.Namespace) -> int:
     return 0
 
 
+def _print_folder(folder: Path, problems: Sequence[str], notes: Iterable[str], held: Mapping[str, object]) -> None:
+    """Print what is said of a folder as JSON."""
+    said = {"folder": str(folder), "complete": not problems, **held, "problems": problems, "notes": list(notes)}
+    print(json.dumps(said, indent=2))
+
+
 def _check_block(args: argparse.Namespace) -> int:
     """Print what is in a block folder, and remarks; the first value that cannot be read is told as by `adjust`."""
     from ..formats.block_folder import read_block
@@ -118,10 +130,11 @@ def _check_block(args: argparse.Namespace) -> int:
     except UserError as error:
         if not args.json:
             raise
-        print(json.dumps({"folder": str(folder), "complete": False, "problems": [str(error)], "notes": []}))
+        _print_folder(folder, [str(error)], [], {})
         return 1
     if args.json:
-        print(json.dumps({"folder": str(folder), "complete": True, "problems": [], "notes": list(notes)}))
+        held = {f"{what}s": n, "image_points": len(rays), "ground_points": len(ground)}
+        _print_folder(folder, [], notes, held)
         return 0
     if not args.quiet:
         for note in notes:

@@ -299,7 +299,7 @@ def flight_messages(folder: Path) -> tuple[Imported, str]:
     imported = read_any(flight.navigation, flight.kind, options)
     notes = imported.notes
     notes[:] = [_in_keys(note) for note in notes if "--position-sigma" not in note]  # flight.toml has said them
-    notes[:0] = [*flight.notes, *(_in_keys(note) for strip in flight.strips for note in strip.notes)]
+    notes[:0] = [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
     return Imported("flight", _messages(flight, imported, notes), notes), flight.platform
 
 
@@ -643,7 +643,7 @@ def _strip(flight: Flight, keys: Keys) -> None:
         strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
     if flight.camera is None:  # told once, with the camera
         strip = replace(strip, notes=())
-    flight.strips.append(strip)
+    flight.strips.append(replace(strip, notes=tuple(_in_keys(note) for note in strip.notes)))
 
 
 def _node(nodes: Keys, name: str) -> None:

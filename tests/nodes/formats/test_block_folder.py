@@ -400,6 +400,9 @@ def test_a_folder_is_checked(tmp_path, capsys):
     assert main(["check", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "complete; 1 strip" in said and "image points" in said
+    assert main(["check", str(tmp_path), "--json"]) == 0
+    held = json.loads(capsys.readouterr().out)
+    assert f"{held['strips']} strip, {held['image_points']} image points, {held['ground_points']} ground points" in said
     points = tmp_path / "image_points.csv"
     points.write_text(points.read_text() + "P9,S1,N,x,1\n")
     assert main(["check", str(tmp_path)]) == 1

@@ -85,6 +85,9 @@ def folder(tmp_path):
 def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
     assert main(["check", str(folder)]) == 0
     assert "complete; 2 strips with images, ground at 612.3 m" in capsys.readouterr().out
+    assert main(["check", str(folder), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert (checked["strips"], checked["ground_height_m"], checked["sensors"]) == (2, GROUND, {})
     out = tmp_path / "o.mcap"
     assert main(["import", str(folder), "-o", str(out)]) == 0
     told = capsys.readouterr().out
