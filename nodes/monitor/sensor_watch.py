@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-#: Rates are means over so many seconds.
+#: Rates are means over so many seconds, of those that the recorder has measured from one status to the next.
 RATE_S = 5.0
 #: A sensor has stopped when it is silent for so long, s, and for so many of its intervals.
 SILENT_S, SILENT_INTERVALS = 2.0, 3.0
@@ -45,24 +45,24 @@ class _Topic:
     lost: int = 0
     heard_s: float = 0.0
     usual_hz: float = 0.0  # its rate when it was heard last
-    history: deque[tuple[float, int]] = field(default_factory=deque)
+    rates: deque[tuple[float, float]] = field(default_factory=deque)  # of the last statuses, and when they came
 
-    def count(self, received: int, now_s: float) -> None:
+    def count(self, received: int, rate_hz: float, now_s: float) -> None:
         if received < self.newest:  # a recorder was started again
             self.before += self.newest
         self.newest = received
         total, heard = self.before + received, self.before + received > self.received
         self.received = max(total, self.received)
-        self.history.append((now_s, self.received))
-        while len(self.history) > 2 and now_s - self.history[0][0] > RATE_S:
-            self.history.popleft()
+        if self.received:
+            self.rates.append((now_s, rate_hz))
+        while len(self.rates) > 1 and now_s - self.rates[0][0] >= RATE_S:
+            self.rates.popleft()
         if heard:
             self.heard_s, self.usual_hz = now_s, self.rate_hz
 
     @property
     def rate_hz(self) -> float:
-        (first_s, first), (last_s, last) = self.history[0], self.history[-1]
-        return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
+        return sum(rate for _, rate in self.rates) / len(self.rates) if self.rates else 0.0
 
 
 class SensorWatch:
@@ -83,6 +83,7 @@ class SensorWatch:
         self._awaited = list(awaited)
         self._clock = clock
         self._topics: dict[str, _Topic] = {}
+        self._status: Any = None  # counted already
         self._states: dict[str, str] = {}
         self._pending: list[str] = []
         self.phase = ""
@@ -97,12 +98,13 @@ class SensorWatch:
         """Take in the newest NodeStatus of each node; returns a line for each sensor that began or stopped."""
         now = self._clock()
         status = nodes.get(COUNTS)
-        for topic in () if status is None else status.topics:
+        new, self._status = status is not self._status, status
+        for topic in status.topics if new and status is not None else ():
             if topic.topic.startswith(("sensor/", "trajectory/")) and (
                 topic.topic.startswith("sensor/") or self._is_awaited(topic.topic)
             ):
                 known = self._topics.setdefault(topic.topic, _Topic())
-                known.count(int(topic.received), now)
+                known.count(int(topic.received), float(topic.rate_hz), now)
                 known.lost = int(topic.gaps + topic.malformed)
         lines, self._pending = self._pending, []
         for row in self.rows():

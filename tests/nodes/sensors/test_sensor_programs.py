@@ -255,10 +255,17 @@ def test_what_comes_in_and_what_is_missing():
             for name in received:
                 counted[name] = counted.get(name, 0) + received[name] // 2
             topics = [
-                SimpleNamespace(topic=f"sensor/{name.replace('_', '/')}", received=n, gaps=0, malformed=0)
+                SimpleNamespace(
+                    topic=f"sensor/{name.replace('_', '/')}", received=n, gaps=0, malformed=0,
+                    rate_hz=received.get(name, 0),
+                )
                 for name, n in counted.items()
-            ]
-            lines += watch.look({"recorder": SimpleNamespace(topics=topics)})
+            ]  # fmt: skip
+            status = SimpleNamespace(topics=topics)
+            lines += watch.look({"recorder": status})
+            now[0] += 0.2  # it looks more often than a status comes
+            lines += watch.look({"recorder": status})
+            now[0] -= 0.2
         return lines
 
     counted: dict[str, int] = {}
@@ -276,3 +283,19 @@ def test_what_comes_in_and_what_is_missing():
     assert after["sensor/gnss"] == before["sensor/gnss"] + 8 and watch.never == ["sensor/lines/N"]
     watch.tell("gnss has ended: no such port")
     assert look(0.5, gnss=4) == ["gnss has ended: no such port"]
+
+
+def test_rates_are_those_that_the_recorder_measures():
+    """Counts that change every 0.53 s, looked at every 0.25 s, made between 89 and 106 Hz of 100."""
+    now = [0.0]
+    watch = SensorWatch([("sensor/attitude",)], lambda: now[0])
+    told, status = [], SimpleNamespace(topics=[])
+    for look in range(120):
+        now[0] = 0.25 * look
+        received = int(100 * 0.53 * (now[0] // 0.53))
+        if not status.topics or status.topics[0].received != received:
+            topic = SimpleNamespace(topic="sensor/attitude", received=received, gaps=0, malformed=0, rate_hz=100.0)
+            status = SimpleNamespace(topics=[topic])
+        watch.look({"recorder": status})
+        told += [row.rate_hz for row in watch.rows() if now[0] > 6.0]
+    assert min(told) == max(told) == 100.0
