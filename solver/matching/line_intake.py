@@ -103,8 +103,10 @@ class LineIntake:
         if not len(pixels) or first_line < 0:
             raise ValueError(f"no lines of {ccd}, or their number {first_line} is below 0")
         full_scale = self._options.full_scale or self._full_scale_now(pixels)
+        # ground beside a cloud that has shown 16 bits is not dark for that
+        dark_scale = self._options.full_scale or min(full_scale, FULL_SCALES[0])
         self.saturated = SATURATED * full_scale
-        verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale)
+        verdict = judge_lines(pixels, self._last_line.get(ccd), full_scale, dark_scale)
         self._last_line[ccd] = pixels[-1].copy()
         usable = (verdict == GOOD) | (verdict == IS_PARTLY_SATURATED)
         self._tell(ccd, first_line, verdict)

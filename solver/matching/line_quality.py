@@ -36,7 +36,10 @@ def full_scale_of(pixels: NDArray[np.unsignedinteger], so_far: int = 0) -> int:
 
 
 def judge_lines(
-    pixels: NDArray[np.unsignedinteger], before: NDArray[np.unsignedinteger] | None, full_scale: int
+    pixels: NDArray[np.unsignedinteger],
+    before: NDArray[np.unsignedinteger] | None,
+    full_scale: int,
+    dark_scale: int | None = None,
 ) -> NDArray[np.int8]:
     """Place in `REASONS` of each line (n,).
 
@@ -47,6 +50,7 @@ def judge_lines(
     pixels : (n, samples)
     before : (samples,) the line before the first one, if there is one
     full_scale : largest grey value
+    dark_scale : the same for lines that are dark, where another one counts for them; None = as ``full_scale``
     """
     step = max(pixels.shape[1] // SAMPLES, 1)
     some = pixels[:, ::step]
@@ -59,5 +63,5 @@ def judge_lines(
     saturated = (some >= SATURATED * full_scale).mean(axis=1)
     out[(saturated > 1 / 3) & ~same] = IS_PARTLY_SATURATED
     out[saturated > 0.9] = IS_SATURATED
-    out[(some < DARK * full_scale).mean(axis=1) > 0.9] = IS_DARK
+    out[(some < DARK * (full_scale if dark_scale is None else dark_scale)).mean(axis=1) > 0.9] = IS_DARK
     return out

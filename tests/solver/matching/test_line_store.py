@@ -89,6 +89,26 @@ def test_bright_pixels_of_14_and_16_bits_are_not_saturated(bits, full_scale):
     assert stated.add("N", 0, bright).all() == (bits == 12)
 
 
+@pytest.mark.parametrize("full_scale", [255, 4095, 16383, 65535])
+def test_lines_of_any_depth_are_fit_for_use_but_where_they_are_saturated(full_scale):
+    """A camera of 14 bits, or values of a range spread over 16 bits, are not all saturated."""
+    rng = np.random.default_rng(3)
+    kind = np.uint8 if full_scale == 255 else np.uint16
+    bright = (rng.uniform(0.3, 0.9, (4, 300)) * full_scale).astype(kind)
+    intake = LineIntake({"N": 300, "F": 300}, MatchingOptions(), lambda dtype: None)
+    intake.begin_strip(100.0)
+    assert intake.add("N", 0, bright).all()
+    assert intake.saturated == pytest.approx(0.995 * full_scale)
+    bright[2] = full_scale
+    assert intake.add("N", 4, bright + (np.arange(4, dtype=kind)[:, None] % 2 == 1)).tolist() == [1, 1, 0, 1]
+    # ground that is dark beside what the camera can bear is no lens cap, and what is known stays known
+    shade = rng.integers(100 if full_scale > 255 else 20, 200, (4, 300)).astype(kind)
+    assert intake.add("F", 0, shade).all() and intake.saturated == pytest.approx(0.995 * full_scale)
+    stated = LineIntake({"N": 300}, MatchingOptions(full_scale=full_scale), lambda dtype: None)
+    stated.begin_strip(100.0)
+    assert not stated.add("N", 0, (0.01 * bright).astype(kind)).any() and stated.counters["lines dark"] == 4
+
+
 def test_a_fault_that_comes_again_and_again_is_summed_up():
     intake = LineIntake({"N": 64}, MatchingOptions(), lambda dtype: None)
     intake.begin_strip(100.0)
