@@ -373,6 +373,7 @@ def job_of(args: argparse.Namespace, block: BlockData) -> Job:
         args.variance_components,
         max_iterations=args.iterations,
         platform=_platform(args),
+        then_stated=sigmas_stated(block.apriori.then),
     )
 
 
@@ -401,6 +402,11 @@ def _platform(args: argparse.Namespace) -> PlatformErrors:
     if not 0 <= arm < MOST_LEVER_ARM_M:
         raise UserError(f"--lever-arm-sigma {arm:g}, wanted 0 or more, and less than {MOST_LEVER_ARM_M:g} m")
     return PlatformErrors(args.clock_sigma, arm)
+
+
+def sigmas_stated(then: Mapping[str, object]) -> bool:
+    """Whether the project states a-priori sigmas for a second model alone."""
+    return any("_sigma" in key for key in then)
 
 
 def wanders(settings: Mapping[str, object]) -> bool:

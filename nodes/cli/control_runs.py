@@ -30,7 +30,7 @@ from ..batch.scene_adjustment import (
 )
 from ..errors import UserError
 from ..formats.scene_block import SceneBlockData
-from .adjust import adjust_block, models_of, wanders
+from .adjust import adjust_block, models_of, sigmas_stated, wanders
 
 Array = NDArray[np.floating]
 D = TypeVar("D", BlockData, SceneBlockData)
@@ -233,7 +233,10 @@ class AirborneBlock(_OfData[BlockData]):
         c, block = configuration, self.data
         first, second = models_of(block, c.model, c.then, _given(c))
         parameters = None if c.selfcal == "none" else SELF_CALIBRATIONS[c.selfcal](block.camera)
-        job = Job(first, second, parameters, snoop=settings.snoop, max_iterations=settings.iterations)
+        job = Job(
+            first, second, parameters, snoop=settings.snoop, max_iterations=settings.iterations,
+            then_stated=sigmas_stated(block.apriori.then),
+        )  # fmt: skip
         result = adjust_block(block, job).result
         network, solution = result.network, result.solution
         points = network.check.point

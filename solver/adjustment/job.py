@@ -76,6 +76,7 @@ class Job:
     ----------
     model : trajectory model
     then : model that runs after it on the orientation it refined; None for one model alone
+    then_stated : its a-priori sigmas are stated for what the first model leaves, not for the measured trajectory
     self_calibration : additional parameters
     eliminate, limits : whether parameters that are not determinable go, and by which critical values
     snoop, critical : data snooping and its critical value
@@ -101,6 +102,7 @@ class Job:
     weights: str = "motion"
     max_iterations: int | None = None
     platform: PlatformErrors = NO_PLATFORM_ERRORS
+    then_stated: bool = False
 
     @property
     def eliminates(self) -> bool:
@@ -314,7 +316,7 @@ class _Stage:
         if before:
             self.given, points = before.given, before.solution.state.points_l
             self.snooping = before.snooping
-            problem = continue_problem(before.solution, model)
+            problem = continue_problem(before.solution, model, stated=job.then_stated)
             problem = self._adapt(replace(problem, control=before.solution.problem.control), control=False)
         else:
             problem = (pose or pose_problem)(network, model, job.self_calibration, job.platform)

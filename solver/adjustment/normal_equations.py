@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -18,7 +19,7 @@ from .elimination import Cell, Cluster, Elimination
 from .layout import Layout
 from .linearisation import Linearisation
 from .network import Control
-from .normal_matrix import NormalMatrix
+from .normal_matrix import DENSE_UP_TO, NormalMatrix
 from .reliability import normalised_residuals
 from .surface_control import SurfaceRows
 
@@ -68,6 +69,23 @@ def whiten_prior(prior: PseudoObservations, n_unknowns: int) -> Prior:
     ends = np.append(0, np.cumsum(present.sum(axis=1)))
     matrix = csr_array((coefficients[present], columns[present], ends), shape=(len(keep), n_unknowns))
     return Prior.of(matrix, prior.value[keep] * weight)
+
+
+def row_variances(B: Any, factor: Any) -> Array:
+    """Diagonal (m,) of ``B Q B^T`` for whitened equations B (m, n_unknowns) of a factorised reduced system."""
+    entries = np.diff(B.indptr)
+    if entries.max(initial=0) <= 1:
+        square = B.multiply(B)
+        return np.asarray(square @ factor.variances()).ravel()
+    if B.shape[1] > DENSE_UP_TO:
+        found = np.empty(B.shape[0])
+        for row in range(B.shape[0]):
+            own = slice(*B.indptr[row : row + 2].tolist())
+            b = B.data[own]
+            found[row] = b @ factor.cofactors(B.indices[own].astype(np.int64)) @ b
+        return found
+    Q = factor.cofactors(np.arange(B.shape[1]))
+    return np.asarray(B.multiply(B @ Q).sum(axis=1)).ravel()
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from .covariance import point_cofactors, point_unknown_cofactors
 from .determinability import Evidence, Limits, Removal, examine, point_sigmas, ranks, strongest_correlations
 from .network import Network
 from .network_weakness import PART, describe
-from .problem import Assumed, with_left_out
+from .problem import NOTHING_ASSUMED, Assumed, assumed_of_model, with_left_out
 
 #: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
 #: rounding.
@@ -61,6 +61,7 @@ class Reduced:
     cost, redundancy : with a-priori values that nobody stated, too
     information : (n_camera,) of the parameters before anything is eliminated
     gsd_m : ground sample distance
+    of_model : what is assumed of the trajectory
     """
 
     solution: Solution
@@ -75,6 +76,7 @@ class Reduced:
     redundancy: int
     information: Array
     gsd_m: float
+    of_model: Assumed = NOTHING_ASSUMED
 
     @classmethod
     def of(cls, solution: Solution) -> Reduced:
@@ -96,6 +98,9 @@ class Reduced:
             solution.n_observations - solution.n_unknowns,
             own_information(solution)[columns],
             ground_sample_distance(solution.network),
+            assumed_of_model(layout, solution.problem.prior, solution.state.theta, solution.factor)
+            if solution.problem.refined
+            else NOTHING_ASSUMED,
         )
 
     @property
@@ -170,7 +175,7 @@ class Reduced:
         """What nobody stated of the parameters that are left, with their variances q (m,)."""
         columns = self.solution.layout.n_model + self.places
         mine = np.isin(columns, self.solution.layout.assumed)
-        return Assumed.of(self.solution.problem.prior, columns[mine], self.theta, q[mine])
+        return self.of_model + Assumed.of(self.solution.problem.prior, columns[mine], self.theta, q[mine])
 
     def _pivots(self, q: Array) -> Array:
         """``1 / (n_ii q_ii)``: what is left of a parameter's own information when all others are free; 0 where
@@ -238,7 +243,7 @@ def without(
     smaller = old.self_calibration.without(gone)
     network = with_left_out(old.network, old.layout, -1.0)  # it is put in again with the unknowns
     problem = adapt(pose_problem(network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
-    problem = replace(problem, control=old.control, earlier=old.earlier)
+    problem = replace(problem, control=old.control, earlier=old.earlier, refined=old.refined)
     start = left.state
     if last := [k for k, name in enumerate(left.names) if name in gone]:  # it could not be taken out of the cofactors
         start = State(np.delete(start.theta, old.layout.n_model + np.array(last)), start.points_l)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from ..arrays import Array, IntArray
 from ..camera.self_calibration import SelfCalibration
@@ -17,7 +18,7 @@ from .freed_memory import keep_freed_memory
 from .layout import Layout, Unknowns, build_layout
 from .linearisation import Linearisation, Whitening, corrected
 from .network import Network
-from .normal_equations import ControlWeights, PointNormals, Prior, weigh_control, whiten_prior
+from .normal_equations import ControlWeights, PointNormals, Prior, row_variances, weigh_control, whiten_prior
 from .reduced_system import Factor
 from .robust import WeightFunction
 
@@ -69,6 +70,8 @@ class Problem:
     layout, elimination, prior, control : made from these
     earlier : solutions of models run before; their corrections are in the orientation of the network's rays
     parts : partitions that do the work on rays and points, which the network then lists only; None for all in memory
+    refined : the orientation of the rays is that of an earlier model, and nobody stated how good it is: a-priori sigmas
+        of model and platform, which are those of the measured one, are wide, see `Assumed`
     """
 
     network: Network
@@ -80,6 +83,7 @@ class Problem:
     control: ControlWeights
     earlier: tuple[Solution, ...] = ()
     parts: Parts | None = None
+    refined: bool = False
 
 
 class Parts(Protocol):
@@ -141,23 +145,44 @@ class Assumed(NamedTuple):
     def of(cls, prior: Prior, columns: IntArray, theta: Array, variance: Array) -> Assumed:
         """Of unknowns (m,) with these columns and variances (m,), for sigma0 = 1; ``theta`` (n_unknowns,) of all."""
         stated = prior.matrix.tocsc()[:, columns].tocoo()
-        share = np.clip(1.0 - stated.data**2 * variance[stated.col], 0.0, 1.0)
         away = prior.value[stated.row] - stated.data * theta[columns[stated.col]]
-        return cls(round(float(share.sum())), float(away @ away))
+        return cls.equations(stated.data**2 * variance[stated.col], away)
+
+    @classmethod
+    def equations(cls, variance: Array, residual: Array) -> Assumed:
+        """Of whitened equations with adjusted variances and residuals (m,)."""
+        share = np.clip(1.0 - variance, 0.0, 1.0)
+        return cls(round(float(share.sum())), float(residual @ residual))
+
+    def __add__(self, other: Assumed) -> Assumed:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Assumed(self.number + other.number, self.squares + other.squares)
 
 
 #: Where all values of unknowns are stated.
 NOTHING_ASSUMED = Assumed(0, 0.0)
 
 
-def assumed_of(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor) -> Assumed:
-    """`Assumed` at values ``theta`` of a reduced system."""
+def assumed_of(
+    unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor, refined: bool = False
+) -> Assumed:
+    """`Assumed` at values ``theta`` of a reduced system; ``refined``: see `Problem`."""
+    found = assumed_of_model(unknowns, prior, theta, factor) if refined else NOTHING_ASSUMED
     columns = unknowns.assumed
     if not len(columns):
-        return NOTHING_ASSUMED
+        return found
     unit = np.zeros((len(theta), len(columns)))
     unit[columns, np.arange(len(columns))] = 1.0
-    return Assumed.of(prior, columns, theta, np.einsum("um,um->m", unit, factor.solve(unit)))
+    return found + Assumed.of(prior, columns, theta, np.einsum("um,um->m", unit, factor.solve(unit)))
+
+
+def assumed_of_model(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor) -> Assumed:
+    """What is assumed of a trajectory that an earlier model refined, and of the platform."""
+    B = prior.matrix.tocsr()
+    rows = np.flatnonzero(np.diff(B.indptr) > 0)
+    last = np.maximum.reduceat(B.indices, B.indptr[rows]) if len(rows) else rows
+    rows = rows[last < unknowns.n_model]
+    own = csr_array(B[rows])
+    return Assumed.equations(row_variances(own, factor), prior.value[rows] - own @ theta)
 
 
 class Fitted:
@@ -281,8 +306,11 @@ def start_state(problem: Problem, points_l: Array | None = None) -> State:
     return State(np.zeros(problem.layout.n_unknowns), points)
 
 
-def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
-    """The problem of another model on the orientation that a solution refined [K 4.2.3]."""
+def continue_problem(solution: Solution, model: ModelOptions, *, stated: bool = False) -> Problem:
+    """The problem of another model on the orientation that a solution refined [K 4.2.3].
+
+    ``stated``: the a-priori sigmas of the model are stated for what is left, see `Problem.refined`.
+    """
     old = solution.problem
     correction = old.layout.corrections(solution.state.theta)
     rays = old.network.rays
@@ -290,7 +318,7 @@ def continue_problem(solution: Solution, model: ModelOptions) -> Problem:
     position, angles = corrected(rays, old.layout, correction)
     refined = refined.with_orientation(position.T, angles.T)
     problem = pose_problem(refined, model, old.self_calibration, old.layout.platform)
-    return replace(problem, earlier=(*old.earlier, solution))
+    return replace(problem, earlier=(*old.earlier, solution), refined=not stated)
 
 
 def cost_of(problem: Problem, state: State, lin: Linearisation) -> float:

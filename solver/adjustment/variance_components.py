@@ -11,19 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..arrays import Array, IntArray
+from ..arrays import IntArray
 from ..models.base import ERROR_GROUPS, error_groups
 from ..quantiles import chi2
 from .adjustment import AdjustmentOptions, Problem, Solution, cost_of, solve
 from .covariance import Cofactors, cofactors, point_unknown_cofactors
 from .linearisation import Whitening
-from .normal_equations import Prior
-from .normal_matrix import DENSE_UP_TO
+from .normal_equations import Prior, row_variances
 
 #: Constants that are known beforehand better than anything else says: what they are stated to be is only questioned
 #: where the solution contradicts it.
@@ -131,7 +129,7 @@ def group_sums(solution: Solution, of: Cofactors) -> dict[str, tuple[int, float,
     taken = control.weight * np.einsum("pii->pi", of.points)
     result["control"] = (int(given.sum()), float(np.sum(c * c)), float(np.sum(np.where(given, 1.0 - taken, 0.0))))
     e = problem.prior.residual(solution.state.theta)
-    r = 1.0 - _row_variances(solution)
+    r = 1.0 - row_variances(problem.prior.matrix, solution.factor)
     for group, rows in prior_groups(problem).items():
         result[group] = (len(rows), float(e[rows] @ e[rows]), float(r[rows].sum()))
     if (surface := control.surface) is not None:
@@ -162,24 +160,6 @@ def _can_be_estimated(sums: dict[str, tuple[int, float, float]], group: str) -> 
 def _contradicted(squares: float, redundancy: float) -> bool:
     """Whether residuals are larger than the stated sigmas let them be by chance."""
     return redundancy > 0 and bool(squares > chi2.isf(BY_CHANCE, redundancy))
-
-
-def _row_variances(solution: Solution) -> Array:
-    """Diagonal of ``B Q B^T`` for the whitened a-priori equations B."""
-    B: Any = solution.problem.prior.matrix
-    entries = np.diff(B.indptr)
-    if entries.max(initial=0) <= 1:
-        square = B.multiply(B)
-        return np.asarray(square @ solution.factor.variances()).ravel()
-    if solution.layout.n_unknowns > DENSE_UP_TO:
-        found = np.empty(B.shape[0])
-        for row in range(B.shape[0]):
-            own = slice(*B.indptr[row : row + 2].tolist())
-            b = B.data[own]
-            found[row] = b @ solution.factor.cofactors(B.indices[own].astype(np.int64)) @ b
-        return found
-    Q = solution.factor.cofactors(np.arange(solution.layout.n_unknowns))
-    return np.asarray(B.multiply(B @ Q).sum(axis=1)).ravel()
 
 
 def estimate_components(

@@ -20,6 +20,7 @@ from triline.solver.adjustment.variance_components import (
 from triline.solver.camera.self_calibration import left_by_calibration, tls
 from triline.solver.camera.sensors import preset
 from triline.solver.models.dgr import DgrOptions
+from triline.solver.models.lim import LimOptions
 from triline.solver.models.ppm import PpmOptions
 from triline.solver.simulation.network import Noise, parallel_and_cross, scatter_points, simulate_network
 
@@ -77,6 +78,22 @@ def test_usual_sigmas_of_a_camera_are_no_observations(how):
     )
     ratio = np.mean([t.sigma0**2 for t in with_camera]) / np.mean([t.sigma0**2 for t in plain])
     assert ratio < 0.93 if how == "stated" else ratio == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_what_is_known_of_the_trajectory_counts_once_in_two_models(stated):
+    """A second model finds next to nothing beside what it would let be: as observations that makes sigma0 too small."""
+    second = LimOptions(4, True, MODEL.offset_sigma_m, MODEL.shift_sigma_deg)
+    one, two = [], []
+    for seed in range(12):
+        network = block(seed, points=12).network
+        one.append(run(network, Job(MODEL)).test)
+        result = run(network, Job(MODEL, second, then_stated=stated))
+        two.append(result.test)
+        measured = result.measured_redundancy
+        assert stated or abs(result.test.redundancy - measured) < 1.0
+    ratio = np.sqrt(np.mean([t.sigma0**2 for t in two]) / np.mean([t.sigma0**2 for t in one]))
+    assert ratio < 0.9 if stated else 0.93 < ratio < 1.02
 
 
 def test_components_recover_sigmas_that_were_stated_wrongly():
