@@ -21,6 +21,7 @@ from ...solver.adjustment.variance_components import CONSTANTS, LEAST_REDUNDANCY
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
 from ...solver.geometry.frames import CrsError, LocalFrame
+from ...solver.models.base import ERROR_GROUPS
 from .json_values import plain
 
 Array = NDArray[np.floating]
@@ -344,6 +345,8 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     for c in result.components or ():
         if c.estimated and c.factor > UNLIKELY and c.group not in CONSTANTS:
             notes.append(f"sigma of {c.group} {c.factor:.0f} times as large as stated: {LIKELIER}")
+    if adjustment.job.then is not None and any(c.estimated and c.group in ERROR_GROUPS for c in result.components):
+        notes.append("factors of sigmas of the trajectory are of what the first model left of its errors, not of all")
     notes += _test_notes(adjustment)
     notes += _control_notes(result)
     notes += _weakness_notes(result)

@@ -430,6 +430,17 @@ def test_a_second_step_keeps_what_the_first_found_of_the_clock(folder, tmp_path)
     assert abs(two["value"] + 0.02) < 4.0 * two["sigma"] < 0.01
 
 
+def test_factors_of_a_second_step_are_told_to_be_of_what_is_left(folder, tmp_path):
+    """Shift and drift that were found already leave less than their sigma."""
+    for name, options in (("one", []), ("two", ["--then", "dgr"])):
+        assert adjust(folder, "--model", "dgr", *options, "--variance-components", "-q", "-o", tmp_path / name) == 0
+    one, two = result_in(tmp_path / "one"), result_in(tmp_path / "two")
+    factors = [r["variance_components"]["shift and drift"] for r in (one, two)]
+    assert not factors[1]["estimated"] or factors[1]["sigma_factor"] < 0.8 * factors[0]["sigma_factor"]
+    told = ["what the first model left" in " ".join(r["notes"]) for r in (one, two)]
+    assert told == [False, True]
+
+
 def test_sigmas_of_a_first_step_are_of_its_own_adjustment(folder, tmp_path):
     """A model that is too poor has a large sigma0; the one after it has not."""
     wandering = shutil.copytree(folder, tmp_path / "wandering")
