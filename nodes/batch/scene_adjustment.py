@@ -38,7 +38,7 @@ from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
 from .adjustment_result import reliability_summary
 from .json_values import plain
-from .two_steps import step_settings
+from .two_steps import sigmas_stated, step_settings
 
 Array = NDArray[np.floating]
 
@@ -133,7 +133,7 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
             before = None
             if then is not None:
                 before, sensors = (problem, solution), _corrected(problem, solution, sensors)
-                problem, solution, found = _stage(data, job, then, sensors)
+                problem, solution, found = _stage(data, job, then, sensors, refined=not sigmas_stated(data.then))
     except NotAdjustableError as error:
         raise UserError(f"{data.name}: {error}") from None
     except ValueError as error:
@@ -143,9 +143,13 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
 
 
 def _stage(
-    data: SceneBlockData, job: SceneJob, model: ModelOptions, sensors: Sequence[PushbroomSensor | None]
+    data: SceneBlockData,
+    job: SceneJob,
+    model: ModelOptions,
+    sensors: Sequence[PushbroomSensor | None],
+    refined: bool = False,
 ) -> tuple[Problem, SceneSolution, SceneSnooping | None]:
-    problem = prepare(data.block(images_of(data, job, model, sensors)))
+    problem = prepare(data.block(images_of(data, job, model, sensors, refined)))
     solution = adjust(problem, max_iterations=job.iterations)
     if not job.snoop:
         return problem, solution, None
@@ -167,9 +171,13 @@ def _corrected(
 
 
 def images_of(
-    data: SceneBlockData, job: SceneJob, options: ModelOptions, sensors: Sequence[PushbroomSensor | None]
+    data: SceneBlockData,
+    job: SceneJob,
+    options: ModelOptions,
+    sensors: Sequence[PushbroomSensor | None],
+    refined: bool = False,
 ) -> tuple[ImageModel, ...]:
-    """The images of a block with their unknowns."""
+    """The images of a block with their unknowns; ``refined``: see `CorrectionSet`."""
     spans = [None if s is None else _span(s) for s in sensors]
     shared: dict[str, CorrectionSet] = {}
     images: list[ImageModel] = []
@@ -189,7 +197,8 @@ def images_of(
             )
             extent = Extent(f"strip {key}", *whole, times if any(rays) else np.empty(0), np.empty(0),
                             job.self_calibration != "none")  # fmt: skip
-            shared[key] = CorrectionSet(key, options.build(extent), flight_axes_b(sensor, 0.5 * sum(whole)))
+            axes_b = flight_axes_b(sensor, 0.5 * sum(whole))
+            shared[key] = CorrectionSet(key, options.build(extent), axes_b, refined)
         images.append(RigorousImage(entry.name, sensor, shared[key], _calibration(data.images[k], sensor, job)))
     return tuple(images)
 

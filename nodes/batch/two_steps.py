@@ -13,6 +13,11 @@ OWNERS = {"segments": "ppm", "order": "ppm", "fixes": "lim"}
 UNUSED = "project.toml: [trajectory.then] is for a second model (--then MODEL) and was not used"
 
 
+def sigmas_stated(then: Mapping[str, object]) -> bool:
+    """Whether a project's ``[trajectory.then]`` states a-priori sigmas of a second model alone."""
+    return any("_sigma" in key for key in then)
+
+
 def step_settings(
     stated: Mapping[str, object],
     then_stated: Mapping[str, object],

@@ -40,7 +40,7 @@ from ..batch.adjustment_summary import summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
 from ..batch.scene_adjustment import SETS
-from ..batch.two_steps import OWNERS, UNUSED, step_settings
+from ..batch.two_steps import OWNERS, UNUSED, sigmas_stated, step_settings
 from ..errors import UserError
 from ..formats.block_folder import is_block_folder, read_block
 from ..formats.block_recording import TOPICS, block_from_messages
@@ -402,11 +402,6 @@ def _platform(args: argparse.Namespace) -> PlatformErrors:
     if not 0 <= arm < MOST_LEVER_ARM_M:
         raise UserError(f"--lever-arm-sigma {arm:g}, wanted 0 or more, and less than {MOST_LEVER_ARM_M:g} m")
     return PlatformErrors(args.clock_sigma, arm)
-
-
-def sigmas_stated(then: Mapping[str, object]) -> bool:
-    """Whether the project states a-priori sigmas for a second model alone."""
-    return any("_sigma" in key for key in then)
 
 
 def wanders(settings: Mapping[str, object]) -> bool:

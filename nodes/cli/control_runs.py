@@ -28,9 +28,10 @@ from ..batch.scene_adjustment import (
     point_sigmas,
     run_scene_job,
 )
+from ..batch.two_steps import sigmas_stated
 from ..errors import UserError
 from ..formats.scene_block import SceneBlockData
-from .adjust import adjust_block, models_of, sigmas_stated, wanders
+from .adjust import adjust_block, models_of, wanders
 
 Array = NDArray[np.floating]
 D = TypeVar("D", BlockData, SceneBlockData)

@@ -26,8 +26,8 @@ class UnknownGroup:
     kind : ORIENTATION (correction functions), CAMERA (additional parameters), IMAGE (coefficients of an image)
     names : (k,) in words
     prior : what is known beforehand of them; None where nothing is
-    assumed : of each of these, whether nobody stated its sigma, and it is wide so that the data decide; such a value
-        holds what nothing else determines, and is no observation that sigma0 could be judged by
+    assumed : of each equation of these, whether nobody stated its sigma, and it is wide so that the data decide; such a
+        value holds what nothing else determines, and is no observation that sigma0 could be judged by
     """
 
     key: str

@@ -104,11 +104,14 @@ class CorrectionSet:
     key : of the set
     model : the functions
     axes_b : (3, 3) columns: axes in the body about which the attitude is corrected
+    refined : orbit and attitude are those of an earlier model, and nobody stated how good they are: a-priori sigmas,
+        which are those of the measured ones, are wide, see `UnknownGroup`
     """
 
     key: str
     model: CorrectionModel
     axes_b: Array = field(repr=False)
+    refined: bool = False
 
 
 def flight_axes_b(sensor: PushbroomSensor, time_s: float) -> Array:
@@ -161,7 +164,9 @@ class RigorousImage:
     ):
         self.name, self.sensor, self.corrections, self.calibration = name, sensor, corrections, calibration
         model = corrections.model
-        groups = [UnknownGroup(corrections.key, ORIENTATION, model.unknown_names, model.pseudo_observations())]
+        prior = model.pseudo_observations()
+        assumed = (corrections.refined,) * len(prior)
+        groups = [UnknownGroup(corrections.key, ORIENTATION, model.unknown_names, prior, assumed)]
         if calibration is not None:
             names = calibration.parameters.unknown_names
             prior = direct_observations(calibration.parameters.apriori_sigma, names)

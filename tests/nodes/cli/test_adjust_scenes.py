@@ -108,6 +108,25 @@ def test_expected_rmse_of_check_points_and_control_holds_the_survey(tmp_path, ca
     assert 0.7 < np.sqrt(np.mean(np.square(control))) < 1.3
 
 
+def test_what_is_known_of_the_orbit_counts_once_in_two_models(block, capsys):
+    """A second model finds next to nothing beside its a-priori sigmas; those stated for it alone are knowledge."""
+    found = []
+    for options, then in (
+        (("--model", "dgr"), ""),
+        (("--model", "dgr", "--then", "dgr"), ""),
+        (("--model", "dgr", "--then", "dgr"), "[trajectory.then]\noffset_sigma_m = [3, 3, 3]\n"),
+    ):
+        with open(block / "project.toml", "a") as file:
+            file.write(then)
+        assert main(["adjust", str(block), "--snoop", *options, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    one, two, stated = found
+    assert one["n_unknowns"] == two["n_unknowns"] == stated["n_unknowns"]
+    assert two["redundancy"] < stated["redundancy"] - 5
+    assert two["sigma0"] == pytest.approx(one["sigma0"], rel=0.06)
+    assert stated["sigma0"] < 0.96 * one["sigma0"]
+
+
 def test_control_that_no_image_measures_is_not_in_the_accuracy_of_control(block, capsys):
     found = []
     for more in (False, True):
