@@ -33,15 +33,19 @@ def stream(f, latency_s=0.1, latency=None, keep=None):
     return sorted(out)
 
 
-def run(f, events, navigator=None, batch=None):
+def run(f, events, navigator=None, batch=None, nominal=None):
+    """Poses and the navigator; with ``nominal``, samples are rates over intervals that are so many times too long."""
     nav = navigator or InertialNavigator(FRAME, f.settings, MOUNT)
     position = FRAME.from_geodetic(np.degrees(f.gnss.lat), np.degrees(f.gnss.lon), f.gnss.height_m)
     R_ln = FRAME.R_ln(position)
     poses = []
     for _, kind, i in events:
         if kind == 0:
-            d = f.inertial
-            poses += nav.add_increments(float(d.time_s[i]), float(d.dt_s[i]), d.dv[i], d.dtheta[i])
+            d, t = f.inertial, float(f.inertial.dt_s[i])
+            if nominal is None:
+                poses += nav.add_increments(float(d.time_s[i]), t, d.dv[i], d.dtheta[i])
+            else:
+                poses += nav.add_inertial(float(d.time_s[i]), nominal * t, d.dv[i] / t, d.dtheta[i] / t)
         else:
             A = R_ln[i] * f.gnss.sigma_ned_m[i]
             poses += nav.add_gnss(float(f.gnss.time_s[i]), position[i], A @ A.T)
@@ -81,6 +85,16 @@ def test_poses_come_at_once_and_smoothed_after_the_lag(usual):
     assert first < 30.0 and all(not p.valid and p.reason for p in filtered if p.time_s < first)
     assert all(p.valid for p in filtered if p.time_s > first + 5.0)
     assert any("aligned" in e.text for e in nav.take_events()) and nav.take_events() == []
+
+
+@pytest.mark.parametrize("nominal", [0.99, 1.01])
+def test_a_nominal_interval_is_no_scale_factor(usual, nominal):
+    """No sensor is as fast as its data sheet says: samples last from stamp to stamp."""
+    f = flight()
+    (_, smoothed), (_, usually) = split(run(f, stream(f), nominal=nominal)[0]), split(usual[0])
+    error, sigma = misses(f, smoothed[-2000:])
+    usual_error, _ = misses(f, usually[-2000:])
+    assert np.abs(error - usual_error).max(axis=0) == pytest.approx(np.zeros(6), abs=0.2 * sigma.min())
 
 
 def test_accuracy_and_covariance(usual):
