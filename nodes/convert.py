@@ -35,6 +35,8 @@ LOCAL_FRAME_ID = "local"
 LATEST_S, CENTURY_S = 9.2e9, 3.2e9
 #: Lines a second that a line camera can have; memory for lines is taken by it.
 LINE_RATES_HZ = (0.01, 100_000.0)
+#: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.
+LARGEST_SIGMAS = {"rate_sigma": 1.0, "force_sigma": 50.0}
 #: Longest strip, s, and how far its first line may lie before or after the message that tells it: what goes beyond is
 #: no flight, and unknowns for all of it would take the memory and the time of the others.
 LONGEST_STRIP_S = 86_400.0

@@ -126,7 +126,15 @@ def _place_of_unit(arm: NDArray[np.floating]) -> str:
 def _grade(imu: list[Any], notes: list[str]) -> InertialGrade:
     """Noise from the sigmas of the samples; biases, which they do not have, as usual for units of such noise."""
     root = np.sqrt(np.median([b.interval_ns for b in imu]) * 1e-9)
-    gyro, accel = (float(np.median([getattr(b, n) for b in imu]) * root) for n in ("rate_sigma", "force_sigma"))
+    noise = []
+    for field, limit in convert.LARGEST_SIGMAS.items():
+        stated = np.array([getattr(b, field) for b in imu])
+        usable = (stated >= 0.0) & (stated < limit)  # false for NaN
+        noise.append(float(np.median(stated[usable]) * root) if usable.any() else 0.0)
+        if not usable.all():
+            text = f"{int((~usable).sum())} samples with a {field} that no unit has: not counted"
+            notes.append(f"sensor/imu: {text}")
+    gyro, accel = noise
     grade = InertialGrade.of_noise(gyro, accel)
     name = "tactical" if grade.gyro_bias == TACTICAL.gyro_bias else "MEMS"
     notes.append(f"sensor/imu: a recording holds no biases; a {name} unit is assumed (--platform gives others)")

@@ -18,9 +18,6 @@ from .. import convert
 from ..formats.sensor_folder import usual_bias_time_s
 from ..formats.track import MOST_LEVER_ARM_M
 
-#: A stated noise of a single sample beyond these is no noise of an inertial sensor: rad/s, m/s^2.
-LARGEST_RATE_SIGMA, LARGEST_FORCE_SIGMA = 1.0, 50.0
-
 
 def kinematic_engine(project: Any, filtered_s: float = 0.0) -> KinematicFilter:
     """The engine for attitude and GNSS input."""
@@ -40,7 +37,7 @@ def kinematic_engine(project: Any, filtered_s: float = 0.0) -> KinematicFilter:
 def stated_noise(sample: Any) -> tuple[float, float, str]:
     """White noise that an Imu message states, rad/sqrt(s) and m/s/sqrt(s), 0 = not given; and what is wrong with it."""
     noise, wrong = [], []
-    for name, limit in (("rate_sigma", LARGEST_RATE_SIGMA), ("force_sigma", LARGEST_FORCE_SIGMA)):
+    for name, limit in convert.LARGEST_SIGMAS.items():
         value = getattr(sample, name)
         usable = 0.0 <= value < limit  # false for NaN
         noise.append(value * (sample.interval_ns * 1e-9) ** 0.5 if usable else 0.0)

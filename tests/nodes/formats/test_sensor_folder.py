@@ -1,6 +1,7 @@
 """Sensor folders: read as they stand, errors with file, line and column; ``triline navigate`` over them."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import inertial_flights as sim
 import numpy as np
 import pytest
 from full_disk import files_of_at_most
+from recording_file import write_recording
 
 from triline.nodes.cli import main
 from triline.nodes.cli.navigate import COLUMNS
@@ -285,6 +287,20 @@ def test_navigate_over_a_recording(tmp_path, capsys):
     assert inside.sum() > 100 and (np.abs(found - true[inside]).mean(axis=0) < 3.0 * sigma).all()
     (tmp_path / "other.mcap").write_bytes(b"nothing")
     assert main(["navigate", str(tmp_path / "other.mcap")]) == 1
+
+
+def test_a_noise_that_no_unit_has_is_not_counted_in_a_recording(tmp_path, capsys):
+    messages = list(sensor_messages(read_sensor_folder(write(tmp_path / "sensors")), []))
+    for message in messages:
+        if message.topic == "sensor/imu":
+            message.body.rate_sigma, message.body.force_sigma = 5.0, 1e3
+    numbered = [replace(message, sequence=i) for i, message in enumerate(messages)]
+    recording = write_recording(tmp_path / "flight.mcap", numbered)
+    assert main(["navigate", str(recording), "--json", "--no-page", "--rate", "1"]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    for field in ("rate_sigma", "force_sigma"):
+        assert any(f"samples with a {field} that no unit has" in note for note in notes)
+    assert any("a MEMS unit is assumed" in note for note in notes)
 
 
 def test_notes_of_a_recording_tell_the_times_of_its_trajectory(tmp_path, capsys):
