@@ -20,7 +20,7 @@ from .errors import UserError
 Tables = dict[str, dict[str, Any]]
 #: Keys of ``[mounting]`` and ``[imu]`` in a flight.toml that are settings of the navigator.
 _ARM = "camera_lever_arm_m"
-_UNIT = ("gyro_bias_deg_h", "accel_bias_mgal", "bias_time_s", "gyro_scale_ppm", "accel_scale_ppm")
+UNIT = ("gyro_bias_deg_h", "accel_bias_mgal", "bias_time_s", "gyro_scale_ppm", "accel_scale_ppm")
 #: Keys of ``[dem]`` in a flight.toml: the adjuster's setting, its type, and what is wanted.
 _ELEVATION: dict[str, tuple[str, Any, str]] = {
     "file": ("dem", str, "a raster of heights in the folder"),
@@ -84,7 +84,7 @@ def _inertial_unit(path: Path, tables: Tables) -> dict[str, Any]:
     if not (isinstance(arm, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in arm)):
         raise UserError(f"{path}: mounting.{_ARM} is {arm!r}, wanted 3 numbers: forward, right, down, m")
     found: dict[str, Any] = {_ARM: arm} if any(arm) else {}
-    return found | {key: imu[key] for key in _UNIT if isinstance(imu, dict) and key in imu}
+    return found | {key: imu[key] for key in UNIT if isinstance(imu, dict) and key in imu}
 
 
 def elevation(path: Path, wanted: bool = False) -> dict[str, Any]:

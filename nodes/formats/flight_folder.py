@@ -218,9 +218,11 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
     if not strips and not live and flight.kind != "ros2":
         flight.notes.append(f"{FILE}: no [[strips]]: the recording has no image lines")
     raw = flight.kind == "ros2" or (flight.tables is not None and flight.tables.time_s is not None)
-    if raw and any(flight.mounting.lever_arm_m):
-        how = f"the navigator gets it with --config {shlex.quote(str(path))}"
-        flight.notes.append(f"{FILE}: mounting.camera_lever_arm_m: a recording has no place for it; {how}")
+    stated = ["mounting.camera_lever_arm_m"] if any(flight.mounting.lever_arm_m) else []
+    stated += [f"imu.{key}" for key in config.UNIT if tables["imu"].has(key)]
+    if raw and stated:
+        how = f"the navigator gets {'it' if len(stated) == 1 else 'them'} with --config {shlex.quote(str(path))}"
+        flight.notes.append(f"{FILE}: {', '.join(stated)}: a recording has no place for that; {how}")
     ids = [id for id, _, _ in flight.announced] if live else [strip.id for strip in flight.strips]
     for id in sorted({id for id in ids if ids.count(id) > 1}):
         flight.problems.append(f"{path}: strips: {id!r} comes twice, wanted another id for each strip")

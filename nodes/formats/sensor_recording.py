@@ -47,6 +47,14 @@ def sensor_messages(
     if grade is None and folder.time_s is not None and any(folder.platform.camera_lever_arm_m):
         how = "the navigator gets it as camera_lever_arm_m of [navigator] (--config)"
         notes.append(f"platform.toml: camera_lever_arm_m: a recording has no place for it; {how}")
+    unit = folder.platform.grade
+    usual = InertialGrade.of_noise(unit.gyro_noise, unit.accel_noise)
+    biases = (unit.gyro_bias, unit.accel_bias, unit.gyro_scale, unit.accel_scale)
+    if grade is None and not np.allclose(
+        biases, (usual.gyro_bias, usual.accel_bias, usual.gyro_scale, usual.accel_scale), rtol=0.5, atol=0.0
+    ):
+        how = "the navigator gets them as settings of [navigator] (--config), else as usual for the noise"
+        notes.append(f"platform.toml: [imu]: a recording has no place for biases and scale factors; {how}")
     messages = [*_imu(folder, notes, source), *_gnss(folder, notes, source), *_attitude(folder, source)]
     if not messages:
         raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")

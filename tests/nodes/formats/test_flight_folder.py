@@ -183,6 +183,9 @@ def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
     assert next(iter(reader.messages(["configuration/project"]))).body.origin_height == GROUND
     imu = next(iter(reader.messages(["sensor/imu"]))).body
     assert imu.rate_sigma == pytest.approx(np.radians(0.06) / 60 / np.sqrt(imu.interval_ns * 1e-9), rel=1e-6)
+    (folder / "flight.toml").write_text(text + "gyro_bias_deg_h = 5\n")
+    lost = "mounting.camera_lever_arm_m, imu.gyro_bias_deg_h: a recording has no place for that; the navigator"
+    assert any(lost in note for note in read_flight(folder).notes)
 
 
 @pytest.mark.parametrize("whole", [True, False])

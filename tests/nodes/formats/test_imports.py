@@ -78,6 +78,12 @@ def test_sensor_folder_becomes_a_flight(tmp_path, increments):
     attitude = [m.body for m in messages if m.topic == "sensor/attitude"]
     assert len(attitude) == 2 and np.degrees(attitude[0].heading) == pytest.approx(3.0)
     assert any("camera_lever_arm_m: a recording has no place for it" in note for note in imported.notes)
+    assert not any("no place for biases" in note for note in imported.notes)
+    platform = tmp_path / "flight" / "platform.toml"
+    platform.write_text(platform.read_text() + "[imu]\ngyro_bias_deg_h = 200\n")
+    imported = read_any(tmp_path / "flight")
+    assert list(imported.messages)
+    assert any("[imu]: a recording has no place for biases" in note for note in imported.notes)
 
 
 def test_sensor_folder_damaged(tmp_path):
