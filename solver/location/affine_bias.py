@@ -19,6 +19,9 @@ Array = NDArray[np.floating]
 
 #: Step of the numerical derivative by a ground coordinate, metres. Derived: models are linear over it to 1e-9 pixels.
 _STEP_M = 1.0
+#: Points nearer to a line than this, pixels and as a share of its length, do not tell what is beside it. Derived: a
+#: tenth of a pixel of theirs would be many pixels across the image.
+_NARROW_PX, _NARROW = 1.0, 1e-3
 #: Two-sided level of the test of one point, the usual one of data snooping.
 SNOOPING_LEVEL = 0.001
 
@@ -165,7 +168,8 @@ def fit_bias(
 
     Raises
     ------
-    ValueError : fewer points than coefficients want, or points that the model does not see
+    ValueError : fewer points than coefficients want, or points that the model does not see; points on a line, which
+        determine no affine correction
     """
     lat, lon, h, u, v = (np.array(np.broadcast_to(a, np.shape(lat)), dtype=float).ravel()
                          for a in (lat, lon, height_m, line, sample))  # fmt: skip
@@ -188,6 +192,11 @@ def fit_bias(
     used, w = np.ones(n, dtype=bool), np.zeros((n, 2))
     limit = float(norm.ppf(1.0 - SNOOPING_LEVEL / 2.0))
     while True:
+        if affine and _on_a_line(pixel[used]):
+            raise ValueError(
+                "its points lie on a line, which does not determine an affine correction; wanted others beside it, or "
+                "a shift alone"
+            )
         N = np.einsum("nki,nkl,nlj->ij", A[used], weight[used], A[used])
         Q = np.linalg.pinv(N, hermitian=True)
         x = Q @ np.einsum("nki,nkl,nl->i", A[used], weight[used], y[used])
@@ -210,6 +219,12 @@ def fit_bias(
     sigma0 = float(np.sqrt(square / redundancy)) if redundancy else float("nan")
     bias = AffineBias(coefficients.reshape(2, 3), full, middle, half)
     return BiasFit(bias, residual, w, ~used, sigma0, redundancy)
+
+
+def _on_a_line(pixel: Array) -> bool:
+    """Whether pixels (n, 2) lie on a line, or in one place."""
+    long, wide = np.linalg.svd(pixel - pixel.mean(axis=0), compute_uv=False) / np.sqrt(len(pixel))
+    return bool(wide < max(_NARROW_PX, _NARROW * long))
 
 
 def _covariances(

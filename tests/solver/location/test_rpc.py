@@ -176,6 +176,25 @@ def test_bias_errors_are_as_large_as_their_sigmas(scene, fitted):
     assert 0.93 < np.sqrt(np.mean(np.square(sigma0))) < 1.07
 
 
+def test_control_on_a_line_determines_no_affine_correction(scene, fitted):
+    """Noise of a tenth of a pixel, which would be any number of pixels beside the line."""
+    t = np.linspace(0.0, 1.0, 20)
+    row = np.stack([np.full(20, 20_000.0), 39_000.0 * t], axis=1)
+    slanted = np.stack([500.0 + 39_000.0 * t, 1000.0 + 38_000.0 * t], axis=1)
+    beside = np.array([2000.0, 35_000.0])
+    h = np.linspace(0.0, 1500.0, 21)
+    for line in (row, slanted):
+        lat, lon = scene.direct(*np.vstack([line, beside]).T, h)[:, :2].T
+        true = CorrectedModel(fitted.rpc, TRUE_BIAS).inverse(lat, lon, h)
+        pixel = true[:20] + np.random.default_rng(9).normal(0, 0.1, (20, 2))
+        with pytest.raises(ValueError, match="lie on a line"):
+            fit_bias(fitted.rpc, lat[:20], lon[:20], h[:20], *pixel.T, 0.1)
+        shift = fit_bias(fitted.rpc, lat[:20], lon[:20], h[:20], *pixel.T, 0.1, affine=False)
+        np.testing.assert_allclose(shift.residual_px[~shift.rejected].mean(axis=0), 0.0, atol=1e-9)
+        fit = fit_bias(fitted.rpc, lat, lon, h, *true.T, 0.1)
+        np.testing.assert_allclose(fit.bias.at(line), TRUE_BIAS.at(line), atol=1e-3)
+
+
 def test_a_gross_error_is_found_and_named(scene, fitted):
     lat, lon, h, _, _ = draw(scene, 20, 8, 0.0, 1500.0)
     pixel = CorrectedModel(fitted.rpc, TRUE_BIAS).inverse(lat, lon, h)
