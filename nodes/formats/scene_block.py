@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...solver.adjustment.block_data import KnownPoints
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.geometry.frames import GEOGRAPHIC, BodyFrame, CrsError, Frame, LocalFrame
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc import Rpc
+from ...solver.location.uncertainty import ground_derivatives
 from ...solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
 from ...solver.scene_adjustment.functional import (
     SHIFT_SIGMA_PX,
@@ -161,15 +162,19 @@ class SceneBlockData:
         )
 
     def trajectory_settings(self) -> dict[str, object]:
-        """Sigmas of the corrections: of the project, else of the metadata (the largest of all scenes), else usual."""
-        stated = [e.scene.scene.sigmas for e in self.images if e.scene.model == "rigorous"]
+        """Sigmas of the corrections: of the project, else of the metadata (the largest of all scenes), else usual.
+
+        Times of lines that are off move the ground as an offset along the track does, and across it as the Earth turns.
+        """
+        rigorous = [e for e in self.images if e.scene.model == "rigorous"]
         found: dict[str, object] = {}
-        for key, values in (
-            ("offset_sigma_m", [s.position_m for s in stated]),
-            ("shift_sigma_deg", [np.degrees(s.attitude_rad) for s in stated]),
-        ):
-            if values and np.min(values) > 0:
-                found[key] = np.max(values, axis=0).tolist()
+        if rigorous:
+            stated = [e.scene.scene.sigmas for e in rigorous]
+            late = [s.time_s * _offset_rate(e.location) for e, s in zip(rigorous, stated, strict=True) if s.time_s]
+            position = _largest([s.position_m for s in stated], DEFAULTS["offset_sigma_m"])
+            found["offset_sigma_m"] = np.hypot(position, np.max([np.zeros(3), *late], axis=0)).tolist()
+            turns = [np.degrees(s.attitude_rad) for s in stated]
+            found["shift_sigma_deg"] = _largest(turns, DEFAULTS["shift_sigma_deg"]).tolist()
         return {**DEFAULTS, **found, **self.trajectory}
 
     def block(self, images: tuple[ImageModel, ...]) -> SceneBlock:
@@ -186,6 +191,19 @@ class SceneBlockData:
             assumed = "shift_sigma_px" not in self.rpc, "slope_sigma_px" not in self.rpc
             return RpcImage(entry.name, entry.location, affine, shift, slope, entry.size_px, self.ellipsoid, assumed)
         return ProjectiveImage(entry.name, entry.scene.model, entry.size_px, self.ellipsoid)
+
+
+def _largest(stated: Sequence[ArrayLike], usual: object) -> Array:
+    """The largest of each component; of one that a scene does not state (0), the usual one."""
+    values = np.asarray(stated, dtype=float)
+    return np.where((values > 0).all(axis=0), values.max(axis=0), np.asarray(usual, dtype=float))
+
+
+def _offset_rate(location: PushbroomSensor | Rpc) -> Array:
+    """Offset of the orbit (3,), m/s along the track, across it and up, that moves the ground as a later time does."""
+    assert isinstance(location, PushbroomSensor)
+    J = ground_derivatives(location, [0.5 * (location.lines - 1)], [0.5 * (location.samples - 1)], [0.0])[0]
+    return np.append(np.abs(np.linalg.solve(J[:2, :2], J[:2, 6])), 0.0) if np.isfinite(J).all() else np.zeros(3)
 
 
 def is_scene_block(folder: Path) -> bool:

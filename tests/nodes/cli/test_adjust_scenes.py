@@ -18,7 +18,7 @@ from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
 from triline.nodes.cli import main
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
-from triline.nodes.formats.scene_block import write_scene_block
+from triline.nodes.formats.scene_block import read_scene_block, write_scene_block
 from triline.solver.location.refraction import Refraction
 from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.scene_adjustment.block import ImagePoints, KnownGround, SceneBlock
@@ -141,6 +141,39 @@ def test_control_that_no_image_measures_is_not_in_the_accuracy_of_control(block,
     one, two = found
     assert one["n"] == two["n"] == 9
     np.testing.assert_allclose(two["rmse_m"], one["rmse_m"], rtol=1e-6)
+
+
+def test_times_that_metadata_state_to_be_uncertain_count_as_an_offset_along_the_track(block, tmp_path):
+    """They counted nowhere: 5 ms are 34 m along the track, and points without control had sigmas of 1 to 3 m."""
+    late, rng = 5e-3, np.random.default_rng(1)
+    scene = block / "spot5-hrs"
+    sensors, truth = read_scene(scene).sensors, pd.read_csv(block / "truth.csv", index_col="point")
+    points = pd.read_csv(block / "image_points.csv")
+    for ccd, of_line in points.groupby("ccd"):
+        place = truth.loc[of_line["point"]]
+        pixel = sensors[ccd].inverse(np.radians(place["Y_m"]), np.radians(place["X_m"]), place["Z_m"])
+        points.loc[of_line.index, ["line", "sample"]] = pixel + rng.normal(0.0, 0.3, pixel.shape)
+    points.to_csv(block / "image_points.csv", index=False)
+    (block / "ground_points.csv").unlink()
+    # the lenses are off by a sigma each, against each other
+    times = pd.read_csv(scene / "line_times.csv")
+    off = {"F": np.timedelta64(round(late * 1e9), "ns"), "B": np.timedelta64(-round(late * 1e9), "ns")}
+    stamps = zip(times["ccd"], times["time_utc"], strict=True)
+    times["time_utc"] = [f"{np.datetime64(stamp.rstrip('Z'), 'ns') + off[ccd]}Z" for ccd, stamp in stamps]
+    times.to_csv(scene / "line_times.csv", index=False)
+    with open(scene / "scene.toml", "a") as file:
+        file.write(f"\n[sigma]\nposition_m = [1, 2, 0]\nattitude_deg = [1e-5, 1e-5, 0]\ntime_s = {late}\n")
+    settings = read_scene_block(block).trajectory_settings()
+    # the ground passes at 6.7 km/s below an orbit of 830 km; at 36 degrees of latitude it turns by 370 m/s across
+    np.testing.assert_allclose(settings["offset_sigma_m"], [33.5, np.hypot(2.0, 370.0 * late), 5.0], rtol=0.05)
+    np.testing.assert_allclose(settings["shift_sigma_deg"], [1e-5, 1e-5, 0.01])  # what is not stated is as usual
+    assert main(["adjust", str(block), "-o", str(tmp_path / "out")]) == 0
+    found = pd.read_csv(tmp_path / "out" / "points.csv", index_col="point")
+    up = found["Z_m"] - truth.loc[found.index, "Z_m"]
+    assert np.abs(up).median() > 60.0
+    sigma0 = json.loads((tmp_path / "out" / "result.json").read_text())["sigma0"]  # which sigmas are times
+    ratio = sigma0 * np.abs(up / found["sigma_Z_m"])[found["rays"] == 2].median()
+    assert 1.2 < ratio < 1.5  # of two equal and opposite errors: the root of 2
 
 
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
