@@ -242,6 +242,9 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     path = Path(args.sensor)
     notes: list[str] = []
     if is_frame_json(path):
+        for name, given in (("ccd", args.ccd), ("model", args.model)):
+            if given is not None:
+                raise UserError(f"--{name} {given}: {path} is of a frame camera, which has one model and no lines")
         bare, stated = read_frame(path, notes)
         kind, sigmas = "frame camera", Sigmas(stated["position_m"], stated["attitude_rad"])
     else:

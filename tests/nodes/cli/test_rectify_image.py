@@ -328,6 +328,16 @@ def test_a_frame_camera_and_its_sigmas(tmp_path):
     assert np.nanmin(planimetric) > 15.0 and np.nanmax(planimetric) < 30.0 and np.nanmax(np.abs(up - 5.0)) < 1e-3
 
 
+@pytest.mark.parametrize(("option", "value"), [("--ccd", "F"), ("--model", "rpc")])
+def test_a_frame_camera_has_one_model_and_no_lines(option, value, tmp_path, capsys):
+    """Both were taken, and the orthoimage was that without them."""
+    (tmp_path / "frame.json").write_text(json.dumps(FRAME))
+    image = write_image(tmp_path / "frame.tif", np.ones((1, 300, 400), np.float32), nodata=-1.0)
+    given = (image, "--sensor", tmp_path / "frame.json", "--height", 900, option, value, "-o", tmp_path / "o.tif")
+    assert f"{option} {value}" in refused(capsys, *given)
+    assert not (tmp_path / "o.tif").exists()
+
+
 def test_stated_errors_of_an_rpc_are_of_each_axis(scene, tmp_path):
     """As RPC00B has them: bias and random error, metres per horizontal axis."""
     _, _, model, _, _, image = scene
