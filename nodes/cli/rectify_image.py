@@ -353,6 +353,7 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
             v,
             sigma,
             affine=args.correction != "shift",
+            stated=args.pixel_sigma is not None,
         )
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None

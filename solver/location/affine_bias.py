@@ -154,6 +154,7 @@ def fit_bias(
     *,
     affine: bool = True,
     snoop: bool = True,
+    stated: bool = True,
 ) -> BiasFit:
     """Estimate the correction of a model from control points.
 
@@ -165,6 +166,7 @@ def fit_bias(
     sigma_ground_m : (n, 3) or (3,) east, north, up, of the points
     affine : False for a shift alone
     snoop : leave out points whose normalised residuals are too large, the largest first
+    stated : whether the sigmas are known; else points are as much worse as the middle one of their residuals tells
 
     Raises
     ------
@@ -208,7 +210,8 @@ def fit_bias(
             now = np.where(spread > 1e-6 * np.sqrt(np.einsum("nkk->nk", weight)), test / spread, 0.0)
         w[used] = now[used]
         worst = int(np.argmax(np.where(used, np.abs(now).max(axis=1), -1.0)))
-        if not snoop or np.abs(now[worst]).max() <= limit or used.sum() - 1 <= terms:
+        scale = 1.0 if stated else max(float(np.median(np.abs(now[used])) / norm.ppf(0.75)), 1.0)
+        if not snoop or np.abs(now[worst]).max() <= limit * scale or used.sum() - 1 <= terms:
             break
         used[worst] = False
     redundancy = 2 * (int(used.sum()) - terms)

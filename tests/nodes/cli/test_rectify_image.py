@@ -551,10 +551,11 @@ def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, caps
         with rasterio.open(target) as found:
             return float(np.nanmean(found.read(1))), told["notes"]
 
-    for noise_px in (0.1, 0.4):
+    for noise_px in (0.1, 0.4, 3.0):  # of three pixels two thirds of the control counted as gross errors
         means[noise_px], notes = sigma_with(noise_px)
         assert any("with control as good as it fits" in note for note in notes)
     assert means[0.4] / means[0.1] == pytest.approx(4.0, rel=0.01)
+    assert means[3.0] / means[0.1] == pytest.approx(30.0, rel=0.02)
     stated, notes = sigma_with(0.1, "--pixel-sigma", "0.5")
     assert not any("as good as it fits" in note for note in notes)
     assert stated > 4.0 * means[0.1]

@@ -176,6 +176,23 @@ def test_bias_errors_are_as_large_as_their_sigmas(scene, fitted):
     assert 0.93 < np.sqrt(np.mean(np.square(sigma0))) < 1.07
 
 
+def test_control_that_is_worse_than_assumed_is_no_gross_error(scene, fitted):
+    """Nobody has stated how well it is measured: 25 points of 3 pixels, where half a pixel is assumed."""
+    off, rejected = [], 0
+    for seed in range(20):
+        lat, lon, h, _, _ = draw(scene, 25, 30 + seed, 0.0, 1500.0)
+        true = CorrectedModel(fitted.rpc, TRUE_BIAS).inverse(lat, lon, h)
+        pixel = true + np.random.default_rng(seed).normal(0, 3.0, (25, 2))
+        fit = fit_bias(fitted.rpc, lat, lon, h, *pixel.T, stated=False)
+        rejected += int(fit.rejected.sum())
+        off.append(fit.bias.at(true) - TRUE_BIAS.at(true))
+        pixel[7, 0] += 60.0
+        assert fit_bias(fitted.rpc, lat, lon, h, *pixel.T, stated=False).rejected[7]
+    assert rejected < 10  # 1 % of 500; 65 % were
+    # 3 pixels of 25 points, 3 coefficients a coordinate
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(3.0 * np.sqrt(3.0 / 25.0), rel=0.2)
+
+
 def test_control_on_a_line_determines_no_affine_correction(scene, fitted):
     """Noise of a tenth of a pixel, which would be any number of pixels beside the line."""
     t = np.linspace(0.0, 1.0, 20)
