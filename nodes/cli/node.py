@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from ..config import Tables, build, load
 from ..errors import UserError
 from ..garbage_collection import RareCollections
 from ..node import Node
+from ..terminal import plain
 from .bus_options import add_bus_arguments, bus_of, reporter
 
 EXAMPLE = "triline node adjuster --config adjuster.toml --platform aircraft1"
@@ -30,14 +32,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.json and args.name == "monitor":
+        raise UserError("node monitor --json: its screen is for people, wanted `triline monitor --json --seconds N`")
     tables = _tables(args)
-    options = ProgramOptions(args.name, bus_file=args.bus, tables=tables, report=reporter(args.quiet), **bus_of(args))
+    said: list[str] = []
+    show = reporter(args.quiet or args.json)
+
+    def report(text: str) -> None:
+        said.append(plain(text))
+        show(text)
+
+    options = ProgramOptions(args.name, bus_file=args.bus, tables=tables, report=report, **bus_of(args))
     stop_on_signals(options.stop)
     stop_with_parent(options.stop)
     if args.name in registry.PROGRAMS:
-        return registry.program(args.name)(options)
-    node = build(registry.node_class(args.name), tables, args.name)
-    return run_on_bus(node, options)
+        code = registry.program(args.name)(options)
+    else:
+        code = run_on_bus(build(registry.node_class(args.name), tables, args.name), options)
+    if args.json:
+        print(json.dumps({"node": args.name, "platform": options.platform, "said": said}, indent=2))
+    return code
 
 
 def run_on_bus(node: Node, options: ProgramOptions) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 
 import numpy as np
 import pytest
+from bus_rig import free_port
 from places import ROOT
 
 from triline.nodes import registry
@@ -185,3 +187,13 @@ def test_settings_of_the_player(tmp_path, capsys):
     ):
         assert main(["node", "player", "--set", "input=flight.mcap", "--set", word]) == 1
         assert told in capsys.readouterr().err
+
+
+def test_a_node_says_at_its_end_as_json_what_it_said(capsys):
+    """The option had no effect."""
+    words = ["node", "player", "--set", f"input={ROOT / 'recordings' / 'strip.mcap'}", "--set", "rate=0"]
+    assert main([*words, "--port", str(free_port()), "--platform", "do228", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"node": "player", "platform": "do228", "said": ["played 4368 messages"]}
+    assert main(["node", "monitor", "--json"]) == 1
+    assert "wanted `triline monitor --json" in capsys.readouterr().err
