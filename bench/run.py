@@ -64,7 +64,7 @@ class Benchmark:
         """What runs it, for a reader."""
         if self.name in SPEED:
             return "make bench"
-        return "run.py --studies --long" if self.long else "make study"
+        return "make study"
 
 
 BENCHMARKS = (
