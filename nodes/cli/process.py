@@ -75,6 +75,11 @@ def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording)
     _check(reader, args)
     names = list(dict.fromkeys(name.strip() for name in args.nodes.split(",")))
+    other = next((name for name in names if name not in registry.STEP_NODES), None)
+    if other is not None:
+        raise UserError(
+            f"--nodes: no node {other!r} that works on a recording, wanted {', '.join(registry.STEP_NODES)}"
+        )
     if ADJUSTER in names and NAVIGATOR not in names and not len(reader.select(POSES)):
         raise UserError(f"{args.recording}: no message on {' or '.join(POSES)}, wanted {NAVIGATOR} among --nodes, too")
     pace = args.pace or usual_pace(reader, names)

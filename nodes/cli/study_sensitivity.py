@@ -213,7 +213,7 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
         sensor = sensors[ccd]
     else:
         if not Path(name).exists():
-            known = ", ".join([*ORBITAL_SENSORS, "ads40"])
+            known = ", ".join([*ORBITAL_SENSORS, "bilsat", "ads40"])
             raise UserError(f"{name}: neither a file nor a simulated sensor, wanted metadata or one of {known}")
         scene = read_scene(Path(name))
         model = scene.model("rigorous", args.ccd)

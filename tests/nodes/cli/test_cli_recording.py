@@ -186,6 +186,7 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         ((longer, "-o", out, "--strict"), "damaged: bytes behind the end of the recording"),
         ((configured, "-o", out), "nothing to process for navigator,adjuster: it holds configuration/camera"),
         ((flight, "-o", out, "--nodes", "pilot"), "no node 'pilot'"),
+        ((flight, "-o", out, "--nodes", "navigator,viewer"), "no node 'viewer' that works on a recording, wanted navi"),
         ((flight, "-o", out, "--nodes", "adjuster"), "wanted navigator among --nodes, too"),
         ((flight, "-o", out, "--config", bad), "configuration [navigator]: wings is not known"),
         ((flight, "-o", tmp_path / "no" / "out.mcap"), "no such file or directory"),
