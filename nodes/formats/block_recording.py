@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,9 @@ TOPICS = (
 
 #: Differences below this share of a variance are rounding.
 ROUNDING = 1e-9
+#: Strips of together so many seconds are adjusted with the wander of an attitude that is learnt, 0.4 s from border to
+#: border; of longer ones it would take minutes. Tuned.
+FAST_WANDER_S = 120.0
 
 
 @dataclass
@@ -109,11 +112,18 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     reference = 0 if poses[-1][0] < 10**8 * SECOND_NS else poses[0][0] // SECOND_NS * SECOND_NS
     stated = any(getattr(project, key) for key in SIGMAS)
     slow = slow_errors_of(project) if stated else None
+    widened = None if slow is None else _as_uncertain_as_poses(slow, found, poses)
+    slow = widened or slow
     strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow)
     if not strips:
         raise UserError(f"{name}: no strip with a trajectory; {notes[0] if notes else ''}")
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
     settings |= {key: getattr(project, key) for key in WANDER_TIMES if getattr(project, key)}
+    if widened is not None:
+        settings |= _settings_of(widened)
+        notes.append(
+            f"{name}: poses are less certain than the project states; so are slow errors, as they are adjusted"
+        )
     apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings)
     if poses[0][0] < found.camera_ns:
         notes.append(
@@ -203,6 +213,41 @@ def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
     return [
         f"strip {strip}: {reasons.total()} of {len(poses)} poses are not valid ({reason}), and were taken as they are"
     ]
+
+
+def _as_uncertain_as_poses(slow: SlowErrors, found: _Collected, poses: list[tuple[int, str, Any]]) -> SlowErrors | None:
+    """Slow errors of a trajectory whose poses are clearly less certain than its project states; None where none is.
+
+    As on line, what a filter does not know at the begin of a strip is an error for long, and no noise of single poses
+    (`SlowErrors.widened`); its wander is as fast as there, unless the strips are so long that this would take too many
+    unknowns (`FAST_WANDER_S`): then it is as slow as the project states.
+    """
+    times = np.array([pose[0] for pose in poses], dtype=np.int64)
+    variance = np.zeros(6)
+    for body in found.strips.values():
+        covariance = poses[min(int(np.searchsorted(times, body.first_line_time_ns)), len(poses) - 1)][2].covariance
+        if len(covariance) == 36 and np.isfinite(covariance).all():
+            variance = np.maximum(variance, covariance[::7])
+    wider = slow.widened(np.diag(variance))
+    if wider is slow:
+        return None
+    lasts_s = sum(body.lines / body.line_rate_hz if body.line_rate_hz > 0 else 0.0 for body in found.strips.values())
+    if all(body.lines for body in found.strips.values()) and lasts_s <= FAST_WANDER_S:
+        return wider
+    times_s = {"wander_time_s": slow.wander_time_s, "attitude_time_s": slow.attitude_time_s}
+    metres = np.sqrt(np.square(slow.wander_m) + np.square(wider.offset_m) - np.square(slow.offset_m)).tolist()
+    return replace(wider, wander_m=(metres[0], metres[1], metres[2]), **times_s)
+
+
+def _settings_of(slow: SlowErrors) -> dict[str, object]:
+    """Slow errors as settings of a project."""
+    degrees = {name: tuple(np.degrees(getattr(slow, name)).tolist()) for name in ("shift", "drift", "wander")}
+    return {
+        "offset_sigma_m": slow.offset_m, "wander_sigma_m": slow.wander_m,
+        **{f"{name}_sigma_deg": value for name, value in degrees.items()},
+        "wander_time_s": slow.wander_time_s,
+        **({"attitude_wander_time_s": slow.attitude_time_s} if slow.attitude_time_s else {}),
+    }  # fmt: skip
 
 
 def _noise_of(poses: list[Any], slow: SlowErrors | None) -> NDArray[np.floating] | None:

@@ -300,6 +300,18 @@ def test_image_points_in_a_gap_of_the_trajectory_have_no_orientation(tmp_path):
     assert np.diff(line_s).max() == pytest.approx(6.0, abs=0.1)
 
 
+def test_what_an_inertial_filter_does_not_know_is_no_noise_of_single_poses(tmp_path):
+    """Its attitudes are uncertain to tenths of a degree, and alike for long: points were 1.6, 3.2 and 5.3 m off."""
+    flight, oriented = tmp_path / "flight.mcap", tmp_path / "oriented.mcap"
+    assert main(["simulate", "-o", str(flight), "--imu", "mems", "--seconds", "40", "--seed", "3", "-q"]) == 0
+    assert main(["process", str(flight), "-o", str(oriented), "--nodes", "navigator", "-q"]) == 0
+    assert adjust(oriented, "-q", "-o", tmp_path / "out") == 0
+    result = result_in(tmp_path / "out")
+    assert any("poses are less certain than the project states" in note for note in result["notes"])
+    rmse, sigma = np.array(result["check"]["rmse_m"]), np.array(result["check"]["sigma_m"])
+    assert (rmse < [0.2, 0.3, 0.7]).all() and (rmse < 2.0 * sigma).all() and (sigma < 0.5).all()
+
+
 @pytest.mark.parametrize("noise", ["t3", "normal"])
 def test_heavy_tails_are_told(tmp_path, noise):
     flight = tmp_path / "flight.mcap"
