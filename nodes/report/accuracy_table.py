@@ -46,13 +46,13 @@ def accuracy_lines(result: dict[str, Any]) -> list[str]:
     for name in shown:
         row = orientation[name]
         nees = None if name == "measured" else row.get("nees")  # sensors state their noise, not their slow errors
-        lines.append(_row(_ORIENTATIONS[name], row, [f"{1e3 * v:8.2f}" for v in row["rmse_deg"]], "mdeg", nees))
+        lines.append(_row(_ORIENTATIONS[name], row, [_figure(1e3 * v, 2) for v in row["rmse_deg"]], "mdeg", nees))
     title = "object points" if result["points"] or not points else "object points, check points"
     lines.append(f"{title:<60} sigma X       Y       Z")
     titles = _POINTS if "adjusted" in points else _INTERSECTED
     for name in (n for n in titles if n in points):
         row = points[name]
-        sigma = [f"{v:8.3f}" for v in row["sigma_m"]] if "sigma_m" in row else ["       -"] * 3
+        sigma = [_figure(v) for v in row["sigma_m"]] if "sigma_m" in row else ["       -"] * 3
         lines.append(_row(titles[name], row, sigma, "m", row.get("nees")))
     lines += _conclusion(result, points)
     return [line.rstrip() for line in lines]
@@ -87,5 +87,10 @@ def early_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _row(title: str, row: dict[str, Any], others: list[str], unit: str, nees: float | None) -> str:
-    text = f"  {title:<26}{row['n']:6d}" + "".join(f"{v:8.3f}" for v in row["rmse_m"]) + " m"
+    text = f"  {title:<26}{row['n']:6d}" + "".join(_figure(v) for v in row["rmse_m"]) + " m"
     return f"{text}{''.join(others)} {unit:<4}" + (f"{nees:7.2f}" if nees is not None else f"{'-':>7}")
+
+
+def _figure(value: float, digits: int = 3) -> str:
+    """Eight characters, a blank before the figure: without decimals where it is large, so that columns stay apart."""
+    return f"{value:8.{digits if abs(value) < 1000.0 else 0}f}"

@@ -121,6 +121,8 @@ def test_terminal_headline_tile_and_highlighted_row_say_the_same(recording):
     line = next(line for line in lines if line.startswith("  adjusted on-line, final"))
     numbers = [float(v) for v in re.findall(r"[\d.]+", line)]
     assert numbers == pytest.approx([row["n"], *row["rmse_m"], *row["sigma_m"], row["nees"]], abs=0.006)
+    result["points"]["adjusted"]["sigma_m"] = [1531.781, 2130.435, 999.9]  # large figures stay apart
+    assert any(line.split()[-5:-1] == ["1532", "2130", "999.900", "m"] for line in accuracy_lines(result))
     direct = result["points"]["direct_georeferencing"]
     gain = next(line for line in lines if "improvement" in line)
     found = [float(v) for v in re.findall(r"([\d.]+)x", gain)]
