@@ -127,7 +127,7 @@ BENCHMARKS = (
         "camera-errors",
         "And where the camera is not as calibrated?",
         ("python bench/camera_errors.py",),
-        3,
+        5,
     ),
     Benchmark(
         "disturbed-folders",
