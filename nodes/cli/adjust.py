@@ -374,6 +374,7 @@ def job_of(args: argparse.Namespace, block: BlockData) -> Job:
         max_iterations=args.iterations,
         platform=_platform(args),
         then_stated=sigmas_stated(block.apriori.then),
+        wide=block.apriori.wide,
     )
 
 

@@ -236,7 +236,7 @@ class AirborneBlock(_OfData[BlockData]):
         parameters = None if c.selfcal == "none" else SELF_CALIBRATIONS[c.selfcal](block.camera)
         job = Job(
             first, second, parameters, snoop=settings.snoop, max_iterations=settings.iterations,
-            then_stated=sigmas_stated(block.apriori.then),
+            then_stated=sigmas_stated(block.apriori.then), wide=block.apriori.wide,
         )  # fmt: skip
         result = adjust_block(block, job).result
         network, solution = result.network, result.solution

@@ -124,7 +124,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
         notes.append(
             f"{name}: poses are less certain than the project states; so are slow errors, as they are adjusted"
         )
-    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings)
+    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings, wide=widened is not None)
     if poses[0][0] < found.camera_ns:
         notes.append(
             f"{name}: before {iso(found.camera_ns)} nodes used another camera; image points of then are adjusted with "

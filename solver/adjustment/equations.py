@@ -213,7 +213,7 @@ class BlockEquations:
             outcome.steps,
             outcome.converged,
             history,
-            assumed_of(at.layout, p.prior, at.state.theta, outcome.factor, p.refined),
+            assumed_of(at.layout, p.prior, at.state.theta, outcome.factor, p.wide),
         )
 
 

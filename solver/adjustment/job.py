@@ -76,6 +76,7 @@ class Job:
     ----------
     model : trajectory model
     then : model that runs after it on the orientation it refined; None for one model alone
+    wide : a-priori sigmas of the first model are far larger than the errors, see `Problem.wide`
     then_stated : its a-priori sigmas are stated for what the first model leaves, not for the measured trajectory
     self_calibration : additional parameters
     eliminate, limits : whether parameters that are not determinable go, and by which critical values
@@ -103,6 +104,7 @@ class Job:
     max_iterations: int | None = None
     platform: PlatformErrors = NO_PLATFORM_ERRORS
     then_stated: bool = False
+    wide: bool = False
 
     @property
     def eliminates(self) -> bool:
@@ -320,6 +322,7 @@ class _Stage:
             problem = self._adapt(replace(problem, control=before.solution.problem.control), control=False)
         else:
             problem = (pose or pose_problem)(network, model, job.self_calibration, job.platform)
+            problem = replace(problem, wide=job.wide)
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
             start = solve(problem, points, self.given, replace(job.options, robust=Huber()), tell)
@@ -346,7 +349,9 @@ class _Stage:
             if left is None:
                 return
             problem = pose_problem(left, model, self.job.self_calibration, self.job.platform)
-            problem = self._adapt(replace(problem, control=self.solution.problem.control), control=False)
+            problem = self._adapt(
+                replace(problem, wide=self.job.wide, control=self.solution.problem.control), control=False
+            )
             options = replace(self.job.options, robust=self.job.robust)
             self._keep(solve(problem, self.solution.state, self.given, options))
 

@@ -99,7 +99,7 @@ class Reduced:
             own_information(solution)[columns],
             ground_sample_distance(solution.network),
             assumed_of_model(layout, solution.problem.prior, solution.state.theta, solution.factor)
-            if solution.problem.refined
+            if solution.problem.wide
             else NOTHING_ASSUMED,
         )
 
@@ -243,7 +243,7 @@ def without(
     smaller = old.self_calibration.without(gone)
     network = with_left_out(old.network, old.layout, -1.0)  # it is put in again with the unknowns
     problem = adapt(pose_problem(network, old.model, smaller if smaller.n_unknowns else None, old.layout.platform))
-    problem = replace(problem, control=old.control, earlier=old.earlier, refined=old.refined)
+    problem = replace(problem, control=old.control, earlier=old.earlier, wide=old.wide)
     start = left.state
     if last := [k for k, name in enumerate(left.names) if name in gone]:  # it could not be taken out of the cofactors
         start = State(np.delete(start.theta, old.layout.n_model + np.array(last)), start.points_l)

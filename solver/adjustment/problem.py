@@ -70,8 +70,8 @@ class Problem:
     layout, elimination, prior, control : made from these
     earlier : solutions of models run before; their corrections are in the orientation of the network's rays
     parts : partitions that do the work on rays and points, which the network then lists only; None for all in memory
-    refined : the orientation of the rays is that of an earlier model, and nobody stated how good it is: a-priori sigmas
-        of model and platform, which are those of the measured one, are wide, see `Assumed`
+    wide : a-priori sigmas of model and platform are far larger than the errors, and no observations, see `Assumed`:
+        those of the measured orientation, where that of the rays is what an earlier model refined, or of a filter
     """
 
     network: Network
@@ -83,7 +83,7 @@ class Problem:
     control: ControlWeights
     earlier: tuple[Solution, ...] = ()
     parts: Parts | None = None
-    refined: bool = False
+    wide: bool = False
 
 
 class Parts(Protocol):
@@ -162,11 +162,9 @@ class Assumed(NamedTuple):
 NOTHING_ASSUMED = Assumed(0, 0.0)
 
 
-def assumed_of(
-    unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor, refined: bool = False
-) -> Assumed:
-    """`Assumed` at values ``theta`` of a reduced system; ``refined``: see `Problem`."""
-    found = assumed_of_model(unknowns, prior, theta, factor) if refined else NOTHING_ASSUMED
+def assumed_of(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor, wide: bool = False) -> Assumed:
+    """`Assumed` at values ``theta`` of a reduced system; ``wide``: see `Problem`."""
+    found = assumed_of_model(unknowns, prior, theta, factor) if wide else NOTHING_ASSUMED
     columns = unknowns.assumed
     if not len(columns):
         return found
@@ -176,7 +174,7 @@ def assumed_of(
 
 
 def assumed_of_model(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor) -> Assumed:
-    """What is assumed of a trajectory that an earlier model refined, and of the platform."""
+    """What is assumed of a trajectory and of the platform."""
     B = prior.matrix.tocsr()
     rows = np.flatnonzero(np.diff(B.indptr) > 0)
     last = np.maximum.reduceat(B.indices, B.indptr[rows]) if len(rows) else rows
@@ -309,7 +307,7 @@ def start_state(problem: Problem, points_l: Array | None = None) -> State:
 def continue_problem(solution: Solution, model: ModelOptions, *, stated: bool = False) -> Problem:
     """The problem of another model on the orientation that a solution refined [K 4.2.3].
 
-    ``stated``: the a-priori sigmas of the model are stated for what is left, see `Problem.refined`.
+    ``stated``: the a-priori sigmas of the model are stated for what is left, see `Problem.wide`.
     """
     old = solution.problem
     correction = old.layout.corrections(solution.state.theta)
@@ -318,7 +316,7 @@ def continue_problem(solution: Solution, model: ModelOptions, *, stated: bool = 
     position, angles = corrected(rays, old.layout, correction)
     refined = refined.with_orientation(position.T, angles.T)
     problem = pose_problem(refined, model, old.self_calibration, old.layout.platform)
-    return replace(problem, earlier=(*old.earlier, solution), refined=not stated)
+    return replace(problem, earlier=(*old.earlier, solution), wide=not stated)
 
 
 def cost_of(problem: Problem, state: State, lin: Linearisation) -> float:
