@@ -134,8 +134,8 @@ class Assumed(NamedTuple):
     """Values of unknowns that nobody stated: how many of them the data determine by themselves, and the squared
     whitened residuals of all.
 
-    Their wide sigmas say nothing of the data: counted as observations, which fit as if by a wonder, they would make
-    sigma0 too small.
+    Their wide sigmas say nothing of the data: counted as observations, whose residuals are next to nothing,
+    they would make sigma0 too small.
     """
 
     number: int

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.ellipsoid import WGS84, Ellipsoid
 from ..orbit.line_times import LineTimes
-from ..orbit.motion import FixedPoses, Motion
+from ..orbit.motion import FixedPoses, Motion, turned_on
 from .look_directions import LookDirections
 from .refraction import Refraction
 
@@ -173,8 +173,6 @@ class PushbroomSensor:
 
         Orbit and attitude may end with the centre of the first or last line, whose pixels are a line wide.
         """
-        from scipy.spatial.transform import Rotation
-
         pose = self.motion.at(time_s)
         out = np.flatnonzero(beyond_s)
         period = abs(float(self.line_times.time_of(1.0) - self.line_times.time_of(0.0)))
@@ -182,8 +180,7 @@ class PushbroomSensor:
         inner = self.motion.at(time_s[out] - step * np.sign(beyond_s[out]))
         position, R = pose.position_e.copy(), pose.R_eb.copy()
         position[out] += pose.velocity_e[out] * beyond_s[out, None]
-        turn = Rotation.from_matrix(R[out] @ np.swapaxes(inner.R_eb, 1, 2)).as_rotvec()
-        R[out] = Rotation.from_rotvec(turn * (np.abs(beyond_s[out]) / step)[:, None]).as_matrix() @ R[out]
+        R[out] = turned_on(R[out], inner.R_eb, np.abs(beyond_s[out]) / step)
         return replace(pose, position_e=position, R_eb=R)
 
     def ground(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:

@@ -119,6 +119,14 @@ class Motion:
         return velocity_e + np.cross(self.omega_e, position_e)
 
 
+def turned_on(R: Array, before: Array, share: Array) -> Array:
+    """Rotations (n, 3, 3) that go on by shares (n,) of the turn that leads from others (n, 3, 3) to them."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(R @ np.swapaxes(before, 1, 2)).as_rotvec()
+    return Rotation.from_rotvec(share[:, None] * turn).as_matrix() @ R
+
+
 def R_from_orbital(position: ArrayLike, velocity: ArrayLike) -> Array:
     """Rotations (n, 3, 3) from the orbital frame to that of position and velocity (n, 3) [D 4.25-4.28].
 

@@ -455,8 +455,8 @@ def _result(
 def _assumed(problem: Problem, state: State, Q: Array) -> tuple[int, float]:
     """How many values that nobody stated the data determine by themselves, and the squares of the residuals of all.
 
-    Their wide sigmas say nothing of the data: counted as observations, which fit as if by a wonder, they made sigma0
-    too small.
+    Their wide sigmas say nothing of the data: counted as observations, whose residuals are next to nothing,
+    they made sigma0 too small.
     """
     mine = problem.block.layout.assumed()
     A = problem.prior[mine]

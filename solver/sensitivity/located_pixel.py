@@ -17,7 +17,7 @@ from ..geometry.rotation import R_ENU_NED, matrix_from_angles
 from ..location.frame_camera import FrameCamera
 from ..location.pushbroom import PushbroomSensor, Rays, without_aberration
 from ..location.uncertainty import Sigmas, named_axes_b
-from ..orbit.motion import FixedPoses
+from ..orbit.motion import FixedPoses, turned_on
 from .inputs import Normal
 
 Array = NDArray[np.floating]
@@ -107,10 +107,9 @@ class SatellitePixel:
         if not len(out) or high - low < 1.0:
             return beyond == 0, pose
         inner = self._sensor.pose(within[out] - np.sign(beyond[out]))
-        position, R, share = pose.position_e.copy(), pose.R_eb.copy(), np.abs(beyond[out])[:, None]
-        position[out] += share * (position[out] - inner.position_e)
-        turn = Rotation.from_matrix(R[out] @ np.swapaxes(inner.R_eb, 1, 2)).as_rotvec()
-        R[out] = Rotation.from_rotvec(share * turn).as_matrix() @ R[out]
+        position, R, share = pose.position_e.copy(), pose.R_eb.copy(), np.abs(beyond[out])
+        position[out] += share[:, None] * (position[out] - inner.position_e)
+        R[out] = turned_on(R[out], inner.R_eb, share)
         return np.abs(beyond) <= _BEYOND_LINES, replace(pose, position_e=position, R_eb=R)
 
 

@@ -64,18 +64,17 @@ class NoiseOfLooks:
 
     def median_ratio(self) -> float:
         """Median of the squares of these over that of right sigmas; 1 where there are too few."""
-        w = self.controlled()
-        return float(np.median(w**2) / median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
+        return _median_ratio(self.controlled())
 
     def is_as_stated(self) -> bool:
         """Whether no other noise is in force than what was stated at first."""
         return self._network.sigmas.image == 1.0 and self._network.pose_noise.vibration == 0.0
 
     def ratio_now(self) -> float:
-        """The same of the newest looks, judged by the solution as it is now; 1 where there are too few."""
+        """As `median_ratio`, of the newest looks, judged by the solution as it is now."""
         judged = [b.judge(self._network.state)[1] for b in list(self._network.batches)[-MOST_JUDGED:]]
         w = np.concatenate([s.w[s.redundancy > LEAST_CONTROLLED] for s in judged]) if judged else np.empty(0)
-        return float(np.median(w**2) / median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
+        return _median_ratio(w)
 
     def residuals(self) -> Residuals | None:
         """Residuals of the looks in the window, where they ask for another noise than is stated; None where not."""
@@ -175,6 +174,11 @@ class Residuals:
         found, noise = float(np.sum(w[a] * w[b] * r**1.5)), float(np.sqrt(np.sum(r**3)))
         total = float(np.sum(w**2 * self.redundancy) / np.sum(self.redundancy))
         return min(found / float(np.sum(r**2)) / total, 1.0) if found > significant * noise * total else 0.0
+
+
+def _median_ratio(w: Array) -> float:
+    """Median of the squares of normalised residuals over that of right sigmas; 1 where there are too few."""
+    return float(np.median(w**2) / median_square(1)) if len(w) >= LEAST_LOOKS else 1.0
 
 
 def _pixel_and_sigma(rays: Sequence[Rays]) -> tuple[float, float]:

@@ -70,12 +70,17 @@ def test_a_scene_from_a_file(tmp_path, capsys):
     assert "column 250, row 2000, height 100 m" in text and "by covariance" in text and "across" in text
 
 
-def test_a_frame_camera_of_ones_own(tmp_path, capsys):
-    file = tmp_path / "photo.json"
+def photo(folder, sigma):
+    """A frame image from 3300 m, with sigmas of its orientation."""
     exterior = {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 3300.0, "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
     interior = {"focal_length_mm": 100.0, "pixel_size_mm": 0.005, "lines": 3000, "samples": 4000}
-    sigma = {"position_m": [0.1, 0.1, 0.2], "attitude_deg": [0.01, 0.01, 0.01]}
+    file = folder / "photo.json"
     file.write_text(json.dumps({"interior": interior, "exterior": exterior, "sigma": sigma}))
+    return file
+
+
+def test_a_frame_camera_of_ones_own(tmp_path, capsys):
+    file = photo(tmp_path, {"position_m": [0.1, 0.1, 0.2], "attitude_deg": [0.01, 0.01, 0.01]})
     assert main(["study", "sensitivity", str(file), *FEW, "--pixel", "1999.5", "1499.5", "--json"]) == 0
     scene = json.loads(capsys.readouterr().out)["scenes"][0]
     parameters = scene["results"]["east"]["parameters"]
@@ -85,11 +90,7 @@ def test_a_frame_camera_of_ones_own(tmp_path, capsys):
 
 def test_what_a_frame_image_cannot_state_has_its_usual_sigma(tmp_path, capsys):
     """With sigmas of position and attitude alone, ground and pixels of a frame image counted as known without error."""
-    file = tmp_path / "photo.json"
-    exterior = {"lat_deg": 39.9, "lon_deg": 32.8, "height_m": 3300.0, "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
-    interior = {"focal_length_mm": 100.0, "pixel_size_mm": 0.005, "lines": 3000, "samples": 4000}
-    sigma = {"position_m": [0.1, 0.1, 0.2], "atitude_deg": [0.01, 0.01, 0.01]}
-    file.write_text(json.dumps({"interior": interior, "exterior": exterior, "sigma": sigma}))
+    file = photo(tmp_path, {"position_m": [0.1, 0.1, 0.2], "atitude_deg": [0.01, 0.01, 0.01]})
     command = ["study", "sensitivity", str(file), *FEW, "--pixel", "0", "1499.5", "--json"]
     assert main(command) == 0
     scene = json.loads(capsys.readouterr().out)["scenes"][0]

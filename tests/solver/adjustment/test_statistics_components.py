@@ -62,7 +62,7 @@ def test_group_redundancies_sum_up():
 
 @pytest.mark.parametrize("how", ["usual", "free", "stated"])
 def test_usual_sigmas_of_a_camera_are_no_observations(how):
-    """A camera without errors fits them as if by a wonder: as observations they make sigma0 too small."""
+    """A camera without errors leaves them no residuals: as observations they make sigma0 too small."""
     parameters = {"usual": tls(CAMERA), "free": tls(CAMERA).free(), "stated": tls(CAMERA).scaled(1.0)}[how]
     plain, with_camera = [], []
     for seed in range(20):
