@@ -15,18 +15,30 @@ from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
 from ...solver.location.rpc import Rpc
-from ...solver.location.uncertainty import Sigmas, ground_covariance, pixel_covariance
+from ...solver.location.uncertainty import Sigmas, ground_derivatives, pixel_covariance
+from ...solver.rectification.error_map import derivatives_on_terrain
+from ...solver.rectification.occlusion import ground_slopes
+from ...solver.rectification.pixel_to_cell import meet_terrain
 from ..errors import UserError
+from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import new_file
 from ..formats.satellite.read import KINDS, read_scene
-from ..formats.table import Column, read_table, write_table
+from ..formats.table import Column, Table, read_table, write_table
+from .heights_under import height_range, rasters_of_heights
+from .outputs import refuse_over_files
 
-EXAMPLE = "triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv"
+EXAMPLE = """triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv
+  triline locate DIM_PHR1A.XML --pixels pixels.csv --dem N44E005.hgt --dem-datum EPSG:5773 -o ground.csv"""
 
 Array = NDArray[np.floating]
 
-_PIXELS = (Column("column"), Column("row"), Column("height_m"))
-_GROUND = (Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0), Column("height_m"))
+_PIXELS = (Column("column"), Column("row"))
+_GROUND = (Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0))
+_HEIGHT = Column("height_m")
+#: With a raster of heights the column may be missing, and is not used.
+_NO_HEIGHT = Column("height_m", optional=True, blank=True)
+#: Pixels meet the terrain in groups of squares of the image with so many pixels a side: one window of the raster each.
+SQUARE_PX = 2048
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +55,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CSV",
         help="lon_deg,lat_deg,height_m, or column,row; note where a row misses",
     )
+    parser.add_argument(
+        "--dem", metavar="FILE", action="append",
+        help="raster of heights, in place of height_m: pixels are where their rays meet it, ground points lie on it; "
+        "may be given again, or a folder of tiles",
+    )  # fmt: skip
+    parser.add_argument("--dem-crs", metavar="CRS", help="of the raster in place of its own; or ellipsoid, EPSG:5773 .. alone")
+    parser.add_argument("--dem-datum", metavar="DATUM", help=f"of its heights: {DATUMS}")
     parser.add_argument("--model", choices=("rigorous", "rpc"), help="where the file has both (default: rigorous)")
     parser.add_argument(
         "--ccd", metavar="ID", help="line of detectors, where the scene has several (default: the first)"
@@ -62,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--attitude-sigma", type=float, nargs=3, metavar=("ROLL", "PITCH", "YAW"), help="of the satellite, degrees"
     )
     parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
-    parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given")
+    parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given, or of the raster")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -73,16 +92,18 @@ def run(args: argparse.Namespace) -> int:
     if sigmas.any and isinstance(model, Rpc):
         raise UserError(f"{args.sensor}: sigmas go with a rigorous model, this is an RPC")
     notes = [*scene.notes, *scene.line_taken(model, args.ccd)]
+    terrain = _terrain(args, model)
     if args.pixels:
-        columns, missed = _to_ground(Path(args.pixels), model, sigmas, notes)
+        columns, missed = _to_ground(Path(args.pixels), model, terrain, sigmas, notes, args.sensor)
     else:
-        columns, missed = _to_pixels(Path(args.ground), model, sigmas, notes)
+        columns, missed = _to_pixels(Path(args.ground), model, terrain, sigmas, notes)
     with new_file(Path(args.output)) as part:
         write_table(part, columns, _FORMATS)
     result = {
         "sensor": str(args.sensor),
         "kind": scene.kind,
         "model": "rpc" if isinstance(model, Rpc) else "rigorous",
+        "heights": "of the file" if terrain is None else f"{terrain.name}, {terrain.datum}",
         "output": str(args.output),
         "rows": len(next(iter(columns.values()))),
         "missed": missed,
@@ -92,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(result, indent=2))
     elif not args.quiet:
         print(f"{args.sensor} ({KINDS[scene.kind]}, {result['model']} model) -> {args.output}")
-        print(f"  {result['rows']} rows, {missed} of them miss")
+        print(f"  {result['rows']} rows, {missed} of them miss; heights {result['heights']}")
         for note in notes:
             print(f"  note: {note}")
     return 0
@@ -147,28 +168,77 @@ def stated_sigmas(args: argparse.Namespace, stated: Sigmas) -> Sigmas:
         ) from None
 
 
+def _terrain(args: argparse.Namespace, model: PushbroomSensor | Rpc) -> HeightRaster | None:
+    """The raster of heights that the command line names."""
+    if not args.dem:
+        for name in ("dem_crs", "dem_datum"):
+            if getattr(args, name) is not None:
+                raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
+        return None
+    ellipsoid = WGS84 if isinstance(model, Rpc) else model.ellipsoid
+    rasters = rasters_of_heights(args.dem)
+    refuse_over_files((args.output,), rasters)
+    return HeightRaster(rasters, args.dem_crs, args.dem_datum, ellipsoid)
+
+
+def _table(path: Path, columns: tuple[Column, ...], terrain: HeightRaster | None, notes: list[str]) -> Table:
+    table = read_table(path, (*columns, _HEIGHT if terrain is None else _NO_HEIGHT), notes)
+    if terrain is not None and "height_m" in table and np.isfinite(table["height_m"]).any():
+        notes.append(f"{path}: height_m is not used: heights are those of {terrain.name}")
+    return table
+
+
 def _to_ground(
-    path: Path, model: PushbroomSensor | Rpc, sigmas: Sigmas, notes: list[str]
+    path: Path, model: PushbroomSensor | Rpc, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str], scene: str
 ) -> tuple[dict[str, Any], int]:
-    table = read_table(path, _PIXELS, notes)
-    u, v, h = table["row"], table["column"], table["height_m"]
+    table = _table(path, _PIXELS, terrain, notes)
+    u, v = table["row"], table["column"]
     note = _outside(model, u, v)
     inside = np.flatnonzero(note == "")
-    located = np.full((len(u), 3), np.nan)
-    located[inside] = model.direct(u[inside], v[inside], h[inside])
-    note[inside[np.isnan(located[inside, 0])]] = "the ray misses the ground"
+    located, slope = np.full((len(u), 3), np.nan), None
+    if terrain is None:
+        located[inside] = model.direct(u[inside], v[inside], table["height_m"][inside])
+        note[inside[np.isnan(located[inside, 0])]] = "the ray misses the ground"
+    elif len(inside):
+        located[inside], slope = _met(model, u[inside], v[inside], terrain, scene)
+        note[inside[np.isnan(located[inside, 0])]] = f"no height of {terrain.name} where the ray comes down"
     seen = np.flatnonzero(np.isfinite(located[:, 0]))
     columns: dict[str, Any] = {
         "column": v, "row": u, "lon_deg": np.degrees(located[:, 1]), "lat_deg": np.degrees(located[:, 0]),
         "height_m": located[:, 2],
     }  # fmt: skip
     if sigmas.any and isinstance(model, PushbroomSensor):
-        covariance = np.full((len(u), 3, 3), np.nan)
-        covariance[seen] = ground_covariance(model, u[seen], v[seen], h[seen], sigmas)
-        for k, name in enumerate(("sigma_e_m", "sigma_n_m", "sigma_u_m")):
-            columns[name] = np.sqrt(covariance[:, k, k])
+        J = ground_derivatives(model, u[seen], v[seen], located[seen, 2])
+        if slope is not None:
+            J = derivatives_on_terrain(J, slope[np.isfinite(located[inside, 0])])
+        sigma = np.full((len(u), 3), np.nan)
+        sigma[seen] = np.sqrt(np.square(J * sigmas.values).sum(axis=2))
+        columns |= {name: sigma[:, k] for k, name in enumerate(("sigma_e_m", "sigma_n_m", "sigma_u_m"))}
     columns["note"] = note
     return columns, len(u) - len(seen)
+
+
+def _met(model: PushbroomSensor | Rpc, u: Array, v: Array, terrain: HeightRaster, scene: str) -> tuple[Array, Array]:
+    """Latitude, longitude and height (n, 3) at which rays of pixels meet the terrain, and its slope there (n, 2)."""
+    guess = float(model.to_image.in_offset[2]) if isinstance(model, Rpc) else 0.0
+
+    def places(height_m: float) -> tuple[Array, Array]:
+        located = model.direct(u, v, np.full(len(u), height_m))
+        return located[:, 0], located[:, 1]
+
+    low, high = height_range(places, terrain, guess, scene, "the pixels")
+    located, slope = np.full((len(u), 3), np.nan), np.full((len(u), 2), np.nan)
+    squares = np.column_stack([u // SQUARE_PX, v // SQUARE_PX])
+    _, of = np.unique(squares, axis=0, return_inverse=True)
+    for k in range(int(of.max()) + 1):
+        some = np.flatnonzero(of.ravel() == k)
+        met = meet_terrain(model, u[some], v[some], terrain, low, high)
+        some, here = some[np.isfinite(met.lat)], np.isfinite(met.lat)
+        if not len(some):
+            continue
+        located[some] = np.column_stack([met.lat, met.lon, met.height_m])[here]
+        slope[some] = ground_slopes(terrain, *located[some].T, terrain.ellipsoid)
+    return located, slope
 
 
 def _outside(model: PushbroomSensor | Rpc, u: Array, v: Array) -> NDArray[np.object_]:
@@ -181,14 +251,19 @@ def _outside(model: PushbroomSensor | Rpc, u: Array, v: Array) -> NDArray[np.obj
 
 
 def _to_pixels(
-    path: Path, model: PushbroomSensor | Rpc, sigmas: Sigmas, notes: list[str]
+    path: Path, model: PushbroomSensor | Rpc, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str]
 ) -> tuple[dict[str, Any], int]:
-    table = read_table(path, _GROUND, notes)
+    table = _table(path, _GROUND, terrain, notes)
     table.refuse(np.abs(table["lat_deg"]) > 90.0, "lat_deg", lambda row: "a latitude beyond 90 degrees")
-    lat, lon, h = np.radians(table["lat_deg"]), np.radians(table["lon_deg"]), table["height_m"]
-    pixel = model.inverse(lat, lon, h, 0.0)
+    lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
+    h = table["height_m"] if terrain is None else terrain.at(lat, lon)
+    known = np.isfinite(h)
+    pixel = np.full((len(h), 2), np.nan)
+    pixel[known] = model.inverse(lat[known], lon[known], h[known], 0.0)
     seen = np.flatnonzero(np.isfinite(pixel[:, 0]))
     note = np.full(len(pixel), "not in the image", dtype=object)
+    if terrain is not None:
+        note[~known] = f"no height of {terrain.name} there"
     note[seen] = ""
     columns: dict[str, Any] = {
         "lon_deg": table["lon_deg"], "lat_deg": table["lat_deg"], "height_m": h,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, read_table
+from .heights_under import height_range, rasters_of_heights
 from .locate import with_refraction
 from .outputs import refuse_over_files
 from .progress import progress
@@ -53,8 +53,6 @@ OPTIONS = (
     "occlusions", "mask", "sigma", "compress", "plain", "position_sigma", "attitude_sigma", "pixel_sigma",
     "height_sigma", "workers",
 )  # fmt: skip
-#: Rasters that are looked for in a folder of heights.
-_DEM_NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("shift", "affine", "camera"),
         help="by control: of the image, or of the parameters of a frame camera (default: affine)",
     )
-    group.add_argument("--dem-crs", metavar="CRS", help="of the heights; of a recording: ellipsoid, EPSG:5773 ..")
+    group.add_argument("--dem-crs", metavar="CRS", help="of the raster in place of its own; or ellipsoid, EPSG:5773 .. alone")
     group.add_argument("--dem-datum", metavar="DATUM", help=f"what heights are above: {DATUMS}")
     group.add_argument(
         "--bounds",
@@ -391,19 +389,9 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
             raise UserError(f"{args.sensor}: the image does not see the ground at {h:g} m")
         return ground
     raster = HeightRaster(rasters_of_heights(args.dem), args.dem_crs, args.dem_datum, sensor.ellipsoid)
-    low = high = guess
-    for _ in range(2):
-        places = [edge_of(model, Ground(h, h, h, 1.0, ""), 60) for h in {low, high}]
-        lat, lon = (np.concatenate(a) for a in zip(*places, strict=True))
-        seen = np.isfinite(lat)
-        if not seen.any():
-            raise UserError(f"{args.sensor}: the image does not see the ground at {low:g} m")
-        lat, lon = lat[seen], lon[seen]
-        found = raster.range_over(lat, lon)
-        if found is None:
-            degrees = f"{np.degrees(lat.mean()):.4f} N, {np.degrees(lon.mean()):.4f} E"
-            raise UserError(f"{raster.name}: does not cover the image, which lies around {degrees}")
-        low, high = found
+    low, high = height_range(
+        lambda h: edge_of(model, Ground(h, h, h, 1.0, ""), 60), raster, guess, args.sensor, "the pixels of the image"
+    )
     u, v = np.meshgrid(np.linspace(0, model.lines - 1, 25), np.linspace(0, model.samples - 1, 25))
     met = meet_terrain(model, u.ravel(), v.ravel(), raster, low, high)
     covered = float(np.isfinite(met.lat).mean())
@@ -412,21 +400,6 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
     if covered < 1.0:
         sensor.notes.append(f"{raster.name}: covers {100 * covered:.0f} % of the image, the rest is missing")
     return Ground(raster, low, high, covered, f"heights of {raster.name} {raster.datum}")
-
-
-def rasters_of_heights(names: Iterable[str]) -> list[Path]:
-    """Rasters that are named, and those in folders."""
-    out: list[Path] = []
-    for name in names:
-        path = Path(name)
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _DEM_NAMES)
-            if not inside:
-                raise UserError(f"{path}: no rasters of heights in it ({', '.join(_DEM_NAMES)})")
-            out += inside
-        else:
-            out.append(path)
-    return out
 
 
 # -- the cells -----------------------------------------------------------------------------------------------------

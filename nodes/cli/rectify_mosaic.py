@@ -47,6 +47,7 @@ from ..recording.access import Recording
 from ..recording.reader import RecordingReader
 from . import rectify_image
 from .damage import tell_damage, tell_other_camera, tell_other_frame
+from .heights_under import rasters_of_heights
 from .outputs import refuse_over_files
 from .progress import progress
 from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
@@ -243,7 +244,7 @@ def _refuse_inputs(args: argparse.Namespace, outputs: Outputs, kinds: list[tuple
     """Refuse to write over what is read: also the names that nobody gave, and what is read of folders."""
     heights: list[Path] = []
     if any(kind == "image" for kind, _, _ in kinds):
-        heights = rectify_image.rasters_of_heights(args.dem or ())
+        heights = rasters_of_heights(args.dem or ())
     named = [
         Path(name) for name in (*(meta for _, _, meta in kinds), *(args.dem or ()), args.camera) if name is not None
     ]

@@ -19,6 +19,7 @@ Array = NDArray[np.floating]
 
 #: What ``--dem-datum`` may be, in words.
 DATUMS = "ellipsoid, a vertical CRS (EPSG:5773), a raster of geoid heights, or the geoid's height in metres"
+ELLIPSOID = ("ellipsoid", "ellipsoidal")
 #: Ellipsoids whose half axes differ by a larger share are of different planets.
 SAME_PLANET = 1e-3
 #: The range of heights is looked up in at most so many values a side; then it is widened by so much, metres. Tuned.
@@ -63,7 +64,8 @@ class HeightRaster:
     Parameters
     ----------
     paths : rasters of one CRS and cell size (tiles of SRTM, say); values stand for the middle of their cells
-    crs : in place of that of the files
+    crs : in place of that of the files; or, as where rasters are put under a recording, ``ellipsoid`` or a vertical CRS
+        alone, which are the datum
     datum : of the heights, of `DATUMS`; may be left out where the CRS says it. Heights are in the unit of the vertical
         CRS, where there is one, and depths where it counts downwards
     ellipsoid : of the sensor that looks at them
@@ -81,6 +83,8 @@ class HeightRaster:
         first = self._files[0]
         self.name = ", ".join(path.name for path in paths)
         self.ellipsoid = ellipsoid
+        if datum is None and crs is not None and _says_heights_alone(crs):
+            crs, datum = None, crs
         whole = _crs(first, crs)
         self._check_planet(first.path, whole, ellipsoid)
         flat, stated = _split(whole)
@@ -160,7 +164,7 @@ class HeightRaster:
                 f"{DATUMS}"
             )
         if datum is not None:
-            if datum.lower() in ("ellipsoid", "ellipsoidal"):
+            if datum.lower() in ELLIPSOID:
                 return "above the ellipsoid", None
             try:
                 constant = float(datum)
@@ -321,6 +325,20 @@ class _GeoidRaster:
     def __call__(self, lat_deg: Array, lon_deg: Array) -> Array:
         shape = np.shape(lat_deg)
         return self._raster.at(np.radians(np.ravel(lat_deg)), np.radians(np.ravel(lon_deg))).reshape(shape)
+
+
+def _says_heights_alone(crs: str) -> bool:
+    """Whether a CRS is ``ellipsoid`` or a vertical one, and leaves the places to the raster."""
+    import pyproj
+    from pyproj.exceptions import CRSError
+
+    if crs.lower() in ELLIPSOID:
+        return True
+    try:
+        given = pyproj.CRS.from_user_input(crs)
+    except CRSError:
+        return False
+    return bool(given.is_vertical and not given.is_compound)
 
 
 def _crs(file: RasterFile, wanted: str | None) -> Any:

@@ -52,14 +52,19 @@ class Sigmas:
     height_m: float = 0.0
 
     def __post_init__(self) -> None:
-        values = np.array([*self.position_m, *self.attitude_rad, self.time_s, *self.pixel, self.height_m], dtype=float)
+        values = self.values
         if values.shape != (10,) or not (np.isfinite(values) & (values >= 0)).all():
             raise ValueError(f"sigmas {values.tolist()}, wanted ten numbers of at least 0")
 
     @property
+    def values(self) -> Array:
+        """All ten of them, in the order above."""
+        return np.array([*self.position_m, *self.attitude_rad, self.time_s, *self.pixel, self.height_m], dtype=float)
+
+    @property
     def any(self) -> bool:
         """Whether one of them is above zero."""
-        return any((*self.position_m, *self.attitude_rad, self.time_s, *self.pixel, self.height_m))
+        return bool(self.values.any())
 
 
 def named_axes_b(sensor: PushbroomSensor) -> Array:
@@ -117,7 +122,7 @@ def ground_covariance(
     sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike, sigmas: Sigmas
 ) -> Array:
     """Covariance (n, 3, 3) in m2, east, north, up, of pixels located at heights."""
-    J = ground_derivatives(sensor, line, sample, height_m) * _column(sigmas)
+    J = ground_derivatives(sensor, line, sample, height_m) * sigmas.values
     return J @ np.swapaxes(J, -1, -2)
 
 
@@ -140,17 +145,13 @@ def pixel_covariance(
     J = ground_derivatives(sensor, line, sample, height_m)
     M = np.linalg.inv(J[:, :2, 7:9])  # of line and sample by east and north at one height
     sources = list(range(7)) if ground_covariance_m2 is not None else [*range(7), 9]
-    B = M @ (J[:, :2, sources] * _column(sigmas)[sources])
+    B = M @ (J[:, :2, sources] * sigmas.values[sources])
     covariance = B @ np.swapaxes(B, -1, -2) + np.diag(np.square(sigmas.pixel))
     if ground_covariance_m2 is not None:
         # a point that is higher appears where a ray to lower ground passes
         G = M @ np.concatenate([np.broadcast_to(np.eye(2), (len(J), 2, 2)), -J[:, :2, 9:10]], axis=2)
         covariance = covariance + G @ np.asarray(ground_covariance_m2, dtype=float) @ np.swapaxes(G, -1, -2)
     return covariance
-
-
-def _column(sigmas: Sigmas) -> Array:
-    return np.array([*sigmas.position_m, *sigmas.attitude_rad, sigmas.time_s, *sigmas.pixel, sigmas.height_m])
 
 
 def _R_en(normal: Array, P: Array) -> Array:

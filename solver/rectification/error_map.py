@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.ellipsoid import Ellipsoid
-from ..orthoimage.error_band import on_slope
+from ..orthoimage.error_band import LEAST_ANGLE, on_slope
 from .cell_to_pixel import HeightsOfTile
 from .occlusion import place_slopes
 from .sampled import SomeCells, ground_steps, over_cells
@@ -55,6 +55,31 @@ def sigmas_of_tile(
     s0, s1 = by_row * M[0, 0] + by_column * M[1, 0], by_row * M[0, 1] + by_column * M[1, 1]
     planimetric, height = on_slope(e00, e01, e11, g0, g1, s0, s1, variance)
     return _root(planimetric), _root(height)
+
+
+def derivatives_on_terrain(level: Array, slope: Array) -> Array:
+    """What errors do to the place (n, 3, k) in east, north, up at which rays meet sloping ground.
+
+    A moved ray finds another height, too: ``dh = (s' J e + h) / (1 - s' g)`` and ``dEN = J e + g dh``.
+
+    Parameters
+    ----------
+    level : (n, 3, k) derivatives at a given height; the last source is the height, and has the way ``g`` of the ray
+    slope : (n, 2) ``s``, metres of height a metre east and north
+
+    Returns
+    -------
+    derivatives ; NaN where the slope is as steep as the ray
+    """
+    way = level[:, :2, -1]
+    angle = 1.0 - np.einsum("ni,ni->n", slope, way)
+    angle = np.where(np.abs(angle) < LEAST_ANGLE, np.nan, angle)
+    moved = level[:, :2].copy()
+    moved[:, :, -1] = 0.0
+    height = np.einsum("ni,nik->nk", slope, moved)
+    height[:, -1] = 1.0
+    height /= angle[:, None]
+    return np.concatenate([moved + way[:, :, None] * height[:, None], height[:, None]], axis=1)
 
 
 def _root(variance: Array) -> NDArray[np.float32]:

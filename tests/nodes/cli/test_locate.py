@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pandas as pd
 import pytest
+from relief import Waves
 from satellite_scenes import Truth, write_dimap2, write_folder
 
 from triline.nodes.cli import main
@@ -122,3 +124,93 @@ def test_refraction_on_another_planet_is_refused(tmp_path, capsys):
     for command in (["locate", str(folder), "--pixels", where, "-o", ground], ["study", "sensitivity", str(folder)]):
         assert main([*command, "--refraction"]) == 1
         assert "--refraction knows the air of the Earth only, this is another planet" in capsys.readouterr().err
+
+
+@pytest.fixture
+def relief(scene, tmp_path):
+    """Relief under the scene, and its raster; the values are heights above the ellipsoid."""
+    waves = Waves.under(read_scene(scene).model(), 120, waves=2.0)
+    return waves, ["--dem", str(waves.write(tmp_path / "dem.tif")), "--dem-datum", "ellipsoid"]
+
+
+def located(scene, tmp_path, where, *more) -> pd.DataFrame:
+    assert main(["locate", str(scene), *map(str, where), "-o", str(tmp_path / "out.csv"), "-q", *map(str, more)]) == 0
+    return pd.read_csv(tmp_path / "out.csv")
+
+
+def on_terrain(scene, tmp_path, rows, *more) -> pd.DataFrame:
+    path = tmp_path / "bare.csv"
+    path.write_text("column,row\n" + rows)
+    return located(scene, tmp_path, ["--pixels", path], *more)
+
+
+def test_pixels_on_a_terrain_lie_on_it_and_come_back(scene, relief, tmp_path):
+    waves, dem = relief
+    rows = "".join(f"{x},{y}\n" for x in (0, 12.5, 250, 499) for y in (0, 1234.5, 3999))
+    table = on_terrain(scene, tmp_path, rows, *dem)
+    assert len(table) == 12 and table["note"].isna().all() and table["height_m"].between(0, 1000).all()
+    assert table["height_m"].max() - table["height_m"].min() > 100
+    surface = waves.at(np.radians(table["lat_deg"]), np.radians(table["lon_deg"]))
+    assert np.abs(table["height_m"] - surface).max() < 0.01
+    table[["lon_deg", "lat_deg"]].to_csv(tmp_path / "places.csv", index=False)
+    back = located(scene, tmp_path, ["--ground", tmp_path / "places.csv"], *dem)
+    assert np.abs(back[["column", "row"]] - table[["column", "row"]]).to_numpy().max() < 0.01
+    assert np.abs(back["height_m"] - table["height_m"]).max() < 0.01
+
+
+def test_one_pixel_alone_is_met_where_the_ground_rises(scene, relief, tmp_path):
+    # around the place at height 0 the terrain lies elsewhere than where the ray comes down
+    _, dem = relief
+    together = on_terrain(scene, tmp_path, "100,700\n0,0\n499,3999\n", *dem)
+    alone = on_terrain(scene, tmp_path, "100,700\n", *dem)
+    assert np.abs(alone.loc[0, ["lon_deg", "lat_deg"]] - together.loc[0, ["lon_deg", "lat_deg"]]).max() < 2e-8
+
+
+def test_sigmas_on_a_slope_are_what_shifts_do(scene, relief, tmp_path):
+    waves, dem = relief
+    rows, moved = "60,900\n320,2500\n", "60,900.5\n320,2500.5\n"
+    nothing = ["--position-sigma", "0", "0", "0", "--attitude-sigma", "0", "0", "0", "--pixel-sigma", "0"]
+    first = on_terrain(scene, tmp_path, rows, *dem, *nothing, "--height-sigma", "1")
+    waves.z = waves.z + np.float32(1.0)
+    higher = on_terrain(scene, tmp_path, rows, "--dem", waves.write(tmp_path / "up.tif"), *dem[2:])
+    east = np.radians(1) * 6.378e6 * np.cos(np.radians(first["lat_deg"]))
+    for sigma, column, metres in (
+        ("sigma_e_m", "lon_deg", east),
+        ("sigma_n_m", "lat_deg", np.radians(1) * 6.37e6),
+        ("sigma_u_m", "height_m", 1.0),
+    ):
+        np.testing.assert_allclose(first[sigma], np.abs(higher[column] - first[column]) * metres, rtol=0.02, atol=2e-4)
+    assert np.abs(first["sigma_u_m"] - 1.0).max() > 0.005  # the ray slides along the slope
+    sigmas = on_terrain(scene, tmp_path, rows, *dem, *nothing[:8], "--pixel-sigma", "1", "--height-sigma", "0")
+    next_line = on_terrain(scene, tmp_path, moved, *dem)
+    next_column = on_terrain(scene, tmp_path, "60.5,900\n320.5,2500\n", *dem)
+    rise = 2 * np.hypot(next_line["height_m"] - first["height_m"], next_column["height_m"] - first["height_m"])
+    np.testing.assert_allclose(sigmas["sigma_u_m"], rise, rtol=0.03, atol=2e-3)
+
+
+def test_what_a_terrain_does_not_cover_is_told(scene, relief, tmp_path, capsys):
+    waves, dem = relief
+    half = Waves(waves.lat_deg, waves.lon_deg, waves.step_deg, waves.rows // 2, waves.columns)
+    path = half.write(tmp_path / "half.tif")
+    table = on_terrain(scene, tmp_path, "100,3999\n100,0\n700,2000\n", "--dem", path, *dem[2:])
+    known = table["lon_deg"].notna()
+    assert known.sum() == 1
+    assert sorted(table["note"][~known]) == [
+        "no height of half.tif where the ray comes down", "outside the image of 500 columns and 4000 rows",
+    ]  # fmt: skip
+    where = ["--pixels", str(pixels(tmp_path)), "-o", str(tmp_path / "o.csv")]
+    assert main(["locate", str(scene), *where, *dem]) == 0
+    assert f"{tmp_path / 'pixels.csv'}: height_m is not used: heights are those of dem.tif" in capsys.readouterr().out
+    far = Waves(waves.lat_deg - 20, waves.lon_deg, waves.step_deg, 20, 20).write(tmp_path / "far.tif")
+    for more, reason in (
+        (["--dem", str(far), *dem[2:]], "far.tif: does not cover the pixels around "),
+        (dem[:2], "does not say what its heights are above"),
+        (["--dem-datum", "ellipsoid"], "--dem-datum: goes with --dem"),
+    ):
+        assert main(["locate", str(scene), *where, *more]) == 1
+        error = capsys.readouterr().err
+        assert reason in error and error.count("\n") == 1, error
+    by_crs = on_terrain(scene, tmp_path, "100,700\n", *dem[:2], "--dem-crs", "ellipsoid")
+    pd.testing.assert_frame_equal(by_crs, on_terrain(scene, tmp_path, "100,700\n", *dem))
+    assert main(["locate", str(scene), "--pixels", str(tmp_path / "bare.csv"), "-o", str(tmp_path / "o.csv")]) == 1
+    assert "height_m: column missing" in capsys.readouterr().err

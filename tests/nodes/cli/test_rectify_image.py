@@ -569,7 +569,7 @@ def test_heights_are_refused_without_a_datum_elsewhere_and_of_another_planet(sce
     base = [image, "--sensor", path, "-o", tmp_path / "o.tif", "--dem"]
     assert "wanted --dem-datum ellipsoid" in refused(capsys, *base, dem)
     far = replace(relief, lon_deg=relief.lon_deg + 30.0).write(tmp_path / "far.tif")
-    assert "does not cover the image" in refused(capsys, *base, far, "--dem-datum", "ellipsoid")
+    assert "does not cover the pixels of the image" in refused(capsys, *base, far, "--dem-datum", "ellipsoid")
     moon = relief.write(tmp_path / "moon.tif", "+proj=longlat +a=1737400 +b=1737400 +no_defs")
     assert "another planet" in refused(capsys, *base, moon, "--dem-datum", "ellipsoid")
     assert "neither a file nor a CRS" in refused(capsys, *base, dem, "--dem-datum", "sea")

@@ -1,0 +1,73 @@
+"""Rasters of heights that a command line names, and between which heights they lie under what a sensor sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UserError
+from ..formats.height_raster import HeightRaster
+
+Array = NDArray[np.floating]
+
+#: Rounds in which pixels are looked up between the heights of the round before; they end where none is new.
+MOST_ROUNDS = 10
+#: Rasters that are looked for in a folder of heights.
+_NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
+
+
+def rasters_of_heights(names: Iterable[str]) -> list[Path]:
+    """Rasters that are named, and those in folders.
+
+    Raises
+    ------
+    UserError : a folder without any
+    """
+    out: list[Path] = []
+    for name in names:
+        path = Path(name)
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _NAMES)
+            if not inside:
+                raise UserError(f"{path}: no rasters of heights in it ({', '.join(_NAMES)})")
+            out += inside
+        else:
+            out.append(path)
+    return out
+
+
+def height_range(
+    places: Callable[[float], tuple[Array, Array]], raster: HeightRaster, guess_m: float, sensor: object, what: str
+) -> tuple[float, float]:
+    """Lowest and highest height above the ellipsoid of the raster under pixels.
+
+    Parameters
+    ----------
+    places : latitudes and longitudes (n,), radians, of the pixels at a height, NaN where they miss
+    guess_m : height at which to look first
+    sensor, what : named in errors: the metadata, and whose pixels they are
+
+    Raises
+    ------
+    UserError : the pixels do not see the ground, or the raster does not lie there
+    """
+    low = high = guess_m
+    known = np.inf, -np.inf
+    for _ in range(MOST_ROUNDS):
+        lat, lon = (np.concatenate(a) for a in zip(*(places(h) for h in {low, high}), strict=True))
+        seen = np.isfinite(lat)
+        if not seen.any():
+            raise UserError(f"{sensor}: {what} see no ground at {low:g} m")
+        lat, lon = lat[seen], lon[seen]
+        found = raster.range_over(lat, lon)
+        if found is None:
+            degrees = f"{np.degrees(lat.mean()):.4f} N, {np.degrees(lon.mean()):.4f} E"
+            raise UserError(f"{raster.name}: does not cover {what} around {degrees}")
+        low, high = min(known[0], found[0]), max(known[1], found[1])
+        if (low, high) == known:
+            break
+        known = low, high
+    return low, high
