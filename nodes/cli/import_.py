@@ -17,9 +17,9 @@ from ...solver.camera.sensors import PRESETS, preset
 from ..errors import UserError
 from ..formats.avirisc import LINE_RATE_HZ, avirisc_has_latitudes
 from ..formats.camera_json import read_camera, write_camera
-from ..formats.detect import KINDS, Imported, Options, kind_of_path, read_any
+from ..formats.detect import KINDS, Imported, Options, image_alone, kind_of_path, read_any
 from ..formats.envi_image import TYPES
-from ..formats.flight_folder import flight_messages
+from ..formats.flight_folder import FILE, NAVIGATION, Instead, flight_messages
 from ..formats.geocal_xml import read_glas_camera, read_tie_points
 from ..formats.gpx import has_attitudes
 from ..formats.ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
@@ -32,7 +32,8 @@ from ..node import Message
 from ..recording.writer import RecordingWriter
 from ..terminal import drawing
 
-EXAMPLE = "triline import block_folder -o flight.mcap"
+EXAMPLE = """triline import block_folder -o flight.mcap
+  triline import day.sbet --flight flight_folder -o flight.mcap    # camera, mounting, control: of the folder"""
 
 _GROUND = ("ground_height", "above_ground", "dem", "dem_crs")
 _IMAGES = ("lines", "strip", "line_times", "first_time", "band", "raw", "samples", "grey_range")
@@ -49,6 +50,8 @@ GO_WITH: dict[str, tuple[str, ...]] = {
     "lines": ("date", "camera", "line_rate", *_IMAGES),
 }
 _OPTIONS = ("crs", "seconds_of_day", *_POSES)
+#: Options that go with ``--flight``: what the folder cannot say of data that are not in it.
+_BESIDE_FLIGHT = ("date", "line_rate", *_IMAGES)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", required=True, metavar="FILE", help="recording; camera.json for a camera, CSV for tie points"
     )
     parser.add_argument("--format", choices=KINDS, metavar="KIND", help=f"what the input is: {', '.join(KINDS)}")
+    parser.add_argument(
+        "--flight", type=Path, metavar="DIR",
+        help="flight folder that says all else: INPUT takes the place of its navigation.file or, image lines, of its "
+        "[[strips]]",
+    )  # fmt: skip
     parser.add_argument("--date", type=_day, metavar="YYYY-MM-DD", help="day of the flight, for files with GPS seconds")
     parser.add_argument("--crs", metavar="CRS", help="of easting and northing, where the file does not say (PROJ)")
     parser.add_argument(
@@ -123,7 +131,10 @@ def run(args: argparse.Namespace) -> int:
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
     _refuse_options(args, kind, source)
-    if kind == "flight":
+    if args.flight is not None:
+        imported, platform = flight_messages(args.flight, _instead(args, kind, source))
+        result = _write(source, imported, output, platform, shown=not args.quiet and not args.json)
+    elif kind == "flight":
         imported, platform = flight_messages(source)
         result = _write(source, imported, output, platform, shown=not args.quiet and not args.json)
     elif kind == "camera":
@@ -145,12 +156,30 @@ def run(args: argparse.Namespace) -> int:
         )
         imported = read_any(source, kind, options)
         result = _write(source, imported, output, "demo", shown=not args.quiet and not args.json)
-    result = {"input": str(source), "kind": kind, "output": str(output), **result}
+    flight = {} if args.flight is None else {"flight": str(args.flight)}
+    result = {"input": str(source), "kind": kind, **flight, "output": str(output), **result}
     if args.json:
         print(json.dumps(result, indent=2))
     elif not args.quiet:
         _print_summary(result)
     return 0
+
+
+def _instead(args: argparse.Namespace, kind: str, source: Path) -> Instead:
+    """What the input is in place of, in the flight folder.
+
+    Raises
+    ------
+    UserError : an input that is no part of a flight
+    """
+    if kind not in (*NAVIGATION, "lines"):
+        raise UserError(f"--flight: goes with poses, sensors, a ROS 2 bag or image lines, not with {KINDS[kind]}")
+    lines = _lines(args, kind)
+    if kind == "lines":
+        return Instead(day=args.date, lines=image_alone(source, lines))
+    if lines is not None and not lines.files and lines.rate_hz is None and not lines.strip:
+        lines = None  # the image topics of the folder
+    return Instead(source, kind, args.date, lines)
 
 
 def _check_numbers(args: argparse.Namespace) -> None:
@@ -261,6 +290,8 @@ def _refuse_options(args: argparse.Namespace, kind: str, source: Path) -> None:
     """Raise UserError for an option that has no effect on what is imported."""
     given = [name for name in _OPTIONS if getattr(args, name) is not None]
     for name in given:
+        if args.flight is not None and name not in _BESIDE_FLIGHT:
+            raise UserError(f"{_flag(name)} does not go with --flight: it stands in {args.flight / FILE}")
         if name not in GO_WITH[kind]:
             what = "a flight folder: it stands in flight.toml" if kind == "flight" else KINDS[kind]
             raise UserError(f"{_flag(name)} does not go with {what}")
@@ -308,7 +339,8 @@ def _with_progress(messages: Iterable[Message], shown: bool) -> Iterator[Message
 
 
 def _print_summary(result: dict[str, Any]) -> None:
-    print(f"{result['input']} ({KINDS[result['kind']]}) -> {result['output']}")
+    flight = f" with {result['flight']}" if "flight" in result else ""
+    print(f"{result['input']} ({KINDS[result['kind']]}){flight} -> {result['output']}")
     for topic, count in result.get("messages", {}).items():
         print(f"  {topic:24s} {count:8d}")
     if "seconds" in result:

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="raster of heights, in place of height_m: pixels are where their rays meet it, ground points lie on it; "
         "may be given again, or a folder of tiles",
     )  # fmt: skip
-    parser.add_argument("--dem-crs", metavar="CRS", help="of the raster in place of its own; or ellipsoid, EPSG:5773 .. alone")
+    parser.add_argument("--dem-crs", metavar="CRS", help="of the raster; or ellipsoid, EPSG:5773 .. alone")
     parser.add_argument("--dem-datum", metavar="DATUM", help=f"of its heights: {DATUMS}")
     parser.add_argument("--model", choices=("rigorous", "rpc"), help="where the file has both (default: rigorous)")
     parser.add_argument(

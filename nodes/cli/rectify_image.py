@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("shift", "affine", "camera"),
         help="by control: of the image, or of the parameters of a frame camera (default: affine)",
     )
-    group.add_argument("--dem-crs", metavar="CRS", help="of the raster in place of its own; or ellipsoid, EPSG:5773 .. alone")
+    group.add_argument("--dem-crs", metavar="CRS", help="of the raster; or ellipsoid, EPSG:5773 .. alone")
     group.add_argument("--dem-datum", metavar="DATUM", help=f"what heights are above: {DATUMS}")
     group.add_argument(
         "--bounds",

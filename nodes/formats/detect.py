@@ -290,18 +290,28 @@ def _strip_of(options: Options, lines: LinesGiven, track: NavigationTrack | None
     return open_strip(lines, options.camera, None if track is None else track.time_ns)
 
 
-def _image_alone(path: Path, options: Options) -> Imported:
-    """A recording of image lines and nothing else."""
-    if options.lines is None:
+def image_alone(path: Path, lines: LinesGiven | None) -> LinesGiven:
+    """What is said of images, where the input is one of them.
+
+    Raises
+    ------
+    UserError : nothing is said of its times, or of other images only
+    """
+    if lines is None:
         raise UserError(
             f"{path}: times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"
         )
-    files = options.lines.files or (("", path, None),)
+    files = lines.files or (("", path, None),)
     if not any(file.exists() and file.samefile(path) for _, file, _ in files):
         raise UserError(
             f"{path}: an image that --lines does not name; wanted poses or sensors as input, or it in --lines"
         )
-    strip = open_strip(replace(options.lines, files=files), options.camera)
+    return replace(lines, files=files)
+
+
+def _image_alone(path: Path, options: Options) -> Imported:
+    """A recording of image lines and nothing else."""
+    strip = open_strip(image_alone(path, options.lines), options.camera)
     notes = [*strip.notes, f"{path.name}: image lines alone: no poses, and no configuration/project"]
     start = int(strip.time_ns[0])
     camera = options.camera

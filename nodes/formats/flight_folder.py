@@ -110,6 +110,23 @@ _ZERO = (0.0, 0.0, 0.0)
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Instead:
+    """Data of a flight that are named beside its folder, in place of those in it.
+
+    Attributes
+    ----------
+    navigation, kind : file of poses or sensors, one of `NAVIGATION`; None for that of the folder
+    day : of the flight; None for what the folder says
+    lines : image files of a strip, or topics of a bag; None for the strips of the folder
+    """
+
+    navigation: Path | None = None
+    kind: str = ""
+    day: date | None = None
+    lines: LinesGiven | None = None
+
+
 @dataclass
 class Flight:
     """What a ``flight.toml`` says, read and checked.
@@ -179,7 +196,7 @@ class Flight:
         return None
 
 
-def read_flight(folder: Path, live: bool | None = None) -> Flight:
+def read_flight(folder: Path, live: bool | None = None, instead: Instead | None = None) -> Flight:
     """A flight folder with all that is wrong in it among its ``problems``.
 
     Parameters
@@ -187,12 +204,14 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
     folder : with a flight.toml
     live : the data are still to come: files of navigation and images are not wanted. None = where the file names
         sensors and no file of navigation
+    instead : data that are not those in the folder; strips without images are left out then
 
     Raises
     ------
     UserError : no flight.toml, or one that is not TOML
     """
     path = folder / FILE
+    others = instead or Instead()
     if not path.is_file():
         if folder.is_file():
             raise UserError(f"{folder}: is a file, wanted a folder with {FILE}")
@@ -209,13 +228,20 @@ def read_flight(folder: Path, live: bool | None = None) -> Flight:
     flight.attempt(lambda: _general(flight, tables["flight"]))
     flight.attempt(lambda: _camera(flight, tables["camera"]))
     flight.attempt(lambda: _mounting(flight, tables["mounting"]))
-    flight.attempt(lambda: _navigation(flight, tables["navigation"], live))
+    flight.attempt(lambda: _navigation(flight, tables["navigation"], live, others))
     flight.attempt(lambda: _errors(flight, tables["navigation"], tables["trajectory"], tables["imu"]))
     flight.attempt(lambda: _ground(flight, tables["dem"], tables["flight"]))
     flight.attempt(lambda: _control(flight, tables["control"], tables["flight"]))
-    for keys in strips or []:
+    given = others.lines if others.lines is not None and others.lines.topics is None and others.lines.files else None
+    for keys in strips or [] if given is None else []:
+        if instead is not None and not keys.has("images"):
+            id = keys.raw("id")
+            flight.notes.append(f"{FILE}: {keys.name('id')}: {id!r} has no images: the recording has no lines of it")
+            continue
         flight.attempt(lambda keys=keys: (_announced if live else _strip)(flight, keys))
-    if not strips and not live and flight.kind != "ros2":
+    if given is not None:
+        flight.attempt(lambda: _open(flight, replace(given, day=flight.day), as_keys=False))
+    elif not strips and not live and flight.kind != "ros2":
         flight.notes.append(f"{FILE}: no [[strips]]: the recording has no image lines")
     raw = flight.kind == "ros2" or (flight.tables is not None and flight.tables.time_s is not None)
     stated = ["mounting.camera_lever_arm_m"] if any(flight.mounting.lever_arm_m) else []
@@ -275,14 +301,19 @@ def live_configuration(flight: Flight, origin_deg: tuple[float, float], stamp_ns
     ]
 
 
-def flight_messages(folder: Path) -> tuple[Imported, str]:
+def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Imported, str]:
     """The messages of a flight folder sorted by stamp and rank, and the name of its platform.
+
+    Parameters
+    ----------
+    folder : with a flight.toml
+    instead : data that are not those in the folder
 
     Raises
     ------
     UserError : the first problem of the folder and the number of the others, or what a reader finds
     """
-    flight = read_flight(folder, live=False)
+    flight = read_flight(folder, live=False, instead=instead)
     refuse_problems(flight)
     if flight.navigation is None or flight.camera is None:
         raise UserError(f"{folder / FILE}: navigation or camera missing")
@@ -454,25 +485,31 @@ def _mounting(flight: Flight, keys: Keys) -> None:
     flight.mounting = Mounting(three("camera_lever_arm_m"), three("boresight_deg"))
 
 
-def _navigation(flight: Flight, keys: Keys, live: bool) -> None:
+def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> None:
     day = keys.raw("date")
     if day is not None and (not isinstance(day, date) or hasattr(day, "hour")):
         raise keys.refuse("date", "a day as 2024-05-17, without quotes")
-    flight.day = day
+    flight.day = day = instead.day or day
     kind = keys.text("kind", "")
     if kind and kind not in NAVIGATION:
         raise keys.refuse("kind", f"one of {', '.join(NAVIGATION)}")
     if live:
         return
-    if not keys.has("file"):
+    if instead.navigation is not None:
+        path, kind = instead.navigation, instead.kind
+    elif not keys.has("file"):
         raise keys.refuse("file", "poses or sensors of the flight; or, for `triline fly`, [[sensor]] tables")
-    path = _beside(flight, keys, "file", keys.text("file"))
-    kind = kind or kind_of_path(path)
-    if kind not in NAVIGATION:
-        raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
-    if kind == "ros2":
-        _image_topics(flight, keys)
     else:
+        path = _beside(flight, keys, "file", keys.text("file"))
+        kind = kind or kind_of_path(path)
+        if kind not in NAVIGATION:
+            raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
+    if kind == "ros2":
+        if instead.lines is not None:
+            flight.lines = instead.lines
+        else:
+            _image_topics(flight, keys)
+    elif instead.navigation is None:
         of_bag = [keys.name(key) for key in ("images", "line_rate_hz") if keys.has(key)]
         flight.problems.extend(f"{keys.path}: {key}: goes with a ROS 2 bag, not with {KINDS[kind]}" for key in of_bag)
     options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
@@ -633,19 +670,23 @@ def _strip(flight: Flight, keys: Keys) -> None:
         raise keys.refuse("type", f"one of {', '.join(TYPES)}")
     given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day, raw)
     track = flight.track
-    pose_times = track.time_ns if track is not None and track.line_rate_hz > 0 else None
-    if times is None and first is None and pose_times is None:
+    if times is None and first is None and (track is None or track.line_rate_hz <= 0):
         raise UserError(
             f"{keys.path}: {keys.where}: times of the lines missing, wanted line_times, or first_time and line_rate_hz"
         )
     if raw is not None and not raw[1] and flight.camera is None:
         return  # how long its lines are would be known from the camera, and what is wrong with that is told
-    strip = open_strip(given, flight.camera, pose_times)
+    _open(flight, given)
+
+
+def _open(flight: Flight, given: LinesGiven, *, as_keys: bool = True) -> None:
+    """Add the images of a strip; ``as_keys`` where a flight.toml names them, and not options."""
+    track = flight.track
+    strip = open_strip(given, flight.camera, track.time_ns if track is not None and track.line_rate_hz > 0 else None)
     if flight.span_ns is not None:
         strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
-    if flight.camera is None:  # told once, with the camera
-        strip = replace(strip, notes=())
-    flight.strips.append(replace(strip, notes=tuple(_in_keys(note) for note in strip.notes)))
+    notes = () if flight.camera is None else strip.notes  # a missing camera is told once
+    flight.strips.append(replace(strip, notes=tuple(_in_keys(note) if as_keys else note for note in notes)))
 
 
 def _node(nodes: Keys, name: str) -> None:

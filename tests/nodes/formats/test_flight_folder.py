@@ -494,3 +494,74 @@ def test_what_is_wrong_is_told_with_keys_and_no_options(folder, capsys, change, 
     assert main(["check", str(folder)]) == 1
     said = capsys.readouterr()
     assert told in said.out and "--" not in said.out, said.out
+
+
+# -- data that are not in the folder -------------------------------------------------------------------------------
+
+
+def test_poses_beside_a_folder_take_the_place_of_its_navigation(folder, tmp_path, capsys):
+    within, beside = tmp_path / "within.mcap", tmp_path / "beside.mcap"
+    assert main(["import", str(folder), "-o", str(within), "-q"]) == 0
+    (tmp_path / "office").mkdir()
+    poses = (folder / "poses.csv").rename(tmp_path / "office" / "poses.csv")
+    assert main(["import", str(poses), "--flight", str(folder), "-o", str(beside)]) == 0
+    assert f"{poses} (trajectory as CSV) with {folder} -> {beside}" in capsys.readouterr().out
+    assert beside.read_bytes() == within.read_bytes()
+
+
+def test_poses_of_a_flight_that_was_live(folder, tmp_path, capsys):
+    """Its folder has sensors and announced strips; the poses come from the office, GPS seconds with their day."""
+    poses = (folder / "poses.csv").rename(tmp_path / "poses.csv")
+    live = TOML.replace('file = "poses.csv"\ndate = 2020-06-01\n', "").partition("[[strips]]")[0]
+    live += '[[strips]]\nid = "S1"\n[[sensor]]\nkind = "stream"\naddress = "listen://127.0.0.1:5555"\n'
+    (folder / "flight.toml").write_text(live)
+    out = tmp_path / "o.mcap"
+    day = ["--date", "2020-06-01"]
+    assert main(["import", str(poses), "--flight", str(folder), "-o", str(out), "--json", *day]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["flight"] == str(folder) and told["messages"]["observation/control"] == 3
+    assert "flight.toml: strips[0].id: 'S1' has no images: the recording has no lines of it" in told["notes"]
+    reader = RecordingReader(out)
+    assert next(iter(reader.messages(["trajectory/smoothed"]))).stamp_ns == ns(START)
+    lines = ["--lines", f"N={folder / 'nadir.img'}", "--first-time", "2020-06-01T12:00:03Z", "--line-rate", "50"]
+    assert main(["import", str(poses), "--flight", str(folder), "-o", str(out), "-q", *day, *lines]) == 0
+    strips = [message.body for message in RecordingReader(out).messages(["configuration/strip"])]
+    assert [(s.id, s.lines) for s in strips] == [("nadir", 20)] * 2
+
+
+def test_image_lines_beside_a_folder_take_the_place_of_its_strips(folder, tmp_path, capsys):
+    image = folder / "nadir.img"
+    out = tmp_path / "o.mcap"
+    times = ["--first-time", "2020-06-01T12:00:02Z", "--line-rate", "40", "--strip", "S9"]
+    command = ["import", str(image), "--flight", str(folder), "-o", str(out)]
+    assert main([*command, "--lines", f"N={image}", *times]) == 0
+    assert "no image of the CCD lines F, B of the camera" in capsys.readouterr().out
+    reader = RecordingReader(out)
+    strips = [message.body for message in reader.messages(["configuration/strip"])]
+    assert [(s.id, s.lines, s.line_rate_hz) for s in strips] == [("S9", 20, 40.0)] * 2
+    assert len(list(reader.messages(["trajectory/smoothed"]))) == 6
+    late = [*times[:1], "2020-06-01T14:00:02Z", *times[2:]]
+    assert main([*command, "--lines", f"N={image}", *late]) == 1
+    assert "strip S9: lines from 2020-06-01T14:00:02Z" in capsys.readouterr().err
+    assert main(command) == 1
+    assert "its CCD line is not said, wanted --lines F=nadir.img" in capsys.readouterr().err
+
+
+def test_what_does_not_go_beside_a_folder(folder, tmp_path, capsys):
+    poses, out = str(folder / "poses.csv"), str(tmp_path / "o.mcap")
+    block = tmp_path / "block"
+    block.mkdir()
+    for name in ("camera.json", "strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv"):
+        (block / name).write_text("")
+    for arguments, told in (
+        ([poses, "--flight", str(folder), "--camera", "ads40"], "--camera does not go with --flight: it stands in "),
+        ([poses, "--flight", str(tmp_path)], "no flight.toml; `triline new flight"),
+        ([str(block), "--flight", str(folder)], "--flight: goes with poses, sensors, a ROS 2 bag or image lines, not "),
+        ([str(folder), "--flight", str(folder)], "not with flight folder (flight.toml)"),
+    ):
+        assert main(["import", *arguments, "-o", out]) == 1
+        error = capsys.readouterr().err
+        assert told in error and error.count("\n") == 1, error
+    (folder / "camera.json").unlink()
+    assert main(["import", poses, "--flight", str(folder), "-o", out]) == 1
+    assert "camera.file: no camera.json in the folder" in capsys.readouterr().err
