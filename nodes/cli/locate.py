@@ -237,7 +237,8 @@ def _met(model: PushbroomSensor | Rpc, u: Array, v: Array, terrain: HeightRaster
         if not len(some):
             continue
         located[some] = np.column_stack([met.lat, met.lon, met.height_m])[here]
-        slope[some] = ground_slopes(terrain, *located[some].T, terrain.ellipsoid)
+        lat, lon, height_m = located[some].T
+        slope[some] = ground_slopes(terrain, lat, lon, height_m, terrain.ellipsoid)
     return located, slope
 
 

@@ -34,8 +34,15 @@ LONGEST = 4.0
 class Direct(Protocol):
     """Any model with direct location."""
 
-    lines: int
-    samples: int
+    @property
+    def lines(self) -> int:
+        """Lines of the image."""
+        ...
+
+    @property
+    def samples(self) -> int:
+        """Samples of a line."""
+        ...
 
     def direct(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
         """Latitude, longitude (radians) and height, (n, 3)."""
