@@ -36,6 +36,9 @@ from .problem import Solution
 
 #: Bandwidths of corrections over that of the noise for which the share left is computed; linear between.
 _LOWEST, _HIGHEST, _STEPS = 1e-2, 1e2, 81
+#: Variance of a contrast between three views, F - 2 N + B with N against the others, over that of independent looks.
+#: Derived.
+IN_STEP = 16.0 / 6.0
 #: Information is counted in pieces of so long, s.
 PIECE_S = 2.0
 
@@ -147,6 +150,20 @@ def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], model: Model
 KEPT_S = 200.0
 #: The noise that is left has to differ by so much of its standard deviation for rays to be weighted again.
 NOISE_CHANGED = 0.15
+
+
+def in_step(share: float) -> float:
+    """Factor by which the variance of what all points say of the difference between views may be larger than stated.
+
+    Looks at a point come from the views one after another, always so long apart. Where the attitude vibrates in step
+    with that, all points show the same contrast between the views, and their number does not tell it from a camera
+    that is off, or from a source that drifts.
+
+    Parameters
+    ----------
+    share : of the variance of looks that may be a vibration
+    """
+    return 1.0 + (IN_STEP - 1.0) * share
 
 
 class PoseNoise:

@@ -32,7 +32,9 @@ class Drifting:
     of_ray: IntArray
 
 
-def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: float) -> list[Cell]:
+def cells_of(
+    drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: float, vibration: float = 0.0
+) -> list[Cell]:
     """Cells of batches whose rays belong to the same groups; what goes ray by ray is computed for all of them at once.
     For the equations see `Batch.border`.
 
@@ -40,6 +42,7 @@ def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: f
     ----------
     strip : its place
     start_s, unit_s : when the drifts began, and their unit of time
+    vibration : noise of the attitude from look to look, rad
     """
     batches, present = [d.batch for d in drifting], drifting[0].present
     ends = np.cumsum([len(b.rays) for b in batches])
@@ -65,7 +68,8 @@ def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: f
     coupling = np.add.reduceat(np.swapaxes(W, 1, 2) @ effect, of_points, axis=0)
     noise = np.concatenate([b.pose_covariance[d.use, :3, :3] for b, d in zip(batches, drifting, strict=True)])
     of_position = orientation[:, :3].transpose(2, 0, 1)[use]
-    variances = ((of_position @ noise) * of_position).sum(axis=(1, 2))
+    variances = 0.5 * ((of_position @ noise) * of_position).sum(axis=(1, 2))
+    vibrating = 0.5 * vibration**2 * (orientation[:, 3:] ** 2).sum(axis=(0, 1))[use]
     places = (EACH * present[:, None] + np.arange(EACH)).ravel()
     cells: list[Cell] = []
     point = used = 0
@@ -75,7 +79,8 @@ def cells_of(drifting: Sequence[Drifting], strip: int, start_s: float, unit_s: f
         border = batch.border(own, of_batch)
         counts = np.zeros(MOST_GROUPS, dtype=np.int64)
         counts[present] = np.bincount(d.of_ray, minlength=len(present))
-        shared = 0.5 * float(variances[used : used + len(d.use)].sum())
-        cells.append(Cell(batch.information, batch.weight, strip, places, border, counts, shared, own, of_batch))
+        here = slice(used, used + len(d.use))
+        shares = np.array([variances[here].sum(), vibrating[here].sum()])
+        cells.append(Cell(batch.information, batch.weight, strip, places, border, counts, shares, own, of_batch))
         point, used = point + batch.n_points, used + len(d.use)
     return cells

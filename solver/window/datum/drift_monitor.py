@@ -32,6 +32,7 @@ from ...adjustment.drift_hypotheses import (
     covers,
     hypotheses,
 )
+from ...adjustment.pose_noise import in_step
 from ...arrays import Array, IntArray
 from ...navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from ..state.batch import Batch, Information
@@ -80,7 +81,7 @@ class DriftMonitor:
         self._groups: dict[Group, int] = {}
         self._cells: dict[int, tuple[Batch, Cell]] = {}
         self._left = Border.of(MOST_GROUPS * EACH)  # of all batches that have left the window
-        self._left_rays, self._left_shared = np.zeros(MOST_GROUPS, dtype=np.int64), 0.0
+        self._left_rays, self._left_shares = np.zeros(MOST_GROUPS, dtype=np.int64), np.zeros(2)
         self._suspicion = Suspicion(self._alpha)
         self._limit = 0.0
         self._drift: tuple[IntArray, Array, Array] | None = None
@@ -145,7 +146,7 @@ class DriftMonitor:
         for cell in cells.values():
             self._left.join(cell.places, cell.border)
             self._left_rays += cell.rays
-            self._left_shared += cell.shared
+            self._left_shares += cell.shares
         return cells
 
     def _take(self, batches: Sequence[Batch]) -> list[Cell | None]:
@@ -176,7 +177,7 @@ class DriftMonitor:
                 alike.setdefault(present.tobytes(), []).append((i, Drifting(batch, use, present, of_ray)))
         for some in alike.values():
             of_some = [drifting for _, drifting in some]
-            made = cells_of(of_some, self._strip, self._start_s, DRIFT_S)
+            made = cells_of(of_some, self._strip, self._start_s, DRIFT_S, self._network.pose_noise.vibration)
             for (i, _), cell in zip(some, made, strict=True):
                 cells[i] = cell
         return cells
@@ -206,19 +207,21 @@ class DriftMonitor:
     def _assembled(self, now_s: float, cells: dict[int, Cell]) -> tuple[Border, list[Hypothesis], float]:
         """The border of these batches and those that have left, beside all unknowns of the state, at theta = 0; what
         may drift; and the `design_effect` by which the variance of scores is larger than stated."""
-        rays, shared = self._left_rays.copy(), self._left_shared
+        rays, shares = self._left_rays.copy(), self._left_shares.copy()
         border = Border.of(len(self._left), self._network.state.numbers)
         border.join(np.arange(len(self._left)), self._left)
         border.join_all((cell.places, cell.border) for cell in cells.values())
         for cell in cells.values():
             rays += cell.rays
-            shared += cell.shared
+            shares += cell.shares
         border.keep(np.arange(EACH * len(self._groups)))
         total = int(rays.sum())
         if not total:
             return border, [], 1.0
         rate = total / len({ccd for _, ccd in self._groups}) / max(now_s - self._start_s, 1.0)
-        factor = design_effect(rate, shared / total, self._network.trajectory.noise_time_s, self._follows)
+        share, vibrating = (shares / total).tolist()
+        factor = design_effect(rate, share, self._network.trajectory.noise_time_s, self._follows)
+        factor += in_step(vibrating) - 1.0
         return border, hypotheses(list(self._groups), rays[: len(self._groups)].tolist()), factor
 
     # -- the test ------------------------------------------------------------------------------------------------------

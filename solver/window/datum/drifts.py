@@ -44,7 +44,8 @@ class Cell:
     places : (k,) of the unknowns among those of the strip
     border : the unknowns beside those of the batch, at theta = 0
     rays : (MOST_GROUPS,) how many rays each group has
-    shared : share of the variance of a ray that is noise of its position, summed over the rays
+    shares : (2,) of the variance of a ray that are noise of its position and a vibration of its attitude, summed over
+        the rays
     effect : (n, 2, k) of the unknowns on the whitened residuals
     coupling : (p, 3, k) how the points hang on the unknowns, see `Batch.coupling`
     """
@@ -55,7 +56,7 @@ class Cell:
     places: IntArray
     border: Border
     rays: IntArray
-    shared: float
+    shares: Array
     effect: Array
     coupling: Array
 

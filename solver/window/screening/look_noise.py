@@ -70,6 +70,13 @@ class NoiseOfLooks:
         """Whether no other noise is in force than what was stated at first."""
         return self._network.sigmas.image == 1.0 and self._network.pose_noise.vibration == 0.0
 
+    def unstated(self, ratio: float) -> float:
+        """Share of the variance of looks that nobody stated at first, where it is so many times what is stated now."""
+        sigmas, noise = self._network.sigmas, self._network.pose_noise
+        pixel, sigma = _pixel_and_sigma([b.rays for b in list(self._network.batches)[-MOST_JUDGED:]])
+        total = sigmas.image**2 + (noise.vibration / pixel / (sigma / sigmas.image)) ** 2
+        return 1.0 - 1.0 / (total * ratio)
+
     def ratio_now(self) -> float:
         """As `median_ratio`, of the newest looks, judged by the solution as it is now."""
         judged = [b.judge(self._network.state)[1] for b in list(self._network.batches)[-MOST_JUDGED:]]

@@ -146,8 +146,8 @@ class SigmaCheck:
             if not calibration.is_contradicted(variance):
                 break
             now = max(variance, self._looks.ratio_now())
-            as_stated = self._looks.is_as_stated() and now < CLEARLY
-            if not calibration.is_contradicted(now, as_stated) or self._constants_instead(strip):
+            unstated = 0.0 if self._looks.is_as_stated() and now < CLEARLY else self._looks.unstated(now)
+            if not calibration.is_contradicted(now, unstated) or self._constants_instead(strip):
                 break
             calibration.state_larger(now)
             self._network.state.solve()

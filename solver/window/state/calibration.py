@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...adjustment.pose_noise import in_step
 from ...arrays import Array
 from ...camera.displacement import Displacement, most_certain
 from ...camera.line_camera import LineCamera
@@ -12,10 +13,8 @@ from ...quantiles import chi2
 from .beforehand import KnownBeforehand
 from .unknowns import WindowState
 
-#: Probability that a camera as calibrated is questioned by one look where the noise of looks is as stated, and where it
-#: is not: how that is distributed, and what looks have in common, is not known (statistical levels). Tuned: a vibration
-#: of 0.01 deg is taken for the camera in none of 32 strips; with one level, and noise as it was found last, in 8.
-QUESTIONED, QUESTIONED_IN_NOISE = 1e-3, 1e-5
+#: Probability that a camera as calibrated is questioned by one look (statistical level).
+QUESTIONED = 1e-3
 #: All sigmas are stated so many times as large in one look, at least and at most. Tuned.
 LEAST, MOST = 1.5, 3.0
 #: Factors that are tried for the likelihood. Tuned.
@@ -47,7 +46,7 @@ class LiveCalibration(KnownBeforehand):
         """Whether sigmas may be stated larger."""
         return bool(self._questioned.any())
 
-    def is_contradicted(self, variance: float, as_stated: bool = True) -> bool:
+    def is_contradicted(self, variance: float, unstated: float = 0.0) -> bool:
         """Whether the solution contradicts the sigmas as a whole.
 
         A lens, or the place of a CCD line, that is not as calibrated is in many parameters, which are correlated: so
@@ -56,10 +55,10 @@ class LiveCalibration(KnownBeforehand):
         Parameters
         ----------
         variance : of looks, as they disagree, over that of right sigmas; 1 at least
-        as_stated : whether the noise of looks is as it was stated
+        unstated : share of that variance that nobody stated: it may be a vibration, see `in_step`
         """
-        test, m = self._test(variance)
-        return m > 0 and bool(test > chi2.isf(QUESTIONED if as_stated else QUESTIONED_IN_NOISE, m))
+        test, m = self._test(variance * in_step(unstated))
+        return m > 0 and bool(test > chi2.isf(QUESTIONED, m))
 
     def state_larger(self, variance: float) -> None:
         """State the sigmas as much larger as the solution asks for; they are contradicted."""

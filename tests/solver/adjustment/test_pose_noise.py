@@ -7,7 +7,7 @@ import pytest
 
 from triline.solver.adjustment.adjustment import solve
 from triline.solver.adjustment.job import Job, run
-from triline.solver.adjustment.pose_noise import followed, share_left, with_noise_left
+from triline.solver.adjustment.pose_noise import followed, in_step, share_left, with_noise_left
 from triline.solver.adjustment.problem import pose_problem
 from triline.solver.adjustment.robust import Huber
 from triline.solver.camera.self_calibration import tls
@@ -133,3 +133,14 @@ def test_the_batch_adjustment_states_as_much_of_the_noise_as_the_window_does():
     by_window = np.diagonal(window.network.pose_noise.usual)[:3]
     assert np.median(share, axis=0) == pytest.approx(by_window, rel=0.15) and by_window.max() < 0.8
     assert whole.sigma0 < found.sigma0 - 0.05 and found.sigma0 == pytest.approx(1.0, abs=0.12)
+
+
+def test_looks_in_step_say_less_than_they_count():
+    """Three looks at each of many points, of a sine at a random phase, in all delays between the views."""
+    phase = np.random.default_rng(5).uniform(0.0, 2.0 * np.pi, (400, 1, 1))
+    first, second = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 49), np.linspace(0.0, 2.0 * np.pi, 49))
+    F, N, B = np.sin(phase), np.sin(phase + first), np.sin(phase + first + second)
+    of_contrast = ((F - 2.0 * N + B) ** 2).mean(axis=0) / (6.0 * 0.5)
+    assert of_contrast.max() == pytest.approx(in_step(1.0), rel=0.05)
+    assert of_contrast.mean() == pytest.approx(1.0, rel=0.05)  # over all delays they are as independent ones
+    assert in_step(0.0) == 1.0

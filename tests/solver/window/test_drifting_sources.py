@@ -12,6 +12,7 @@ import pytest
 from triline.solver.adjustment.dense_in_parts import in_one_go
 from triline.solver.adjustment.drift_hypotheses import ALL, EACH, Hypothesis, Scores, Suspicion, hypotheses
 from triline.solver.adjustment.eliminated_points import eliminated
+from triline.solver.camera.line_camera import finest_pixel
 from triline.solver.camera.self_calibration import tls
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors
 from triline.solver.simulation.error_models import ErrorModel
@@ -29,6 +30,7 @@ from triline.solver.window.block.backward import LeftPoints
 from triline.solver.window.datum.drift_monitor import DRIFT_S, DriftMonitor
 from triline.solver.window.datum.drifts import Compensation, Named, estimated, of_block
 from triline.solver.window.results import AdjustedPoint, Look, WindowOptions
+from triline.solver.window.state.maker import BatchMaker
 from triline.solver.window.state.unknowns import Border
 from triline.solver.window.window import Window
 
@@ -99,6 +101,30 @@ def test_the_test_value_is_what_the_adjustment_gains_by_the_drift(flight):
         assert before - cost(corrected) == pytest.approx(values[h.name[1]], rel=0.04)
     # the three are almost parallel, so that noise decides which is the largest
     assert min(values.values()) > 30.0 and max(values.values()) < 1.2 * min(values.values())
+
+
+def test_a_vibration_makes_a_drift_less_sure(flight):
+    """What looks have in step may be a drift: the limit grows with the share of the noise that is a vibration."""
+    simulation, poses = flight
+    window = adjust_at_once(simulation, poses, WindowOptions(snoop=False), until_s=20.0).window
+    assert window is not None
+    network = window.network
+
+    def factor(vibration: float) -> float:
+        network.pose_noise.vibration = vibration
+        batches, monitor = list(network.batches), DriftMonitor(network)
+        BatchMaker(network).refresh(batches)
+        for batch in batches:
+            network.batches.linearise(batch, network.state.values(batch.columns), reweigh=True)
+        monitor._strip = 0
+        monitor._take(batches)
+        return monitor._assembled(20.0, monitor._in_border(batches))[2]
+
+    pixel = finest_pixel(network.camera)
+    without = factor(0.0)
+    for pixels in (0.5, 1.5):
+        share = pixels**2 / (pixels**2 + 0.3**2)
+        assert factor(pixels * pixel) - without == pytest.approx((16.0 / 6.0 - 1.0) * share, rel=0.12)
 
 
 def test_points_are_what_they_are_without_the_drift(flight):
