@@ -394,7 +394,7 @@ class Adjuster(Node):
         for image in body.images:
             look = Look(
                 image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma,
-                image.sigma_sample or sigma, source,
+                image.sigma_sample or sigma, source, self._seconds(image.time_ns) if image.time_ns else np.nan,
             )  # fmt: skip
             if body.point:
                 self._window.add_look(body.point, look)

@@ -89,7 +89,7 @@ class AdjustedStrips:
         if self._by_poses and not known:  # a strip that the window refused is not followed
             self._stated[body.id] = slow, slow
         if body.ended:
-            window.end_strip(body.id, int(body.lines))
+            window.end_strip(body.id, int(body.lines), first_s + body.lines / body.line_rate_hz)
 
     def held(self) -> list[Any]:
         """Strips that wait."""

@@ -63,7 +63,10 @@ def not_carried(block: BlockData) -> list[str]:
             u = np.arange(len(strip.line_time_s))
             rate = strip.line_rate_hz
             off = float(np.abs((strip.line_time_s - strip.line_time_s[0]) * rate - u).max())
-            notes.append(f"strip {strip.id}: line times become a constant rate, off by {off:.2f} lines at most")
+            notes.append(
+                f"strip {strip.id}: its line times are off a constant rate by {off:.2f} lines at most: image points "
+                "keep theirs, the strip has the rate"
+            )
         if not strip.lines:
             notes.append(
                 f"strip {strip.id}: number of lines not known, taken as the {lines_of(strip)} under its trajectory"

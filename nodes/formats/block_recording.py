@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ...schemas import messages as m
 from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
-from ...solver.adjustment.network import Strip
+from ...solver.adjustment.network import SAME_S, Strip, most_off
+from ...solver.arrays import Array
 from ...solver.geometry.frames import CrsError
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
@@ -48,6 +49,7 @@ class _Collected:
     ground: dict[str, Any] = field(default_factory=dict)
     refused: set[str] = field(default_factory=set)
     ties: list[tuple[str, Any]] = field(default_factory=list)
+    times: dict[str, list[tuple[float, int]]] = field(default_factory=dict)  # lines of strips and their UTC, ns
     poses: dict[str, list[tuple[int, str, Any]]] = field(default_factory=dict)
 
     def add(self, message: Message) -> None:
@@ -69,6 +71,9 @@ class _Collected:
             (self.refused.discard if body.accepted else self.refused.add)(body.point)
         elif message.topic == "observation/tie":
             self.ties.extend((body.point, image) for image in body.images)
+            for image in body.images:
+                if image.time_ns:
+                    self.times.setdefault(image.strip, []).append((image.line, image.time_ns))
         elif message.topic in ("trajectory/filtered", "trajectory/smoothed"):
             stamp = body.timestamp.seconds * SECOND_NS + body.timestamp.nanos
             self.poses.setdefault(message.topic, []).append((stamp, body.strip, body))
@@ -131,7 +136,7 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
             "the same one as those after"
         )
     ground = _ground_of(found, notes)
-    point_ids, image = _image_of(found, camera, strips, ground, apriori)
+    point_ids, image = _image_of(found, camera, strips, ground, apriori, reference)
     frame = local_frame(project)
     notes += _notes_of_heights(frame.crs, name)
     return BlockData(
@@ -166,6 +171,9 @@ def _strips_of(
         start, end = body.first_line_time_ns, body.first_line_time_ns
         if lines and rate > 0:
             end += round((lines - 1) / rate * 1e9)
+        looks = _times_stated(found, body) if rate > 0 else None
+        if looks is not None and len(looks[1]):
+            end = max(end, int(looks[1][-1]))
         own = np.flatnonzero(label == id)
         if len(own):
             start, end = min(start, int(time_ns[own[0]])), max(end, int(time_ns[own[-1]]))
@@ -187,20 +195,45 @@ def _strips_of(
         )
         noise = _noise_of(bodies, slow)
         lens = id.rpartition("/")[2] if "/" in id else None
-        strips.append(
-            Strip(
-                id,
-                trajectory,
-                first,
-                rate,
-                lines,
-                lens=lens if lens in lenses else None,
-                noise=noise,
-                noise_time_s=bodies[-1].noise_time_s,
-                gap_s=largest_step_ns(time_ns[rows]) / SECOND_NS,
-            )
+        strip = Strip(
+            id,
+            trajectory,
+            first,
+            rate,
+            lines,
+            lens=lens if lens in lenses else None,
+            noise=noise,
+            noise_time_s=bodies[-1].noise_time_s,
+            gap_s=largest_step_ns(time_ns[rows]) / SECOND_NS,
         )
+        if looks is not None:
+            strip = replace(strip, line_time_s=_line_times(strip, looks[0], (looks[1] - reference) * 1e-9))
+        strips.append(strip)
     return tuple(strips)
+
+
+def _times_stated(found: _Collected, body: Any) -> tuple[Array, NDArray[np.int64]]:
+    """Lines (k,) of a strip and their UTC (k,), ns, as image points state them: in the order of the lines, later and
+    later. Times that cannot be those of their lines are left out, as on line."""
+    stated = found.times.get(body.id, [])
+    line, time_ns = np.array([u for u, _ in stated]), np.array([t for _, t in stated], dtype=np.int64)
+    since_s = line / body.line_rate_hz
+    good = np.abs((time_ns - body.first_line_time_ns) * 1e-9 - since_s) <= most_off(since_s)
+    good &= line >= -0.5
+    line, first = np.unique(line[good], return_index=True)
+    time_ns = time_ns[good][first]
+    later = np.concatenate([[True], time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]])[: len(line)]
+    return line[later], time_ns[later]
+
+
+def _line_times(strip: Strip, line: Array, time_s: Array) -> Array | None:
+    """Times of all lines of a strip through those that are known (k,); None where these are as its rate says."""
+    count = strip.lines or int(np.ceil(line.max(initial=0.0))) + 1
+    if count < 2 or not len(line) or np.abs(time_s - strip.time_of(line)).max() <= SAME_S:
+        return None
+    u = np.arange(count)
+    beyond = np.minimum(u - line[0], 0.0) + np.maximum(u - line[-1], 0.0)
+    return np.interp(u, line, time_s) + beyond / strip.line_rate_hz
 
 
 def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
@@ -284,7 +317,12 @@ def _ground_of(found: _Collected, notes: list[str]) -> KnownPoints:
 
 
 def _image_of(
-    found: _Collected, camera: Any, strips: tuple[Strip, ...], ground: KnownPoints, apriori: Apriori
+    found: _Collected,
+    camera: Any,
+    strips: tuple[Strip, ...],
+    ground: KnownPoints,
+    apriori: Apriori,
+    reference: int,
 ) -> tuple[tuple[str, ...], ImagePoints]:
     ids = {id: i for i, id in enumerate(ground.id)}
     place = {strip.id: i for i, strip in enumerate(strips)}
@@ -300,8 +338,13 @@ def _image_of(
         if index[1:, i].min() < 0:
             unknown[i] = (image.strip, image.ccd)
     time = np.full(n, np.nan)
+    stated_ns = np.array([image.time_ns for _, image in found.ties], dtype=np.int64)
     for i, strip in enumerate(strips):
-        mine = index[1] == i
-        time[mine] = strip.time_of(value[0, mine])
+        mine = np.flatnonzero(index[1] == i)
+        line, stated_s = value[0, mine], np.where(stated_ns[mine] == 0, np.nan, (stated_ns[mine] - reference) * 1e-9)
+        by_rate = replace(strip, line_time_s=None).time_of(line)
+        off_s = np.abs(stated_s - by_rate)
+        own = (off_s > SAME_S) & (off_s <= most_off(line / strip.line_rate_hz))
+        time[mine] = np.where(own, stated_s, strip.time_of(line))
     line, sample, sigma, of_sample = value
     return tuple(ids), ImagePoints(index[0], index[1], index[2], line, sample, sigma, time, unknown, of_sample)

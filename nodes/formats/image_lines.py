@@ -199,16 +199,16 @@ def open_strip(
     if equal and given.first is not None:
         rate = given.first[1]
     off = float(np.abs((time_ns - time_ns[0]) * (rate * 1e-9) - np.arange(lines)).max())
-    notes.extend(off_the_rate(off, rate))
+    notes.extend(off_the_rate(off, rate, "the strip has that rate, tie points have the times of their lines"))
     return ImageStrip(given.strip or first.image.path.stem, views, time_ns, rate, equal, tuple(notes))
 
 
-def off_the_rate(lines: float, rate_hz: float) -> list[str]:
-    """A note where lines of a strip are further off its constant rate than tie points may be."""
+def off_the_rate(lines: float, rate_hz: float, so: str) -> list[str]:
+    """A note where lines of a strip are off its constant rate, and what follows."""
     if lines <= 0.1:
         return []
     what = f"line times are off a constant rate of {rate_hz:.4f} lines/s by {lines:.1f} lines at most"
-    return [f"{what}; strip and tie points take the constant rate"]
+    return [f"{what}; {so}"]
 
 
 def with_lines(messages: Iterable[Message], strip: ImageStrip, notes: list[str]) -> Iterator[Message]:

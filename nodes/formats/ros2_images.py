@@ -256,7 +256,7 @@ def _strips(
             lines = max(lines, line)
         first, rate = _fitted(np.array(stamps, dtype=float), np.array(numbers, dtype=float), rate_hz, given.rate_hz)
         off = np.abs((np.array(stamps) - first) * (rate / SECOND_NS) - numbers).max()
-        notes.extend(off_the_rate(float(off), rate))
+        notes.extend(off_the_rate(float(off), rate, "strip and tie points take the constant rate"))
         strips.append(_Strip(name, start + round(first), rate, lines, images))
     if missing:
         notes.append(f"{path.name}: {missing} image lines are missing between images")

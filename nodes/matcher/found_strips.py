@@ -6,15 +6,14 @@ from typing import Any
 
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
+from ...solver.matching.line_times import OTHER_LINES
 from ..convert import SECOND_NS
 
 #: A strip has ended when no line of it has come for so long, ns of platform time.
 SILENT_NS = 5 * SECOND_NS
-#: Lines that are off the rate of their strip by more are told, lines; then its tie points are worse than their sigma,
-#: also where the strip was announced: with a nominal rate, while the lines have times of their own.
+#: Lines without times of their own that are off the rate of their strip by more are told, lines; then its tie points
+#: are worse than their sigma, also where the strip was announced, with a nominal rate.
 OFF_LINES = 0.5
-#: Lines that are off by more are not of this strip, lines: the camera was off meanwhile, or the driver began anew.
-OTHER_LINES = 20.0
 
 
 def _off(strip: Any, block: LineBlock) -> float:
@@ -33,6 +32,7 @@ class FoundStrips:
         self._begun: dict[str, Any] = {}
         self._lines: dict[str, int] = {}
         self._newest_ns: dict[str, int] = {}
+        self._end_ns: dict[str, int] = {}  # when the last line was imaged, of lines with times of their own
         self._off: set[str] = set()
 
     def __contains__(self, id: str) -> bool:
@@ -59,6 +59,8 @@ class FoundStrips:
     def note(self, block: LineBlock, stamp_ns: int, announced: Any = None) -> str:
         """Keep how far a strip is; returns a line for the operator where lines are off its rate, once a strip.
 
+        Lines with times of their own may be: tie points get these (`LineTimes`).
+
         Parameters
         ----------
         announced : the strip of the block, if it was announced and not found
@@ -67,16 +69,18 @@ class FoundStrips:
         ------
         ValueError : the lines of a strip that was found are far off, so their numbers do not go with their times
         """
-        strip = self._begun.get(block.strip)
+        strip, own = self._begun.get(block.strip), block.line_times_ns is not None
         if strip is None:
-            return "" if announced is None else self._told_off(announced, _off(announced, block), block)
-        off = _off(strip, block)
+            return "" if announced is None or own else self._told_off(announced, _off(announced, block), block)
+        off = 0.0 if own else _off(strip, block)
         if abs(off) > OTHER_LINES:
             raise ValueError(
                 f"line {block.first_line} of strip {strip.id!r} came {off:+.0f} lines off its time; a strip that "
                 "begins anew wants another name"
             )
         self._lines[strip.id] = max(self._lines.get(strip.id, 0), int(block.first_line) + len(block.pixels))
+        if own:
+            self._end_ns[strip.id] = max(self._end_ns.get(strip.id, 0), int(block.times_ns()[-1]))
         self._newest_ns[strip.id] = max(self._newest_ns.get(strip.id, 0), stamp_ns)
         return self._told_off(strip, off, block)
 
@@ -108,4 +112,7 @@ class FoundStrips:
         strip = m.Strip()
         strip.CopyFrom(self._begun[id])
         strip.lines, strip.ended = self._lines[id], True
+        lasted_ns = self._end_ns.get(id, 0) - strip.first_line_time_ns
+        if lasted_ns > 0 and strip.lines > 1:
+            strip.line_rate_hz = (strip.lines - 1) * SECOND_NS / lasted_ns
         return strip

@@ -10,6 +10,7 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES, find
+from ...solver.matching.line_times import LineTimes
 from ...solver.matching.options import MatchedTie, MatchingOptions
 from ...solver.matching.round_earth import above_sphere
 from ...solver.matching.strip_matcher import StripMatcher
@@ -19,6 +20,7 @@ from ..governor import Announced, Governor
 from ..node import Message, Node
 from .found_strips import FoundStrips
 from .pace import PARTS, WINDOW_S, MatcherPace
+from .strip_clock import StripClock
 from .targets import DoubtfulTargets
 
 DEFAULTS = MatchingOptions()
@@ -119,6 +121,7 @@ class Matcher(Node):
         self._matcher: TieMatcher | StripMatcher | None = None
         self._camera: Any = None
         self._strips: dict[str, Any] = {}
+        self._times: dict[str, LineTimes] = {}
         self._found = FoundStrips()
         self._reference_ns = 0
         self._stamp_ns = self._told_ns = 0
@@ -238,6 +241,7 @@ class Matcher(Node):
         camera = convert.camera_from(body)
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
+        self._times.clear()
         # lines of one lens see the ground in the same strip; several lenses, or one line, in one strip after another
         in_strip = len(camera.lenses) == 1 and len(camera.lines) > 1
         self._matcher = TieMatcher(camera, self.options) if in_strip else StripMatcher(camera, self.options)
@@ -333,13 +337,14 @@ class Matcher(Node):
             return []
         if block.ccd and block.ccd != ccd:
             raise ValueError(f"a block of CCD line {block.ccd!r}")
-        strip = self._strips[block.strip]
-        out: list[Message] = []
+        strip, out = self._strips[block.strip], list[Message]()
+        times = self._clock(strip).times
+        if block.line_times_ns is not None:
+            times.add(int(block.first_line), (block.line_times_ns - self._reference_ns) * 1e-9)
         if matcher.strip != strip.id:
             out += [self._log(text, warning=True) for text in self._strip_over()]
-            first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
-            matcher.begin_strip(strip.id, first_s, strip.line_rate_hz, int(block.first_line))
-            self._targets.begin_strip(strip, first_s, matcher.orientation)
+            matcher.begin_strip(strip.id, times, int(block.first_line))
+            self._targets.begin_strip(self._clock(strip), matcher.orientation)
             self._failed, self._ground_unknown = 0, matcher.ground_m is None
         if self._pace.blind:
             self.counters["lines gone by"] += len(block.pixels)
@@ -351,6 +356,14 @@ class Matcher(Node):
         out += [self._log(f"{strip.id}: {text}", warning=True) for text in words]
         self.counters.update(self._targets.take_counters())
         return out
+
+    def _clock(self, strip: Any) -> StripClock:
+        """Times of the lines of a strip, which may have begun or not."""
+        times = self._times.get(strip.id)
+        if times is None:
+            first_s = (strip.first_line_time_ns - self._reference_ns) * 1e-9
+            times = self._times[strip.id] = LineTimes(first_s, strip.line_rate_hz)
+        return StripClock(strip, times, self._reference_ns)
 
     def _ties(self, ties: list[MatchedTie], strip: str) -> list[Message]:
         """Ties that the lines of a strip gave, and what is to be told of it."""
@@ -399,7 +412,7 @@ class Matcher(Node):
                     "sample": ray.sample,
                     "sigma_line": ray.sigma_line,
                     "sigma_sample": ray.sigma_sample,
-                    "time_ns": strip.first_line_time_ns + round(ray.line * convert.SECOND_NS / strip.line_rate_hz),
+                    "time_ns": self._clock(strip).time_ns(ray.line),
                 }
             )
         return Message("observation/tie", self._observed_ns, convert.tie_message(tie.name, images))

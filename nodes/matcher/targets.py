@@ -12,6 +12,7 @@ from ...solver.matching.current_orientation import CurrentOrientation
 from ...solver.matching.target_finder import NO_LINES, Target, TargetFinder, TargetLook, TargetOptions
 from .. import convert
 from ..node import Message
+from .strip_clock import StripClock
 
 
 class DoubtfulTargets:
@@ -28,10 +29,10 @@ class DoubtfulTargets:
     def __init__(self, options: TargetOptions | None = None) -> None:
         self.options = options or TargetOptions()
         self._finder: TargetFinder | None = None
-        self._strip: Any = None
+        self._strip: StripClock | None = None
         self._points: dict[str, Target] = {}
         self._verdict: dict[str, bool] = {}
-        self._held: dict[str, list[tuple[Any, TargetLook]]] = {}
+        self._held: dict[str, list[tuple[StripClock, TargetLook]]] = {}
 
     def configure(self, camera: LineCamera, orientation: CurrentOrientation) -> None:
         """Begin (again) with a camera; ``orientation`` is kept up to date by the caller."""
@@ -74,12 +75,12 @@ class DoubtfulTargets:
             out += [self._observation(strip, look, stamp_ns) for strip, look in held]
         return out
 
-    def begin_strip(self, strip: Any, first_s: float, orientation: CurrentOrientation) -> None:
-        """Lines that follow belong to a strip, whose orientation is kept up to date by the caller."""
+    def begin_strip(self, strip: StripClock, orientation: CurrentOrientation) -> None:
+        """Lines that follow belong to a strip; its times and its orientation are kept up to date by the caller."""
         self._strip = strip
         if self._finder is not None:
             self._finder.orientation = orientation
-            self._finder.begin_strip(first_s, strip.line_rate_hz)
+            self._finder.begin_strip(strip.times)
 
     def lines(
         self, ccd: str, first_line: int, pixels: Any, stamp_ns: int, usable: Any = None
@@ -123,7 +124,7 @@ class DoubtfulTargets:
 
     # -- messages ------------------------------------------------------------------------------------------------------
 
-    def _told(self, strip: Any, look: TargetLook, state: str, reason: str, stamp_ns: int) -> Message:
+    def _told(self, strip: StripClock, look: TargetLook, state: str, reason: str, stamp_ns: int) -> Message:
         body = m.TargetLook(
             point=look.target, image=m.ImagePoint(**_image(strip, look)), state=m.TargetLook.State.Value(state),
             reason=reason, score=look.score, expected_line=look.expected_line, expected_sample=look.expected_sample,
@@ -132,17 +133,17 @@ class DoubtfulTargets:
         return Message("observation/target", stamp_ns, body)
 
     @staticmethod
-    def _observation(strip: Any, look: TargetLook, stamp_ns: int) -> Message:
+    def _observation(strip: StripClock, look: TargetLook, stamp_ns: int) -> Message:
         return Message("observation/tie", stamp_ns, convert.tie_message(look.target, [_image(strip, look)]))
 
 
-def _image(strip: Any, look: TargetLook) -> dict[str, Any]:
+def _image(strip: StripClock, look: TargetLook) -> dict[str, Any]:
     return {
-        "strip": strip.id,
+        "strip": strip.strip.id,
         "ccd": look.ccd,
         "line": look.line,
         "sample": look.sample,
         "sigma_line": look.sigma_line,
         "sigma_sample": look.sigma_sample,
-        "time_ns": strip.first_line_time_ns + round(look.line * convert.SECOND_NS / strip.line_rate_hz),
+        "time_ns": strip.time_ns(look.line),
     }

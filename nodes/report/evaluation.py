@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.accuracy import Accuracy, accuracy, angle_difference
+from ...solver.adjustment.network import SAME_S, most_off
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import R_lc_from_navigation, opk_covariance_from_navigation
 from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_matrix
@@ -279,7 +280,11 @@ def usable_rays(flight: Flight) -> tuple[list[str], ImageRays, ImageRays] | None
         if strip is None or not strip.line_rate_hz > 0 or look.key in bad or look.key in seen:
             continue
         seen.add(look.key)
-        time = (strip.first_line_time_ns - flight.start_ns) / convert.SECOND_NS + look.line / strip.line_rate_hz
+        since_s = look.line / strip.line_rate_hz
+        time = (strip.first_line_time_ns - flight.start_ns) / convert.SECOND_NS + since_s
+        own = (look.time_ns - flight.start_ns) / convert.SECOND_NS if look.time_ns else time
+        if SAME_S < abs(own - time) <= most_off(since_s):
+            time = own
         inside = not strip.lines or -0.5 <= look.line <= strip.lines - 0.5
         inside = inside and bool(np.isfinite([look.sigma_line, look.sigma_sample]).all())
         if inside and path.start_s <= time <= path.end_s:

@@ -92,7 +92,8 @@ class PoseSeries:
 
 @dataclass(frozen=True)
 class Look:
-    """One image measurement of a point: ids, line and sample in px, their sigma (0: the project's)."""
+    """One image measurement of a point: ids, line and sample in px, their sigma (0: the project's), and UTC of the line
+    (0: as the rate of its strip says)."""
 
     point: str
     strip: str
@@ -101,6 +102,7 @@ class Look:
     sample: float
     sigma_line: float
     sigma_sample: float
+    time_ns: int = 0
 
     @property
     def key(self) -> Key:
@@ -337,7 +339,9 @@ def _take(flight: Flight, rows: dict[str, list[Any]], rejected: dict[Any, Any], 
         rows[POSE_TOPICS[topic]].append(convert.pose_sample(body))
     elif topic == "observation/tie":
         for i in body.images:
-            flight.looks.append(Look(body.point, i.strip, i.ccd, i.line, i.sample, i.sigma_line, i.sigma_sample))
+            flight.looks.append(
+                Look(body.point, i.strip, i.ccd, i.line, i.sample, i.sigma_line, i.sigma_sample, i.time_ns)
+            )
     elif topic == "point/object":
         _finite(body, body.x, body.y, body.z)
         if body.status == body.WHOLE:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
@@ -39,6 +40,10 @@ KEYS = ("endpoint", "domain", "imu", "fix", "images", "line_rate_hz", "strip")
 _DEPTH = 2000
 #: A strip begins when all topics of images have, or one of them is so far ahead, s: publishers that start together.
 BEGIN_S = 1.0
+#: Images whose stamps the rate is looked for in, the newest ones; how many there have to be, and by how many lines half
+#: of them have to be off the rate that is known, to say that the camera has another one. Tuned: stamps of a program are
+#: off by a millisecond or so, of one image or another.
+FITTED, LEAST_FITTED, OFF_LINES = 200, 9, 0.5
 
 
 @dataclass(frozen=True)
@@ -118,16 +123,28 @@ class LiveStrips:
     from the others. When no topic has brought an image for `SILENT_S` the next one begins another strip, which is named
     by the time of its first line.
 
+    Where the camera keeps another rate than the nominal one, its lines get times of their own, by a straight line
+    through the newest stamps; the next strip begins with the rate found.
+
     Parameters
     ----------
     settings : with the topics, the line rate, and what the name of a strip begins with
     left_out : by topic, where is counted what could not be used
+
+    Attributes
+    ----------
+    told : what an operator should know
     """
 
     def __init__(self, settings: Ros2Settings, left_out: Mapping[str, Counter[str]]) -> None:
         self._settings = settings
         self._left_out = {ccd: left_out[topic] for ccd, topic in settings.images.items()}
         self._period_ns = round(SECOND_NS / settings.rate_hz)
+        self._come: deque[tuple[int, int]] = deque(maxlen=FITTED)  # line and time since the first line, of images
+        self._first_image = (0, 0)
+        self._fit: tuple[float, float] | None = None  # time of line 0 since the first line, and period, ns
+        self._end = (0, -1)  # the line after the newest one, and the time of that
+        self.told: list[str] = []
         self._held: list[_Image] = []
         self._strip, self._first_ns = "", 0
         self._next: dict[str, tuple[int, int]] = {}  # time and number of the row that each CCD line gives next
@@ -157,6 +174,11 @@ class LiveStrips:
         self._first_ns = min(image.time_ns for image in held)
         self._strip = self._settings.strip + strip_name(self._settings.clock.utc(self._first_ns))
         self._next = {}
+        if self._fit is not None:
+            (line, since_ns), (last, last_ns) = self._first_image, self._come[-1]
+            self._period_ns = round((last_ns - since_ns) / max(last - line, 1))
+        self._come.clear()
+        self._fit, self._end = None, (0, -1)
         return [message for image in held for message in self._numbered(image, (self._first_ns, 0))]
 
     def _numbered(self, image: _Image, known: tuple[int, int] | None = None) -> list[Message]:
@@ -176,8 +198,40 @@ class LiveStrips:
             return []
         self._next[image.ccd] = image.time_ns + len(image.pixels) * self._period_ns, line + len(image.pixels)
         clock = self._settings.clock
-        utc_ns = clock.utc(image.time_ns)
-        return [block_message(clock, LineBlock(image.pixels, image.ccd, self._strip, line, utc_ns, self._period_ns))]
+        self._look_at_rate(line, image.time_ns - self._first_ns)
+        utc_ns, how = clock.utc(image.time_ns), (self._period_ns, None)
+        if self._fit is not None:
+            times = self._own_times(line, len(image.pixels), *self._fit) + clock.utc(self._first_ns)
+            utc_ns, how = int(times[0]), (0, times)
+        return [block_message(clock, LineBlock(image.pixels, image.ccd, self._strip, line, utc_ns, *how))]
+
+    def _look_at_rate(self, line: int, since_ns: int) -> None:
+        """Whether the camera keeps the rate that is known, and which one it does keep."""
+        if not self._come:
+            self._first_image = line, since_ns
+        self._come.append((line, since_ns))
+        lines, times = np.array(self._come, dtype=float).T
+        off = np.median(np.abs(times / self._period_ns - lines)[-LEAST_FITTED:])
+        if len(lines) < LEAST_FITTED or np.ptp(lines) < 1 or (self._fit is None and off < OFF_LINES):
+            return
+        if self._fit is None:
+            nominal, found = SECOND_NS / self._period_ns, SECOND_NS / np.polyfit(lines, times, 1)[0]
+            self.told.append(
+                f"{self._strip}: {found:.2f} lines/s come, not {nominal:.2f}, line_rate_hz; lines get times by that"
+            )
+        middle = lines.mean()
+        period, at_middle = np.polyfit(lines - middle, times, 1)
+        self._fit = float(at_middle - period * middle), float(period)
+
+    def _own_times(self, line: int, rows: int, first_ns: float, period_ns: float) -> NDArray[np.int64]:
+        """Times (rows,) of lines since the first line of the strip, ns; they go on where the fit goes back a little."""
+        times = np.rint(first_ns + period_ns * (line + np.arange(rows))).astype(np.int64)
+        end_line, end_ns = self._end
+        if line >= end_line:
+            if end_line:
+                times += max(end_ns - int(times[0]), 0)
+            self._end = line + rows, int(times[-1]) + round(0.5 * period_ns)
+        return times
 
 
 _Convert = Callable[[Iterable[bytes], Counter[str]], Iterator["Message | _Image"]]
@@ -193,6 +247,7 @@ class Ros2(Sensor):
         self._settings = settings
         self._left_out: dict[str, Counter[str]] = {}
         self._told: Counter[str] = Counter()
+        self._strips: LiveStrips | None = None
 
     def messages(self, stop: Event) -> Iterator[Message | None]:
         s = self._settings
@@ -200,7 +255,7 @@ class Ros2(Sensor):
         waiting: dict[str, queue.Queue[bytes | None]] = {}
         threads = []
         self._left_out = {topic: Counter() for topic in (s.fix, s.imu, *s.images.values()) if topic}
-        strips = LiveStrips(s, self._left_out) if s.images else None
+        strips = self._strips = LiveStrips(s, self._left_out) if s.images else None
         for topic, kind, convert in self._topics():
             key = key_expression(s.domain, topic, kind)
             waiting[key.removesuffix("*")] = come = queue.Queue(_DEPTH)
@@ -280,7 +335,9 @@ class Ros2(Sensor):
         return replace(message, stamp_ns=clock.stamp(utc_ns))
 
     def _tell(self) -> None:
-        """Count what could not be used."""
+        """Count what could not be used, and say what an operator should know."""
+        while self._strips is not None and self._strips.told:
+            self.problem("another line rate", self._strips.told.pop(0))
         for topic, left_out in self._left_out.items():
             for why, n in list(left_out.items()):
                 new = n - self._told[f"{topic} {why}"]

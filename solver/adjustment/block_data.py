@@ -156,7 +156,9 @@ def network_from_block(block: BlockData) -> Network:
         block.camera,
         block.strips,
         block.point_ids,
-        Measurements(image.point, image.strip, image.ccd, image.line, image.sample, image.sigma_px, of_sample),
+        Measurements(
+            image.point, image.strip, image.ccd, image.line, image.sample, image.sigma_px, of_sample, image.time_s
+        ),
         Control(index[~check], block.ground.xyz_l[~check], sigma[~check]),
         Control(index[check], block.ground.xyz_l[check], sigma[check]),
     )

@@ -16,8 +16,17 @@ from ..geometry.rotation import matrix_from_angles
 from ..geometry.trajectory import Trajectory, noise_between, sample_before
 from .surface_control import SurfaceControl
 
+#: A look whose own time is off that by the rate of its strip by less, s, has that of the rate, rounded. Definition.
+SAME_S = 1e-6
+#: A time that is farther off is not that of the line: s, and share of the time since the strip began. Definition.
+OTHER_S, OTHER_SHARE = 5.0, 0.2
 #: Roles of ground points.
 ROLES = ("control", "planimetric", "height", "check")
+
+
+def most_off(since_s: Array | float) -> Array | float:
+    """How far the times (...) of lines may be off those by the rate of their strip, which began so long before, s."""
+    return OTHER_S + OTHER_SHARE * abs(since_s)
 
 
 @dataclass(frozen=True)
@@ -62,12 +71,12 @@ class Strip:
             return np.full(u.shape, 1.0 / self.line_rate_hz)
         return np.diff(self.line_time_s)[self._below(u)]
 
-    def contains(self, line: ArrayLike) -> Bools:
-        """Which lines lie on the strip and below its trajectory."""
+    def contains(self, line: ArrayLike, time_s: ArrayLike | None = None) -> Bools:
+        """Which lines, imaged at times, lie on the strip and below its trajectory."""
         u = np.asarray(line, dtype=float)
         count = self.lines if self.line_time_s is None else len(self.line_time_s)
         inside = (u >= -0.5) & (u <= count - 0.5) if count else np.ones(u.shape, dtype=bool)
-        return inside & self.oriented(self.time_of(u))
+        return inside & self.oriented(self.time_of(u) if time_s is None else time_s)
 
     def oriented(self, time_s: ArrayLike) -> Bools:
         """Which times lie on the trajectory, and not in a gap of it."""
@@ -225,6 +234,7 @@ class Measurements:
     point, strip, ccd : (n,) indices into the caller's point ids, strips, and the camera's CCD lines (-1: not known)
     line, sample : (n,) pixels
     sigma_line_px, sigma_sample_px : (n,)
+    time_s : (n,) when the lines were imaged; None where that is as their strips say
     """
 
     point: IntArray
@@ -234,6 +244,11 @@ class Measurements:
     sample: Array
     sigma_line_px: Array
     sigma_sample_px: Array
+    time_s: Array | None = None
+
+    def times(self, strip: Strip, which: IntArray) -> Array:
+        """Times of some (k,) of a strip."""
+        return strip.time_of(self.line[which]) if self.time_s is None else self.time_s[which]
 
 
 def build_network(
@@ -307,8 +322,8 @@ def _reasons(camera: LineCamera, strips: Sequence[Strip], m: Measurements) -> ND
     reason[(m.ccd < 0) | (m.ccd >= len(camera.lines))] = "unknown CCD line"
     for i, strip in enumerate(strips):
         mine = np.flatnonzero((m.strip == i) & (reason == ""))
-        reason[mine[~strip.contains(m.line[mine])]] = "outside strip or trajectory"
-        time = strip.time_of(m.line[mine])
+        time = m.times(strip, mine)
+        reason[mine[~strip.contains(m.line[mine], time)]] = "outside strip or trajectory"
         reason[mine[strip.trajectory.covers(time) & ~strip.oriented(time)]] = "in a gap of the trajectory"
         if strip.lens is not None:
             other = np.array([line.lens != strip.lens for line in camera.lines])
@@ -331,7 +346,7 @@ def _rays(camera: LineCamera, strips: Sequence[Strip], m: Measurements, good: ND
     noise = np.zeros((n, 6, 6)) if any(s.noise is not None for s in strips) else None
     for i in np.unique(strip):
         mine = strip == i
-        time[mine] = strips[i].time_of(line[mine])
+        time[mine] = m.times(strips[i], good[mine])
         period[mine] = strips[i].line_period(line[mine])
         p = strips[i].trajectory.at(time[mine])
         pose[:, mine] = p.position_l, p.angles, p.velocity_l, p.angle_rate

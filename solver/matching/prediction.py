@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .consistency import SlowDisagreement
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, View
+from .line_times import LineTimes
 from .options import MatchingOptions
 from .round_earth import ORBIT_M, RoundHeights, above_sphere, way_of_platform
 from .search import CORRELATION_HALF, REACH_PX, Ground, coarsest_factor
@@ -46,16 +47,21 @@ class Prediction:
         self.orientation = CurrentOrientation()
         self.heights = RoundHeights(0.0, options.relief_sigma_m)
         self.slow = SlowDisagreement(len(self.others))
-        self.first_s = self.rate = 0.0
+        self.times = LineTimes(0.0, 1.0)
         self._axes: tuple[Array, Array] | None = None
         self._told = (-np.inf, (1.0, 1.0))
         self.nadir_m = 0.0
         # of each view: least reach, and the widest search of late
         self._least, self._widest = np.full(len(views), LEAST_REACH), np.zeros(len(views))
 
-    def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
-        """Lines begin anew."""
-        self.first_s, self.rate = first_line_time_s, line_rate_hz
+    @property
+    def rate(self) -> float:
+        """Lines a second, about."""
+        return self.times.rate
+
+    def begin_strip(self, times: LineTimes) -> None:
+        """Lines begin anew, with their times."""
+        self.times = times
         self.slow.forget()
         self.orientation.forget_corrections()
         self._axes = None
@@ -65,7 +71,7 @@ class Prediction:
     @property
     def known_lines(self) -> float:
         """Lines before this one have their orientation."""
-        return (self.orientation.end_s - self.first_s) * self.rate
+        return float(self.times.line_of(self.orientation.end_s))
 
     @property
     def knows_travel(self) -> bool:
@@ -99,7 +105,7 @@ class Prediction:
         self._told = (-np.inf, self._told[1])
 
     def lines_later(self, index: int, height_m: Array) -> Array:
-        """How many lines after the master a view sees ground at heights (k,), about; local frame, m."""
+        """How many lines, at the rate, after the master a view sees ground at heights (k,), about; local frame, m."""
         above, travel = self.height_and_travel()
         if self.heights.in_orbit:
             ways = [way_of_platform(self.views[i].forward, above) for i in (self.master, index)]
@@ -109,16 +115,19 @@ class Prediction:
 
     def look_lines(self, index: int, line: Array, point_l: Array) -> Array:
         """Lines (k,) of a view that see ground (k, 3), seen in lines (k,) of the master, about."""
-        return np.asarray(line + self.lines_later(index, point_l[:, 2]))
+        later = self.lines_later(index, point_l[:, 2])
+        if self.times.is_constant:
+            return np.asarray(line + later)
+        return self.times.line_of(self.times.time_of(line) + later / self.rate)
 
     def scan(self, index: int, first: float, last: float) -> LineScan | None:
         """Lines of a view with their orientation, as far as there is one."""
         o = self.orientation
-        low = max(int(np.floor(first)), int(np.ceil((o.start_s - self.first_s) * self.rate)) + 1)
+        low = max(int(np.floor(first)), int(np.ceil(self.times.line_of(o.start_s))) + 1)
         high = min(int(np.ceil(last)), int(np.floor(self.known_lines)) - 1)
         if high - low < 4:
             return None
-        position, R = o.at(self.first_s + np.arange(low, high + 1) / self.rate)
+        position, R = o.at(self.times.time_of(np.arange(low, high + 1)))
         return LineScan(self.views[index], low, position, R)
 
     def ground(self, scan: LineScan, centre_l: Array) -> Ground:

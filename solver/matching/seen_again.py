@@ -76,7 +76,7 @@ class SeenAgain:
         if not len(chosen):
             return []
         ground, (_, travel) = strip.ground(chosen), p.height_and_travel()
-        time_s, across = p.first_s + line / p.rate, 2 * sample / scan.view.pixels - 1
+        time_s, across = p.times.time_of(line), 2 * sample / scan.view.pixels - 1
         expected = strip.slow.expected(time_s, across)[:, 0]
         here = p.ground(scan, ground.centre_l)
         turn = np.array([[a @ b for b in (strip.along, strip.across)] for a in (here.along, here.across)])

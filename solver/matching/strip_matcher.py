@@ -23,6 +23,7 @@ from .ground_search import LEAST_FOUND, OVERLAP, SHARE, TOGETHER
 from .line_intake import LineIntake
 from .line_scan import LineScan, View, view_of
 from .line_store import LineRing, LineStore
+from .line_times import LineTimes
 from .looks import Looked, LookMatcher, Track
 from .options import MatchedRay, MatchedTie, MatchingOptions, Place, first_part_of_names
 from .places import PlaceChooser
@@ -51,18 +52,18 @@ LEAST_SHARE, LARGEST_TILT = 0.05, np.radians(75.0)
 
 @dataclass(eq=False)
 class _Strip:
-    """A strip; image line u is taken at first_s + u / rate.
+    """A strip.
 
     Attributes
     ----------
     id : its name
+    times : of its lines
     views : its CCD lines, by name
     over : whether its last line has come
     """
 
     id: str
-    first_s: float
-    rate: float
+    times: LineTimes
     orientation: CurrentOrientation = field(default_factory=CurrentOrientation)
     views: dict[str, _StripView] = field(default_factory=dict)
     over: bool = False
@@ -97,11 +98,11 @@ class _StripView:
         strip, o = self.strip, self.strip.orientation
         if not np.isfinite(o.end_s):
             return None
-        low = max(int(np.floor(first)), int(np.ceil((o.start_s - strip.first_s) * strip.rate)))
-        high = min(int(np.ceil(last)), int(np.floor((o.end_s - strip.first_s) * strip.rate)))
+        low = max(int(np.floor(first)), int(np.ceil(strip.times.line_of(o.start_s))))
+        high = min(int(np.ceil(last)), int(np.floor(strip.times.line_of(o.end_s))))
         if high - low < 4:
             return None
-        position, R = o.at(strip.first_s + np.arange(low, high + 1) / strip.rate)
+        position, R = o.at(strip.times.time_of(np.arange(low, high + 1)))
         return LineScan(self.view, low, position, R, self.ground_share)
 
     @cached_property
@@ -155,7 +156,7 @@ class _PairPrediction(Prediction):
         self._pair = pair
         strip = pair[0].strip
         self.orientation, self.heights = strip.orientation, heights
-        self.first_s, self.rate = strip.first_s, strip.rate
+        self.times = strip.times
         self.whole = [v.whole() for v in pair]
         self.height_and_travel()  # tells the heights whether the platform is in orbit
 
@@ -319,21 +320,16 @@ class StripMatcher:
         known = self._strips.get(strip)
         return None if known is None else known.orientation
 
-    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float, first_line: int = 0) -> None:
-        """Lines that follow, from ``first_line`` on, belong to a strip, new or begun before.
-
-        Raises
-        ------
-        ValueError : a line rate that is not positive
+    def begin_strip(self, strip: str, times: LineTimes, first_line: int = 0) -> None:
+        """Lines that follow, from ``first_line`` on, belong to a strip, new or begun before, with the times of its
+        lines.
         """
-        if not (np.isfinite(line_rate_hz) and line_rate_hz > 0 and np.isfinite(first_line_time_s)):
-            raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip = strip
         if strip not in self._strips:
             self._first_parts[strip] = first_part_of_names(strip, first_line)
-            begun = self._strips[strip] = _Strip(strip, first_line_time_s, line_rate_hz)
+            begun = self._strips[strip] = _Strip(strip, times)
             for pose in self._poses:
-                if pose[0] >= first_line_time_s - POSES_BEFORE_S:
+                if pose[0] >= times.first_s - POSES_BEFORE_S:
                     begun.orientation.add_pose(*pose)
         self.orientation = self._strips[strip].orientation
 
@@ -352,7 +348,7 @@ class StripMatcher:
         if ccd not in strip.views:
             samples = {ccd: self._views[ccd].pixels}
             lines = LineIntake(samples, self.options, lambda dtype: self._store(samples, dtype))
-            lines.begin_strip(strip.rate, first_line)
+            lines.begin_strip(strip.times.rate, first_line)
             strip.views[ccd] = _StripView(strip, self._views[ccd], lines)
         lines = strip.views[ccd].lines
         usable = lines.add(ccd, first_line, pixels)
@@ -421,7 +417,7 @@ class StripMatcher:
         others = [v for s in self._strips.values() if s.over for v in s.views.values() if v is not view and v.known]
         if not others and not self._lone:
             return []
-        ring, rate = view.ring, view.strip.rate
+        ring, rate = view.ring, view.strip.times.rate
         assert ring is not None
         chooser = PlaceChooser(self.options, 2 * LEAST_SQUARES_HALF + 1, 1)
         chooser.density.load = self._share

@@ -21,6 +21,7 @@ from ..ranges import check_ranges
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
 from .line_store import LineRing, Stretch
+from .line_times import LineTimes
 from .search import LEAST_MEASURED
 from .target_image import RING, Centre, candidates, fit
 
@@ -141,7 +142,7 @@ class TargetFinder:
         self._targets: dict[str, Target] = {}
         self._rings: dict[str, LineRing] = {}
         self._open: set[tuple[str, str]] = set()
-        self._first_s = self._rate = 0.0
+        self._times: LineTimes | None = None
 
     def set_target(self, target: Target) -> None:
         """Add a target, or change its coordinates.
@@ -154,13 +155,13 @@ class TargetFinder:
             raise ValueError(f"target {target.name!r} of radius {target.radius_m} m, wanted more than 0")
         known = target.name in self._targets
         self._targets[target.name] = target
-        if not known and self._rate:
+        if not known and self._times is not None:
             self._open |= {(target.name, ccd) for ccd in self.views}
 
-    def begin_strip(self, first_line_time_s: float, line_rate_hz: float) -> None:
-        """Lines that follow belong to a new strip; all targets may appear in it."""
-        self._first_s, self._rate = first_line_time_s, line_rate_hz
-        lines = int(WAIT_S * line_rate_hz + 2 * self.options.largest_reach_px) + 8 * PAD
+    def begin_strip(self, times: LineTimes) -> None:
+        """Lines that follow belong to a new strip, with their times; all targets may appear in it."""
+        self._times = times
+        lines = int(WAIT_S * times.rate + 2 * self.options.largest_reach_px) + 8 * PAD
         self._rings = {}
         self._capacity = lines
         self._open = {(name, ccd) for name in self._targets for ccd in self.views}
@@ -174,7 +175,9 @@ class TargetFinder:
     ) -> None:
         """Lines of one CCD line of the strip, and which (n,) are fit for use; nothing is kept without a target."""
         view = self.views.get(ccd)
-        if view is None or not self._targets or not self._rate or pixels.ndim != 2 or pixels.shape[1] != view.pixels:
+        if view is None or not self._targets or self._times is None:
+            return
+        if pixels.ndim != 2 or pixels.shape[1] != view.pixels:
             return
         if ccd not in self._rings:
             self._rings[ccd] = LineRing(view.pixels, self._capacity, pixels.dtype)
@@ -182,20 +185,21 @@ class TargetFinder:
 
     def measure(self, ccd: str) -> list[TargetLook]:
         """Targets whose look by a CCD line has become known, in the order of their names."""
-        ring, o = self._rings.get(ccd), self.orientation
-        if ring is None or not np.isfinite(o.end_s) or ring.end <= ring.start:
+        ring, o, times = self._rings.get(ccd), self.orientation, self._times
+        if ring is None or times is None or not np.isfinite(o.end_s) or ring.end <= ring.start:
             return []
         names = sorted(name for name, view in self._open if view == ccd)
         if not names:
             return []
-        low = max(ring.start, int(np.ceil((o.start_s - self._first_s) * self._rate)) + 1)
-        high = min(ring.end - 1, int(np.floor((o.end_s - self._first_s) * self._rate)) - 1)
+        low = max(ring.start, int(np.ceil(times.line_of(o.start_s))) + 1)
+        high = min(ring.end - 1, int(np.floor(times.line_of(o.end_s))) - 1)
         if high - low < 4 * PAD:
             return []
-        near = self._near(ccd, names, high)
+        near = self._near(ccd, names, float(times.time_of(high)))
         if not near:
             return []
-        position, R = o.at(self._first_s + np.arange(low, high + 1) / self._rate)
+        time_s = times.time_of(np.arange(low, high + 1))
+        position, R = o.at(time_s)
         scan = LineScan(self.views[ccd], low, position, R)
         looks = []
         for name in near:
@@ -208,10 +212,9 @@ class TargetFinder:
 
     # -- where -------------------------------------------------------------------------------------------------------
 
-    def _near(self, ccd: str, names: list[str], newest: int) -> list[str]:
-        """The targets that the newest lines have passed a moment ago, roughly."""
+    def _near(self, ccd: str, names: list[str], t: float) -> list[str]:
+        """The targets that the lines at a time have passed a moment ago, roughly."""
         o, view = self.orientation, self.views[ccd]
-        t = self._first_s + newest / self._rate
         position, R = o.at([t - 0.1, t])
         velocity = (position[1] - position[0]) / 0.1
         middle = R[1] @ view.rays_c(np.array([0.5 * (view.pixels - 1)]))[0]
@@ -259,6 +262,10 @@ class TargetFinder:
             return replace(nothing, reason=found)
         return self._judge(nothing, target, scan, found, covariance, pixel, travel)
 
+    def _time_of(self, line: float) -> float:
+        assert self._times is not None
+        return float(self._times.time_of(line))
+
     def _expected(self, target: Target, scan: LineScan, line: float, sample: float) -> Array:
         """Covariance (2, 2) of where the target appears, as X and Y on the ground, m^2: pose and coordinates."""
         i = int(np.clip(round(line) - scan.first_line, 0, len(scan.position_l) - 1))
@@ -268,13 +275,12 @@ class TargetFinder:
         xyz, slope = moved.to_plane(np.arange(7.0), np.full(7, sample), np.full(7, target.xyz_l[2]))
         by_pose = ((xyz[1:, :2] - xyz[0, :2]) / np.array(STEPS)[:, None]).T
         by_point = np.column_stack([-np.eye(2), slope[0]])
-        time_s = self._first_s + line / self._rate
-        pose = self.orientation.covariance(time_s)
+        pose = self.orientation.covariance(self._time_of(line))
         return by_pose @ pose @ by_pose.T + by_point @ target.covariance @ by_point.T
 
     def _shaken(self, scan: LineScan, line: float, height_m: float) -> Array:
         """Noise (2,) of single poses, as X and Y on the ground, m: from third differences, which no flight has."""
-        time_s = self._first_s + line / self._rate + POSE_STEP_S * np.arange(-20, 21)
+        time_s = self._time_of(line) + POSE_STEP_S * np.arange(-20, 21)
         time_s = time_s[(time_s > self.orientation.start_s) & (time_s < self.orientation.end_s)]
         if len(time_s) < 12:
             return np.zeros(2)

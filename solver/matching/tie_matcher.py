@@ -16,6 +16,7 @@ from .current_orientation import CurrentOrientation
 from .line_intake import LineIntake
 from .line_scan import LineScan, view_of
 from .line_store import LineStore
+from .line_times import LineTimes
 from .master_view import MasterView
 from .options import MatchedRay, MatchedTie, MatchingOptions, first_part_of_names
 from .prediction import PAD, Prediction
@@ -90,22 +91,16 @@ class TieMatcher:
         """The lines of the strip; None before the first poses."""
         return self._lines.store
 
-    def begin_strip(self, strip: str, first_line_time_s: float, line_rate_hz: float, first_line: int = 0) -> None:
-        """Lines that follow, from ``first_line`` on, belong to a strip; lines of the last one are forgotten, patches
-        about its points kept.
-
-        Raises
-        ------
-        ValueError : a line rate that is not positive
+    def begin_strip(self, strip: str, times: LineTimes, first_line: int = 0) -> None:
+        """Lines that follow, from ``first_line`` on, belong to a strip, with the times of its lines; lines of the last
+        one are forgotten, patches about its points kept.
         """
-        if not (np.isfinite(line_rate_hz) and line_rate_hz > 0 and np.isfinite(first_line_time_s)):
-            raise ValueError(f"strip {strip!r} with {line_rate_hz} lines a second")
         self._strip, self._first_part = strip, first_part_of_names(strip, first_line)
         self._next_number = 0
         self._named.clear()
-        self._lines.begin_strip(line_rate_hz, first_line)
+        self._lines.begin_strip(times.rate, first_line)
         self._at_work = [self._master]
-        self.prediction.begin_strip(first_line_time_s, line_rate_hz)
+        self.prediction.begin_strip(times)
         self._master.begin_strip(strip)
 
     def set_mean_height(self, height_m: float) -> None:
@@ -211,7 +206,7 @@ class TieMatcher:
         if new is None:
             new = self._view(steepest)
             new.prediction.orientation, new.prediction.heights = self.orientation, old.prediction.heights
-            new.prediction.first_s, new.prediction.rate = old.prediction.first_s, old.prediction.rate
+            new.prediction.times = old.prediction.times
             new.chooser.density.like(old.chooser.density)
             new.begin_strip(self._strip, first)
         else:

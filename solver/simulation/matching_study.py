@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.rotation import quaternion_from_angles
+from ..matching.line_times import LineTimes
 from ..matching.options import MatchedTie, MatchingOptions
 from ..matching.tie_matcher import TieMatcher
 from .flight import Flight
@@ -65,7 +66,7 @@ def match_strip(
     matcher = TieMatcher(camera, options or MatchingOptions())
     if ground is not None:
         matcher.search_ground(ground)
-    matcher.begin_strip(strip.id, strip.first_line_time_s, strip.line_rate_hz)
+    matcher.begin_strip(strip.id, LineTimes(strip.first_line_time_s, strip.line_rate_hz))
     time_s = np.arange(0.0, flight.truth.end_s, POSE_S)
     truth = flight.truth.at(time_s)
     rng = np.random.default_rng(seed)

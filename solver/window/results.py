@@ -80,7 +80,8 @@ class Look:
     """One image measurement of a point: strip and CCD line by name, line and sample in pixels with their sigmas.
     Nobody changes one.
 
-    ``source`` is who measured it; the same measurement from two is one.
+    ``source`` is who measured it; the same measurement from two is one. ``time_s`` is when its line was imaged, NaN
+    where that is as the rate of its strip says.
     """
 
     strip: str
@@ -90,6 +91,7 @@ class Look:
     sigma_line_px: float
     sigma_sample_px: float
     source: str = field(default="", compare=False)
+    time_s: float = field(default=float("nan"), compare=False)
 
 
 #: Reason of a "refusal" that is the opposite: what was refused before is used again.

@@ -202,10 +202,10 @@ class Window:
         )  # fmt: skip
         self._block.begin(self.strips[id])
 
-    def end_strip(self, id: str, lines: int = 0) -> None:
-        """A strip is over; ``lines`` as counted."""
+    def end_strip(self, id: str, lines: int = 0, end_s: float | None = None) -> None:
+        """A strip is over; ``lines`` as counted, and when that was, where it is not as its rate says."""
         if id in self.strips:
-            self.strips[id].end(lines)
+            self.strips[id].end(lines, end_s)
 
     def add_control(self, name: str, xyz_l: ArrayLike, sigma_m: ArrayLike, role: str) -> None:
         """Known coordinates of a point.

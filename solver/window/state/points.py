@@ -10,6 +10,7 @@ from math import isfinite
 import numpy as np
 
 from ...adjustment.drift_hypotheses import Group
+from ...adjustment.network import SAME_S, most_off
 from ...adjustment.normal_equations import ControlWeights
 from ...arrays import Array, Bools
 from ...camera.line_camera import LineCamera
@@ -138,7 +139,10 @@ class Intake:
     def _time_of(self, look: Look) -> float:
         """NaN for a strip that is not known."""
         strip = self._strips.get(look.strip)
-        return float("nan") if strip is None else strip.first_line_time_s + look.line / strip.line_rate_hz
+        if strip is None:
+            return float("nan")
+        by_rate = strip.first_line_time_s + look.line / strip.line_rate_hz
+        return look.time_s if abs(look.time_s - by_rate) > SAME_S else by_rate
 
     def _judge(self, look: Look) -> str:
         if not all(map(isfinite, (look.line, look.sample, look.sigma_line_px, look.sigma_sample_px))):
@@ -152,9 +156,13 @@ class Intake:
             return "unknown ccd"
         if look.strip not in self._strips:
             return "unknown strip"
+        strip = self._strips[look.strip]
+        since_s = look.line / strip.line_rate_hz
+        if abs(look.time_s - strip.first_line_time_s - since_s) > most_off(since_s):
+            return "time is not that of its line"
         if not -0.5 <= look.sample <= self._camera.lines[self._camera.line_index[look.ccd]].pixels - 0.5:
             return "beyond the ccd line"
-        if not self._strips[look.strip].contains(look.line):
+        if not strip.contains(look.line):
             return "outside strip"
         return ""
 

@@ -205,12 +205,12 @@ class WindowStrip:
     def contains(self, line: float) -> bool:
         return line >= -0.5 and (not self.lines or line <= self.lines - 0.5)
 
-    def end(self, lines: int) -> None:
+    def end(self, lines: int, end_s: float | None = None) -> None:
         """The strip is over."""
         self.ended = True
         if lines:
             self.lines = lines
-            self.end_s = float(self.time_of(lines))
+            self.end_s = float(self.time_of(lines)) if end_s is None else end_s
 
     def design(self, time_s: ArrayLike, poses: Poses | None = None) -> Design:
         """Design with the unknowns' numbers in the window, those of the platform among them.

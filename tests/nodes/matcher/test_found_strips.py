@@ -67,8 +67,9 @@ def test_lines_that_are_off_the_rate_are_told_once():
     assert found.note(block("S1", 300, late_ns=9_000_000), EPOCH_NS) == ""
 
 
-def test_lines_that_are_off_the_rate_of_an_announced_strip_are_told_once():
-    """A nominal rate, and lines with times of their own: tie points take the rate, and would be metres off for it."""
+@pytest.mark.parametrize("own", [False, True])
+def test_lines_that_are_off_the_rate_of_an_announced_strip_are_told_once(own):
+    """A nominal rate: tie points would be metres off for it, unless the lines have times of their own."""
     node = Matcher()
     node.step(Message("configuration/camera", EPOCH_NS, camera_message(preset("ads40-small")), "x"))
     strip = m.Strip(id="S1", first_line_time_ns=EPOCH_NS, line_rate_hz=199.0)
@@ -76,11 +77,28 @@ def test_lines_that_are_off_the_rate_of_an_announced_strip_are_told_once():
     told = []
     for first in range(0, 400, 20):
         times = EPOCH_NS + (first + np.arange(20)) * PERIOD_NS
-        lines = replace(block("S1", first, period_ns=0, times=times), pixels=np.zeros((20, 1500), np.uint8))
+        which = {"period_ns": 0, "times": times} if own else {}
+        lines = replace(block("S1", first, **which), pixels=np.zeros((20, 1500), np.uint8))
         out = node.step(Message("sensor/lines/N", EPOCH_NS + (first + 19) * PERIOD_NS, lines, "x"))
         told += [o.body.message for o in out if o.topic == "event/log" and "lines/s" in o.body.message]
-    assert len(told) == 1
-    assert told[0].startswith("S1: line 100 came -0.5 lines off the 199.0000 lines/s that the strip was announced with")
+    assert len(told) == (0 if own else 1)
+    for text in told:
+        assert text.startswith(
+            "S1: line 100 came -0.5 lines off the 199.0000 lines/s that the strip was announced with"
+        )
+
+
+def test_a_strip_whose_lines_have_times_of_their_own_ends_when_they_do():
+    found = FoundStrips()
+    times = EPOCH_NS + np.arange(100) * PERIOD_NS + (np.arange(100) * 1e-2) ** 2 * 1e8  # slower and slower
+    for first in range(0, 100, 20):
+        part = block("S1", first, period_ns=0, times=times[first : first + 20].astype(np.int64))
+        if not first:
+            found.begin(part)
+        assert found.note(part, EPOCH_NS) == ""
+    (ended,) = found.finish()
+    last_ns = ended.first_line_time_ns + (ended.lines - 1) * 10**9 / ended.line_rate_hz
+    assert ended.lines == 100 and last_ns == pytest.approx(times[-1], abs=1000)
 
 
 def test_a_strip_that_begins_anew_under_its_name_is_refused():

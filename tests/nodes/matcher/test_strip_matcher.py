@@ -24,6 +24,7 @@ from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import angles_from_matrix
+from triline.solver.matching.line_times import LineTimes
 from triline.solver.matching.strip_matcher import StripMatcher
 from triline.solver.models.dgr import DgrOptions
 
@@ -186,18 +187,16 @@ def test_lines_that_a_budget_does_not_hold():
 
 def test_bad_input():
     matcher = StripMatcher(preset("spot5-hrs"))
-    with pytest.raises(ValueError, match="with nan lines a second"):
-        matcher.begin_strip("S/F", 0.0, float("nan"))
     with pytest.raises(ValueError, match="lines of F before their strip"):
         matcher.add_lines("F", 0, np.zeros((2, 12000), np.uint16))
     with pytest.raises(ValueError, match="wanted 0 to 1"):
         matcher.keep(1.5)
-    matcher.begin_strip("S/F", 0.0, 100.0)
+    matcher.begin_strip("S/F", LineTimes(0.0, 100.0))
     with pytest.raises(ValueError, match="unknown CCD line 'N'"):
         matcher.add_lines("N", 0, np.zeros((2, 12000), np.uint16))
     with pytest.raises(ValueError, match="wanted 12000 samples"):
         matcher.add_lines("F", 0, np.zeros((2, 100), np.uint16))
     matcher.add_lines("F", 0, np.zeros((2, 12000), np.uint16))  # lines without any pose
     assert matcher.end_strip("S/F") == [] and matcher.end_strip("never begun") == []
-    matcher.begin_strip("S/B", 20.0, 100.0)
+    matcher.begin_strip("S/B", LineTimes(20.0, 100.0))
     assert matcher.finish() == []

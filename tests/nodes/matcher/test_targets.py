@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from triline.nodes.adjuster.adjuster import Adjuster
+from triline.nodes.matcher.strip_clock import StripClock
 from triline.nodes.matcher.targets import DoubtfulTargets
 from triline.nodes.node import Message
 from triline.nodes.simulator.flight_settings import simulated_flight
@@ -11,6 +12,7 @@ from triline.nodes.simulator.simulator import Simulator
 from triline.schemas import messages as m
 from triline.solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from triline.solver.matching.current_orientation import CurrentOrientation
+from triline.solver.matching.line_times import LineTimes
 from triline.solver.matching.target_finder import Target, TargetFinder, TargetOptions
 from triline.solver.matching.target_image import RING, candidates, fit, pattern
 from triline.solver.simulation.observations import find_looks
@@ -62,7 +64,7 @@ def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_d
     radius = flown.imager.texture.target_radius_m
     for name, place in zip(names, places, strict=True):
         finder.set_target(Target(name, place, COORDINATE_SIGMA_M**2 * np.eye(3), radius))
-    finder.begin_strip(strip.first_line_time_s, strip.line_rate_hz)
+    finder.begin_strip(LineTimes(strip.first_line_time_s, strip.line_rate_hz))
     out, poses = [], 0
     for first in range(0, strip.lines, BLOCK):
         end_s = float(strip.time_of(min(first + BLOCK, strip.lines) - 1))
@@ -242,7 +244,8 @@ def held(flown, images):
             cov = (COORDINATE_SIGMA_M**2 * np.eye(3)).ravel().tolist()
             radius = flown.imager.texture.target_radius_m
             desk.ground_point(m.GroundPoint(point=name, x=x, y=y, z=z, covariance=cov, target_radius=radius))
-        desk.begin_strip(strip, flight.strips[0].first_line_time_s, orientation)
+        times = LineTimes(flight.strips[0].first_line_time_s, strip.line_rate_hz)
+        desk.begin_strip(StripClock(strip, times, 10**18), orientation)
         return desk
 
     def fly(desk, verdict_at=None, accepted=True):

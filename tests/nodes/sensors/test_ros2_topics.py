@@ -17,7 +17,9 @@ from triline.nodes.convert import time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.keys import Keys
 from triline.nodes.formats.ros2_images import image_rows
+from triline.nodes.matcher.found_strips import FoundStrips
 from triline.nodes.sensors.ros2 import LiveStrips, Ros2, Ros2Settings, key_expression
+from triline.solver.matching.line_times import LineTimes
 
 T = 1_795_339_670_000_000_000
 #: Of ROS 2 Jazzy's sensor_msgs/msg/Imu; any hash is taken.
@@ -163,6 +165,36 @@ def test_topics_of_one_camera_have_one_strip_and_one_count_of_lines_though_they_
     for message in out:
         off = (message.body.time_ns - (t - 30_000_000)) / 10_000_000 - message.body.first_line
         assert abs(off) <= 0.5
+
+
+def test_a_camera_that_keeps_another_rate_than_the_nominal_one():
+    """Half a per cent: by the nominal rate lines would be refused after 20 of them, as of another strip."""
+    rng = np.random.default_rng(4)
+    true_ns = 10_050_000  # of a line, stamps of a program that are off by a millisecond
+    given = settings(images=CAMERA, line_rate_hz=100.0)
+    strips, found = LiveStrips(given, {topic: Counter() for topic in CAMERA.values()}), FoundStrips()
+    times, off = LineTimes(0.0, 100.0), []
+    for strip in (0, 1):
+        for i in range(1500):
+            for ccd in CAMERA:
+                stamp = T + strip * 10**12 + round(4 * i * true_ns + 1e6 * rng.standard_normal())
+                for message in strips.add(ccd, stamp, PIXELS):
+                    block = message.body
+                    if block.first_line == 0 and block.ccd == "F":
+                        found.begin(block)
+                        start_ns = T + strip * 10**12
+                        times = LineTimes(0.0, 1e9 / (block.line_period_ns or true_ns))
+                    if block.line_times_ns is not None:
+                        times.add(block.first_line, (block.line_times_ns - start_ns) * 1e-9)
+                    found.note(block, message.stamp_ns)  # raises where a line is far off
+                    if i > 100:
+                        true_s = (4 * i + np.arange(4)) * true_ns * 1e-9
+                        off.append((strip, np.abs(times.time_of(block.first_line + np.arange(4)) - true_s).max()))
+    assert len(off) == 2 * 1399 * 3
+    # to half a line, where stamps alone are off by up to four tenths; by the nominal rate it would be 30 lines
+    assert max(o for _, o in off) < 5e-3 and np.mean([o for _, o in off]) < 2e-3
+    assert len(strips.told) == 1
+    assert "lines/s come, not 100.00, line_rate_hz; lines get times by that" in strips.told[0]
 
 
 def test_a_publisher_that_begins_anew_goes_on_in_the_strip_of_the_others():

@@ -66,7 +66,7 @@ def test_rays_keep_their_values_whatever_their_order(simulated):
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(len(network.rays))
     m = measurements(network)
-    mixed = Measurements(*(getattr(m, name)[shuffled] for name in m.__dataclass_fields__))
+    mixed = Measurements(*(getattr(m, name)[shuffled] for name in m.__dataclass_fields__ if name != "time_s"))
     got = build_network(network.camera, network.strips, network.point_ids, mixed, network.control, network.check)
     assert got.point_ids == network.point_ids
     np.testing.assert_array_equal(got.rays.line, network.rays.line)

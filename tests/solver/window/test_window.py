@@ -300,6 +300,7 @@ def empty_window(simulation, **options):
         (replace(LOOK, sample=12000.0), "beyond the ccd line"),
         (replace(LOOK, line=13500.0), "outside strip"),
         (replace(LOOK, line=-1.0), "outside strip"),
+        (replace(LOOK, time_s=20.0), "time is not that of its line"),
     ],
 )
 def test_looks_that_cannot_be_are_refused_and_named(flight, look, reason):
@@ -307,6 +308,13 @@ def test_looks_that_cannot_be_are_refused_and_named(flight, look, reason):
     assert window.add_look("P", look) == reason
     update = window.update(4.0)
     assert [(r.point, r.look.ccd, r.reason) for r in update.refused] == [("P", look.ccd, reason)]
+
+
+@pytest.mark.parametrize(("stated_s", "time_s"), [(np.nan, 3.0 + 2000 / 450.0), (7.6, 7.6)])
+def test_a_look_has_its_own_time_or_that_of_the_rate(flight, stated_s, time_s):
+    window = empty_window(flight[0])
+    assert window.add_look("P", replace(LOOK, time_s=stated_s)) == ""
+    assert window.network.intake.points["P"].time_s == [pytest.approx(time_s, abs=1e-12)]
 
 
 def test_duplicates_single_looks_and_looks_without_orientation_are_refused(flight):
