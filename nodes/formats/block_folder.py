@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from .camera_json import read_camera
 from .keys import Keys, is_there, read_toml
 from .place_columns import PLACE, check_place_units, place_column
 from .projection import notes_of_heights
-from .table import Column, Table, one_line, read_table
+from .table import Column, Table, column_names_of, one_line, read_table
 
 #: Files that make a folder a block folder (project.toml may be absent).
 FILES = ("camera.json", "strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv")
@@ -35,6 +36,8 @@ _STRIPS = (
     Column("lens", "text", optional=True, blank=True),
     Column("line_times", "text", optional=True, blank=True),
 )
+#: What a file of line times says in their place.
+_OF_LINE_TIMES = ("first_line_time_s", "line_rate_hz", "lines")
 _LINE_TIMES = (Column("line", "integer", low=0), Column("time_s"))
 _POSE = (*PLACE, "omega_deg", "phi_deg", "kappa_deg")
 _TRAJECTORY = (
@@ -89,7 +92,7 @@ def read_block(folder: Path | str) -> BlockData:
     notes: list[str] = []
     name, crs, apriori = _project(folder, notes)
     camera = read_camera(folder / "camera.json", notes)
-    strip_table = read_table(folder / "strips.csv", _STRIPS, notes)
+    strip_table = _strip_table(folder / "strips.csv", notes)
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
     ground_table = read_table(folder / "ground_points.csv", GROUND, notes, may_be_empty=True)
     frame = _frame(folder, crs, poses, ground_table)
@@ -259,6 +262,13 @@ def _groups(strip: NDArray[np.object_], lens: NDArray[np.object_]):
         yield key, np.flatnonzero(code == i)
 
 
+def _strip_table(path: Path, notes: list[str]) -> Table:
+    """strips.csv; where it names files of line times, the columns that these replace may be absent."""
+    if "line_times" not in column_names_of(path):
+        return read_table(path, _STRIPS, notes)
+    return read_table(path, [replace(c, optional=c.optional or c.name in _OF_LINE_TIMES) for c in _STRIPS], notes)
+
+
 def _strips(
     table: Table, camera: LineCamera, trajectories: Mapping[Key, Trajectory], notes: list[str]
 ) -> tuple[Strip, ...]:
@@ -278,7 +288,7 @@ def _strips(
         trajectory = trajectories.get((id, lens)) or trajectories.get((id, None))
         if trajectory is None:
             raise refuse("strip", f"no trajectory of {name} in trajectory.csv")
-        first, rate, lines = (float(table[c][row]) for c in ("first_line_time_s", "line_rate_hz", "lines"))
+        first, rate, lines = (float(table[c][row]) if c in table else np.nan for c in _OF_LINE_TIMES)
         lines = 0 if np.isnan(lines) else int(lines)
         times = table["line_times"][row] if "line_times" in table else ""
         line_time = None
