@@ -28,6 +28,9 @@ _BAD = SUSPICIOUS_CHI2
 _GOOD, _BETTER = 1.5, 10.0
 #: Another cause whose misfit is less than so many times that of the best is named beside it. Tuned.
 _CLEARLY = 1.3
+#: A factor on gravity is that of a cause within this logarithm; causes whose logarithms differ by less than the second
+#: are both named: turns and vibration move the median by some per cent. Tuned.
+_FITS, _ALIKE = 0.4, 0.1
 _NAMES = ("forward", "right", "down")
 
 
@@ -74,19 +77,22 @@ def _force_unit(inertial: InertialData, increments: bool) -> Finding | None:
     ratio = float(np.median(np.linalg.norm(inertial.dv, axis=1) / inertial.dt_s)) / 9.80665
     if 0.6 < ratio < 1.7:
         return None
+    mixed_up = (
+        (1.0 / dt, "the columns say velocity increments, but they hold specific force (rates)")
+        if increments
+        else (dt, "the columns say specific force, but they hold velocity increments")
+    )
     known = [
+        mixed_up,
         (1.0 / 9.80665, "accelerometers give g, not m/s^2"),
         (100.0, "accelerometers give cm/s^2 (Gal) or thousandths of g, not m/s^2"),
         (1.0 / 0.3048, "accelerometers give ft/s^2, not m/s^2"),
     ]
-    if increments:
-        known.append((1.0 / dt, "the columns say velocity increments, but they hold specific force (rates)"))
-    else:
-        known.append((dt, "the columns say specific force, but they hold velocity increments"))
-    factor, cause = min(known, key=lambda k: abs(np.log(max(ratio, 1e-12) / k[0])))
+    off = [abs(float(np.log(max(ratio, 1e-12) / factor))) for factor, _ in known]
     figure = f"gravity comes out as {ratio * 9.80665:.4g} m/s^2"
-    if abs(np.log(max(ratio, 1e-12) / factor)) < 0.4:
-        return Finding("force unit", "imu.force", f"{cause}: {figure}", True)
+    if min(off) < _FITS:  # at 100 Hz a mix-up looks like cm/s^2, at 10 Hz like g
+        alike = [cause for miss, (_, cause) in zip(off, known, strict=True) if miss < min(off) + _ALIKE]
+        return Finding("force unit", "imu.force", f"{'; or '.join(alike)}: {figure}", True)
     if ratio < 0.3:
         return Finding("force unit", "imu.force", f"gravity is not in the accelerations: {figure}", True)
     return Finding("force unit", "imu.force", f"not in m/s^2: {figure}", True)

@@ -92,6 +92,27 @@ def test_wrong_units_and_axes_are_named(case):
     assert "\n" not in finding.text
 
 
+@pytest.mark.parametrize(
+    ("rate_hz", "increments", "mixed_up", "unit"),
+    [
+        (100, True, "the columns say velocity increments, but they hold specific force", "cm/s^2 (Gal)"),
+        (10, False, "the columns say specific force, but they hold velocity increments", "accelerometers give g"),
+        (200, True, "the columns say velocity increments, but they hold specific force", None),
+        (50, False, "the columns say specific force, but they hold velocity increments", None),
+    ],
+)
+def test_a_mix_up_is_named_where_another_unit_looks_like_it(rate_hz, increments, mixed_up, unit):
+    """At 100 Hz gravity of a mix-up is that of cm/s^2, at 10 Hz that of g."""
+    time = 50.0 + np.arange(40 * rate_hz) / rate_hz
+    force = np.tile([0.3, -0.2, -9.81], (len(time), 1)) * (rate_hz if increments else 1.0 / rate_hz)
+    inertial = InertialData.from_rates(time, np.zeros_like(force), force)
+    _, gnss, settings = data()
+    (finding,) = check(inertial, gnss, settings, increments=increments)
+    assert finding.subject == "imu.force" and finding.text.startswith(mixed_up), finding.text
+    assert ("; or " in finding.text) == (unit is not None)
+    assert unit is None or unit in finding.text
+
+
 @pytest.mark.parametrize("shift", [1.0, -18.0, *(pytest.param(s, marks=pytest.mark.study) for s in (-1.0, 18.0, 37.0))])
 def test_time_scales_that_differ_by_whole_seconds_are_named(shift):
     d, g, s = data()
