@@ -39,6 +39,10 @@ def rasters_of_heights(names: Iterable[str]) -> list[Path]:
     return out
 
 
+class NothingUnder(UserError):
+    """No height of a raster is known under any of the pixels."""
+
+
 def height_range(
     places: Callable[[float], tuple[Array, Array]], raster: HeightRaster, guess_m: float, sensor: object, what: str
 ) -> tuple[float, float]:
@@ -47,27 +51,44 @@ def height_range(
     Parameters
     ----------
     places : latitudes and longitudes (n,), radians, of the pixels at a height, NaN where they miss
-    guess_m : height at which to look first
+    guess_m : height at which to look first; where the raster has none there, along the rays between its own heights
     sensor, what : named in errors: the metadata, and whose pixels they are
 
     Raises
     ------
-    UserError : the pixels do not see the ground, or the raster does not lie there
+    NothingUnder : the pixels do not see the ground, or the raster does not lie there
     """
     low = high = guess_m
     known = np.inf, -np.inf
     for _ in range(MOST_ROUNDS):
-        lat, lon = (np.concatenate(a) for a in zip(*(places(h) for h in {low, high}), strict=True))
-        seen = np.isfinite(lat)
-        if not seen.any():
-            raise UserError(f"{sensor}: {what} see no ground at {low:g} m")
-        lat, lon = lat[seen], lon[seen]
+        lat, lon = _seen(places, {low, high})
+        if not len(lat):
+            raise NothingUnder(f"{sensor}: {what} see no ground at {low:g} m")
         found = raster.range_over(lat, lon)
+        if found is None and not np.isfinite(known).all():
+            found = _along_rays(places, raster, lat, lon)
         if found is None:
             degrees = f"{np.degrees(lat.mean()):.4f} N, {np.degrees(lon.mean()):.4f} E"
-            raise UserError(f"{raster.name}: does not cover {what} around {degrees}")
+            raise NothingUnder(f"{raster.name}: does not cover {what} around {degrees}")
         low, high = min(known[0], found[0]), max(known[1], found[1])
         if (low, high) == known:
             break
         known = low, high
     return low, high
+
+
+def _along_rays(
+    places: Callable[[float], tuple[Array, Array]], raster: HeightRaster, lat: Array, lon: Array
+) -> tuple[float, float] | None:
+    """The heights under rays between the lowest and the highest height of the whole raster; None for none."""
+    whole = raster.range_over(lat, lon, everywhere=True)
+    if whole is None:
+        return None
+    lat, lon = _seen(places, set(whole))
+    return raster.range_over(lat, lon) if len(lat) else None
+
+
+def _seen(places: Callable[[float], tuple[Array, Array]], heights_m: set[float]) -> tuple[Array, Array]:
+    """Latitudes and longitudes of the pixels at heights, of those that do not miss."""
+    lat, lon = (np.concatenate(a) for a in zip(*(places(h) for h in sorted(heights_m)), strict=True))
+    return lat[np.isfinite(lat)], lon[np.isfinite(lat)]

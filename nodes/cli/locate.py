@@ -24,7 +24,7 @@ from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import new_file
 from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, Table, read_table, write_table
-from .heights_under import height_range, rasters_of_heights
+from .heights_under import NothingUnder, height_range, rasters_of_heights
 from .outputs import refuse_over_files
 
 EXAMPLE = """triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv
@@ -200,8 +200,11 @@ def _to_ground(
         located[inside] = model.direct(u[inside], v[inside], table["height_m"][inside])
         note[inside[np.isnan(located[inside, 0])]] = "the ray misses the ground"
     elif len(inside):
-        located[inside], slope = _met(model, u[inside], v[inside], terrain, scene)
-        note[inside[np.isnan(located[inside, 0])]] = f"no height of {terrain.name} where the ray comes down"
+        located[inside], slope = _met(model, u[inside], v[inside], terrain, scene, notes)
+        unmet = inside[np.isnan(located[inside, 0])]
+        note[unmet] = f"no height of {terrain.name} where the ray comes down"
+        passing = np.isnan(model.direct(u[unmet], v[unmet], np.zeros(len(unmet)))[:, 0])
+        note[unmet[passing]] = "the ray misses the ground"
     seen = np.flatnonzero(np.isfinite(located[:, 0]))
     columns: dict[str, Any] = {
         "column": v, "row": u, "lon_deg": np.degrees(located[:, 1]), "lat_deg": np.degrees(located[:, 0]),
@@ -218,27 +221,40 @@ def _to_ground(
     return columns, len(u) - len(seen)
 
 
-def _met(model: PushbroomSensor | Rpc, u: Array, v: Array, terrain: HeightRaster, scene: str) -> tuple[Array, Array]:
+def _met(
+    model: PushbroomSensor | Rpc, u: Array, v: Array, terrain: HeightRaster, scene: str, notes: list[str]
+) -> tuple[Array, Array]:
     """Latitude, longitude and height (n, 3) at which rays of pixels meet the terrain, and its slope there (n, 2)."""
     guess = float(model.to_image.in_offset[2]) if isinstance(model, Rpc) else 0.0
-
-    def places(height_m: float) -> tuple[Array, Array]:
-        located = model.direct(u, v, np.full(len(u), height_m))
-        return located[:, 0], located[:, 1]
-
-    low, high = height_range(places, terrain, guess, scene, "the pixels")
     located, slope = np.full((len(u), 3), np.nan), np.full((len(u), 2), np.nan)
-    squares = np.column_stack([u // SQUARE_PX, v // SQUARE_PX])
-    _, of = np.unique(squares, axis=0, return_inverse=True)
-    for k in range(int(of.max()) + 1):
-        some = np.flatnonzero(of.ravel() == k)
-        met = meet_terrain(model, u[some], v[some], terrain, low, high)
-        some, here = some[np.isfinite(met.lat)], np.isfinite(met.lat)
-        if not len(some):
-            continue
-        located[some] = np.column_stack([met.lat, met.lon, met.height_m])[here]
-        lat, lon, height_m = located[some].T
-        slope[some] = ground_slopes(terrain, lat, lon, height_m, terrain.ellipsoid)
+    rest = np.arange(len(u))
+    while len(rest):
+
+        def places(height_m: float, rest: NDArray[np.intp] = rest) -> tuple[Array, Array]:
+            at = model.direct(u[rest], v[rest], np.full(len(rest), height_m))
+            return at[:, 0], at[:, 1]
+
+        try:
+            low, high = height_range(places, terrain, guess, scene, "the pixels")
+        except NothingUnder as reason:
+            if len(rest) == len(u):
+                notes.append(str(reason))
+            break
+        squares = np.column_stack([u[rest] // SQUARE_PX, v[rest] // SQUARE_PX])
+        _, of = np.unique(squares, axis=0, return_inverse=True)
+        for k in range(int(of.max()) + 1):
+            some = rest[of.ravel() == k]
+            met = meet_terrain(model, u[some], v[some], terrain, low, high)
+            some, here = some[np.isfinite(met.lat)], np.isfinite(met.lat)
+            if not len(some):
+                continue
+            located[some] = np.column_stack([met.lat, met.lon, met.height_m])[here]
+            lat, lon, height_m = located[some].T
+            slope[some] = ground_slopes(terrain, lat, lon, height_m, terrain.ellipsoid)
+        # what is left may lie on heights that are not among those under the others
+        before, rest = len(rest), rest[np.isnan(located[rest, 0])]
+        if len(rest) == before:
+            break
     return located, slope
 
 

@@ -238,13 +238,18 @@ class HeightRaster:
         z = _read(file, *place)
         return z if self._unit_m == 1.0 else z * np.float32(self._unit_m)
 
-    def range_over(self, lat: Array, lon: Array) -> tuple[float, float] | None:
-        """Lowest and highest height above the ellipsoid around points, by a thinned-out window; None for none."""
+    def range_over(self, lat: Array, lon: Array, *, everywhere: bool = False) -> tuple[float, float] | None:
+        """Lowest and highest height above the ellipsoid around points, by a thinned-out window; None for none.
+
+        ``everywhere`` : of the whole raster, above the ellipsoid by the geoid where it is nearest to the points.
+        """
         row, column = self.place(lat, lon)
         if not (np.isfinite(row).any() and np.isfinite(column).any()):
             return None
         top, left = int(np.nanmin(row)) - 2, int(np.nanmin(column)) - 2
         height, width = int(np.nanmax(row)) + 3 - top, int(np.nanmax(column)) + 3 - left
+        if everywhere:
+            top, left, height, width = 0, 0, self.rows, self.columns
         low, high, slack = np.inf, -np.inf, 0.0
         for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
             r0, c0 = max(top, first_row) - first_row, max(left, first_column) - first_column

@@ -166,6 +166,22 @@ def test_one_pixel_alone_is_met_where_the_ground_rises(scene, relief, tmp_path):
     assert np.abs(alone.loc[0, ["lon_deg", "lat_deg"]] - together.loc[0, ["lon_deg", "lat_deg"]]).max() < 2e-8
 
 
+def test_a_pixel_is_met_by_a_raster_of_its_place_alone(scene, tmp_path):
+    """At height 0 the ray is beside it; that other pixels meet something, or nothing does, makes no difference."""
+    waves = Waves.under(read_scene(scene).model(), 300, low_m=4000.0, high_m=4500.0)
+    pixel, datum = "250,2000\n", ["--dem-datum", "ellipsoid"]
+    whole = on_terrain(scene, tmp_path, pixel, "--dem", waves.write(tmp_path / "whole.tif"), *datum).iloc[0]
+    row, column = (int(at) for at in waves.place(np.radians(whole["lat_deg"]), np.radians(whole["lon_deg"])))
+    near = np.zeros(waves.z.shape, dtype=bool)
+    near[row - 1 : row + 3, column - 1 : column + 3] = True
+    waves.z = np.where(near, waves.z, np.float32(np.nan))
+    alone = ["--dem", waves.write(tmp_path / "alone.tif"), *datum]
+    for rows in (pixel, pixel + "100,0\n"):
+        table = on_terrain(scene, tmp_path, rows, *alone)
+        assert np.abs(table.loc[0, ["lon_deg", "lat_deg"]] - whole[["lon_deg", "lat_deg"]]).max() < 2e-8
+        assert len(table) == 1 or table.loc[1, "note"] == "no height of alone.tif where the ray comes down"
+
+
 def test_sigmas_on_a_slope_are_what_shifts_do(scene, relief, tmp_path):
     waves, dem = relief
     rows, moved = "60,900\n320,2500\n", "60,900.5\n320,2500.5\n"
@@ -203,13 +219,16 @@ def test_what_a_terrain_does_not_cover_is_told(scene, relief, tmp_path, capsys):
     assert f"{tmp_path / 'pixels.csv'}: height_m is not used: heights are those of dem.tif" in capsys.readouterr().out
     far = Waves(waves.lat_deg - 20, waves.lon_deg, waves.step_deg, 20, 20).write(tmp_path / "far.tif")
     for more, reason in (
-        (["--dem", str(far), *dem[2:]], "far.tif: does not cover the pixels around "),
         (dem[:2], "does not say what its heights are above"),
         (["--dem-datum", "ellipsoid"], "--dem-datum: goes with --dem"),
     ):
         assert main(["locate", str(scene), *where, *more]) == 1
         error = capsys.readouterr().err
         assert reason in error and error.count("\n") == 1, error
+    assert main(["locate", str(scene), *where, "--dem", str(far), *dem[2:]]) == 0
+    assert "3 of them miss; heights far.tif" in (told := capsys.readouterr().out)
+    assert "note: far.tif: does not cover the pixels around " in told
+    assert pd.read_csv(tmp_path / "o.csv")["note"].eq("no height of far.tif where the ray comes down").all()
     by_crs = on_terrain(scene, tmp_path, "100,700\n", *dem[:2], "--dem-crs", "ellipsoid")
     pd.testing.assert_frame_equal(by_crs, on_terrain(scene, tmp_path, "100,700\n", *dem))
     assert main(["locate", str(scene), "--pixels", str(tmp_path / "bare.csv"), "-o", str(tmp_path / "o.csv")]) == 1
