@@ -39,7 +39,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "a valid recording from a broken one"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
     "import": ("import_", "flight folder, poses, sensors, image lines and others to a recording"),
-    "locate": ("locate", "pixels to the ground and back, by a satellite's rigorous model or RPC"),
+    "locate": ("locate", "pixels to the ground and back, by any sensor or RPC"),
     "rectify": ("rectify", "image lines to an orthoimage, a cloud-optimised GeoTIFF"),
     "study": ("study", "Monte Carlo and sensitivity studies"),
     "view": ("view", "open a recording in Rerun"),

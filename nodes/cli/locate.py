@@ -1,4 +1,4 @@
-"""``triline locate``: pixels to the ground and back, by the rigorous model or the RPC of any satellite scene."""
+"""``triline locate``: pixels to the ground and back, by the rigorous model or RPC of a scene, or a frame camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
-from ...solver.location.pushbroom import PushbroomSensor
+from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, ground_derivatives, pixel_covariance
@@ -22,9 +22,9 @@ from ...solver.rectification.pixel_to_cell import meet_terrain
 from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import new_file
-from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, Table, read_table, write_table
 from .heights_under import NothingUnder, height_range, rasters_of_heights
+from .location_model import SENSORS, Model, read_location_model
 from .outputs import refuse_over_files
 
 EXAMPLE = """triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv
@@ -39,10 +39,12 @@ _HEIGHT = Column("height_m")
 _NO_HEIGHT = Column("height_m", optional=True, blank=True)
 #: Pixels meet the terrain in groups of squares of the image with so many pixels a side: one window of the raster each.
 SQUARE_PX = 2048
+#: Rays are looked at from so far below a frame camera on; the terrain is searched from one metre more.
+BELOW_CAMERA_M = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("sensor", metavar="META", help="metadata of a scene: " + "; ".join(KINDS.values()))
+    parser.add_argument("sensor", metavar="META", help="metadata of a scene or image: " + "; ".join(SENSORS.values()))
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "--pixels", metavar="CSV", help="column,row,height_m: 0-based, integers at pixel centres, above the ellipsoid"
@@ -75,23 +77,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "vapour pressure (hPa) at sea level (default: straight rays)",
     )
     parser.add_argument(
-        "--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"), help="of the orbit, m"
+        "--position-sigma",
+        type=float,
+        nargs=3,
+        metavar=("ALONG", "ACROSS", "UP"),
+        help="of the orbit, m; of a frame camera east, north, up",
     )
     parser.add_argument(
-        "--attitude-sigma", type=float, nargs=3, metavar=("ROLL", "PITCH", "YAW"), help="of the satellite, degrees"
+        "--attitude-sigma",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="roll, pitch, yaw of the satellite, degrees; of a frame camera about east, north, up",
     )
     parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
     parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given, or of the raster")
 
 
 def run(args: argparse.Namespace) -> int:
-    scene = read_scene(Path(args.sensor))
-    model = scene.model(args.model, args.ccd)
-    model = with_refraction(args, model)
+    scene = read_location_model(Path(args.sensor), args.model, args.ccd)
+    model, notes = with_refraction(args, scene.model), scene.notes
     sigmas = stated_sigmas(args, scene.sigmas)
     if sigmas.any and isinstance(model, Rpc):
         raise UserError(f"{args.sensor}: sigmas go with a rigorous model, this is an RPC")
-    notes = [*scene.notes, *scene.line_taken(model, args.ccd)]
     terrain = _terrain(args, model)
     if args.pixels:
         columns, missed = _to_ground(Path(args.pixels), model, terrain, sigmas, notes, args.sensor)
@@ -112,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(result, indent=2))
     elif not args.quiet:
-        print(f"{args.sensor} ({KINDS[scene.kind]}, {result['model']} model) -> {args.output}")
+        print(f"{args.sensor} ({SENSORS[scene.kind]}, {result['model']} model) -> {args.output}")
         print(f"  {result['rows']} rows, {missed} of them miss; heights {result['heights']}")
         for note in notes:
             print(f"  note: {note}")
@@ -168,7 +176,7 @@ def stated_sigmas(args: argparse.Namespace, stated: Sigmas) -> Sigmas:
         ) from None
 
 
-def _terrain(args: argparse.Namespace, model: PushbroomSensor | Rpc) -> HeightRaster | None:
+def _terrain(args: argparse.Namespace, model: Model) -> HeightRaster | None:
     """The raster of heights that the command line names."""
     if not args.dem:
         for name in ("dem_crs", "dem_datum"):
@@ -189,7 +197,7 @@ def _table(path: Path, columns: tuple[Column, ...], terrain: HeightRaster | None
 
 
 def _to_ground(
-    path: Path, model: PushbroomSensor | Rpc, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str], scene: str
+    path: Path, model: Model, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str], scene: str
 ) -> tuple[dict[str, Any], int]:
     table = _table(path, _PIXELS, terrain, notes)
     u, v = table["row"], table["column"]
@@ -210,7 +218,7 @@ def _to_ground(
         "column": v, "row": u, "lon_deg": np.degrees(located[:, 1]), "lat_deg": np.degrees(located[:, 0]),
         "height_m": located[:, 2],
     }  # fmt: skip
-    if sigmas.any and isinstance(model, PushbroomSensor):
+    if sigmas.any and not isinstance(model, Rpc):
         J = ground_derivatives(model, u[seen], v[seen], located[seen, 2])
         if slope is not None:
             J = derivatives_on_terrain(J, slope[np.isfinite(located[inside, 0])])
@@ -221,9 +229,7 @@ def _to_ground(
     return columns, len(u) - len(seen)
 
 
-def _met(
-    model: PushbroomSensor | Rpc, u: Array, v: Array, terrain: HeightRaster, scene: str, notes: list[str]
-) -> tuple[Array, Array]:
+def _met(model: Model, u: Array, v: Array, terrain: HeightRaster, scene: str, notes: list[str]) -> tuple[Array, Array]:
     """Latitude, longitude and height (n, 3) at which rays of pixels meet the terrain, and its slope there (n, 2)."""
     guess = float(model.to_image.in_offset[2]) if isinstance(model, Rpc) else 0.0
     located, slope = np.full((len(u), 3), np.nan), np.full((len(u), 2), np.nan)
@@ -240,6 +246,9 @@ def _met(
             if len(rest) == len(u):
                 notes.append(str(reason))
             break
+        if isinstance(model, FrameCamera):  # an aircraft in a valley looks at what is below it
+            high = min(high, float(model.ellipsoid.geodetic(model.position_e)[2]) - BELOW_CAMERA_M)
+        low = min(low, high)
         squares = np.column_stack([u[rest] // SQUARE_PX, v[rest] // SQUARE_PX])
         _, of = np.unique(squares, axis=0, return_inverse=True)
         for k in range(int(of.max()) + 1):
@@ -258,7 +267,7 @@ def _met(
     return located, slope
 
 
-def _outside(model: PushbroomSensor | Rpc, u: Array, v: Array) -> NDArray[np.object_]:
+def _outside(model: Model, u: Array, v: Array) -> NDArray[np.object_]:
     """A note for pixels outside the image; an RPC may not know its size."""
     note = np.full(len(u), "", dtype=object)
     if model.lines and model.samples:
@@ -268,7 +277,7 @@ def _outside(model: PushbroomSensor | Rpc, u: Array, v: Array) -> NDArray[np.obj
 
 
 def _to_pixels(
-    path: Path, model: PushbroomSensor | Rpc, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str]
+    path: Path, model: Model, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str]
 ) -> tuple[dict[str, Any], int]:
     table = _table(path, _GROUND, terrain, notes)
     table.refuse(np.abs(table["lat_deg"]) > 90.0, "lat_deg", lambda row: "a latitude beyond 90 degrees")
@@ -286,7 +295,7 @@ def _to_pixels(
         "lon_deg": table["lon_deg"], "lat_deg": table["lat_deg"], "height_m": h,
         "column": pixel[:, 1], "row": pixel[:, 0],
     }  # fmt: skip
-    if sigmas.any and isinstance(model, PushbroomSensor):
+    if sigmas.any and not isinstance(model, Rpc):
         covariance = np.full((len(pixel), 2, 2), np.nan)
         covariance[seen] = pixel_covariance(model, pixel[seen, 0], pixel[seen, 1], h[seen], sigmas)
         for k, name in enumerate(("sigma_row", "sigma_column")):

@@ -25,14 +25,13 @@ from ...solver.rectification.pixel_to_cell import meet_terrain
 from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
 from ..batch.image_rectification import ErrorMap, Ground, ImageRectification, SourceImage, edge_of
 from ..errors import UserError
-from ..formats.frame_json import is_frame_json, read_frame
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map, unit_of
-from ..formats.satellite.read import KINDS, read_scene
 from ..formats.table import Column, read_table
 from .heights_under import height_range, rasters_of_heights
 from .locate import with_refraction
+from .location_model import SENSORS, read_location_model
 from .outputs import refuse_over_files
 from .progress import progress
 
@@ -63,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--sensor", metavar="META", action="append",
-        help="metadata of the image: JSON of a frame camera (docs/rectification.md); " + "; ".join(KINDS.values()),
+        help="metadata of the image: " + "; ".join(SENSORS.values()),
     )  # fmt: skip
     group.add_argument("--model", choices=("rigorous", "rpc"), help="where the metadata have both (default: rigorous)")
     group.add_argument("--first-pixel", type=int, nargs=2, metavar=("COLUMN", "ROW"), help="of the image in the scene")
@@ -238,18 +237,9 @@ def _check(args: argparse.Namespace) -> None:
 
 def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     path = Path(args.sensor)
-    notes: list[str] = []
-    if is_frame_json(path):
-        for name, given in (("ccd", args.ccd), ("model", args.model)):
-            if given is not None:
-                raise UserError(f"--{name} {given}: {path} is of a frame camera, which has one model and no lines")
-        bare, stated = read_frame(path, notes)
-        kind, sigmas = "frame camera", Sigmas(stated["position_m"], stated["attitude_rad"])
-    else:
-        scene = read_scene(path)
-        bare = scene.model(args.model, args.ccd)
-        notes += [*scene.notes, *scene.line_taken(bare, args.ccd)]
-        kind, sigmas = ("RPC" if isinstance(bare, Rpc) else "rigorous model"), scene.sigmas
+    read = read_location_model(path, args.model, args.ccd)
+    bare, sigmas, notes = read.model, read.sigmas, read.notes
+    kind = "frame camera" if read.kind == "frame" else "RPC" if isinstance(bare, Rpc) else "rigorous model"
     bare = with_refraction(args, bare)
     ellipsoid = WGS84 if isinstance(bare, Rpc) else bare.ellipsoid
     unknown = isinstance(bare, Rpc) and not (bare.lines and bare.samples)

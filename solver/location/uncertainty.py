@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..orbit.motion import R_from_orbital
+from .frame_camera import FrameCamera
 from .pushbroom import PushbroomSensor
 
 Array = NDArray[np.floating]
@@ -34,9 +35,10 @@ class Sigmas:
 
     Attributes
     ----------
-    position_m : (3,) of the orbit along the track, across, and up
-    attitude_rad : (3,) of small turns about the axes of the body that point forward, right and down (`named_axes_b`)
-    time_s : of the times of the lines against orbit and attitude
+    position_m : (3,) of the orbit along the track, across, and up; of a frame camera east, north, up
+    attitude_rad : (3,) of small turns about the axes of the body that point forward, right and down (`named_axes_b`);
+        of a frame camera about east, north, up
+    time_s : of the times of the lines against orbit and attitude; a frame image has none
     pixel : (2,) of line and sample
     height_m : of the height that is given with a pixel
 
@@ -79,12 +81,16 @@ def named_axes_b(sensor: PushbroomSensor) -> Array:
     return _WAYS[int(np.argmax(np.einsum("nij,ij->n", _WAYS, flight)))]
 
 
-def ground_derivatives(sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
+def ground_derivatives(
+    sensor: PushbroomSensor | FrameCamera, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike
+) -> Array:
     """Derivatives (n, 3, 10) of the ground position in east, north, up by the ten quantities of `Sigmas`.
 
     Light time and aberration are left out here; they change a derivative by less than 1e-4 of itself.
     """
     u, v, h = (np.array(a, dtype=float) for a in np.broadcast_arrays(*map(np.atleast_1d, (line, sample, height_m))))
+    if isinstance(sensor, FrameCamera):
+        return _of_frame(sensor, u, v, h)
     P = sensor.ground(u, v, h)
     pose = sensor.pose(u)
     look, slope = sensor.look.at(v)
@@ -118,8 +124,21 @@ def ground_derivatives(sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLi
     return np.swapaxes(_R_en(normal, P), -1, -2) @ J
 
 
+def _of_frame(camera: FrameCamera, u: Array, v: Array, h: Array) -> Array:
+    """`ground_derivatives` of a frame camera: what moves a ground point in the image moves the ray of a pixel back."""
+    P = camera.ground(u, v, h)
+    d = P - camera.position_e
+    normal, _ = camera.ellipsoid.normal_and_height(P)
+    J = np.zeros((len(u), 3, 10))
+    J[:, :, 7] = camera.ground(u + 0.5, v, h) - camera.ground(u - 0.5, v, h)
+    J[:, :, 8] = camera.ground(u, v + 0.5, h) - camera.ground(u, v - 0.5, h)
+    J[:, :, 0:6] = -J[:, :, 7:9] @ camera.image_derivatives(u, v, h)
+    J[:, :, 9] = d / np.einsum("ni,ni->n", normal, d)[:, None]
+    return np.swapaxes(_R_en(normal, P), -1, -2) @ J
+
+
 def ground_covariance(
-    sensor: PushbroomSensor, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike, sigmas: Sigmas
+    sensor: PushbroomSensor | FrameCamera, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike, sigmas: Sigmas
 ) -> Array:
     """Covariance (n, 3, 3) in m2, east, north, up, of pixels located at heights."""
     J = ground_derivatives(sensor, line, sample, height_m) * sigmas.values
@@ -127,7 +146,7 @@ def ground_covariance(
 
 
 def pixel_covariance(
-    sensor: PushbroomSensor,
+    sensor: PushbroomSensor | FrameCamera,
     line: ArrayLike,
     sample: ArrayLike,
     height_m: ArrayLike,

@@ -47,7 +47,7 @@ def read_isd(path: Path) -> SatelliteScene:
     file, notes = read_json(path), list[str]()
     if file.has("exterior") and not file.has("name_model"):
         raise UserError(
-            f"{path}: orientation of a frame camera, which `triline rectify --sensor` takes; wanted a scene"
+            f"{path}: orientation of a frame camera, which `triline locate` and `rectify --sensor` take; wanted a scene"
         )
     model = file.text("name_model")
     if model != _LINE_SCANNER:

@@ -233,3 +233,107 @@ def test_what_a_terrain_does_not_cover_is_told(scene, relief, tmp_path, capsys):
     pd.testing.assert_frame_equal(by_crs, on_terrain(scene, tmp_path, "100,700\n", *dem))
     assert main(["locate", str(scene), "--pixels", str(tmp_path / "bare.csv"), "-o", str(tmp_path / "o.csv")]) == 1
     assert "height_m: column missing" in capsys.readouterr().err
+
+
+# -- a frame camera ------------------------------------------------------------------------------------------------
+
+FRAME = {
+    "interior": {
+        "focal_length_mm": 100.0, "pixel_size_mm": 0.01, "lines": 3000, "samples": 4000,
+        "principal_point_mm": [0.12, -0.08], "distortion": {"k1": -1e-6},
+    },
+    "exterior": {"lat_deg": 47.0, "lon_deg": 11.0, "height_m": 2500.0, "omega_phi_kappa_deg": [4.0, -15.0, 33.0]},
+    "sigma": {"position_m": [0.1, 0.2, 0.3], "attitude_deg": [0.01, 0.02, 0.03]},
+}  # fmt: skip
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.eye(3)
+    R[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return R
+
+
+def _in_image(lon_deg, lat_deg, height_m, moved_m=(0.0, 0.0, 0.0), turned_rad=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Column and row of a ground point in `FRAME`, by the definitions of docs/rectification.md."""
+    from pyproj import Transformer
+
+    to_earth = Transformer.from_crs(4979, 4978, always_xy=True)
+    inside, outside = FRAME["interior"], FRAME["exterior"]
+    lon, lat = np.radians(outside["lon_deg"]), np.radians(outside["lat_deg"])
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    enu = np.column_stack([east, np.cross(up, east), up])
+    R = np.eye(3)
+    for axis, angle in enumerate(np.radians(outside["omega_phi_kappa_deg"])):
+        R = R @ _turn(axis, angle)
+    for axis, angle in enumerate(turned_rad):
+        R = _turn(axis, angle) @ R
+    C = np.array(to_earth.transform(outside["lon_deg"], outside["lat_deg"], outside["height_m"])) + enu @ moved_m
+    d = (enu @ R).T @ (np.array(to_earth.transform(lon_deg, lat_deg, height_m)) - C)
+    x, y = -inside["focal_length_mm"] * d[:2] / d[2]
+    x, y = np.array([x, y]) * (1.0 + inside["distortion"]["k1"] * (x * x + y * y)) + inside["principal_point_mm"]
+    return np.array([1999.5 + x / 0.01, 1499.5 - y / 0.01])
+
+
+@pytest.fixture
+def frame(tmp_path):
+    path = tmp_path / "frame.json"
+    path.write_text(json.dumps(FRAME))
+    return path
+
+
+def test_a_frame_camera_by_its_definition(frame, tmp_path, capsys):
+    rows = "0,0,600\n3999,2999,500\n1999.5,1499.5,700\n-3,10,0\n"
+    more = ["--pixel-sigma", "0.3", "--height-sigma", "0.5"]
+    table = located(frame, tmp_path, ["--pixels", pixels(tmp_path, rows)], *more)
+    assert table["note"].tolist()[3] == "outside the image of 4000 columns and 3000 rows"
+    for _, row in table[:3].iterrows():
+        at = row[["lon_deg", "lat_deg", "height_m"]].to_numpy(float)
+        assert _in_image(*at) == pytest.approx(row[["column", "row"]].to_numpy(float), abs=1e-4)
+        # sigmas by differences of the definition
+        step = 1e-7
+        metres = np.radians(1.0) * np.array([6388182.0 * np.cos(np.radians(at[1])), 6369510.0])
+        by = [(_in_image(*(at + e)) - _in_image(*(at - e))) / (2 * step) for e in np.eye(3)[:2] * step]
+        to_ground = metres[:, None] * np.linalg.inv(np.column_stack(by))
+        half = np.array([0.0, 0.0, 0.5])  # of a metre, the sigma of the height
+        errors = [np.diag([0.3, 0.3]), 0.5 * (_in_image(*(at + half)) - _in_image(*(at - half)))[:, None]]
+        for name, steps, sigmas in (
+            ("moved_m", 0.01, FRAME["sigma"]["position_m"]),
+            ("turned_rad", 1e-5, np.radians(FRAME["sigma"]["attitude_deg"])),
+        ):
+            ways = [_in_image(*at, **{name: e}) - _in_image(*at, **{name: -e}) for e in np.eye(3) * steps]
+            errors.append(np.column_stack(ways) * sigmas / (2 * steps))
+        wanted = np.sqrt(np.square(to_ground @ np.hstack(errors)).sum(axis=1))
+        assert row[["sigma_e_m", "sigma_n_m"]].to_numpy(float) == pytest.approx(wanted, rel=2e-3)
+        assert row["sigma_u_m"] == pytest.approx(0.5, abs=1e-4)
+    table[:3][["lon_deg", "lat_deg", "height_m"]].to_csv(tmp_path / "places.csv", index=False)
+    back = located(frame, tmp_path, ["--ground", tmp_path / "places.csv"], *more)
+    assert np.abs(back[["column", "row"]] - table[:3][["column", "row"]]).to_numpy().max() < 1e-4
+    assert back["sigma_row"].between(1.0, 5.0).all() and back["sigma_column"].between(1.0, 5.0).all()
+    where = ["--pixels", str(tmp_path / "pixels.csv"), "-o", str(tmp_path / "o.csv")]
+    assert main(["locate", str(frame), *where, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kind"], told["model"], told["missed"]) == ("frame", "rigorous", 1)
+    assert main(["locate", str(frame), *where, "--ccd", "F"]) == 1
+    assert "is of a frame camera, which has one model and no lines" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("summit_m", [0.0, 1500.0])
+def test_a_frame_camera_over_a_terrain_that_may_be_higher_than_it(frame, summit_m, tmp_path):
+    valley = Waves(47.02, 10.98, 1e-4, 400, 500, low_m=550.0, high_m=650.0)
+    valley.z[189, 300] += np.float32(summit_m + 500.0)  # beside what the pixels see, between their places
+    table = on_terrain(
+        frame,
+        tmp_path,
+        "0,0\n3999,2999\n1999.5,1499.5\n",
+        "--dem",
+        valley.write(tmp_path / "valley.tif"),
+        "--dem-datum",
+        "ellipsoid",
+    )
+    surface = valley.at(np.radians(table["lat_deg"]), np.radians(table["lon_deg"]))
+    assert np.abs(table["height_m"] - surface).max() < 0.01
+    for _, row in table.iterrows():
+        found = _in_image(row["lon_deg"], row["lat_deg"], row["height_m"])
+        assert found == pytest.approx(row[["column", "row"]].to_numpy(float), abs=0.02)
