@@ -230,6 +230,8 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
     flight.attempt(lambda: _mounting(flight, tables["mounting"]))
     flight.attempt(lambda: _navigation(flight, tables["navigation"], live, others))
     flight.attempt(lambda: _errors(flight, tables["navigation"], tables["trajectory"], tables["imu"]))
+    if flight.tables is not None:
+        _beside_platform(flight, flight.tables, tables["mounting"])
     flight.attempt(lambda: _ground(flight, tables["dem"], tables["flight"]))
     flight.attempt(lambda: _control(flight, tables["control"], tables["flight"]))
     given = others.lines if others.lines is not None and others.lines.topics is None and others.lines.files else None
@@ -483,6 +485,28 @@ def _mounting(flight: Flight, keys: Keys) -> None:
     refuse_mounting(keys)
     flight.lever_arm_m = three("lever_arm_m")
     flight.mounting = Mounting(three("camera_lever_arm_m"), three("boresight_deg"))
+
+
+def _beside_platform(flight: Flight, folder: SensorFolder, keys: Keys) -> None:
+    """What a platform.toml in the folder of the sensors says: flight.toml counts, and has to say as much."""
+    own = folder.platform
+    for key, said, counts in (
+        ("lever_arm_m", own.lever_arm_m, flight.lever_arm_m),
+        ("camera_lever_arm_m", own.camera_lever_arm_m, flight.mounting.lever_arm_m),
+        ("boresight_deg", own.boresight_deg, flight.mounting.boresight_deg),
+    ):
+        if not any(said) or tuple(said) == tuple(counts):
+            continue
+        shown = ", ".join(f"{value:g}" for value in said)
+        if keys.has(key):
+            flight.notes.append(f"platform.toml: {key} [{shown}] is not used: {keys.name(key)} of {FILE} counts")
+        else:
+            where = folder.path / "platform.toml"
+            flight.problems.append(f"{keys.path}: {keys.name(key)}: missing, but {where} says [{shown}]: wanted one")
+    if own.grade not in (MEMS, flight.grade):
+        flight.notes.append(f"platform.toml: [imu] is not used: imu.* and navigation.imu of {FILE} count")
+    if any(own.wander_sigma_ned_m):
+        flight.notes.append(f"platform.toml: [gnss] is not used: trajectory.* and navigation.gnss of {FILE} count")
 
 
 def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> None:

@@ -188,6 +188,34 @@ def test_sensors_get_height_and_noise_from_the_folder(folder, tmp_path):
     assert any(lost in note for note in read_flight(folder).notes)
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_mounting_that_the_sensor_folder_alone_states_is_asked_for(beside, folder, tmp_path, capsys):
+    """Its lever arm was lost without a word; the notes spoke of zero, or of nothing."""
+    at, out = (tmp_path if beside else folder) / "sensors", tmp_path / "o.mcap"
+    at.mkdir()
+    fixes = [f"{1591012800 + i},{LAT},{LON},2000,0.1,0.1,0.2" for i in range(6)]
+    head = "time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m\n"
+    (at / "gnss.csv").write_text(head + "\n".join(fixes) + "\n")
+    (at / "platform.toml").write_text(
+        "lever_arm_m = [0.2, 0, -1.5]\nboresight_deg = [0, 0.3, 0]\n[imu]\ngyro_noise_deg_sqrt_h = 7\n"
+        "[gnss]\nwander_sigma_m = [1, 1, 2]\n"
+    )
+    text = TOML.replace('"poses.csv"', '"sensors"')
+    command = ["import", *([str(at), "--flight"] if beside else []), str(folder), "-o", str(out)]
+    (folder / "flight.toml").write_text(text)
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "note: platform.toml: boresight_deg [0, 0.3, 0] is not used: mounting.boresight_deg of flight.toml" in told
+    assert "platform.toml: [imu] is not used: " in told and "platform.toml: [gnss] is not used: " in told
+    assert "platform.toml: lever_arm_m" not in told  # the same in both
+    project = next(iter(RecordingReader(out).messages(["configuration/project"]))).body
+    np.testing.assert_allclose(project.boresight_deg, [0.0, 0.1, 0.0])
+    (folder / "flight.toml").write_text(text.replace("lever_arm_m = [0.2, 0.0, -1.5]\n", "", 1))
+    assert main(command) == 1
+    wanted = f"mounting.lever_arm_m: missing, but {at / 'platform.toml'} says [0.2, 0, -1.5]: wanted one"
+    assert wanted in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("whole", [True, False])
 def test_tables_of_sensors_are_read_once(whole, folder, tmp_path, monkeypatch):
     """With images and a height above the ground they were read three times, four times of a flight folder."""
