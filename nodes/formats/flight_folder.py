@@ -106,6 +106,8 @@ _AS_KEYS = (
     (r"--ground-height\b", "flight.ground_height_m"),
     (r"--camera\b", "camera.file"),
 )
+#: Of these, options of `triline import` that say of image lines what [[strips]] says of those in the folder.
+_OF_LINES = ("--grey-range", "--band", "--raw", "--samples", "--line-times", "--first-time", "--line-rate")
 _ZERO = (0.0, 0.0, 0.0)
 T = TypeVar("T")
 
@@ -125,6 +127,11 @@ class Instead:
     kind: str = ""
     day: date | None = None
     lines: LinesGiven | None = None
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options that have said it: what is wrong with them is told by their names, and not by those of keys."""
+        return (*(["--date"] if self.day else []), *(_OF_LINES if self.lines is not None else ()))
 
 
 @dataclass
@@ -154,6 +161,7 @@ class Flight:
     announced : strips of a live flight that are known beforehand: id, time of the first line in ns, lines a second
     sensors : tables of the sensor programs of a live flight
     lines : image topics of a ROS 2 bag, where they are stated
+    options : of the command line that say something in place of keys
     notes : remarks
     problems : what is wrong or missing, a line each; an empty list for a flight that can be imported
     """
@@ -182,6 +190,7 @@ class Flight:
     announced: list[tuple[str, int, float]] = field(default_factory=list)
     sensors: list[Keys] = field(default_factory=list)
     lines: LinesGiven | None = None
+    options: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
@@ -190,10 +199,17 @@ class Flight:
         try:
             return work()
         except UserError as error:
-            self.problems.append(_in_keys(str(error)))
+            self.problems.append(self.in_keys(str(error)))
         except OSError as error:
             self.problems.append(f"{error.filename}: {(error.strerror or str(error)).lower()}")
         return None
+
+    def in_keys(self, text: str) -> str:
+        """What a reader says, with keys of the ``flight.toml`` for the options that it names and nobody gave."""
+        for option, key in _AS_KEYS:
+            if not option.startswith(self.options):
+                text = re.sub(option, key, text)
+        return text
 
 
 def read_flight(folder: Path, live: bool | None = None, instead: Instead | None = None) -> Flight:
@@ -217,7 +233,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
             raise UserError(f"{folder}: is a file, wanted a folder with {FILE}")
         raise UserError(f"{folder}: no {FILE}; `triline new flight {shlex.quote(str(folder))}` writes one")
     file = read_toml(path)
-    flight = Flight(folder)
+    flight = Flight(folder, options=others.options)
     tables = {}
     for name in (name for name in _KEYS[""] if name not in ("strips", "sensor")):
         tables[name] = flight.attempt(lambda name=name: file.table(name)) or Keys(path, {}, name)
@@ -242,7 +258,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
             continue
         flight.attempt(lambda keys=keys: (_announced if live else _strip)(flight, keys))
     if given is not None:
-        flight.attempt(lambda: _open(flight, replace(given, day=flight.day), as_keys=False))
+        flight.attempt(lambda: _open(flight, replace(given, day=flight.day)))
     elif not strips and not live and flight.kind != "ros2":
         flight.notes.append(f"{FILE}: no [[strips]]: the recording has no image lines")
     raw = flight.kind == "ros2" or (flight.tables is not None and flight.tables.time_s is not None)
@@ -261,13 +277,6 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
         unknown = [key for key in keys.values if key not in known]
         flight.problems.extend(f"{path}: {keys.name(key)}: not known, wanted {', '.join(known)}" for key in unknown)
     return flight
-
-
-def _in_keys(text: str) -> str:
-    """What a reader says, with keys of the ``flight.toml`` for the options that it names."""
-    for option, key in _AS_KEYS:
-        text = re.sub(option, key, text)
-    return text
 
 
 def refuse_problems(flight: Flight) -> None:
@@ -333,7 +342,7 @@ def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Impor
     )
     imported = read_any(flight.navigation, flight.kind, options)
     notes = imported.notes
-    notes[:] = [_in_keys(note) for note in notes if "--position-sigma" not in note]  # flight.toml has said them
+    notes[:] = [flight.in_keys(note) for note in notes if "--position-sigma" not in note]  # flight.toml has said them
     notes[:0] = [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
     return Imported("flight", _messages(flight, imported, notes), notes), flight.platform
 
@@ -703,14 +712,14 @@ def _strip(flight: Flight, keys: Keys) -> None:
     _open(flight, given)
 
 
-def _open(flight: Flight, given: LinesGiven, *, as_keys: bool = True) -> None:
-    """Add the images of a strip; ``as_keys`` where a flight.toml names them, and not options."""
+def _open(flight: Flight, given: LinesGiven) -> None:
+    """Add the images of a strip."""
     track = flight.track
     strip = open_strip(given, flight.camera, track.time_ns if track is not None and track.line_rate_hz > 0 else None)
     if flight.span_ns is not None:
         strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
     notes = () if flight.camera is None else strip.notes  # a missing camera is told once
-    flight.strips.append(replace(strip, notes=tuple(_in_keys(note) if as_keys else note for note in notes)))
+    flight.strips.append(replace(strip, notes=tuple(map(flight.in_keys, notes))))
 
 
 def _node(nodes: Keys, name: str) -> None:

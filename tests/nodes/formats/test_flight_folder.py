@@ -590,6 +590,15 @@ def test_what_does_not_go_beside_a_folder(folder, tmp_path, capsys):
         assert main(["import", *arguments, "-o", out]) == 1
         error = capsys.readouterr().err
         assert told in error and error.count("\n") == 1, error
+    lines = ["--lines", f"N={folder / 'nadir.img'}"]
+    for more, told in (  # by the names of options that were given, and not of keys
+        (lines, "times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"),
+        (["--date", "2019-01-01"], "--date"),
+    ):
+        (folder / "dated.csv").write_text((folder / "poses.csv").read_text().replace("gps_s", "time_s"))
+        source = poses if more is lines else str(folder / "dated.csv")
+        assert main(["import", source, "--flight", str(folder), "-o", out, *more]) == 1
+        assert told in (error := capsys.readouterr().err) and "navigation.date" not in error, error
     (folder / "camera.json").unlink()
     assert main(["import", poses, "--flight", str(folder), "-o", out]) == 1
     assert "camera.file: no camera.json in the folder" in capsys.readouterr().err
