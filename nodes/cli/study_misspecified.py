@@ -26,7 +26,7 @@ from ...solver.simulation.misspecified_study import (
 from ...solver.simulation.real_motion import RealMotion
 from ..batch.json_values import plain
 from ..errors import UserError
-from ..formats.new_file import new_file
+from ..formats.new_file import new_file, refuse_unless_file
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
@@ -63,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     parser.add_argument("--csv", metavar="FILE", help="also write a row of figures for each row and setting")
+    parser.add_argument("--page", metavar="FILE", help="also write tables and pictures as a page (HTML)")
     parser.add_argument(
         "--flights", metavar="FILE",
         help="keep each flight there as soon as it is flown, and take from there what the same code has flown before: "
@@ -77,6 +78,9 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("a motion is one strip: wanted --motion or --strips")
     if not args.motion and (args.from_s or args.ground != GROUND_M):
         raise UserError("--from and --ground belong to a motion: wanted --motion")
+    for path in (args.csv, args.page):
+        if path:
+            refuse_unless_file(Path(path))
     motion = _motion(args) if args.motion else None
     rows = [row for row in ROWS if row in args.rows]
     keys = [(setting, row) for setting in args.settings for row in rows]
@@ -84,6 +88,12 @@ def run(args: argparse.Namespace) -> int:
     cells = cells_of(flights)
     if args.csv:
         write_csv(cells, Path(args.csv))
+    if args.page:
+        from ..report.misspecified_page import write_page  # draws with matplotlib
+
+        words = {setting: remarks([cell for cell in cells if cell.setting == setting]) for setting in args.settings}
+        with new_file(Path(args.page)) as part:
+            write_page(part, cells, f"{args.seeds} flights a row, {_flown(args)}.", words, limits_line(cells))
     if args.json:
         print(json.dumps(document(args, cells, flights), indent=2))
     else:
@@ -191,16 +201,26 @@ def lines(cells: Sequence[Cell], seeds: int, flown: str) -> list[str]:
         out += ["", _HEAD.format(setting)]
         mine = [cell for cell in cells if cell.setting == setting]
         out += [_line(cell) for cell in mine]
-        for cell in mine:
-            if ROWS[cell.row].unknowable:
-                title = ROWS[cell.row].title
-                out.append(f"  {title}: in the datum of control; against truth on line {cell.in_truth_m:.2f} m")
-        out += [f"  the worst of {ROWS[c.row].title}, seed {c.worst_seed}: {c.worst_words or '-'}" for c in mine]
+        out += [f"  {line}" for line in remarks(mine)]
+    return [*out, "", limits_line(cells)]
+
+
+def remarks(cells: Sequence[Cell]) -> list[str]:
+    """What is to be said of rows of a setting beside their figures."""
+    out = []
+    for cell in cells:
+        if ROWS[cell.row].unknowable:
+            title = ROWS[cell.row].title
+            out.append(f"{title}: in the datum of control; against truth on line {cell.in_truth_m:.2f} m")
+    return out + [f"the worst of {ROWS[c.row].title}, seed {c.worst_seed}: {c.worst_words or '-'}" for c in cells]
+
+
+def limits_line(cells: Sequence[Cell]) -> str:
+    """How many limits hold, and what the study took."""
     missed = sum(not held for cell in cells for held in cell.limits.values())
     total, took = sum(len(cell.limits) for cell in cells), sum(cell.seconds for cell in cells)
     count = sum(cell.flights for cell in cells)
-    out += ["", f"{total - missed} of {total} limits hold; {count} flights, {took:.0f} s of processor time"]
-    return out
+    return f"{total - missed} of {total} limits hold; {count} flights, {took:.0f} s of processor time"
 
 
 _HEAD = (

@@ -12,7 +12,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ...solver.rectification.comparison import METHODS, Compared, Noise, compare
 from ..errors import UserError
 from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.table import write_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXAMPLE = "triline study rectification --control 25 --plot comparison.png --csv comparison.csv"
 #: Errors of starts: position m, attitude degrees.
@@ -38,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="draws (10)")
     parser.add_argument("--csv", metavar="FILE", help="write one row a scene and method")
     parser.add_argument("--plot", metavar="FILE", help="write a picture of the comparison (PNG, SVG, PDF)")
+    parser.add_argument("--page", metavar="FILE", help="write picture and tables as a page (HTML)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: wanted a number of at least 0")
     if args.pixel_sigma == args.ground_sigma == 0:
         raise UserError("--pixel-sigma, --ground-sigma: wanted one above 0")
-    for path in (args.csv, args.plot):
+    for path in (args.csv, args.plot, args.page):
         if path:
             refuse_unless_file(Path(path))
     noise = Noise(args.pixel_sigma, args.ground_sigma, args.height_sigma)
@@ -77,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
         _write_csv(Path(args.csv), tables)
     if args.plot:
         _plot(Path(args.plot), tables)
+    if args.page:
+        _page(Path(args.page), args, tables, starts)
     if args.json:
         scenes = {scene: {name: _plain(got) for name, got in table.items()} for scene, table in tables.items()}
         print(json.dumps({"scenes": scenes, "starts": {name: _plain(got) for name, got in starts.items()}}, indent=2))
@@ -99,16 +105,13 @@ def _number(value: float) -> float | None:
 
 def _text(args: argparse.Namespace, tables: dict[str, dict[str, Compared]], starts: dict[str, Compared]) -> str:
     lines = [
-        f"{args.control} control points, {args.check} check points, {args.seeds} draws; RMSE of check points east, "
-        "north, m (a pixel is 27.6 m)",
+        f"{_what(args)}; RMSE of check points east, north, m (a pixel is 27.6 m)",
         f"{'':14s}" + "".join(f"{scene:>26s}" for scene in tables) + f"{'ms':>10s}",
     ]
     for name in METHODS:
         row = f"{name:14s}"
         for table in tables.values():
-            got = table[name]
-            text = f"{got.rmse_m[0]:.1f} {got.rmse_m[1]:7.1f}" if np.isfinite(got.rmse_m).all() else "too few points"
-            row += f"{text:>26s}"
+            row += f"{_rmse(table[name], 'too few points'):>26s}"
         lines.append(row + f"{1e3 * next(iter(tables.values()))[name].seconds:10.1f}")
     lines += [
         "",
@@ -116,9 +119,16 @@ def _text(args: argparse.Namespace, tables: dict[str, dict[str, Compared]], star
         f"{'':22s}{'RMSE east, north, m':>22s}{'failed':>8s}",
     ]
     for name, got in starts.items():
-        text = f"{got.rmse_m[0]:.1f} {got.rmse_m[1]:7.1f}" if np.isfinite(got.rmse_m).all() else "-"
-        lines.append(f"{name:22s}{text:>22s}{got.failed:8d}")
+        lines.append(f"{name:22s}{_rmse(got, '-'):>22s}{got.failed:8d}")
     return "\n".join(lines)
+
+
+def _what(args: argparse.Namespace) -> str:
+    return f"{args.control} control points, {args.check} check points, {args.seeds} draws"
+
+
+def _rmse(got: Compared, none: str) -> str:
+    return f"{got.rmse_m[0]:.1f} {got.rmse_m[1]:7.1f}" if np.isfinite(got.rmse_m).all() else none
 
 
 def _write_csv(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
@@ -129,13 +139,11 @@ def _write_csv(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
         write_table(part, columns, dict.fromkeys((k for k in keys if k.endswith("_m")), ".3f") | {"seconds": ".6f"})
 
 
-def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
-    import matplotlib
+def _figure(tables: dict[str, dict[str, Compared]]) -> Figure:
+    from ..report.style import figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    fig = figure(4.5)
+    axes = fig.subplots()
     width = 0.8 / len(tables)
     for k, (scene, table) in enumerate(tables.items()):
         rmse = [float(np.hypot(*table[name].rmse_m)) for name in METHODS]
@@ -144,9 +152,34 @@ def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
     axes.set_yscale("log")
     axes.set_xticks(range(len(METHODS)), METHODS, rotation=30, ha="right")
     axes.set_ylabel("RMSE of check points, m")
-    axes.legend(frameon=False, fontsize="small")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.legend()
+    return fig
+
+
+def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
+    from ..report.style import styled
+
+    with styled(), new_file(path) as part:
+        _figure(tables).savefig(part, format=path.suffix.lstrip(".") or "png", dpi=120)
+
+
+def _page(
+    path: Path, args: argparse.Namespace, tables: dict[str, dict[str, Compared]], starts: dict[str, Compared]
+) -> None:
+    from ..report.render import drawing, render
+    from ..report.style import styled
+
+    first = next(iter(tables.values()))
+    methods = [
+        [name, *(_rmse(table[name], "too few points") for table in tables.values()), f"{1e3 * first[name].seconds:.1f}"]
+        for name in METHODS
+    ]
+    rows = [[name, _rmse(got, "-"), got.failed] for name, got in starts.items()]
+    with styled():
+        picture = drawing(_figure(tables))
+    what = f"A frame image over level ground and over relief: {_what(args)}."
     with new_file(path) as part:
-        figure.savefig(part, format=path.suffix.lstrip(".") or "png", dpi=120)
-    plt.close(figure)
+        page = render(
+            "rectification.html", what=what, heads=list(tables), methods=methods, starts=rows, picture=picture
+        )
+        part.write_text(page, encoding="utf-8")

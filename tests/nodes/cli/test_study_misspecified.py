@@ -42,8 +42,20 @@ GOOD = FlightFigures(
 
 def test_the_command(tmp_path, capsys):
     """Two rows of one short flight: as stated beside a GNSS datum, which shows in direct georeferencing at least."""
-    table = tmp_path / "table.csv"
-    words = ["study", "misspecified", "--seeds", "1", "--seconds", "12", "--rows", "gnss-datum", "stated"]
+    table, page = tmp_path / "table.csv", tmp_path / "page.html"
+    words = [
+        "study",
+        "misspecified",
+        "--page",
+        str(page),
+        "--seeds",
+        "1",
+        "--seconds",
+        "12",
+        "--rows",
+        "gnss-datum",
+        "stated",
+    ]
     assert main([*words, "--settings", "rtk", "--online", "window", "--jobs", "1", "--json", "--csv", str(table)]) == 0
     document = json.loads(capsys.readouterr().out)
     stated, datum = document["cells"]
@@ -59,6 +71,11 @@ def test_the_command(tmp_path, capsys):
         read = list(csv.DictReader(rows))
     assert [row["row"] for row in read] == ["stated", "gnss-datum"]
     assert float(read[1]["direct_m"]) == datum["direct_m"] and read[0]["limit light"] in ("0", "1")
+    text = page.read_text()
+    assert text.count("<svg") == 1 and "Stated: rtk" in text and "src=" not in text and 'href="http' not in text
+    for cell in document["cells"]:
+        assert f"<td>{cell['online_m']:.3f}</td>" in text and f"<td>{cell['worst_seed']}</td>" in text
+    assert "limits hold; 2 flights" in text
 
 
 @needs_motion

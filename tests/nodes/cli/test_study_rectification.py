@@ -64,14 +64,20 @@ def test_too_few_points_are_told():
 
 
 def test_study_of_methods_writes_table_and_picture(tmp_path, capsys):
-    csv, plot = tmp_path / "c.csv", tmp_path / "c.png"
+    csv, plot, page = tmp_path / "c.csv", tmp_path / "c.png", tmp_path / "c.html"
     args = ["--control", "9", "--check", "20", "--seeds", "1", "--csv", str(csv), "--plot", str(plot)]
+    args += ["--page", str(page)]
     assert main(["study", "rectification", *args]) == 0
     out = capsys.readouterr().out
     assert "differential" in out and "too few points" in out  # nine points are no RPC
     table = pd.read_csv(csv)
     assert len(table) == 3 * 9 and table["rmse_east_m"].notna().sum() >= 3 * 7
     assert plot.read_bytes().startswith(b"\x89PNG")
+    text = page.read_text()
+    assert text.count("<svg") == 1 and "too few points" in text and "9 control points, 20 check points" in text
+    assert "src=" not in text and 'href="http' not in text  # one file
+    level = table[(table["scene"] == "level ground") & (table["method"] == "differential")].iloc[0]
+    assert f"<td>{level['rmse_east_m']:.1f} {level['rmse_north_m']:7.1f}</td>" in text
     assert main(["study", "rectification", "--control", "2"]) == 1
     assert "--control: wanted at least 3" in capsys.readouterr().err
 
