@@ -41,12 +41,12 @@ _SENSORS = ("date", "camera", "line_rate", *_GROUND, *_IMAGES)
 _POSES = ("lever_arm", "boresight", "position_sigma", "attitude_sigma", *_SENSORS)
 #: Kind of input -> options (as attributes) that have an effect on it.
 GO_WITH: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("flight", "block", "ties", "camera"), ()),
+    **dict.fromkeys(("flight", "ties", "camera"), ()),
     **dict.fromkeys(("sensors", "ros2"), _SENSORS),
     **dict.fromkeys(("avirisng", "pos", "headwall", "resonon", "gpx"), _POSES),
     **dict.fromkeys(("avirisc", "csv"), (*_POSES, "crs")),
     "sbet": (*_POSES, "seconds_of_day"),
-    "scenes": _IMAGES,
+    **dict.fromkeys(("block", "scenes"), _IMAGES),
     "lines": ("date", "camera", "line_rate", *_IMAGES),
 }
 _OPTIONS = ("crs", "seconds_of_day", *_POSES)
@@ -100,7 +100,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     images.add_argument(
         "--lines", action="append", metavar="VIEW=FILE,..",
         help="images (ENVI, TIFF, raw) of one strip, one for each CCD line (F=forward.img,N=nadir.img); FILE@BAND for "
-        "a band of it; of a ROS 2 bag topics (N=/camera/nadir); of satellite scenes one a scene (scene/F=f.tif)",
+        "a band of it; of a ROS 2 bag topics (N=/camera/nadir); of a block folder one a strip and CCD line "
+        "(S1/F=f.img), of satellite scenes one a scene (scene/F=f.tif)",
     )  # fmt: skip
     images.add_argument("--strip", metavar="ID", help="of the images (default: name of the first file)")
     images.add_argument(

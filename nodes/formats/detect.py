@@ -18,6 +18,7 @@ from ..node import Message
 from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
 from .avirisng import is_avirisng, read_avirisng
 from .block_folder import is_block_folder, read_block
+from .block_images import with_block_images
 from .block_messages import block_messages, not_carried
 from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
@@ -207,7 +208,8 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         block = read_block(path) if kind == "block" else local_block(read_scene_block(path))
         notes, messages = [*block.notes, *not_carried(block)], block_messages(block)
         if options.lines is not None:
-            messages = with_scene_images(block, messages, options.lines, notes)
+            with_images = with_scene_images if kind == "scenes" else with_block_images
+            messages = with_images(block, messages, options.lines, notes)
         return Imported(kind, messages, notes)
     if kind == "ties":
         ties = read_tie_points(path)

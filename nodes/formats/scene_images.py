@@ -60,10 +60,10 @@ def with_scene_images(
     if lost:
         notes.append(f"no image of the scenes {', '.join(lost)}")
     merged = merge(told, *(strip.blocks() for strip in found.values()), key=lambda m: (m.stamp_ns, rank(m.topic)))
-    return _with_notes(merged, found.values(), notes)
+    return with_notes(merged, found.values(), notes)
 
 
-def _with_notes(messages: Iterable[Message], strips: Iterable[ImageStrip], notes: list[str]) -> Iterator[Message]:
+def with_notes(messages: Iterable[Message], strips: Iterable[ImageStrip], notes: list[str]) -> Iterator[Message]:
     """The messages; then notes get what was done to values that did not fit."""
     yield from messages
     notes += [note for strip in strips for image in strip.views.values() for note in image.notes()]

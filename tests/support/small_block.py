@@ -45,6 +45,9 @@ FILES = {
 }
 
 
+TRAJECTORY_ROWS = FILES["trajectory.csv"].splitlines()
+
+
 def write_files(folder: Path, **changed: str | None) -> Path:
     """Write the folder; ``image_points='...'`` replaces that file (None leaves it out)."""
     folder.mkdir(exist_ok=True)
