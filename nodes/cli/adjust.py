@@ -58,6 +58,7 @@ from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
 from .dem_options import add_dem_options, dem_settings
 from .locate import refraction_of
+from .navigated import navigated
 from .outputs import refuse_folder_of_inputs
 
 EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
@@ -265,10 +266,11 @@ def read_input(path: Path) -> BlockData:
         raise UserError(f"{path}: no such file or folder")
     refuse_importable(path)
     reader = RecordingReader(path, by_ranges=True)
-    voices = RecordedVoices()
-    block = block_from_messages(voices.all_used(reader.sorted_messages(TOPICS)), path.name)
+    voices, notes = RecordedVoices(), list[str]()
+    with navigated(reader, path.name, notes) as oriented:
+        block = block_from_messages(voices.all_used(oriented.sorted_messages(TOPICS)), path.name)
     damage = (f"damaged recording: {line}" for line in damage_lines(reader))
-    return replace(block, notes=(*damage, *voices.lines(), *block.notes))
+    return replace(block, notes=(*damage, *notes, *voices.lines(), *block.notes))
 
 
 def refuse_worker_options(args: argparse.Namespace) -> None:
