@@ -128,7 +128,7 @@ def _day(text: str) -> date:
 def run(args: argparse.Namespace) -> int:
     source, output = Path(args.input), Path(args.output)
     _check_numbers(args)
-    kind = args.format or ("lines" if args.raw and not args.lines else kind_of_path(source))
+    kind = args.format or ("lines" if _is_raw_image(args, source) else kind_of_path(source))
     if not source.exists():
         raise UserError(f"{source}: no such file or folder")
     _refuse_options(args, kind, source)
@@ -164,6 +164,12 @@ def run(args: argparse.Namespace) -> int:
     elif not args.quiet:
         _print_summary(result)
     return 0
+
+
+def _is_raw_image(args: argparse.Namespace, source: Path) -> bool:
+    """Whether the input is an image that does not say so: there is no other one, or ``--lines`` names it, too."""
+    named = [path.absolute() for _, path, _ in files_of(args.lines or ())]
+    return args.raw is not None and (not named or source.absolute() in named)
 
 
 def _instead(args: argparse.Namespace, kind: str, source: Path) -> Instead:

@@ -161,6 +161,19 @@ def test_a_tiff_and_a_raw_strip_give_the_lines_of_the_envi_image(tmp_path, capsy
     np.testing.assert_array_equal(pixels_of(out, "N"), cube[..., 1])
 
 
+def test_a_raw_image_that_says_its_ccd_line_is_an_input(tmp_path, monkeypatch):
+    """It was of no known kind, as of a camera of several CCD lines --lines has to say which one it is."""
+    cube, out = cube_of("u2", bands=1), tmp_path / "o.mcap"
+    raw = tmp_path / "nadir.raw"
+    raw.write_bytes(cube.tobytes())
+    camera = ["--camera", str(write_camera(tmp_path / "camera.json"))]
+    how = ["--raw", "u2", "--first-time", START, "--line-rate", "100", "-o", str(out), "-q"]
+    monkeypatch.chdir(tmp_path)
+    for name in (raw, "./nadir.raw"):
+        assert main(["import", "nadir.raw", "--lines", f"N={name}", *camera, *how]) == 0
+        np.testing.assert_array_equal(pixels_of(out, "N"), cube[..., 0])
+
+
 def test_a_tiff_with_coordinates_is_told(tmp_path):
     place = {"crs": "EPSG:32632", "transform": rasterio.Affine(1, 0, 5e5, 0, -1, 5e6)}
     tiff = write_tiff(tmp_path / "a.tif", cube_of("u1", bands=1), **place)
